@@ -1,0 +1,47 @@
+"""Arrays from the caller made fit for the compiled part, with errors that name the argument."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:
+    """Real numeric array of one of the ranks `ndim`, in native byte order and C order.
+
+    A copy is made only where the caller's array is not already so.
+    """
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{name}' is not an array of numbers: {error}") from error
+    if array.dtype.kind not in "buif":
+        raise InputError(f"'{name}' has dtype {array.dtype}, expected real numbers")
+    ranks = (ndim,) if isinstance(ndim, int) else ndim
+    if array.ndim not in ranks:
+        wanted = " or ".join(str(rank) for rank in ranks)
+        raise InputError(
+            f"'{name}' has shape {array.shape}, expected {wanted} dimensions, not {array.ndim}"
+        )
+    return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+
+
+def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:
+    """Like `as_array`, with float32 kept and every other dtype made float64."""
+    array = as_array(name, values, ndim=ndim)
+    return array if array.dtype == np.float32 else array.astype(np.float64, copy=False)
+
+
+def positive_workers(workers: int | None) -> int | None:
+    """The number of worker threads, checked."""
+    if workers is None:
+        return None
+    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or workers < 1:
+        raise InputError(f"'workers' is {workers!r}, expected a positive whole number or None")
+    return int(workers)

@@ -1,0 +1,41 @@
+"""Errors and warnings: everything that equipix raises is one of these."""
+
+
+class EquipixError(Exception):
+    """Base class of all errors of this package."""
+
+
+class InputError(EquipixError, ValueError):
+    """An argument is not what was wanted; the message names it, its value and what to do."""
+
+
+class SpotError(InputError):
+    """A spot is missing, cut by the edge, doubled or saturated."""
+
+
+class FileError(EquipixError, OSError):
+    """A file cannot be read or written, or holds something else; the message names it."""
+
+
+class InsufficientMemoryError(EquipixError, MemoryError):
+    """The memory that the work needs cannot be had; the message names the bytes."""
+
+
+class EquipixWarning(UserWarning):
+    """Base class of all warnings of this package."""
+
+
+class ConvergenceWarning(EquipixWarning):
+    """A solver stopped before the error that was asked for."""
+
+
+class IdentifiabilityWarning(EquipixWarning):
+    """The measurements do not determine every pixel."""
+
+
+class ShiftRoundingWarning(EquipixWarning):
+    """Fractional shifts were rounded to whole pixels."""
+
+
+class ShiftSignWarning(EquipixWarning):
+    """The data contradict the sign of the shifts."""

@@ -1,0 +1,82 @@
+//! Threads: the only module that names rayon.
+//!
+//! Work is cut into blocks whose size does not depend on the number of threads, and partial sums
+//! are folded in the order of the blocks, so the same bytes come out for any number of workers.
+
+use std::collections::HashMap;
+use std::num::NonZeroUsize;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+
+/// A pool of worker threads.
+#[derive(Clone, Debug)]
+pub struct Workers {
+    pool: Arc<rayon::ThreadPool>,
+}
+
+/// The pools of this process, by process id and number of threads.
+///
+/// A forked child inherits the table but not the threads, so the id is part of the key; the
+/// parent's pools stay in the child's table untouched, since to drop one would wait for threads
+/// that the child does not have.
+static POOLS: Mutex<Option<HashMap<(u32, usize), Workers>>> = Mutex::new(None);
+
+impl Workers {
+    /// The pool of `count` threads, started at its first use; `None` means every processor that
+    /// this process may run on.
+    ///
+    /// # Errors
+    /// [`Error::Workers`] if the threads cannot be started.
+    pub fn new(count: Option<NonZeroUsize>) -> Result<Self> {
+        let available = || std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
+        let count = count.map_or_else(available, NonZeroUsize::get);
+        let mut guard = POOLS.lock().unwrap_or_else(PoisonError::into_inner);
+        let pools = guard.get_or_insert_default();
+        let key = (std::process::id(), count);
+        if let Some(workers) = pools.get(&key) {
+            return Ok(workers.clone());
+        }
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(count)
+            .thread_name(|index| format!("equipix-{index}"))
+            .build()
+            .map_err(|error| Error::Workers { workers: count, reason: error.to_string() })?;
+        let workers = Self { pool: Arc::new(pool) };
+        pools.insert(key, workers.clone());
+        Ok(workers)
+    }
+
+    /// How many threads the pool has.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.pool.current_num_threads()
+    }
+
+    /// Calls `work` for 0, 1, … `count` − 1 in parallel; the results stand in that order.
+    pub fn map<R: Send>(&self, count: usize, work: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
+        self.pool.install(|| (0..count).into_par_iter().map(work).collect())
+    }
+
+    /// Cuts `data` into blocks of `size` and calls `work(index, block)` for each, in parallel;
+    /// the results stand in the order of the blocks.
+    pub fn map_blocks<T, R>(
+        &self,
+        data: &mut [T],
+        size: usize,
+        work: impl Fn(usize, &mut [T]) -> R + Sync + Send,
+    ) -> Vec<R>
+    where
+        T: Send,
+        R: Send,
+    {
+        self.pool.install(|| {
+            data.par_chunks_mut(size.max(1))
+                .enumerate()
+                .map(|(index, block)| work(index, block))
+                .collect()
+        })
+    }
+}

@@ -1,0 +1,24 @@
+//! Python binding of [`equipix_core`], the module `equipix._native`.
+//!
+//! Every function views its arrays, calls the core through [`run::interruptible`] (which releases
+//! the GIL, shows progress and hears Ctrl-C), maps the error and wraps the result; nothing else.
+//! The Python layer hands over C-contiguous arrays in native byte order, so nothing is copied here.
+//!
+//! Callers must not change an array from another thread while a call reads it.
+
+mod errors;
+mod run;
+
+use pyo3::prelude::*;
+
+/// The compiled part of equipix.
+#[pymodule]
+mod _native {
+    use super::{Bound, PyModule, PyResult};
+    use pyo3::prelude::*;
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+}
