@@ -216,8 +216,9 @@ class ReducedSystem:
 
     def noise(self, rng: np.random.Generator) -> Floats:
         """Draw a right-hand side b: white noise of variance 1 per measurement, times √ω."""
-        drawn = self._root * rng.standard_normal(self._root.shape)
-        return drawn.sum(axis=0) - self._eliminated(self._scatter(drawn))
+        drawn: Floats = self._root * rng.standard_normal(self._root.shape)
+        on_pixels: Floats = drawn.sum(axis=0)
+        return on_pixels - self._eliminated(self._scatter(drawn))
 
     def solve(self, rhs: Floats, *, tolerance: float = 1e-5) -> Floats:
         """Solve S·g = rhs by conjugate gradients, preconditioned by D_M."""
