@@ -6,6 +6,7 @@
 //!
 //! Callers must not change an array from another thread while a call reads it.
 
+mod calibrate;
 mod errors;
 mod run;
 
@@ -16,6 +17,9 @@ use pyo3::prelude::*;
 mod _native {
     use super::{Bound, PyModule, PyResult};
     use pyo3::prelude::*;
+
+    #[pymodule_export]
+    use crate::calibrate::{PySolution, calibrate_frames};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -1,0 +1,20 @@
+"""Executable specification: what equipix computes, in plain NumPy.
+
+Nothing here is fast, and the package itself never imports it: it is what the fast code is
+checked against, so it shares no line with it.
+"""
+
+from equipix.reference.connectivity import components
+from equipix.reference.descent import Solution, coordinate_descent
+from equipix.reference.least_squares import solve_dense
+from equipix.reference.model import exposures, grid_cells, objective
+
+__all__ = [
+    "Solution",
+    "components",
+    "coordinate_descent",
+    "exposures",
+    "grid_cells",
+    "objective",
+    "solve_dense",
+]

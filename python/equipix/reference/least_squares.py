@@ -1,0 +1,80 @@
+"""The minimiser of F by dense linear algebra, for tiny sensors: a truth of its own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.reference.descent import Solution, best_beam, best_sensitivity, gauged
+from equipix.reference.model import Problem, exposures, objective, problem
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+def solve_dense(
+    frames: ArrayLike,
+    shifts: ArrayLike,
+    *,
+    variance: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    flux: ArrayLike | None = None,
+    rotation: ArrayLike | None = None,
+    steps: int = 20,
+) -> Solution:
+    """Minimise F by Gauss-Newton steps, each a dense least-squares problem of least norm.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n, rows, cols)
+        Exposures, dark subtracted; NaN counts as masked.
+    shifts : array_like of int, shape (n, 2)
+        Shifts (row, col) in whole pixels.
+    variance : array_like, optional
+        Variance of the values, like `frames` or (n,); 1 unless given.
+    mask : array_like of bool, optional
+        True = do not use; (rows, cols) or (n, rows, cols).
+    flux : array_like, shape (n,), optional
+        Relative power of the lamp in each exposure; 1 unless given.
+    rotation : array_like, shape (n,), optional
+        Rotations of the sensor in degrees, multiples of 90; 0 unless given.
+    steps : int
+        Largest number of steps.
+
+    Returns
+    -------
+    Solution
+        Sensitivity, beam and the objective after each step.
+
+    Notes
+    -----
+    The steps are linear, M + δM and L + δL, and the free scales of M and L in each component
+    are what least norm settles. Cost: (measurements)·(unknowns)² per step.
+    """
+    data = problem(frames, shifts, variance=variance, mask=mask, flux=flux, rotation=rotation)
+    beam = best_beam(data, np.ones(data.values.shape[1:]))
+    sensitivity = best_sensitivity(data, beam)
+    history = [objective(data, sensitivity, beam)]
+    for _ in range(steps):
+        change = _step(data, np.nan_to_num(sensitivity), np.nan_to_num(beam))
+        sensitivity = sensitivity + change[: sensitivity.size].reshape(sensitivity.shape)
+        beam = beam + change[sensitivity.size :].reshape(beam.shape)
+        history.append(objective(data, sensitivity, beam))
+        if np.abs(change).max() < 1e-14 * np.nanmax(beam):
+            break
+    return gauged(data, sensitivity, beam, history)
+
+
+def _step(data: Problem, sensitivity: NDArray[Any], beam: NDArray[Any]) -> NDArray[Any]:
+    """Solve √w·(c·L·δM + c·M·δL) = √w·(y − c·L·M) for (δM, δL), of least norm."""
+    exposure, pixel = np.nonzero((data.weights > 0).reshape(len(data.weights), -1))
+    root = np.sqrt(data.weights.reshape(len(data.weights), -1)[exposure, pixel])
+    cell = data.cells.reshape(len(data.cells), -1)[exposure, pixel]
+    gradient = np.zeros((len(root), sensitivity.size + beam.size))
+    rows = np.arange(len(root))
+    gradient[rows, pixel] = root * data.flux[exposure] * beam.flat[cell]
+    gradient[rows, sensitivity.size + cell] = root * data.flux[exposure] * sensitivity.flat[pixel]
+    residual = data.values - exposures(sensitivity, beam, data.flux, data.cells)
+    wanted = root * residual.reshape(len(residual), -1)[exposure, pixel]
+    return np.asarray(np.linalg.lstsq(gradient, wanted, rcond=1e-12)[0])

@@ -1,0 +1,240 @@
+"""How far a measured sensitivity is from the true one, and how far noise alone would put it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix._arrays import as_array
+from equipix.errors import InputError
+from equipix.simulate.signal import checked_shifts, exposures
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from equipix.simulate.signal import Beam, Floats, Rng
+
+BLOCK = 16
+
+
+def relative_error(sensitivity: ArrayLike, truth: ArrayLike) -> Floats:
+    """Relative error of a measured sensitivity, both in the gauge mean 1.
+
+    Parameters
+    ----------
+    sensitivity : array_like, shape (rows, cols)
+        The measured sensitivity; NaN where undetermined.
+    truth : array_like, shape (rows, cols)
+        The true one; NaN in pixels that are not to count.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols), float64
+        (M − M₀)/M₀ after both are divided by their means over the pixels where both are
+        finite; NaN elsewhere.
+
+    Examples
+    --------
+    >>> from equipix import simulate
+    >>> simulate.relative_error([[2.0, 2.0]], [[3.0, 3.0]])
+    array([[0., 0.]])
+    """
+    measured = as_array("sensitivity", sensitivity, ndim=2)
+    true = as_array("truth", truth, ndim=2)
+    ratio = measured / true
+    valid = np.isfinite(ratio)
+    scale = np.mean(measured, where=valid) / np.mean(true, where=valid)
+    return np.where(valid, ratio / scale - 1, np.nan)
+
+
+def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:
+    """Means over square blocks: what is left of an error at large scales.
+
+    Parameters
+    ----------
+    image : array_like, shape (rows, cols)
+        The image; NaN pixels do not count.
+    size : int
+        Edge of a block in pixels.
+
+    Returns
+    -------
+    ndarray, shape (rows // size, cols // size), float64
+        The means of all whole blocks, counted from the first row and column; NaN for a block
+        without a valid pixel.
+
+    Raises
+    ------
+    InputError
+        If the image holds no whole block.
+    """
+    pixels = as_array("image", image, ndim=2).astype(np.float64)
+    rows, cols = pixels.shape[0] // size, pixels.shape[1] // size
+    if rows == 0 or cols == 0:
+        raise InputError(f"'image' has shape {pixels.shape}, smaller than one block of {size}")
+    blocks = pixels[: rows * size, : cols * size].reshape(rows, size, cols, size)
+    valid = np.isfinite(blocks)
+    count = valid.sum(axis=(1, 3))
+    total = np.sum(blocks, axis=(1, 3), where=valid)
+    means: Floats = np.divide(total, count, where=count > 0, out=np.full((rows, cols), np.nan))
+    return means
+
+
+def noise_prediction(
+    sensitivity: ArrayLike,
+    beam: Beam,
+    shifts: ArrayLike,
+    variance: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    draws: int = 4,
+    rng: Rng,
+) -> tuple[float, float]:
+    """Error of the sensitivity that noise alone of known variance leaves at the optimum.
+
+    Parameters
+    ----------
+    sensitivity : array_like, shape (rows, cols)
+        True sensitivity M.
+    beam : callable
+        True beam L, a function of arrays of row and column coordinates.
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col) in pixels, rounded to whole ones here.
+    variance : array_like
+        Variance of the noise of each value, in the units of the beam squared: one number,
+        (rows, cols) or (n, rows, cols). The solution weights each value by its inverse.
+    mask : array_like of bool, shape (rows, cols), optional
+        True in pixels that are not used.
+    draws : int
+        Number of random draws that are averaged.
+    rng : numpy.random.Generator or int
+        Source of the random numbers, or its seed.
+
+    Returns
+    -------
+    rms : float
+        Root mean square of the relative error of M over the pixels, mean over the draws.
+    block_rms : float
+        The same for means over blocks of 16×16 pixels; NaN for a sensor smaller than a block.
+
+    Raises
+    ------
+    InputError
+        If an argument has the wrong shape, or a variance or a signal is not above 0.
+
+    Notes
+    -----
+    Around the truth, with relative steps g of M and f of L and ω = (L·M)²/variance, least
+    squares is a graph Laplacian problem, S g = b with S = D_M − B·D_L⁻¹·Bᵀ, where D_M and D_L
+    sum ω over the exposures on pixels and on beam cells. Noise puts √ω·(white noise of variance
+    1) on each measurement, and b sums that as S does. Conjugate gradients, preconditioned by the
+    diagonal, solve it; the remaining error is far below the scatter of the draws. A pattern that
+    leaves pixels in several connected components has a scale free in each: the prediction then
+    leaves those scales out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from equipix import simulate
+    >>> beam = simulate.gaussian_beam((48, 64))
+    >>> cross = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
+    >>> rms, block_rms = simulate.noise_prediction(np.ones((48, 64)), beam, cross, 1e-6, rng=1)
+    >>> print(f"{rms:.1e}")
+    5.5e-04
+    """
+    truth = as_array("sensitivity", sensitivity, ndim=2).astype(np.float64)
+    cells = np.rint(checked_shifts(shifts)).astype(int)
+    signal = exposures(truth, beam, cells)
+    noise = _like_signal("variance", variance, signal.shape)
+    if not (np.all(noise > 0) and np.all(signal > 0)):
+        raise InputError("'variance' and the signal must be above 0 in every pixel")
+    used = np.ones(truth.shape, bool) if mask is None else ~as_array("mask", mask, ndim=2)
+    system = ReducedSystem(signal**2 / noise * used, cells - cells.min(axis=0))
+    rng = np.random.default_rng(rng)
+    results = []
+    for _ in range(draws):
+        steps = system.solve(system.noise(rng))
+        error = steps - np.average(steps, weights=truth * used)
+        results.append(_rms_at_both_scales(np.where(used, error, np.nan)))
+    rms, block_rms = np.mean(results, axis=0)
+    return float(rms), float(block_rms)
+
+
+def _like_signal(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    if np.shape(values) not in ((), shape[1:], shape):
+        raise InputError(f"'{name}' has shape {np.shape(values)}, expected {shape} or {shape[1:]}")
+    return as_array(name, values, ndim=(0, 2, 3)).astype(np.float64)
+
+
+def _rms_at_both_scales(error: Floats) -> tuple[float, float]:
+    blocks = block_means(error) if min(error.shape) >= BLOCK else np.array([np.nan])
+    return float(np.sqrt(np.nanmean(error**2))), float(np.sqrt(np.nanmean(blocks**2)))
+
+
+class ReducedSystem:
+    """The normal equations of relative steps of M, those of the beam eliminated.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (n, rows, cols)
+        ω of each measurement.
+    corners : ndarray of int, shape (n, 2)
+        First beam cell (row, col) that each exposure sees; the smallest is (0, 0).
+    """
+
+    def __init__(self, weights: Floats, corners: NDArray[np.int64]) -> None:
+        rows, cols = weights.shape[1:]
+        self._windows = [np.s_[r : r + rows, c : c + cols] for r, c in corners.tolist()]
+        self._grid = (rows + int(corners[:, 0].max()), cols + int(corners[:, 1].max()))
+        self._root: Floats = np.sqrt(weights)
+        self._weights = weights
+        self._on_pixels: Floats = weights.sum(axis=0)
+        self._on_cells = self._scatter(weights)
+
+    def _scatter(self, values: Iterable[Floats]) -> Floats:
+        """Sum values over the exposures on the beam cells."""
+        cells = np.zeros(self._grid)
+        for seen, value in zip(self._windows, values, strict=True):
+            cells[seen] += value
+        return cells
+
+    def _eliminated(self, on_cells: Floats) -> Floats:
+        """Apply B·D_L⁻¹ to a sum on beam cells."""
+        beam = np.divide(on_cells, self._on_cells, where=self._on_cells > 0, out=on_cells)
+        result: Floats = np.zeros_like(self._on_pixels)
+        for seen, weight in zip(self._windows, self._weights, strict=True):
+            result += weight * beam[seen]
+        return result
+
+    def product(self, steps: Floats) -> Floats:
+        """Multiply S by steps."""
+        scattered = self._scatter(weight * steps for weight in self._weights)
+        return self._on_pixels * steps - self._eliminated(scattered)
+
+    def noise(self, rng: np.random.Generator) -> Floats:
+        """Draw a right-hand side b: white noise of variance 1 per measurement, times √ω."""
+        drawn: Floats = self._root * rng.standard_normal(self._root.shape)
+        on_pixels: Floats = drawn.sum(axis=0)
+        return on_pixels - self._eliminated(self._scatter(drawn))
+
+    def solve(self, rhs: Floats, *, tolerance: float = 1e-5) -> Floats:
+        """Solve S·g = rhs by conjugate gradients, preconditioned by D_M."""
+        used = self._on_pixels > 0
+        solution = np.zeros_like(rhs)
+        residual = rhs.copy()
+        direction = np.zeros_like(rhs)
+        energy, first = 0.0, 0.0
+        while True:
+            scaled = np.divide(residual, self._on_pixels, where=used, out=np.zeros_like(rhs))
+            previous, energy = energy, float(np.vdot(residual, scaled))
+            first = first or energy
+            if energy <= tolerance**2 * first:
+                return solution
+            direction = scaled + (energy / previous if previous else 0.0) * direction
+            image = self.product(direction)
+            length = energy / float(np.vdot(direction, image))
+            solution += length * direction
+            residual -= length * image

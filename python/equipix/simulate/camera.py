@@ -1,0 +1,169 @@
+"""A virtual camera: photons to digital numbers, one frame at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from equipix._arrays import as_array
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from equipix.simulate.signal import Floats, Rng
+
+Pixels: TypeAlias = "NDArray[np.int64]"
+
+DEAD_RESPONSE = 0.02
+"""Sensitivity of a dead pixel."""
+
+HOT_LEVEL = 0.915
+"""Dark level of a hot pixel, as a fraction of full scale: daylight saturates it."""
+
+
+def _no_pixels() -> Pixels:
+    return np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """A camera with photon and read noise, a dark level, an ADC and bad pixels.
+
+    Attributes
+    ----------
+    sensitivity : array_like, shape (rows, cols)
+        Relative sensitivity of each pixel, were none dead.
+    dark : array_like, shape (rows, cols) or a number
+        Dark level of each pixel, were none hot, in DN.
+    gain_dn_per_e : float
+        Digital numbers per photoelectron.
+    read_noise_e : float
+        Standard deviation of the read noise, in electrons.
+    bit_depth : int
+        Bits of the ADC, 8 to 16: values are rounded and clipped to 0 .. 2^bits − 1.
+    full_well_e : float
+        Largest number of electrons a pixel holds.
+    dead, hot : ndarray of int64
+        Flat indices of pixels of 2 % sensitivity and of pixels that are nearly full in the dark.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range; the message names it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from equipix import simulate
+    >>> camera = simulate.Camera(sensitivity=np.ones((2, 3)), bit_depth=8, gain_dn_per_e=0.01)
+    >>> [frame.dtype.name for frame in camera.frames(np.full((2, 3), 9000.0), 2, rng=1)]
+    ['uint8', 'uint8']
+    """
+
+    sensitivity: ArrayLike
+    dark: ArrayLike = 60.0
+    gain_dn_per_e: float = 0.2
+    read_noise_e: float = 10.0
+    bit_depth: int = 12
+    full_well_e: float = np.inf
+    dead: Pixels = field(default_factory=_no_pixels)
+    hot: Pixels = field(default_factory=_no_pixels)
+
+    def __post_init__(self) -> None:
+        """Refuse values that no camera has."""
+        if self.bit_depth not in range(8, 17):
+            raise InputError(f"'bit_depth' is {self.bit_depth!r}, expected 8 to 16")
+        for name in ("gain_dn_per_e", "full_well_e"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
+        if not self.read_noise_e >= 0:
+            raise InputError(f"'read_noise_e' is {self.read_noise_e!r}, expected 0 or more")
+        sensitivity = as_array("sensitivity", self.sensitivity, ndim=2)
+        for name, pixels in (("dead", self.dead), ("hot", self.hot)):
+            if pixels.size and (pixels.min() < 0 or pixels.max() >= sensitivity.size):
+                raise InputError(f"'{name}' holds indices outside 0 to {sensitivity.size - 1}")
+        if np.shape(self.dark) not in ((), sensitivity.shape):
+            raise InputError(f"'dark' has shape {np.shape(self.dark)}, not {sensitivity.shape}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.response.shape
+        return rows, cols
+
+    @property
+    def full_scale(self) -> int:
+        """Largest digital number."""
+        return int(2**self.bit_depth - 1)
+
+    @cached_property
+    def response(self) -> Floats:
+        """Sensitivity with the dead pixels in it, shape (rows, cols)."""
+        response = np.array(self.sensitivity, np.float64)
+        response.flat[self.dead] = DEAD_RESPONSE
+        return response
+
+    @cached_property
+    def offset(self) -> Floats:
+        """Dark level with the hot pixels in it, shape (rows, cols), in DN."""
+        offset = np.array(np.broadcast_to(self.dark, self.shape), np.float64)
+        offset.flat[self.hot] = HOT_LEVEL * self.full_scale
+        return offset
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """True in pixels that are neither dead nor hot, shape (rows, cols)."""
+        good = np.ones(self.shape, np.bool_)
+        good.flat[np.concatenate([self.dead, self.hot])] = False
+        return good
+
+    def variance(self, light: Floats) -> Floats:
+        """Variance of one frame, saturation aside.
+
+        Parameters
+        ----------
+        light : ndarray, shape (rows, cols)
+            Mean photoelectrons of a pixel of sensitivity 1.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols), float64
+            gain²·(light·M + read noise²) + 1/12, in DN²; the last term is the rounding.
+        """
+        return self.gain_dn_per_e**2 * (light * self.response + self.read_noise_e**2) + 1 / 12
+
+    def frames(self, light: Floats, count: int, *, rng: Rng) -> Iterator[NDArray[Any]]:
+        """Frames of a steady light, made one at a time.
+
+        Parameters
+        ----------
+        light : ndarray, shape (rows, cols)
+            Mean photoelectrons of a pixel of sensitivity 1; 0 for dark frames.
+        count : int
+            Number of frames.
+        rng : numpy.random.Generator or int
+            Source of the random numbers, or its seed.
+
+        Yields
+        ------
+        ndarray, shape (rows, cols), uint8 up to 8 bits, else uint16
+            The next frame, in DN.
+        """
+        rng = np.random.default_rng(rng)
+        electrons = light * self.response
+        dtype = np.uint8 if self.bit_depth == 8 else np.uint16
+        for _ in range(count):
+            yield self._digitised(self._collected(electrons, rng)).astype(dtype)
+
+    def _collected(self, electrons: Floats, rng: np.random.Generator) -> Floats:
+        collected: Floats = np.minimum(rng.poisson(electrons), self.full_well_e)
+        return collected + self.read_noise_e * rng.standard_normal(self.shape)
+
+    def _digitised(self, electrons: Floats) -> Floats:
+        return np.clip(np.rint(self.gain_dn_per_e * electrons + self.offset), 0, self.full_scale)

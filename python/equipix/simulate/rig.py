@@ -1,0 +1,408 @@
+"""A whole calibration experiment: a camera on a stage before a steady beam, and a hole."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tifffile
+
+from equipix._arrays import as_array
+from equipix.errors import FileError, InputError
+from equipix.simulate.accuracy import noise_prediction
+from equipix.simulate.camera import Camera
+from equipix.simulate.signal import Beam, checked_shifts, window
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from equipix.simulate.camera import Pixels
+    from equipix.simulate.signal import Floats, Rng
+
+FULL_SCALE_E = 20_000.0
+"""Electrons that fill the range of the ADC where no gain is given."""
+
+DARK_LEVEL, DARK_SPREAD = 60 / 4095, 3 / 4095
+"""Mean and standard deviation of the dark level over the pixels, relative to full scale."""
+
+HOLE_EDGE = 1.5
+"""Half width of the soft edge of the hole's image, in pixels."""
+
+SMALLEST_HOLE = 3.0
+"""Least radius of the hole's image, in pixels."""
+
+_FRAMES, _DARK, _BEFORE, _AFTER = range(4)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What an experiment should find.
+
+    Attributes
+    ----------
+    sensitivity : ndarray, shape (rows, cols), float64
+        Relative sensitivity, that of the dead pixels included.
+    shifts : ndarray, shape (n, 2), float64
+        Where the stage really was: (row, col) in pixels.
+    dead, hot : ndarray of int64
+        Flat indices of the bad pixels.
+    dark : ndarray, shape (rows, cols), float64
+        Dark level, that of the hot pixels included, in DN.
+    gain_dn_per_e : float
+        Digital numbers per photoelectron.
+    """
+
+    sensitivity: Floats
+    shifts: Floats
+    dead: Pixels
+    hot: Pixels
+    dark: Floats
+    gain_dn_per_e: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VirtualExperiment:
+    """An experiment whose frames are made when they are asked for; see `experiment`.
+
+    Every stream of frames has random numbers of its own and can be drawn again.
+
+    Attributes
+    ----------
+    camera : Camera
+        The camera.
+    beam : callable
+        The beam, in electrons that a pixel of sensitivity 1 collects in a frame.
+    hole : callable
+        The same beam behind the screen with the hole.
+    positions : ndarray, shape (n, 2), float64
+        Where the stage really stands in each exposure, the first at (0, 0).
+    count, dark_count, aperture_count : int
+        Numbers of frames: of an exposure, of the dark, of an image of the hole.
+    entropy : int
+        Seed of all frames.
+    """
+
+    camera: Camera
+    beam: Beam
+    hole: Beam
+    positions: Floats
+    count: int
+    dark_count: int
+    aperture_count: int
+    entropy: int
+
+    @property
+    def truth(self) -> Truth:
+        """What a calibration should find."""
+        camera = self.camera
+        return Truth(
+            sensitivity=camera.response,
+            shifts=self.positions,
+            dead=camera.dead,
+            hot=camera.hot,
+            dark=camera.offset,
+            gain_dn_per_e=camera.gain_dn_per_e,
+        )
+
+    def frames(self, k: int) -> Iterator[NDArray[Any]]:
+        """Frames of exposure `k`, one at a time."""
+        return self._stream(self.beam, k, self.count, _FRAMES, k)
+
+    def dark(self) -> Iterator[NDArray[Any]]:
+        """Dark frames, one at a time."""
+        rng = np.random.default_rng([self.entropy, _DARK])
+        return self.camera.frames(np.zeros(self.camera.shape), self.dark_count, rng=rng)
+
+    def aperture_before(self, k: int) -> Iterator[NDArray[Any]]:
+        """Frames of the hole before the move to exposure `k`, from 1 on."""
+        return self._stream(self.hole, k - 1, self.aperture_count, _BEFORE, k)
+
+    def aperture_after(self, k: int) -> Iterator[NDArray[Any]]:
+        """Frames of the hole after the move to exposure `k`, from 1 on."""
+        return self._stream(self.hole, k, self.aperture_count, _AFTER, k)
+
+    def _stream(
+        self, beam: Beam, position: int, count: int, kind: int, k: int
+    ) -> Iterator[NDArray[Any]]:
+        light = window(beam, self.camera.shape, self.positions[position])
+        rng = np.random.default_rng([self.entropy, kind, k])
+        return self.camera.frames(light, count, rng=rng)
+
+    def variance_of_mean(self) -> Floats:
+        """Variance of the dark-subtracted mean of each exposure, (n, rows, cols), in DN²."""
+        shape = self.camera.shape
+        dark = self.camera.variance(np.zeros(shape)) / self.dark_count
+        lights = (window(self.beam, shape, position) for position in self.positions)
+        return np.stack([self.camera.variance(light) / self.count + dark for light in lights])
+
+    def noise_prediction(self, *, draws: int = 4, rng: Rng) -> tuple[float, float]:
+        """Error of the sensitivity of the good pixels that the camera's noise alone leaves.
+
+        Parameters
+        ----------
+        draws : int
+            Number of random draws that are averaged.
+        rng : numpy.random.Generator or int
+            Source of the random numbers, or its seed.
+
+        Returns
+        -------
+        rms, block_rms : float
+            Relative root mean square over the pixels and over means of 16×16 pixels; see
+            `equipix.simulate.noise_prediction`.
+        """
+        gain = self.camera.gain_dn_per_e
+        return noise_prediction(
+            self.camera.response,
+            self.beam,
+            self.positions,
+            self.variance_of_mean() / gain**2,
+            mask=~self.camera.good,
+            draws=draws,
+            rng=rng,
+        )
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        force: bool = False,
+        progress: Callable[[int, int, str], None] | None = None,
+    ) -> Path:
+        """Write the experiment as TIFF files with their manifest, whole or not at all.
+
+        Parameters
+        ----------
+        folder : path
+            Folder to make. It gets ``experiment.toml``, the folders ``frames``, ``dark`` and
+            ``aperture`` that this names, and ``truth.npz``, which it does not name.
+        force : bool
+            Whether a folder that holds an experiment may be replaced.
+        progress : callable, optional
+            Called as ``progress(frames done, frames in all, "writing")``.
+
+        Returns
+        -------
+        Path
+            The manifest.
+
+        Raises
+        ------
+        FileError
+            If the folder holds files already, or cannot be written.
+        """
+        target = Path(folder)
+        report = _Report(progress, self._frames_in_all())
+        with _new_folder(target, force) as made:
+            self._write_images(made, report)
+            np.savez(made / "truth.npz", **vars(self.truth))
+            (made / "experiment.toml").write_text(self._manifest(), encoding="utf-8")
+        return target / "experiment.toml"
+
+    def _frames_in_all(self) -> int:
+        n = len(self.positions)
+        return n * self.count + self.dark_count + 2 * (n - 1) * self.aperture_count
+
+    def _write_images(self, folder: Path, report: _Report) -> None:
+        _write_pages(folder / "dark/dark.tif", self.dark(), report)
+        for k in range(len(self.positions)):
+            _write_pages(folder / f"frames/p{k}.tif", self.frames(k), report)
+        for k in range(1, len(self.positions)):
+            _write_pages(folder / f"aperture/p{k}-before.tif", self.aperture_before(k), report)
+            _write_pages(folder / f"aperture/p{k}-after.tif", self.aperture_after(k), report)
+
+    def _manifest(self) -> str:
+        lines = [
+            "# calibration experiment of a virtual camera; the truth is in truth.npz",
+            "[sensor]",
+            'name = "virtual"',
+            f"bit_depth = {self.camera.bit_depth}",
+            "",
+            "[dark]",
+            'frames = "dark/dark.tif"',
+        ]
+        for k in range(len(self.positions)):
+            lines += ["", "[[exposure]]", f'name = "p{k}"', f'frames = "frames/p{k}.tif"']
+            if k:
+                lines.append(f'aperture_before = "aperture/p{k}-before.tif"')
+                lines.append(f'aperture_after = "aperture/p{k}-after.tif"')
+        return "\n".join(lines) + "\n"
+
+
+def experiment(
+    sensitivity: ArrayLike,
+    beam: Beam,
+    shifts: ArrayLike,
+    *,
+    frames: int = 50,
+    dark_frames: int | None = None,
+    aperture_frames: int = 8,
+    exposure_e: float = 14_000.0,
+    bit_depth: int = 12,
+    gain_dn_per_e: float | None = None,
+    read_noise_e: float = 10.0,
+    dead: int = 4,
+    hot: int = 4,
+    stage_error: float = 0.002,
+    rng: Rng,
+) -> VirtualExperiment:
+    """Prepare a shift-calibration experiment with a virtual camera on a stage.
+
+    Parameters
+    ----------
+    sensitivity : array_like, shape (rows, cols)
+        Relative sensitivity of the pixels.
+    beam : callable
+        Beam of amplitude about 1, a function of arrays of row and column coordinates.
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col), in pixels, that the stage is told to make; the first is (0, 0).
+    frames, dark_frames, aperture_frames : int
+        Numbers of frames of an exposure, of the dark (as many as of an exposure unless given)
+        and of each image of the hole.
+    exposure_e : float
+        Electrons that a pixel of sensitivity 1 collects in a frame where the beam is 1.
+    bit_depth : int
+        Bits of the ADC, 8 to 16.
+    gain_dn_per_e : float, optional
+        Digital numbers per electron; full scale for 20 000 electrons unless given.
+    read_noise_e : float
+        Standard deviation of the read noise, in electrons.
+    dead, hot : int
+        Numbers of dead and of hot pixels, placed at random.
+    stage_error : float
+        Standard deviation of the error of each move, along each axis, in pixels; the errors add
+        up along the way.
+    rng : numpy.random.Generator or int
+        Source of the random numbers, or its seed.
+
+    Returns
+    -------
+    VirtualExperiment
+        The experiment: streams of frames, the truth, and `write`.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of its range, or the hole does not stay in view.
+
+    Examples
+    --------
+    >>> from equipix import simulate
+    >>> sensitivity = simulate.paper_sensitivity((48, 64), rng=1)
+    >>> beam = simulate.gaussian_beam(sensitivity.shape)
+    >>> virtual = simulate.experiment(sensitivity, beam, [(0, 0), (0, 5), (7, 0)], rng=2)
+    >>> next(virtual.frames(1)).shape
+    (48, 64)
+    """
+    rng = np.random.default_rng(rng)
+    size = as_array("sensitivity", sensitivity, ndim=2).size
+    dark_frames = frames if dark_frames is None else dark_frames
+    for name, number in (("frames", frames), ("dark_frames", dark_frames)):
+        if number < 1:
+            raise InputError(f"'{name}' is {number}, expected 1 or more")
+    if dead < 0 or hot < 0 or dead + hot > size:
+        raise InputError(f"{dead} dead and {hot} hot pixels do not fit {size} pixels")
+    full_scale = 2**bit_depth - 1
+    bad = rng.choice(size, dead + hot, replace=False)
+    camera = Camera(
+        sensitivity=sensitivity,
+        dark=full_scale * rng.normal(DARK_LEVEL, DARK_SPREAD, np.shape(sensitivity)),
+        gain_dn_per_e=full_scale / FULL_SCALE_E if gain_dn_per_e is None else gain_dn_per_e,
+        read_noise_e=read_noise_e,
+        bit_depth=bit_depth,
+        dead=bad[:dead],
+        hot=bad[dead:],
+    )
+    positions = _reached(checked_shifts(shifts), stage_error, rng)
+
+    def light(rows: Floats, cols: Floats) -> Floats:
+        return exposure_e * beam(rows, cols)
+
+    return VirtualExperiment(
+        camera=camera,
+        beam=light,
+        hole=_behind_hole(light, camera.shape, positions),
+        positions=positions,
+        count=frames,
+        dark_count=dark_frames,
+        aperture_count=aperture_frames,
+        entropy=int(rng.integers(2**63)),
+    )
+
+
+def _reached(shifts: Floats, stage_error: float, rng: np.random.Generator) -> Floats:
+    """Where the stage gets: each move is off by a random error."""
+    errors = np.zeros_like(shifts)
+    errors[1:] = rng.normal(0, stage_error, errors[1:].shape).cumsum(axis=0)
+    return shifts + errors
+
+
+def _behind_hole(beam: Beam, shape: tuple[int, int], positions: Floats) -> Beam:
+    """Put the beam through a round hole in the middle of what every position sees."""
+    low, high = positions.max(axis=0), positions.min(axis=0) + shape
+    row, col = (low + high - 1) / 2
+    radius = float(min(0.1 * min(shape), 0.35 * (high - low).min()))
+    if radius < SMALLEST_HOLE:
+        raise InputError(f"'shifts' leave no hole in view on a sensor of shape {shape}")
+
+    def hole(rows: Floats, cols: Floats) -> Floats:
+        distance = np.hypot(rows - row, cols - col)
+        transmission: Floats = 0.5 - 0.5 * np.tanh((distance - radius) / HOLE_EDGE)
+        return beam(rows, cols) * transmission
+
+    return hole
+
+
+class _Report:
+    """Counts frames for a progress callback."""
+
+    def __init__(self, progress: Callable[[int, int, str], None] | None, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
+
+    def frame(self) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._total, "writing")
+
+
+def _write_pages(path: Path, frames: Iterator[NDArray[Any]], report: _Report) -> None:
+    path.parent.mkdir(exist_ok=True)
+    with tifffile.TiffWriter(path) as writer:
+        for frame in frames:
+            writer.write(frame, photometric="minisblack", metadata=None)
+            report.frame()
+
+
+@contextmanager
+def _new_folder(target: Path, force: bool) -> Iterator[Path]:
+    """Make a folder beside the target that takes its place when all is written."""
+    if target.exists() and not _may_replace(target, force):
+        raise FileError(
+            f"'{target}' exists and is not empty: name another folder, or force the replacement "
+            "of an experiment"
+        )
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if target.exists():
+            shutil.rmtree(target)
+        partial.rename(target)
+    except OSError as error:
+        raise FileError(f"cannot write '{target}': {error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _may_replace(target: Path, force: bool) -> bool:
+    """Whether the target is an empty folder, or an experiment that may go."""
+    if not target.is_dir():
+        return False
+    return not any(target.iterdir()) or (force and (target / "experiment.toml").is_file())

@@ -1,0 +1,80 @@
+//! From the measurements of one experiment to the sensitivity of its sensor.
+
+use crate::connectivity::{Components, NONE};
+use crate::control::Control;
+use crate::descent::{self, History, Stop};
+use crate::error::Result;
+use crate::frames::{Real, flag};
+use crate::model::Model;
+use crate::parallel::Workers;
+
+/// A calibrated sensor.
+#[derive(Clone, Debug)]
+pub struct Solution {
+    /// Relative sensitivity M, row by row, of mean 1; NaN outside the largest component.
+    pub sensitivity: Vec<f64>,
+    /// The beam L on its padded grid, row by row, in the units of the frames; NaN where unobserved.
+    pub beam: Vec<f64>,
+    /// Bits of [`flag`] for each pixel.
+    pub flags: Vec<u32>,
+    /// What the measurements can compare.
+    pub components: Components,
+    /// F at the end, and along the way.
+    pub history: History,
+    /// Measurements used less unknowns determined.
+    pub degrees_of_freedom: i64,
+    /// Whether the estimated largest relative error of M is within the tolerance.
+    pub converged: bool,
+}
+
+/// Minimises F by coordinate descent.
+///
+/// M is given in the gauge mean(M) = 1 over the pixels of a component, each component for itself.
+///
+/// # Errors
+/// As [`descent::solve`].
+pub fn calibrate<T: Real>(
+    model: &Model<'_, T>,
+    stop: Stop,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Solution> {
+    let components = Components::of(model);
+    let (descent, history) = descent::solve(model, stop, workers, control)?;
+    let beam = descent.beam();
+    let mut sensitivity = descent.sensitivity;
+    let means = component_means(&sensitivity, &components);
+    for (value, &label) in sensitivity.iter_mut().zip(&components.pixels) {
+        *value = if label == 0 { *value / means[0] } else { f64::NAN };
+    }
+    let observed = |label: i32| usize::try_from(label).ok().map(|label| means[label]);
+    let beam = beam.iter().zip(&components.cells);
+    let undetermined = flag::NO_FLAT_FIELD | flag::DO_NOT_USE;
+    Ok(Solution {
+        sensitivity,
+        beam: beam.map(|(l, &label)| observed(label).map_or(f64::NAN, |mean| l * mean)).collect(),
+        flags: components.pixels.iter().map(|&l| if l == 0 { 0 } else { undetermined }).collect(),
+        degrees_of_freedom: degrees_of_freedom(model.used(), &components),
+        converged: history.last_estimate() <= stop.tolerance,
+        components,
+        history,
+    })
+}
+
+/// The mean sensitivity of each component.
+fn component_means(sensitivity: &[f64], components: &Components) -> Vec<f64> {
+    let mut sums = vec![0.0; components.sizes.len()];
+    for (value, &label) in sensitivity.iter().zip(&components.pixels) {
+        if let Ok(label) = usize::try_from(label) {
+            sums[label] += value;
+        }
+    }
+    sums.iter().zip(&components.sizes).map(|(sum, &size)| sum / size as f64).collect()
+}
+
+/// Measurements less unknowns; each component has one unknown less than values, by its gauge.
+fn degrees_of_freedom(used: usize, components: &Components) -> i64 {
+    let known = |labels: &[i32]| labels.iter().filter(|&&label| label != NONE).count();
+    let unknowns = known(&components.pixels) + known(&components.cells) - components.sizes.len();
+    used as i64 - unknowns as i64
+}

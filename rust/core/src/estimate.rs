@@ -1,0 +1,164 @@
+//! How far M still is from the minimum of F, large scales included.
+//!
+//! One sweep of coordinate descent takes the relative error e of M to e − s with the step
+//! s = (λ/n)·e, where λ is the graph Laplacian that is left of F when L has been eliminated. Far
+//! from the borders λ is diagonal in plane waves, with the symbol
+//!
+//! ```text
+//! λ(q)/n = 1 − |Σ_k W_k e^{iq·d_k}|² / (Σ_k W_k)²
+//! ```
+//!
+//! (W the weight of an exposure). It is about q²·var(d) for waves much longer than the shifts: the
+//! step shows nearly nothing of an error of the sensor's own size, and no rule on the step or on
+//! the change of F can tell that it is there. Dividing the step by the symbol, mode by mode of a
+//! cosine transform, brings it back: the estimate is max |DCT⁻¹(DCT(s)·n/λ)|.
+//!
+//! Where masks narrow the way between two parts of the sensor, errors fade more slowly than the
+//! symbol says. So the rate at which the steps really shrink gives a second figure, that of a
+//! geometric series, max |s| / (1 − rate), and the larger of the two is the estimate.
+//!
+//! Exposures that are turned against each other do not share plane waves. The phases between them
+//! are then taken as the worst possible, which makes the estimate too large rather than too small.
+
+use std::f64::consts::PI;
+
+use crate::frames::{Real, Shape};
+use crate::model::Model;
+use crate::parallel::Workers;
+use crate::transform::CosineTransform;
+
+/// Estimates the error of M from the steps that sweeps take.
+pub struct Estimator<'m> {
+    workers: &'m Workers,
+    transform: CosineTransform,
+    waves: Vec<Waves>,
+    slowest: f64,
+    last: Option<LastStep>,
+}
+
+/// The exposures of one view: weight and phases e^{iq·d} of each for every mode of the transform.
+struct Waves {
+    exposures: Vec<Wave>,
+}
+
+struct Wave {
+    weight: f64,
+    row_phases: Vec<Complex>,
+    col_phases: Vec<Complex>,
+}
+
+#[derive(Clone, Copy)]
+struct LastStep {
+    sweep: u64,
+    rms: f64,
+}
+
+#[derive(Clone, Copy)]
+struct Complex {
+    re: f64,
+    im: f64,
+}
+
+impl<'m> Estimator<'m> {
+    /// Prepares the symbol of an experiment.
+    #[must_use]
+    pub fn new<T: Real>(model: &Model<'_, T>, workers: &'m Workers) -> Self {
+        let shape = model.sensor();
+        let mut estimator = Self {
+            workers,
+            transform: CosineTransform::new(shape),
+            waves: waves(model),
+            slowest: 1.0,
+            last: None,
+        };
+        let lowest =
+            [(1, 0), (0, 1)].into_iter().filter(|&(i, j)| i < shape.rows && j < shape.cols);
+        estimator.slowest = lowest
+            .map(|(i, j)| estimator.symbol(i, j, 1.0))
+            // An axis along which nothing was shifted couples nothing, at whatever scale.
+            .filter(|&symbol| symbol > f64::EPSILON.sqrt())
+            .fold(1.0, f64::min);
+        estimator
+    }
+
+    /// The share of the slowest error that one sweep removes, as the symbol has it.
+    #[must_use]
+    pub const fn slowest(&self) -> f64 {
+        self.slowest
+    }
+
+    /// The largest relative error of M, from the `step` that sweep number `sweep` took.
+    ///
+    /// `step` is in units of the mean sensitivity, and 0 at pixels without measurements.
+    pub fn largest_error(&mut self, mut step: Vec<f64>, sweep: u64) -> f64 {
+        let largest_step = largest(&step);
+        let rms = (step.iter().map(|s| s * s).sum::<f64>() / step.len() as f64).sqrt();
+        let by_rate = largest_step / self.lost_per_sweep(sweep, rms);
+        self.last = Some(LastStep { sweep, rms });
+        self.transform.filter(&mut step, |i, j| self.amplification(i, j), self.workers);
+        by_rate.max(largest(&step))
+    }
+
+    /// 1 − the factor by which the steps have shrunk per sweep, never below what the symbol allows
+    /// by an order of magnitude: steps that are nothing but rounding do not shrink at all.
+    fn lost_per_sweep(&self, sweep: u64, rms: f64) -> f64 {
+        let lost = self
+            .last
+            .map_or(1.0, |last| 1.0 - (rms / last.rms).powf(1.0 / (sweep - last.sweep) as f64));
+        lost.clamp(0.1 * self.slowest, 1.0)
+    }
+
+    /// n/λ of a cosine mode: the mean over the two plane waves that it is made of. The constant
+    /// belongs to the gauge. A component of its own has null modes of its own; near one, as near
+    /// the constant, no error fades more slowly than the slowest mode of the sensor.
+    fn amplification(&self, i: usize, j: usize) -> f64 {
+        if (i, j) == (0, 0) {
+            return 0.0;
+        }
+        let inverse = |sign| 1.0 / self.symbol(i, j, sign).max(self.slowest);
+        0.5 * (inverse(1.0) + inverse(-1.0))
+    }
+
+    /// λ/n of the plane wave (πi/R, ±πj/C).
+    fn symbol(&self, i: usize, j: usize, sign: f64) -> f64 {
+        let [mut amplitude, mut weight] = [0.0; 2];
+        for view in &self.waves {
+            let mut sum = Complex { re: 0.0, im: 0.0 };
+            for wave in &view.exposures {
+                let (a, b) = (wave.row_phases[i], wave.col_phases[j]);
+                let b = Complex { re: b.re, im: sign * b.im };
+                sum.re += wave.weight * (a.re * b.re - a.im * b.im);
+                sum.im += wave.weight * (a.re * b.im + a.im * b.re);
+                weight += wave.weight;
+            }
+            amplitude += sum.re.hypot(sum.im);
+        }
+        1.0 - (amplitude / weight).powi(2)
+    }
+}
+
+fn waves<T: Real>(model: &Model<'_, T>) -> Vec<Waves> {
+    let Shape { rows, cols } = model.sensor();
+    let weights = model.exposure_weights();
+    let places = &model.geometry.exposures;
+    let of_view = |view| {
+        let exposures = places.iter().zip(&weights).filter(|(place, _)| place.view == view);
+        let waves = exposures.map(|(place, &weight)| Wave {
+            weight,
+            row_phases: phases(place.row, rows),
+            col_phases: phases(place.col, cols),
+        });
+        Waves { exposures: waves.collect() }
+    };
+    (0..model.geometry.views.len()).map(of_view).collect()
+}
+
+/// e^{iπ·mode·shift/count} for every mode.
+fn phases(shift: usize, count: usize) -> Vec<Complex> {
+    let phase = |mode| PI * mode as f64 * shift as f64 / count as f64;
+    (0..count).map(|mode| Complex { re: phase(mode).cos(), im: phase(mode).sin() }).collect()
+}
+
+fn largest(values: &[f64]) -> f64 {
+    values.iter().fold(0.0, |largest, value| value.abs().max(largest))
+}

@@ -1,0 +1,299 @@
+//! The measurements of one experiment and the objective that a calibration minimises.
+//!
+//! ```text
+//! F = Σ_k Σ_p w_k(p) [ y_k(p) − c_k L(u_k(p)) M(p) ]²
+//! ```
+//!
+//! (Stukachev and Kozhevatov 2011, where all weights are 1; here w = 1/variance.) A measurement is
+//! *used* if its mask is not set and its value is finite; any other has weight 0.
+
+use std::ops::Range;
+
+use crate::error::{Error, Result};
+use crate::frames::{Real, Shape, Stack};
+use crate::geometry::Geometry;
+use crate::parallel::Workers;
+
+/// The variance of the values of a stack of frames.
+#[derive(Clone, Copy, Debug)]
+pub enum Variance<'a, T> {
+    /// Unknown: every weight is 1.
+    Unknown,
+    /// One value for each exposure.
+    Exposures(&'a [f64]),
+    /// One value for each measurement.
+    Measurements(Stack<'a, T>),
+}
+
+/// Which measurements not to use (`true`).
+#[derive(Clone, Copy, Debug)]
+pub enum Mask<'a> {
+    /// All are used.
+    None,
+    /// The same pixels in every exposure, row by row.
+    Pixels(&'a [bool]),
+    /// Each measurement, in the order of the frames.
+    Measurements(&'a [bool]),
+}
+
+/// The model of an experiment: its measurements, their weights and places.
+#[derive(Clone, Debug)]
+pub struct Model<'a, T> {
+    /// The places of the exposures.
+    pub geometry: Geometry,
+    /// Flux c of each exposure.
+    pub flux: Vec<f64>,
+    frames: Stack<'a, T>,
+    variance: Variance<'a, T>,
+    mask: Mask<'a>,
+    tallies: Vec<Tally>,
+}
+
+/// What one exposure contributes.
+#[derive(Clone, Copy, Debug, Default)]
+struct Tally {
+    used: usize,
+    positive: usize,
+    weight: f64,
+}
+
+/// A stretch of one row of one exposure, as the kernels take it.
+pub(crate) enum Stretch<'a, T> {
+    /// All measurements are used, with one weight.
+    Uniform(&'a [T], f64),
+    /// The weights stand in the scratch space; where one is 0, the value counts for nothing.
+    Weighted(&'a [T], &'a [f64]),
+}
+
+impl<'a, T: Real> Model<'a, T> {
+    /// Checks the measurements of an experiment and views them.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if the arguments do not fit each other; [`Error::Value`] if a flux is not
+    /// a positive number, the variance of a used measurement not positive, no measurement of an
+    /// exposure is used, or the median of an exposure is not above 0.
+    pub fn new(
+        frames: Stack<'a, T>,
+        geometry: Geometry,
+        flux: &[f64],
+        variance: Variance<'a, T>,
+        mask: Mask<'a>,
+        workers: &Workers,
+    ) -> Result<Self> {
+        let flux = flux.to_vec();
+        let mut model = Self { geometry, flux, frames, variance, mask, tallies: Vec::new() };
+        model.check_shapes()?;
+        model.check_flux()?;
+        model.tallies = (0..frames.count())
+            .map(|exposure| model.tally(exposure, workers))
+            .collect::<Result<_>>()?;
+        model.check_light()?;
+        Ok(model)
+    }
+
+    /// Number of exposures.
+    #[must_use]
+    pub const fn count(&self) -> usize {
+        self.frames.count()
+    }
+
+    /// Sizes of the sensor.
+    #[must_use]
+    pub const fn sensor(&self) -> Shape {
+        self.frames.shape()
+    }
+
+    /// Number of measurements used.
+    #[must_use]
+    pub fn used(&self) -> usize {
+        self.tallies.iter().map(|tally| tally.used).sum()
+    }
+
+    /// The weight that each exposure has in all: Σ_p w c².
+    #[must_use]
+    pub fn exposure_weights(&self) -> Vec<f64> {
+        self.tallies.iter().zip(&self.flux).map(|(tally, c)| tally.weight * c * c).collect()
+    }
+
+    /// Calls `visit(pixel, cell)` for each used measurement.
+    pub fn for_each_used(&self, mut visit: impl FnMut(usize, usize)) {
+        let Shape { rows, cols } = self.sensor();
+        let mut scratch = vec![0.0; cols];
+        for (exposure, place) in self.geometry.exposures.iter().enumerate() {
+            let cells = self.geometry.views[place.view].cells;
+            for row in 0..rows {
+                let stretch = self.stretch(exposure, row, 0..cols, &mut scratch);
+                for col in 0..cols {
+                    let used = match &stretch {
+                        Stretch::Uniform(..) => true,
+                        Stretch::Weighted(_, weights) => weights[col] > 0.0,
+                    };
+                    if used {
+                        visit(row * cols + col, cells.at(row + place.row, col + place.col));
+                    }
+                }
+            }
+        }
+    }
+
+    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` has room for them.
+    #[inline(always)]
+    pub(crate) fn stretch<'s>(
+        &self,
+        exposure: usize,
+        row: usize,
+        cols: Range<usize>,
+        scratch: &'s mut [f64],
+    ) -> Stretch<'s, T>
+    where
+        'a: 's,
+    {
+        let values = &self.frames.row(exposure, row)[cols.clone()];
+        let whole = self.tallies.get(exposure).is_some_and(|t| t.used == self.sensor().len());
+        if whole && !matches!(self.variance, Variance::Measurements(_)) {
+            return Stretch::Uniform(values, self.exposure_weight(exposure));
+        }
+        let weights = &mut scratch[..values.len()];
+        match self.variance {
+            Variance::Measurements(variance) => {
+                let variance = &variance.row(exposure, row)[cols.clone()];
+                for (weight, &variance) in weights.iter_mut().zip(variance) {
+                    *weight = 1.0 / variance.to_f64();
+                }
+            }
+            _ => weights.fill(self.exposure_weight(exposure)),
+        }
+        for (weight, &value) in weights.iter_mut().zip(values) {
+            *weight = if value.to_f64().is_finite() { *weight } else { 0.0 };
+        }
+        if let Some(mask) = self.mask_row(exposure, row) {
+            for (weight, &masked) in weights.iter_mut().zip(&mask[cols]) {
+                *weight = if masked { 0.0 } else { *weight };
+            }
+        }
+        Stretch::Weighted(values, weights)
+    }
+
+    /// The weight of an exposure's measurements where it is the same for all.
+    fn exposure_weight(&self, exposure: usize) -> f64 {
+        match self.variance {
+            Variance::Exposures(variance) => 1.0 / variance[exposure],
+            _ => 1.0,
+        }
+    }
+
+    fn mask_row(&self, exposure: usize, row: usize) -> Option<&'a [bool]> {
+        let Shape { rows, cols } = self.sensor();
+        match self.mask {
+            Mask::None => None,
+            Mask::Pixels(mask) => Some(&mask[row * cols..][..cols]),
+            Mask::Measurements(mask) => Some(&mask[(exposure * rows + row) * cols..][..cols]),
+        }
+    }
+
+    fn check_shapes(&self) -> Result<()> {
+        let (count, shape) = (self.count(), self.sensor());
+        let wanted = format!("({count}, {}, {})", shape.rows, shape.cols);
+        let check = |argument, good, got: String, wanted: &str| {
+            let wanted = wanted.to_owned();
+            if good { Ok(()) } else { Err(Error::Shape { argument, got, wanted }) }
+        };
+        let each = format!("({count},), one an exposure");
+        let places = self.geometry.exposures.len();
+        check("shifts", places == count, format!("({places}, 2)"), &format!("({count}, 2)"))?;
+        check("flux", self.flux.len() == count, format!("({},)", self.flux.len()), &each)?;
+        match self.variance {
+            Variance::Unknown => {}
+            Variance::Exposures(v) => {
+                check("variance", v.len() == count, format!("({},)", v.len()), &each)?;
+            }
+            Variance::Measurements(v) => {
+                let good = v.count() == count && v.shape() == shape;
+                let Shape { rows, cols } = v.shape();
+                check("variance", good, format!("({}, {rows}, {cols})", v.count()), &wanted)?;
+            }
+        }
+        let (length, size) = match self.mask {
+            Mask::None => (0, 0),
+            Mask::Pixels(mask) => (mask.len(), shape.len()),
+            Mask::Measurements(mask) => (mask.len(), shape.len() * count),
+        };
+        check("mask", length == size, format!("({length},)"), &format!("{shape} or {wanted}"))
+    }
+
+    fn check_flux(&self) -> Result<()> {
+        match self.flux.iter().position(|&c| !(c.is_finite() && c > 0.0)) {
+            None => Ok(()),
+            Some(k) => {
+                let c = self.flux[k];
+                let problem = format!("of exposure {k} is {c}: expected a positive number");
+                Err(Error::value("flux", problem))
+            }
+        }
+    }
+
+    /// Counts one exposure's measurements and checks their variances.
+    fn tally(&self, exposure: usize, workers: &Workers) -> Result<Tally> {
+        let Shape { rows, cols } = self.sensor();
+        let by_row = workers.map(rows, |row| {
+            let mut scratch = vec![0.0; cols];
+            let mut tally = Tally::default();
+            if let Stretch::Weighted(values, weights) =
+                self.stretch(exposure, row, 0..cols, &mut scratch)
+            {
+                for (col, (&value, &weight)) in values.iter().zip(weights).enumerate() {
+                    if weight == 0.0 {
+                        continue;
+                    }
+                    if !(weight > 0.0 && weight.is_finite()) {
+                        return Err(self.bad_variance(exposure, row, col, 1.0 / weight));
+                    }
+                    tally.used += 1;
+                    tally.positive += usize::from(value.to_f64() > 0.0);
+                    tally.weight += weight;
+                }
+            }
+            Ok(tally)
+        });
+        by_row.into_iter().try_fold(Tally::default(), |sum, row| {
+            let row = row?;
+            Ok(Tally {
+                used: sum.used + row.used,
+                positive: sum.positive + row.positive,
+                weight: sum.weight + row.weight,
+            })
+        })
+    }
+
+    fn bad_variance(&self, exposure: usize, row: usize, col: usize, variance: f64) -> Error {
+        let place = match self.variance {
+            Variance::Measurements(_) => format!(" at row {row}, column {col}"),
+            _ => String::new(),
+        };
+        let problem =
+            format!("of exposure {exposure}{place} is {variance}: expected a positive number");
+        Error::value("variance", problem)
+    }
+
+    fn check_light(&self) -> Result<()> {
+        if self.used() == 0 {
+            let problem = "leaves no measurement: every pixel is masked or not a number";
+            return Err(Error::value("mask", problem));
+        }
+        for (exposure, tally) in self.tallies.iter().enumerate() {
+            if tally.used == 0 {
+                let problem = format!("leaves nothing of exposure {exposure}: leave it out");
+                return Err(Error::value("mask", problem));
+            }
+            if 2 * tally.positive <= tally.used {
+                let problem = format!(
+                    "of exposure {exposure} have a median that is not above 0 ({} of {} values \
+                     are positive): is there light, and is the right dark subtracted?",
+                    tally.positive, tally.used
+                );
+                return Err(Error::value("frames", problem));
+            }
+        }
+        Ok(())
+    }
+}

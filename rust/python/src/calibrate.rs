@@ -1,0 +1,188 @@
+//! `calibrate`: shift calibration.
+//!
+//! | argument | dtype and rank | here | how |
+//! |---|---|---|---|
+//! | frames | float32 or float64, 3 | `Stack<f32>` or `Stack<f64>` | view |
+//! | shifts | int64, 2 | `Vec<[i64; 2]>` | copy of a few numbers |
+//! | rotation, flux | int64, float64, 1 | `Vec` | copy of a few numbers |
+//! | variance | float64, 1, or the frames' dtype, 3 | `Variance` | view |
+//! | mask | bool, 2 or 3 | `Mask` | view |
+
+use std::num::NonZeroUsize;
+
+use equipix_core::calibrate::{Solution, calibrate};
+use equipix_core::control::Control;
+use equipix_core::descent::Stop;
+use equipix_core::error::{Error, Result};
+use equipix_core::frames::{Real, Shape, Stack};
+use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::model::{Mask, Model, Variance};
+use equipix_core::parallel::Workers;
+use numpy::{
+    Element, IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArray3, PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+
+use crate::run;
+
+/// Mean frames of either precision.
+#[derive(FromPyObject)]
+pub(crate) enum Frames<'py> {
+    Single(PyReadonlyArray3<'py, f32>),
+    Double(PyReadonlyArray3<'py, f64>),
+}
+
+/// Variances: one an exposure, or one a measurement.
+#[derive(FromPyObject)]
+pub(crate) enum PyVariance<'py> {
+    Exposures(PyReadonlyArray1<'py, f64>),
+    Single(PyReadonlyArray3<'py, f32>),
+    Double(PyReadonlyArray3<'py, f64>),
+}
+
+/// Masks: one for all exposures, or one for each.
+#[derive(FromPyObject)]
+pub(crate) enum PyMask<'py> {
+    Pixels(PyReadonlyArray2<'py, bool>),
+    Measurements(PyReadonlyArray3<'py, bool>),
+}
+
+/// What `calibrate` found; see `equipix.Calibration`.
+#[pyclass(frozen, get_all, name = "Solution")]
+pub(crate) struct PySolution {
+    sensitivity: Py<PyArray2<f64>>,
+    beam: Py<PyArray2<f64>>,
+    beam_origin: (usize, usize),
+    flags: Py<PyArray2<u32>>,
+    component_labels: Py<PyArray2<i32>>,
+    components: usize,
+    objective: Py<PyArray1<f64>>,
+    estimates: Vec<(u64, f64)>,
+    degrees_of_freedom: i64,
+    converged: bool,
+}
+
+/// Everything but the frames and their variances, which have a type of their own.
+struct Setting<'a> {
+    shifts: Vec<[i64; 2]>,
+    rotation: Vec<i64>,
+    flux: Vec<f64>,
+    mask: Mask<'a>,
+    stop: Stop,
+    workers: Option<NonZeroUsize>,
+}
+
+/// Solves for sensitivity and beam.
+#[pyfunction]
+#[pyo3(signature = (frames, shifts, *, rotation, flux, variance, mask, tolerance, max_sweeps,
+                    workers, progress))]
+#[expect(clippy::too_many_arguments, reason = "the keywords of equipix.calibrate")]
+pub(crate) fn calibrate_frames(
+    py: Python<'_>,
+    frames: Frames<'_>,
+    shifts: PyReadonlyArray2<'_, i64>,
+    rotation: Vec<i64>,
+    flux: Vec<f64>,
+    variance: Option<PyVariance<'_>>,
+    mask: Option<PyMask<'_>>,
+    tolerance: f64,
+    max_sweeps: Option<u64>,
+    workers: Option<NonZeroUsize>,
+    progress: Option<Bound<'_, PyAny>>,
+) -> PyResult<PySolution> {
+    let shifts = shifts.as_slice()?.chunks_exact(2).map(|d| [d[0], d[1]]).collect();
+    let stop = Stop { tolerance, max_sweeps };
+    let mask = mask.as_ref().map_or(Ok(Mask::None), view_mask)?;
+    let setting = Setting { shifts, rotation, flux, mask, stop, workers };
+    let progress = progress.as_ref();
+    let outcome = match (&frames, &variance) {
+        (Frames::Single(frames), Some(PyVariance::Single(variance))) => {
+            let (frames, variance) = (stack("frames", frames)?, stack("variance", variance)?);
+            let variance = Variance::Measurements(variance);
+            run::interruptible(py, progress, |c| solve(frames, variance, &setting, c))
+        }
+        (Frames::Double(frames), Some(PyVariance::Double(variance))) => {
+            let (frames, variance) = (stack("frames", frames)?, stack("variance", variance)?);
+            let variance = Variance::Measurements(variance);
+            run::interruptible(py, progress, |c| solve(frames, variance, &setting, c))
+        }
+        (Frames::Single(frames), variance) => {
+            let (frames, variance) = (stack("frames", frames)?, by_exposure(variance.as_ref())?);
+            run::interruptible(py, progress, |c| solve(frames, variance, &setting, c))
+        }
+        (Frames::Double(frames), variance) => {
+            let (frames, variance) = (stack("frames", frames)?, by_exposure(variance.as_ref())?);
+            run::interruptible(py, progress, |c| solve(frames, variance, &setting, c))
+        }
+    };
+    let (solution, geometry) = outcome?;
+    wrap(py, solution, &geometry)
+}
+
+fn solve<T: Real>(
+    frames: Stack<'_, T>,
+    variance: Variance<'_, T>,
+    setting: &Setting<'_>,
+    control: &Control,
+) -> Result<(Solution, Geometry)> {
+    let workers = Workers::new(setting.workers)?;
+    let rotations = setting.rotation.iter().map(|&degrees| rotation(degrees));
+    let rotations = rotations.collect::<Result<Vec<_>>>()?;
+    let geometry = Geometry::new(frames.shape(), &setting.shifts, &rotations)?;
+    let model = Model::new(frames, geometry, &setting.flux, variance, setting.mask, &workers)?;
+    let solution = calibrate(&model, setting.stop, &workers, control)?;
+    Ok((solution, model.geometry))
+}
+
+fn rotation(degrees: i64) -> Result<Rotation> {
+    Rotation::from_degrees(degrees).ok_or_else(|| Error::Value {
+        argument: "rotation",
+        problem: format!("holds {degrees}: expected 0, 90, 180 or 270 degrees"),
+    })
+}
+
+fn stack<'a, T: Element + Real>(
+    argument: &'static str,
+    array: &'a PyReadonlyArray3<'_, T>,
+) -> PyResult<Stack<'a, T>> {
+    let shape = array.shape();
+    let sizes = Shape::new(shape[1], shape[2]);
+    let stack = Stack::new(argument, array.as_slice()?, shape[0], sizes);
+    stack.map_err(|error| crate::errors::exception(array.py(), &error))
+}
+
+fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance<'a, T>> {
+    match variance {
+        Some(PyVariance::Exposures(values)) => Ok(Variance::Exposures(values.as_slice()?)),
+        Some(_) => Err(pyo3::exceptions::PyTypeError::new_err("variance: not the frames' dtype")),
+        None => Ok(Variance::Unknown),
+    }
+}
+
+fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
+    Ok(match mask {
+        PyMask::Pixels(mask) => Mask::Pixels(mask.as_slice()?),
+        PyMask::Measurements(mask) => Mask::Measurements(mask.as_slice()?),
+    })
+}
+
+fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PySolution> {
+    let history = solution.history;
+    Ok(PySolution {
+        sensitivity: image(py, solution.sensitivity, geometry.sensor)?,
+        beam: image(py, solution.beam, geometry.beam)?,
+        beam_origin: geometry.origin.into(),
+        flags: image(py, solution.flags, geometry.sensor)?,
+        component_labels: image(py, solution.components.pixels, geometry.sensor)?,
+        components: solution.components.sizes.len(),
+        objective: history.objective.into_pyarray(py).unbind(),
+        estimates: history.error_estimate,
+        degrees_of_freedom: solution.degrees_of_freedom,
+        converged: solution.converged,
+    })
+}
+
+fn image<T: Element>(py: Python<'_>, values: Vec<T>, shape: Shape) -> PyResult<Py<PyArray2<T>>> {
+    Ok(values.into_pyarray(py).reshape([shape.rows, shape.cols])?.unbind())
+}
