@@ -1,4 +1,4 @@
-"""What stands in experiment.toml, checked: wrong keys, values and files are named with the place."""
+"""What stands in experiment.toml, checked: faults are named with their value and place."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Manifest(_Table):
 
 
 def read_manifest(path: Path) -> Manifest:
-    """The checked content of the file `path`."""
+    """Read and check the file `path`."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -138,7 +138,7 @@ def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
         if (folder / pattern).is_file():
             found.append(folder / pattern)
             continue
-        matches = sorted(glob.glob(pattern, root_dir=folder))
+        matches = sorted(glob.glob(pattern, root_dir=folder))  # noqa: PTH207 (may be absolute)
         if not matches:
             raise FileError(f"{manifest}: no file '{pattern}' in {folder}")
         found += [folder / match for match in matches]

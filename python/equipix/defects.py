@@ -85,7 +85,7 @@ def pixel_flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) 
 
 
 def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
-    """The median of the 16×16 block that each pixel lies in."""
+    """Take for each pixel the median of the 16×16 block that it lies in."""
     rows, cols = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
     blocks = padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK)

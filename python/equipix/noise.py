@@ -56,7 +56,7 @@ class NoiseModel:
         Returns
         -------
         NoiseModel
-            Weighted least squares; a variance σ² of ν degrees of freedom has variance 2σ⁴/ν.
+            Weighted least squares; a variance s² of f degrees of freedom has variance 2s⁴/f.
             Neither parameter is below 0.
         """
         signal, variance, degrees = points.T
@@ -112,8 +112,8 @@ def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
 
     Notes
     -----
-    The quantile of χ²/ν at `sigmas` standard deviations of a normal variable, ν = frames − 1, in
-    the approximation of Wilson and Hilferty (1931): (1 − 2/(9ν) + z·√(2/(9ν)))³.
+    The quantile of χ²/f at `sigmas` standard deviations of a normal variable, f = frames − 1, in
+    the approximation of Wilson and Hilferty (1931): (1 − 2/(9f) + z·√(2/(9f)))³.
     """
     width = 2 / (9 * (frames - 1))
     return float((1 - width + sigmas * np.sqrt(width)) ** 3)
