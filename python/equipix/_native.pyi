@@ -1,3 +1,45 @@
 """The compiled part of equipix: private; the docs stand in the Python modules that wrap it."""
 
+from collections.abc import Callable
+from typing import Any, final
+
+from numpy.typing import NDArray
+
 __version__: str
+
+@final
+class Solution:
+    @property
+    def sensitivity(self) -> NDArray[Any]: ...
+    @property
+    def beam(self) -> NDArray[Any]: ...
+    @property
+    def beam_origin(self) -> tuple[int, int]: ...
+    @property
+    def flags(self) -> NDArray[Any]: ...
+    @property
+    def component_labels(self) -> NDArray[Any]: ...
+    @property
+    def components(self) -> int: ...
+    @property
+    def objective(self) -> NDArray[Any]: ...
+    @property
+    def estimates(self) -> list[tuple[int, float]]: ...
+    @property
+    def degrees_of_freedom(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+
+def calibrate_frames(
+    frames: NDArray[Any],
+    shifts: NDArray[Any],
+    *,
+    rotation: list[int],
+    flux: list[float],
+    variance: NDArray[Any] | None,
+    mask: NDArray[Any] | None,
+    tolerance: float,
+    max_sweeps: int | None,
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> Solution: ...

@@ -61,7 +61,7 @@ def solve_dense(
         sensitivity = sensitivity + change[: sensitivity.size].reshape(sensitivity.shape)
         beam = beam + change[sensitivity.size :].reshape(beam.shape)
         history.append(objective(data, sensitivity, beam))
-        if np.abs(change).max() < 1e-14 * np.nanmax(beam):
+        if np.abs(change).max() < 1e-13 * np.nanmax(beam):
             break
     return gauged(data, sensitivity, beam, history)
 

@@ -151,7 +151,9 @@ def noise_prediction(
     noise = _like_signal("variance", variance, signal.shape)
     if not (np.all(noise > 0) and np.all(signal > 0)):
         raise InputError("'variance' and the signal must be above 0 in every pixel")
-    used = np.ones(truth.shape, bool) if mask is None else ~as_array("mask", mask, ndim=2)
+    used = ~as_array("mask", np.zeros(truth.shape, bool) if mask is None else mask, ndim=2)
+    if used.shape != truth.shape or not used.any():
+        raise InputError(f"'mask' of shape {used.shape} leaves no pixel of {truth.shape}")
     system = ReducedSystem(signal**2 / noise * used, cells - cells.min(axis=0))
     rng = np.random.default_rng(rng)
     results = []
@@ -170,8 +172,11 @@ def _like_signal(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats
 
 
 def _rms_at_both_scales(error: Floats) -> tuple[float, float]:
-    blocks = block_means(error) if min(error.shape) >= BLOCK else np.array([np.nan])
-    return float(np.sqrt(np.nanmean(error**2))), float(np.sqrt(np.nanmean(blocks**2)))
+    return _rms(error), _rms(block_means(error)) if min(error.shape) >= BLOCK else np.nan
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
 
 
 class ReducedSystem:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tifffile
 
 from equipix._arrays import as_array
-from equipix.errors import FileError, InputError
+from equipix.errors import InputError
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
 from equipix.simulate.signal import Beam, checked_shifts, window
+from equipix.simulate.store import Progress, write_experiment
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    import os
+    from collections.abc import Iterator
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -174,7 +172,7 @@ class VirtualExperiment:
         folder: str | os.PathLike[str],
         *,
         force: bool = False,
-        progress: Callable[[int, int, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> Path:
         """Write the experiment as TIFF files with their manifest, whole or not at all.
 
@@ -198,42 +196,7 @@ class VirtualExperiment:
         FileError
             If the folder holds files already, or cannot be written.
         """
-        target = Path(folder)
-        report = _Report(progress, self._frames_in_all())
-        with _new_folder(target, force) as made:
-            self._write_images(made, report)
-            np.savez(made / "truth.npz", **vars(self.truth))
-            (made / "experiment.toml").write_text(self._manifest(), encoding="utf-8")
-        return target / "experiment.toml"
-
-    def _frames_in_all(self) -> int:
-        n = len(self.positions)
-        return n * self.count + self.dark_count + 2 * (n - 1) * self.aperture_count
-
-    def _write_images(self, folder: Path, report: _Report) -> None:
-        _write_pages(folder / "dark/dark.tif", self.dark(), report)
-        for k in range(len(self.positions)):
-            _write_pages(folder / f"frames/p{k}.tif", self.frames(k), report)
-        for k in range(1, len(self.positions)):
-            _write_pages(folder / f"aperture/p{k}-before.tif", self.aperture_before(k), report)
-            _write_pages(folder / f"aperture/p{k}-after.tif", self.aperture_after(k), report)
-
-    def _manifest(self) -> str:
-        lines = [
-            "# calibration experiment of a virtual camera; the truth is in truth.npz",
-            "[sensor]",
-            'name = "virtual"',
-            f"bit_depth = {self.camera.bit_depth}",
-            "",
-            "[dark]",
-            'frames = "dark/dark.tif"',
-        ]
-        for k in range(len(self.positions)):
-            lines += ["", "[[exposure]]", f'name = "p{k}"', f'frames = "frames/p{k}.tif"']
-            if k:
-                lines.append(f'aperture_before = "aperture/p{k}-before.tif"')
-                lines.append(f'aperture_after = "aperture/p{k}-after.tif"')
-        return "\n".join(lines) + "\n"
+        return write_experiment(self, Path(folder), force=force, progress=progress)
 
 
 def experiment(
@@ -358,51 +321,3 @@ def _behind_hole(beam: Beam, shape: tuple[int, int], positions: Floats) -> Beam:
         return beam(rows, cols) * transmission
 
     return hole
-
-
-class _Report:
-    """Counts frames for a progress callback."""
-
-    def __init__(self, progress: Callable[[int, int, str], None] | None, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-
-    def frame(self) -> None:
-        self._done += 1
-        if self._progress is not None:
-            self._progress(self._done, self._total, "writing")
-
-
-def _write_pages(path: Path, frames: Iterator[NDArray[Any]], report: _Report) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with tifffile.TiffWriter(path) as writer:
-        for frame in frames:
-            writer.write(frame, photometric="minisblack", metadata=None)
-            report.frame()
-
-
-@contextmanager
-def _new_folder(target: Path, force: bool) -> Iterator[Path]:
-    """Make a folder beside the target that takes its place when all is written."""
-    if target.exists() and not _may_replace(target, force):
-        raise FileError(
-            f"'{target}' exists and is not empty: name another folder, or force the replacement "
-            "of an experiment"
-        )
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        if target.exists():
-            shutil.rmtree(target)
-        partial.rename(target)
-    except OSError as error:
-        raise FileError(f"cannot write '{target}': {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _may_replace(target: Path, force: bool) -> bool:
-    """Whether the target is an empty folder, or an experiment that may go."""
-    if not target.is_dir():
-        return False
-    return not any(target.iterdir()) or (force and (target / "experiment.toml").is_file())

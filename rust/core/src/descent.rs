@@ -30,7 +30,7 @@ const CHECK_EVERY: u64 = 16;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
 /// Columns that a kernel works on at a time: its sums stay in the first-level cache.
-const BLOCK: usize = 512;
+const BLOCK: usize = 400;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug)]
@@ -189,10 +189,13 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                         let first = block * BLOCK;
                         let stretch = first..first + cells.len();
                         let row = band * BAND + index;
-                        arch.dispatch(|| {
-                            sums.fill(model, 0, row, stretch, sensitivity);
-                            sums.divide(cells);
-                        });
+                        arch.dispatch(
+                            #[inline(always)]
+                            || {
+                                sums.fill(model, 0, row, stretch, sensitivity);
+                                sums.divide(cells);
+                            },
+                        );
                     }
                 }
             });
@@ -237,7 +240,10 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
             let mut sums = BeamSums::default();
             for (block, cells) in cells.chunks_mut(BLOCK).enumerate() {
                 let stretch = block * BLOCK..block * BLOCK + cells.len();
-                self.arch.dispatch(|| sums.fill(self.model, view, row, stretch, &self.sensitivity));
+                self.arch.dispatch(
+                    #[inline(always)]
+                    || sums.fill(self.model, view, row, stretch, &self.sensitivity),
+                );
                 for (index, cell) in cells.iter_mut().enumerate() {
                     *cell = [sums.signal[index], sums.weight[index]];
                 }
@@ -259,10 +265,13 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                 for (block, pixels) in row.chunks_mut(BLOCK).enumerate() {
                     let stretch = block * BLOCK..block * BLOCK + pixels.len();
                     let row = band * BAND + index;
-                    objective += arch.dispatch(|| {
-                        sums.fill(model, row, stretch, beams, pixels);
-                        sums.step(pixels)
-                    });
+                    objective += arch.dispatch(
+                        #[inline(always)]
+                        || {
+                            sums.fill(model, row, stretch, beams, pixels);
+                            sums.step(pixels)
+                        },
+                    );
                 }
             }
             objective
@@ -404,13 +413,17 @@ impl PixelSums {
             let first = (row + place.row) * model.geometry.views[place.view].shape.cols + place.col;
             let beam = &beams[place.view][first + cols.start..][..length];
             let flux = model.flux[exposure];
-            let sums = (&mut self.slope, &mut self.weight, &mut self.objective);
+            let slope = &mut self.slope[..length];
+            let weight = &mut self.weight[..length];
+            let objective = &mut self.objective[..length];
             match model.stretch(exposure, row, cols.clone(), &mut self.scratch) {
                 Stretch::Uniform(values, w) => {
-                    add_to_pixels(sums, values, beam, sensitivity, flux, |_| w);
+                    add_to_pixels(slope, weight, objective, values, beam, sensitivity, flux, |_| w);
                 }
                 Stretch::Weighted(values, w) => {
-                    add_to_pixels(sums, values, beam, sensitivity, flux, |i| w[i]);
+                    add_to_pixels(slope, weight, objective, values, beam, sensitivity, flux, |i| {
+                        w[i]
+                    });
                 }
             }
         }
@@ -436,7 +449,9 @@ impl PixelSums {
 
 #[inline(always)]
 fn add_to_pixels<T: Real>(
-    sums: (&mut [f64; BLOCK], &mut [f64; BLOCK], &mut [f64; BLOCK]),
+    slope: &mut [f64],
+    weight: &mut [f64],
+    objective: &mut [f64],
     values: &[T],
     beam: &[f64],
     sensitivity: &[f64],
@@ -444,9 +459,8 @@ fn add_to_pixels<T: Real>(
     weight_of: impl Fn(usize) -> f64,
 ) {
     let length = values.len();
-    let slope = &mut sums.0[..length];
-    let weight = &mut sums.1[..length];
-    let objective = &mut sums.2[..length];
+    let (slope, weight) = (&mut slope[..length], &mut weight[..length]);
+    let objective = &mut objective[..length];
     let (beam, sensitivity) = (&beam[..length], &sensitivity[..length]);
     for i in 0..length {
         let w = weight_of(i);

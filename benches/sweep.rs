@@ -1,0 +1,82 @@
+//! One sweep of coordinate descent: a plain loop beside the core's kernels, over sensor sizes.
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use equipix_core::control::Control;
+use equipix_core::descent::Descent;
+use equipix_core::frames::{Shape, Stack};
+use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::model::{Mask, Model, Variance};
+use equipix_core::parallel::Workers;
+use std::hint::black_box;
+
+const SHIFTS: [[i64; 2]; 5] = [[0, 0], [0, 11], [0, 19], [11, 0], [19, 0]];
+const PAD: usize = 19;
+
+/// Five exposures of a Gaussian beam on a sensor with a 5 % ripple.
+fn frames(shape: Shape) -> Vec<f32> {
+    let width = 1000.0 * (shape.cols as f64 / 782.0).max(1.0);
+    let gaussian = |x: f64, size: usize| (-((x - size as f64 / 2.0) / width).powi(2)).exp();
+    let pixels = || (0..shape.rows).flat_map(|r| (0..shape.cols).map(move |c| (r, c)));
+    let signal = |[down, right]: [i64; 2], (r, c): (usize, usize)| {
+        let beam = gaussian(r as f64 + down as f64, shape.rows)
+            * gaussian(c as f64 + right as f64, shape.cols);
+        (beam * (1.0 + 0.05 * ((r * 7 + c * 13) as f64).sin())) as f32
+    };
+    SHIFTS.into_iter().flat_map(|shift| pixels().map(move |p| signal(shift, p))).collect()
+}
+
+/// The same sweep as one would write it down: M and L updated in place, whole images at a time.
+fn naive_sweep(frames: &[f32], shape: Shape, sensitivity: &mut [f64], beam: &mut [f64]) {
+    let cols = shape.cols + PAD;
+    let mut sums = vec![[0.0; 2]; beam.len()];
+    for (k, [down, right]) in SHIFTS.into_iter().enumerate() {
+        for (r, c) in (0..shape.rows).flat_map(|r| (0..shape.cols).map(move |c| (r, c))) {
+            let m = sensitivity[r * shape.cols + c];
+            let y = f64::from(frames[k * shape.len() + r * shape.cols + c]);
+            let sum = &mut sums[(r + down as usize) * cols + c + right as usize];
+            *sum = [sum[0] + m * y, sum[1] + m * m];
+        }
+    }
+    for (cell, [signal, weight]) in beam.iter_mut().zip(sums) {
+        *cell = if weight > 0.0 { signal / weight } else { 0.0 };
+    }
+    for (r, c) in (0..shape.rows).flat_map(|r| (0..shape.cols).map(move |c| (r, c))) {
+        let [mut signal, mut weight] = [0.0; 2];
+        for (k, [down, right]) in SHIFTS.into_iter().enumerate() {
+            let light = beam[(r + down as usize) * cols + c + right as usize];
+            signal += light * f64::from(frames[k * shape.len() + r * shape.cols + c]);
+            weight += light * light;
+        }
+        sensitivity[r * shape.cols + c] = signal / weight;
+    }
+}
+
+fn sweep(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("sweep");
+    for shape in [Shape::new(240, 320), Shape::new(582, 782), Shape::new(1164, 1564)] {
+        let data = frames(shape);
+        group.throughput(Throughput::Elements(data.len() as u64));
+        let mut sensitivity = vec![1.0; shape.len()];
+        let mut beam = vec![0.0; (shape.rows + PAD) * (shape.cols + PAD)];
+        group.bench_function(BenchmarkId::new("naive", shape), |bencher| {
+            bencher.iter(|| naive_sweep(&data, shape, &mut sensitivity, black_box(&mut beam)));
+        });
+        for (name, count) in [("one worker", Some(1)), ("all workers", None)] {
+            let workers = Workers::new(count.and_then(std::num::NonZeroUsize::new)).unwrap();
+            let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
+            let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
+            let model =
+                Model::new(stack, geometry, &[1.0; 5], Variance::Unknown, Mask::None, &workers)
+                    .unwrap();
+            let mut descent = Descent::new(&model, &workers);
+            let control = Control::new();
+            group.bench_function(BenchmarkId::new(name, shape), |bencher| {
+                bencher.iter(|| descent.sweep(&control).unwrap());
+            });
+        }
+    }
+    group.finish();
+}
+
+criterion_group!(benches, sweep);
+criterion_main!(benches);

@@ -1,0 +1,499 @@
+"""Shift calibration: sensitivity and beam from exposures of one beam at several positions."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from equipix import _native
+from equipix._arrays import as_array, as_floats, positive_workers
+from equipix.correction import Flagged, apply_gain
+from equipix.errors import (
+    ConvergenceWarning,
+    IdentifiabilityWarning,
+    InputError,
+    ShiftRoundingWarning,
+)
+from equipix.io import save_pages
+from equipix.noise import smoothed_variances
+from equipix.results import FrameStatistics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from os import PathLike
+
+    from numpy.typing import ArrayLike, NDArray
+
+    Progress = Callable[[int, int, str], object]
+
+FORMAT = 1
+"""Number of the file format; a file with a higher one is refused."""
+
+_UNNOTICED = 0.02
+"""Fraction of a pixel that a shift may be rounded by without a warning."""
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """How a calibration went.
+
+    Attributes
+    ----------
+    objective : ndarray, shape (sweeps,), float64
+        Objective F after each sweep; it never rises.
+    sweep : ndarray, int64
+        Numbers of the sweeps at which the error was estimated.
+    error_estimate : ndarray, float64
+        The estimated largest relative error of the sensitivity at those sweeps.
+    """
+
+    objective: NDArray[Any]
+    sweep: NDArray[Any]
+    error_estimate: NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibrated sensor: the result of `calibrate`.
+
+    Attributes
+    ----------
+    sensitivity : ndarray, shape (rows, cols)
+        Relative sensitivity M of mean 1 over valid pixels; NaN where undetermined. float32 for
+        float32 frames, else float64.
+    beam : ndarray, shape of the padded grid, float64
+        The beam L in the units of the frames; NaN where unobserved.
+    beam_origin : tuple of int
+        ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`; 0 for a good pixel.
+    shifts : ndarray, shape (n, 2), float64
+        The shifts (row, col) that were used, in pixels.
+    flux : ndarray, shape (n,), float64
+        The relative flux of each exposure.
+    objective : float
+        Objective F at the end.
+    reduced_chi2 : float
+        F over the degrees of freedom: 1 on average where the variances given are right, and the
+        variance of one value where none were given. NaN without any degree of freedom.
+    components : int
+        Number of connected components: parts of the sensor that the measurements do not compare.
+    component_labels : ndarray, shape (rows, cols), int32
+        The component of each pixel, the largest being 0; −1 for a pixel without measurement.
+    sweeps : int
+        Passes over the data.
+    converged : bool
+        Whether `error_estimate` is within the tolerance.
+    error_estimate : float
+        Estimated largest distance of `sensitivity` from the minimum of F, large scales included.
+        It says nothing of noise.
+    history : History
+        Objective and error estimate along the way.
+    dark : ndarray, shape (rows, cols), or None
+        The dark frame in DN, if it is part of the calibration.
+    metadata : dict
+        Versions, options and origin, as JSON values.
+    """
+
+    sensitivity: NDArray[Any]
+    beam: NDArray[Any]
+    beam_origin: tuple[int, int]
+    flags: NDArray[Any]
+    shifts: NDArray[Any]
+    flux: NDArray[Any]
+    objective: float
+    reduced_chi2: float
+    components: int
+    component_labels: NDArray[Any]
+    sweeps: int
+    converged: bool
+    error_estimate: float
+    history: History
+    dark: NDArray[Any] | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.sensitivity.shape
+        return rows, cols
+
+    def correct(
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Literal["stored"] | ArrayLike | None = "stored",
+        flagged: Flagged = "nan",
+        out: NDArray[Any] | None = None,
+    ) -> NDArray[Any]:
+        """Frames as a sensor of equal pixels would have given them: (frame − dark) / M.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames, in DN.
+        dark : "stored", array_like of shape (rows, cols), or None
+            The dark frame to subtract, in DN: the one that is part of the calibration, another,
+            or none where it is already subtracted.
+        flagged : {"nan", "keep", "replace"}
+            What becomes of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
+            (NaN still where M is undetermined), or the mean of the nearest good pixels around.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32 or float64.
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            float64 for float64 frames, else float32; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, `dark` is "stored" and none is stored, or `flagged` is
+            unknown.
+        """
+        if isinstance(dark, str):
+            if dark != "stored":
+                raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+            if self.dark is None:
+                raise InputError(
+                    "'dark' is 'stored' but this calibration holds no dark frame: give one, or "
+                    "None if it is already subtracted"
+                )
+            dark = self.dark
+        return apply_gain(
+            frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
+        )
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        InputError
+            If the suffix is unknown.
+        """
+        pages = {
+            "sensitivity": self.sensitivity,
+            "flags": self.flags,
+            "beam": self.beam,
+            "component_labels": self.component_labels,
+        }
+        if self.dark is not None:
+            pages["dark"] = self.dark
+        numbers = {
+            "beam_origin": list(self.beam_origin),
+            "shifts": self.shifts.tolist(),
+            "flux": self.flux.tolist(),
+            "objective": self.objective,
+            "reduced_chi2": self.reduced_chi2 if np.isfinite(self.reduced_chi2) else None,
+            "components": self.components,
+            "sweeps": self.sweeps,
+            "converged": self.converged,
+            "error_estimate": self.error_estimate,
+            "history": {
+                "objective": self.history.objective.tolist(),
+                "sweep": self.history.sweep.tolist(),
+                "error_estimate": self.history.error_estimate.tolist(),
+            },
+        }
+        content = {
+            "format": FORMAT,
+            "kind": "calibration",
+            "calibration": numbers,
+            "metadata": self.metadata,
+        }
+        save_pages(path, pages, content, force=force)
+
+
+def calibrate(
+    frames: ArrayLike | Sequence[FrameStatistics],
+    shifts: ArrayLike,
+    *,
+    variance: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    flux: ArrayLike | None = None,
+    rotation: ArrayLike | None = None,
+    method: Literal["coordinate-descent"] = "coordinate-descent",
+    tolerance: float = 1e-6,
+    max_sweeps: int | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    r"""Measure the relative sensitivity of every pixel without a uniform source.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
+        Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
+        `FrameStatistics` bring their variances along: a noise model fitted over all pixels, not
+        each pixel's own sample variance, gives the weights.
+    shifts : array_like, shape (n, 2)
+        Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
+        unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result without
+        any residual to show it. Rounded to whole pixels.
+    variance : array_like, shape (n,) or (n, rows, cols), optional
+        Variance of the values given. Without it all weights are 1.
+    mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+        True = do not use.
+    flux : array_like, shape (n,), optional
+        Known relative flux of each exposure; 1 unless given.
+    rotation : array_like of int, shape (n,), optional
+        How far each exposure is turned, in degrees: 0, 90, 180 or 270, as by ``numpy.rot90`` of
+        the beam's window; 0 unless given.
+    method : {"coordinate-descent"}
+        How to minimise the objective.
+    tolerance : float
+        Largest relative error of the sensitivity, against the minimum of the objective, at
+        which the solver stops. The estimate includes errors of the sensor's own size.
+    max_sweeps : int, optional
+        Most passes over the data; unless given, five times what theory says is needed.
+    workers : int, optional
+        Number of threads; unless given, as many as processors may be used. The result is the
+        same to the last bit.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then; what it raises stops the work.
+
+    Returns
+    -------
+    Calibration
+        Sensitivity, beam, flags and how far the solver came.
+
+    Raises
+    ------
+    InputError
+        If an argument has a wrong shape or value, or an exposure shows no light.
+
+    Warns
+    -----
+    ShiftRoundingWarning
+        If a shift is rounded by more than 0.02 pixel.
+    IdentifiabilityWarning
+        If the measurements leave parts of the sensor uncompared.
+    ConvergenceWarning
+        If the tolerance was not reached.
+
+    Notes
+    -----
+    Minimises :math:`F = \sum_k \sum_p w_k(p) [y_k(p) - c_k L(u_k(p)) M(p)]^2` over the sensitivity
+    M and the beam L, with weights w = 1/variance, fluxes c and the position u of pixel p in the
+    beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
+    mean(M) = 1 over valid pixels.
+
+    References
+    ----------
+    .. [1] S. E. Stukachev, I. E. Kozhevatov, "Calibration method for spatial distribution of light
+       sensitivity of matrix photo receivers", Radiophysics and Quantum Electronics, 2011.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> shape = (48, 64)
+    >>> beam = equipix.simulate.gaussian_beam(shape)
+    >>> truth = equipix.simulate.paper_sensitivity(shape, rng=1)
+    >>> shifts = equipix.cross_pattern(5, 7)
+    >>> cal = equipix.calibrate(equipix.simulate.exposures(truth, beam, shifts), shifts)
+    >>> bool(np.abs(cal.sensitivity / (truth / truth.mean()) - 1).max() < 1e-6)
+    True
+    """
+    started = datetime.now(UTC)
+    if method != "coordinate-descent":
+        raise InputError(f"'method' is {method!r}, expected 'coordinate-descent'")
+    values, variances = _values_and_variances(frames, variance)
+    count = len(values)
+    positions = round_shifts(shifts)
+    _check_count("shifts", len(positions), count)
+    turns = _per_exposure("rotation", rotation, count, default=0)
+    if not np.all(np.isin(turns, (0, 90, 180, 270))):
+        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+    fluxes = _per_exposure("flux", flux, count, default=1)
+    result = _native.calibrate_frames(
+        values,
+        positions,
+        rotation=turns.astype(int).tolist(),
+        flux=fluxes.tolist(),
+        variance=variances,
+        mask=None if mask is None else _boolean_mask(mask),
+        tolerance=_number("tolerance", tolerance),
+        max_sweeps=None if max_sweeps is None else _positive_count("max_sweeps", max_sweeps),
+        workers=positive_workers(workers),
+        progress=progress,
+    )
+    options = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps}
+    calibration = _wrapped(result, values.dtype, positions, fluxes)
+    calibration.metadata.update(
+        versions={"equipix": _native.__version__, "numpy": np.__version__},
+        options=options | {"rotation": turns.astype(int).tolist()},
+        started=started.isoformat(timespec="seconds"),
+        finished=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    _warn(calibration, tolerance)
+    return calibration
+
+
+def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.int64]:
+    """Shifts rounded to whole pixels, with a warning where that changes them noticeably.
+
+    Parameters
+    ----------
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col) in pixels.
+    std : array_like, shape (n, 2), optional
+        Their standard errors, in pixels; 0 unless given.
+
+    Returns
+    -------
+    ndarray, shape (n, 2), int64
+        The nearest whole shifts.
+
+    Raises
+    ------
+    InputError
+        If a shift is not a finite number.
+
+    Warns
+    -----
+    ShiftRoundingWarning
+        If a shift is more than 0.02 pixel and more than three standard errors from whole.
+    """
+    exact = as_array("shifts", shifts, ndim=2).astype(np.float64)
+    if exact.shape[1] != 2:
+        raise InputError(f"'shifts' has shape {exact.shape}, expected (n, 2): row and column")
+    if not np.isfinite(exact).all():
+        k = int(np.flatnonzero(~np.isfinite(exact).all(axis=1))[0])
+        raise InputError(f"'shifts' of exposure {k} is {exact[k].tolist()}, expected numbers")
+    limit = float(np.iinfo(np.int32).max)
+    whole = np.rint(np.clip(exact, -limit, limit))
+    known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
+    noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
+    if noticeable.any():
+        worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
+        warnings.warn(
+            f"shifts are rounded to whole pixels: that of exposure {worst[0]} is "
+            f"{np.round(exact[worst[0]], 3).tolist()}",
+            ShiftRoundingWarning,
+            stacklevel=3,
+        )
+    return whole.astype(np.int64)
+
+
+def _values_and_variances(
+    frames: ArrayLike | Sequence[FrameStatistics], variance: ArrayLike | None
+) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Frames as (n, rows, cols) and their variances in a dtype that fits."""
+    if isinstance(frames, list | tuple) and any(isinstance(f, FrameStatistics) for f in frames):
+        means = [f.mean for f in frames if isinstance(f, FrameStatistics)]
+        if len(means) != len(frames) or len({mean.shape for mean in means}) != 1:
+            shapes = [getattr(frame, "shape", np.shape(getattr(frame, "mean", frame))) for frame in frames]
+            raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
+        values = as_floats("frames", np.stack(means), ndim=3)
+        if variance is None:
+            return values, as_floats("variance", smoothed_variances(frames), ndim=3)
+    else:
+        values = as_floats("frames", frames, ndim=3)
+    if 0 in values.shape[1:]:
+        raise InputError(f"'frames' has shape {values.shape}, expected at least one pixel")
+    if variance is None:
+        return values, None
+    variances = as_array("variance", variance, ndim=(1, 3))
+    if variances.ndim == 1:
+        _check_count("variance", len(variances), len(values))
+        return values, variances.astype(np.float64)
+    if variances.shape != values.shape:
+        raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
+    return values, variances.astype(values.dtype, copy=False)
+
+
+def _boolean_mask(mask: ArrayLike) -> NDArray[np.bool_]:
+    array = as_array("mask", mask, ndim=(2, 3))
+    if array.dtype != np.bool_:
+        raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
+    return array
+
+
+def _per_exposure(
+    name: str, values: ArrayLike | None, count: int, *, default: float
+) -> NDArray[np.float64]:
+    if values is None:
+        return np.full(count, float(default))
+    array = as_array(name, values, ndim=1).astype(np.float64)
+    _check_count(name, len(array), count)
+    return array
+
+
+def _check_count(name: str, got: int, count: int) -> None:
+    if got != count:
+        raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")
+
+
+def _number(name: str, value: float) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{name}' is {value!r}, expected a number") from error
+
+
+def _positive_count(name: str, value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
+    return int(value)
+
+
+def _wrapped(
+    result: _native.Solution,
+    dtype: np.dtype[Any],
+    shifts: NDArray[np.int64],
+    flux: NDArray[np.float64],
+) -> Calibration:
+    sweeps, estimates = zip(*result.estimates, strict=True)
+    objective = float(result.objective[-1])
+    freedom = result.degrees_of_freedom
+    return Calibration(
+        sensitivity=result.sensitivity.astype(dtype, copy=False),
+        beam=result.beam,
+        beam_origin=result.beam_origin,
+        flags=result.flags,
+        shifts=shifts.astype(np.float64),
+        flux=flux,
+        objective=objective,
+        reduced_chi2=objective / freedom if freedom > 0 else float("nan"),
+        components=result.components,
+        component_labels=result.component_labels,
+        sweeps=len(result.objective),
+        converged=result.converged,
+        error_estimate=float(estimates[-1]),
+        history=History(result.objective, np.array(sweeps), np.array(estimates)),
+    )
+
+
+def _warn(calibration: Calibration, tolerance: float) -> None:
+    if calibration.components > 1:
+        left = int(np.count_nonzero(calibration.component_labels > 0))
+        warnings.warn(
+            f"the measurements leave {calibration.components} parts of the sensor uncompared: "
+            f"{left} pixels outside the largest part are NaN; choose other shifts",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
+    if not calibration.converged:
+        warnings.warn(
+            f"stopped after {calibration.sweeps} sweeps with an estimated error of "
+            f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: "
+            "allow more sweeps",
+            ConvergenceWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,90 @@
+"""Frames corrected by maps of offset and gain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from equipix._arrays import as_array
+from equipix.errors import InputError
+from equipix.results import Flag
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+Flagged = Literal["nan", "keep", "replace"]
+
+
+def apply_gain(
+    frames: ArrayLike,
+    *,
+    gain: NDArray[Any],
+    dark: ArrayLike | None,
+    flags: NDArray[Any],
+    flagged: Flagged,
+    out: NDArray[Any] | None,
+) -> NDArray[Any]:
+    """(frame − dark) / gain, frame by frame, and what becomes of flagged pixels.
+
+    The parameters are those of `equipix.Calibration.correct`.
+    """
+    raw = as_array("frames", frames, ndim=(2, 3))
+    if raw.shape[-2:] != gain.shape:
+        raise InputError(f"'frames' has shape {raw.shape}, the sensor {gain.shape}")
+    if flagged not in get_args(Flagged):
+        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
+    dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
+    offset = np.zeros((), dtype) if dark is None else as_array("dark", dark, ndim=2)
+    if dark is not None and offset.shape != gain.shape:
+        raise InputError(f"'dark' has shape {offset.shape}, the sensor {gain.shape}")
+    result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
+    bad = (flags & Flag.DO_NOT_USE) != 0
+    for source, target in zip(_each(raw), _each(result), strict=True):
+        np.subtract(source, offset, out=target, dtype=target.dtype, casting="same_kind")
+        np.divide(target, gain, out=target, casting="same_kind")
+        if flagged == "nan":
+            target[bad] = np.nan
+        elif flagged == "replace":
+            replace_bad(target, bad)
+    return result
+
+
+def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> None:
+    """Put the mean of the nearest good pixels in place of each bad one.
+
+    The good ones of the eight neighbours count; where there are none, those that were filled in
+    the round before. An image without any good pixel becomes NaN.
+    """
+    rows, cols = image.shape
+    good = np.zeros((rows + 2, cols + 2), bool)
+    good[1:-1, 1:-1] = ~bad
+    values = np.zeros(good.shape)
+    values[1:-1, 1:-1] = np.where(bad, 0, image)
+    todo = np.argwhere(bad) + 1
+    around = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+    while len(todo):
+        places = [tuple((todo + step).T) for step in around]
+        count = np.sum([good[place] for place in places], axis=0)
+        ready = count > 0
+        if not ready.any():
+            image[tuple((todo - 1).T)] = np.nan
+            return
+        total = np.sum([values[place] for place in places], axis=0)
+        filled = tuple(todo[ready].T)
+        values[filled] = total[ready] / count[ready]
+        good[filled] = True
+        image[tuple((todo[ready] - 1).T)] = values[filled]
+        todo = todo[~ready]
+
+
+def _each(stack: NDArray[Any]) -> NDArray[Any]:
+    return stack[None] if stack.ndim == 2 else stack
+
+
+def _checked_out(out: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    fits = isinstance(out, np.ndarray) and out.shape == shape and out.dtype.kind == "f"
+    if not fits or not out.flags.writeable:
+        got = f"{getattr(out, 'dtype', type(out).__name__)} {np.shape(out)}"
+        raise InputError(f"'out' is {got}, expected a writeable float array of shape {shape}")
+    return out

@@ -1,0 +1,77 @@
+"""Reading back what equipix has saved."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.calibration import FORMAT, Calibration, History
+from equipix.errors import FileError
+from equipix.io import load_pages
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from numpy.typing import NDArray
+
+
+def load(path: str | PathLike[str]) -> Calibration:
+    """Read a calibration that `Calibration.save` wrote.
+
+    Parameters
+    ----------
+    path : str or path
+        The file; its suffix, .tif or .npz, names the format.
+
+    Returns
+    -------
+    Calibration
+        As it was saved, bit by bit.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, holds something else, or was written in a newer format.
+    """
+    pages, content = load_pages(path)
+    if not isinstance(content, dict) or content.get("kind") != "calibration":
+        raise FileError(f"{path}: not a calibration that equipix has saved")
+    if content.get("format", 0) > FORMAT:
+        raise FileError(
+            f"{path}: written in format {content['format']}, this version of equipix reads up to "
+            f"{FORMAT}: install a newer one"
+        )
+    try:
+        return _calibration(pages, content)
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{path}: damaged or incomplete calibration: {error!r}") from error
+
+
+def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Calibration:
+    numbers = content["calibration"]
+    history = numbers["history"]
+    row, col = numbers["beam_origin"]
+    chi2 = numbers["reduced_chi2"]
+    return Calibration(
+        sensitivity=pages["sensitivity"],
+        beam=pages["beam"],
+        beam_origin=(row, col),
+        flags=pages["flags"],
+        shifts=np.array(numbers["shifts"], dtype=np.float64),
+        flux=np.array(numbers["flux"], dtype=np.float64),
+        objective=numbers["objective"],
+        reduced_chi2=float("nan") if chi2 is None else chi2,
+        components=numbers["components"],
+        component_labels=pages["component_labels"],
+        sweeps=numbers["sweeps"],
+        converged=numbers["converged"],
+        error_estimate=numbers["error_estimate"],
+        history=History(
+            np.array(history["objective"]),
+            np.array(history["sweep"], dtype=np.int64),
+            np.array(history["error_estimate"]),
+        ),
+        dark=pages.get("dark"),
+        metadata=content["metadata"],
+    )
