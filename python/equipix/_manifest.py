@@ -1,0 +1,175 @@
+"""What stands in experiment.toml, checked: faults are named with their value and place."""
+
+from __future__ import annotations
+
+import glob
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from equipix.errors import FileError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+_WANTED = {
+    "format": "1: a newer format needs a newer equipix",
+    "sensor": "a table",
+    "bit_depth": "a whole number from 1 to 16",
+    "saturation": "a positive number (DN)",
+    "gain_dn_per_e": "a positive number (DN per electron)",
+    "dark": "a table",
+    "exposure": "two or more tables [[exposure]]",
+    "name": "a text",
+    "frames": "a file, a glob or a list of them",
+    "aperture_before": "a file, a glob or a list of them",
+    "aperture_after": "a file, a glob or a list of them",
+    "shift": "[row, col] in pixels",
+    "flux": "a positive number",
+    "rotation": "0, 90, 180 or 270",
+}
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Text = Annotated[str, Field(min_length=1)]
+Files = Text | Annotated[list[Text], Field(min_length=1)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Sensor(_Table):
+    """Table ``[sensor]``: levels in DN."""
+
+    name: str = ""
+    bit_depth: Annotated[int, Field(ge=1, le=16)] | None = None
+    saturation: Positive | None = None
+    gain_dn_per_e: Positive | None = None
+
+    @property
+    def saturation_level(self) -> float | None:
+        """Level that counts as saturated: the given one, else the largest of `bit_depth`."""
+        if self.saturation is None and self.bit_depth is not None:
+            return float(2**self.bit_depth - 1)
+        return self.saturation
+
+
+class Dark(_Table):
+    """Table ``[dark]``: frames without light."""
+
+    frames: Files
+
+
+class Exposure(_Table):
+    """One ``[[exposure]]``: the frames of one sensor position and how the sensor came there."""
+
+    name: Text
+    frames: Files
+    aperture_before: Files | None = None
+    aperture_after: Files | None = None
+    shift: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    flux: Positive | None = None
+    rotation: Literal[0, 90, 180, 270] = 0
+
+    @model_validator(mode="after")
+    def _one_way_to_know_the_position(self) -> Self:
+        if (self.aperture_before is None) != (self.aperture_after is None):
+            raise _problem("give both 'aperture_before' and 'aperture_after'")
+        if self.aperture_before is not None and self.shift is not None:
+            raise _problem("give aperture images or 'shift', not both")
+        return self
+
+
+class Manifest(_Table):
+    """The whole file."""
+
+    format: Literal[1] = 1
+    sensor: Sensor = Sensor()
+    dark: Dark
+    exposure: Annotated[list[Exposure], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _exposures_fit_together(self) -> Self:
+        first, *others = self.exposure
+        if first.aperture_before is not None:
+            raise _problem(
+                f"exposure 1 ('{first.name}') has aperture images, but no move before it"
+            )
+        for number, exposure in enumerate(others, start=2):
+            if exposure.aperture_before is None and exposure.shift is None:
+                raise _problem(
+                    f"exposure {number} ('{exposure.name}') needs 'aperture_before' and "
+                    "'aperture_after', or 'shift'"
+                )
+        names = [exposure.name for exposure in self.exposure]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise _problem(f"two exposures have the name '{repeated[0]}'")
+        missing = [exposure.name for exposure in self.exposure if exposure.flux is None]
+        if missing and len(missing) < len(names):
+            raise _problem(f"'flux' is missing in exposure '{missing[0]}': give all or none")
+        return self
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read and check the file `path`."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: is not a TOML file: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"{path}: is not valid TOML: {error}") from error
+    try:
+        return Manifest.model_validate(content)
+    except ValidationError as error:
+        problems = {_sentence(detail, content): None for detail in error.errors()}
+        raise FileError(f"{path}: {'; '.join(problems)}") from None
+
+
+def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
+    """Files that an entry of `manifest` (a file, a glob or a list of them) stands for."""
+    folder = manifest.parent
+    found: list[Path] = []
+    for pattern in [entry] if isinstance(entry, str) else entry:
+        if (folder / pattern).is_file():
+            found.append(folder / pattern)
+            continue
+        matches = sorted(glob.glob(pattern, root_dir=folder))  # noqa: PTH207 (may be absolute)
+        if not matches:
+            raise FileError(f"{manifest}: no file '{pattern}' in {folder}")
+        found += [folder / match for match in matches]
+    return found
+
+
+def _problem(text: str) -> PydanticCustomError:
+    return PydanticCustomError("manifest", "{text}", {"text": text})
+
+
+def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
+    """One of pydantic's findings in the terms of the file."""
+    location = detail["loc"]
+    match location:
+        case ["exposure", int(index), *_]:
+            place = f" in exposure {index + 1}{_name(content['exposure'][index])}"
+        case [table, _, *_]:
+            place = f" in [{table}]"
+        case _:
+            place = ""
+    if detail["type"] == "manifest":
+        return detail["msg"] + place
+    if detail["type"] == "extra_forbidden":
+        return f"unknown key '{location[-1]}'{place}"
+    if detail["type"] == "missing":
+        return f"key '{location[-1]}' is missing{place}"
+    key = next(key for key in reversed(location) if key in _WANTED)
+    value = detail["input"]
+    return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"
+
+
+def _name(table: object) -> str:
+    name = table.get("name") if isinstance(table, dict) else None
+    return f" ('{name}')" if name else ""

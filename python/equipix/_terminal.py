@@ -1,0 +1,101 @@
+"""What every command of the command line shares: bars, one-line messages, results, outputs."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from equipix.errors import FileError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    Report = Callable[[int, int, str], None]
+
+
+@contextmanager
+def progress_bars() -> Iterator[Report | None]:
+    """Bars on a terminal's stderr, one for each stage of the work; nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bars:
+        stages: dict[str, Any] = {}
+
+        def report(done: int, total: int, stage: str) -> None:
+            if stage not in stages:
+                stages[stage] = bars.add_task(stage, total=total)
+            bars.update(stages[stage], completed=done, total=total)
+
+        yield report
+
+
+def say(kind: str, message: object) -> None:
+    """Write one line to stderr: ``equipix: kind: message``."""
+    text = " ".join(str(message).split())
+    print(f"equipix: {kind}: {text}", file=sys.stderr)  # noqa: T201
+
+
+def show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Stand in for `warnings.showwarning`: one line on stderr, no source code."""
+    say("warning", message)
+
+
+def show_result(result: dict[str, Any], *, as_json: bool) -> None:
+    """Print a result for machines (one JSON object) or for people (a table)."""
+    if as_json:
+        print(json.dumps(_json_value(result), allow_nan=False))  # noqa: T201
+        return
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in result.items():
+        table.add_row(name.replace("_", " "), _words(value))
+    Console(soft_wrap=True).print(table)
+
+
+def check_output(path: Path, *, force: bool) -> None:
+    """Refuse an output that cannot be written, before the work starts.
+
+    Raises
+    ------
+    FileError
+        If `path` exists and `force` is not given, or its folder does not exist or is closed.
+    """
+    if path.exists() and not force:
+        raise FileError(f"'{path}' exists: name another output, or replace it with --force")
+    if not path.parent.is_dir():
+        raise FileError(f"'{path}' cannot be written: there is no folder '{path.parent}'")
+    if not os.access(path.parent, os.W_OK):
+        raise FileError(f"'{path}' cannot be written: folder '{path.parent}' is read-only")
+
+
+def _json_value(value: Any) -> Any:
+    """Put None in the place of numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _json_value(item) for key, item in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _words(value: object) -> str:
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.4g}"
+        case dict():
+            return ", ".join(f"{name} {_words(item)}" for name, item in value.items()) or "none"
+        case list() | tuple():
+            return " × ".join(str(item) for item in value)
+    return str(value)

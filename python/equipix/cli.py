@@ -1,0 +1,222 @@
+"""The command line: it parses and prints, the work is done elsewhere."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from equipix import simulate as simulation
+from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
+from equipix.calibration import Calibration
+from equipix.errors import EquipixError, EquipixWarning
+from equipix.experiment import Experiment
+from equipix.frames import average as average_frames
+from equipix.load import load
+from equipix.results import Flag
+from equipix.shifts import cross_pattern
+
+app = typer.Typer(
+    name="equipix",
+    help="Pixel sensitivity of image sensors, measured without a uniform light source.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
+Tolerance = Annotated[float, typer.Option(help="Largest relative error of the sensitivity.")]
+MaxSweeps = Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")]
+Saturation = Annotated[
+    float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
+]
+Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
+Shape = Annotated[tuple[int, int], typer.Option(help="Rows and columns of the sensor.")]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; the exit status is 0, 1 (failed), 2 (usage) or 130 (Ctrl-C)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", EquipixWarning)
+        warnings.showwarning = show_warning
+        try:
+            app(arguments, prog_name="equipix")
+        except (EquipixError, OSError, MemoryError) as error:
+            say("error", error or type(error).__name__)
+            raise SystemExit(1) from None
+
+
+@app.command(epilog="Example: equipix calibrate experiment.toml -o cal.tif")
+def calibrate(
+    experiment: Annotated[Path, typer.Argument(help="The experiment.toml.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration: .tif or .npz.")],
+    method: Annotated[
+        Literal["coordinate-descent"], typer.Option(help="How to solve.")
+    ] = "coordinate-descent",
+    tolerance: Tolerance = 1e-6,
+    max_sweeps: MaxSweeps = None,
+    workers: Workers = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a sensor from the images of an experiment."""
+    check_output(output, force=force)
+    loaded = Experiment.load(experiment)
+    with progress_bars() as progress:
+        calibration = loaded.run(
+            method=method,
+            tolerance=tolerance,
+            max_sweeps=max_sweeps,
+            workers=workers,
+            progress=progress,
+        )
+    calibration.save(output)
+    show_result({"output": str(output), **_summary(calibration)}, as_json=as_json)
+
+
+@app.command(epilog="Example: equipix inspect cal.tif")
+def inspect(
+    file: Annotated[Path, typer.Argument(help="A calibration: .tif or .npz.")],
+    as_json: Json = False,
+) -> None:
+    """Show what a calibration file holds."""
+    calibration = load(file)
+    result = {"file": str(file), **_summary(calibration)}
+    if as_json:
+        result["metadata"] = calibration.metadata
+    show_result(result, as_json=as_json)
+
+
+def _summary(calibration: Calibration) -> dict[str, Any]:
+    """What one wants to know first of a calibration."""
+    sensitivity = calibration.sensitivity
+    flagged = {
+        flag.name or "": int(np.count_nonzero(calibration.flags & flag))
+        for flag in Flag
+        if (calibration.flags & flag).any()
+    }
+    return {
+        "shape": list(calibration.shape),
+        "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
+        "spread": float(np.nanstd(sensitivity, dtype=np.float64)),
+        "converged": calibration.converged,
+        "error_estimate": calibration.error_estimate,
+        "sweeps": calibration.sweeps,
+        "reduced_chi2": calibration.reduced_chi2,
+        "components": calibration.components,
+        "flagged_pixels": flagged,
+    }
+
+
+@app.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")
+def average(
+    source: Annotated[list[str], typer.Argument(help="Image files or globs.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Statistics: .tif or .npz.")],
+    dark: Annotated[list[str] | None, typer.Option(help="Dark frames, to be subtracted.")] = None,
+    saturation: Saturation = None,
+    workers: Workers = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Mean and variance of every pixel over many frames."""
+    check_output(output, force=force)
+    with progress_bars() as progress:
+        offset = None
+        if dark:
+            offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+        frames = average_frames(
+            source, dark=offset, saturation=saturation, workers=workers, progress=progress
+        )
+    write_arrays(output, vars(frames), {"source": source, "dark": dark})
+    result = {
+        "output": str(output),
+        "shape": list(frames.mean.shape),
+        "frames": int(frames.count.max()),
+        "mean": float(frames.mean.mean()),
+        "variance": float(frames.variance.mean()),
+        "saturated_pixels": int(np.count_nonzero(frames.saturated)),
+    }
+    show_result(result, as_json=as_json)
+
+
+@app.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
+def correct(
+    calibration: Annotated[Path, typer.Argument(help="A calibration: .tif or .npz.")],
+    frames: Annotated[list[Path], typer.Argument(help="Image files.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="A .tif of all frames, or a folder of files.")
+    ],
+    dark: Annotated[
+        str, typer.Option(help="'stored' in the calibration, 'none', or a file of dark frames.")
+    ] = "stored",
+    flagged: Annotated[
+        Literal["nan", "keep", "replace"], typer.Option(help="What flagged pixels become.")
+    ] = "nan",
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Divide frames by the sensitivity, their dark level subtracted."""
+    check_output(output, force=force)
+    with progress_bars() as progress:
+        done = correct_files(
+            load(calibration), frames, output, dark=dark, flagged=flagged, progress=progress
+        )
+    show_result({"output": str(output), "frames": done}, as_json=as_json)
+
+
+@app.command(epilog="Example: equipix simulate --shape 240 320 --frames 20 -o experiment")
+def simulate(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to make.")],
+    shape: Shape = (240, 320),
+    frames: Annotated[int, typer.Option(min=1, help="Frames of an exposure.")] = 20,
+    bit_depth: Annotated[int, typer.Option(min=8, max=16, help="Bits of the ADC.")] = 12,
+    rng: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write the images of an experiment with a virtual camera, and its truth."""
+    check_output(output, force=force)
+    virtual = virtual_experiment(shape, frames=frames, bit_depth=bit_depth, rng=rng)
+    with progress_bars() as progress:
+        manifest = virtual.write(output, force=force, progress=progress)
+    show_result({"experiment": str(manifest), "shape": list(shape)}, as_json=as_json)
+
+
+@app.command(epilog="Example: equipix demo -o demo.png")
+def demo(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The picture: .png, .pdf or .svg.")
+    ] = Path("equipix-demo.png"),
+    shape: Shape = (582, 782),
+    frames: Annotated[int, typer.Option(min=2, help="Frames of an exposure.")] = 40,
+    rng: Seed = 0,
+    keep: Annotated[
+        Path | None, typer.Option(help="Folder to make for the images, which else go away.")
+    ] = None,
+    workers: Workers = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a simulated CCD from image files and compare with the truth and a flat field."""
+    check_output(output, force=force)
+    if keep is not None:
+        check_output(keep, force=force)
+    with tempfile.TemporaryDirectory(prefix="equipix-") as scratch, progress_bars() as progress:
+        folder = keep or Path(scratch) / "experiment"
+        result = run_demo(
+            folder, shape=shape, frames=frames, workers=workers, progress=progress, rng=rng
+        )
+    save_figure(draw_demo(result), output)
+    show_result({"picture": str(output), **result.figures()}, as_json=as_json)
+    if not result.passed:
+        raise EquipixError(
+            f"the errors exceed {RMS_LIMIT} and {BLOCK_RMS_LIMIT} times what the noise predicts"
+        )

@@ -1,0 +1,93 @@
+"""Which pixels must not be used: dead, hot, saturated."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.noise import scatter_limit
+from equipix.results import Flag
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from equipix.noise import NoiseModel
+    from equipix.results import FrameStatistics
+
+SIGMAS = 6.0
+"""Standard deviations that chance does not reach on a sensor of some million pixels."""
+
+HOT_SIGMAS = 10.0
+"""How far above the others' spread a dark level is hot: real ones have long tails."""
+
+DEAD_RESPONSE = 0.5
+"""Response relative to the neighbours below which a pixel is dead."""
+
+_BLOCK = 16
+
+
+def dead_pixels(signals: NDArray[Any], variances: NDArray[Any] | None) -> NDArray[Any]:
+    """Pixels that answer to light with less than half of what their neighbours do.
+
+    Parameters
+    ----------
+    signals : ndarray, shape (n, rows, cols)
+        Dark-subtracted means of the exposures, in DN.
+    variances : ndarray, shape (n, rows, cols), optional
+        Variances of `signals`, in DN²: a pixel must be below by more than chance explains.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where this holds in every exposure; the neighbours' response is the median of a
+        block of 16×16 pixels.
+    """
+    dead = np.ones(signals.shape[1:], dtype=bool)
+    for k, signal in enumerate(signals):
+        margin = 0.0 if variances is None else SIGMAS * np.sqrt(variances[k])
+        dead &= signal + margin < DEAD_RESPONSE * _block_medians(signal)
+    return dead
+
+
+def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
+    """Pixels whose dark level or dark noise is far above that of the others.
+
+    Parameters
+    ----------
+    dark : FrameStatistics
+        The averaged dark frames.
+    noise : NoiseModel, optional
+        The noise of the good pixels; without it only the level counts.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where the level is more than 10 standard deviations above the median (estimated by
+        1.4826 times the median absolute deviation, and at least one DN), or the variance beyond
+        what chance explains.
+    """
+    excess = dark.mean - np.median(dark.mean)
+    spread = max(1.0, 1.4826 * float(np.median(np.abs(excess))))
+    hot: NDArray[Any] = excess > HOT_SIGMAS * spread
+    frames = int(dark.count.max())
+    if noise is not None and frames > 1:
+        hot |= dark.variance > scatter_limit(frames, sigmas=SIGMAS) * noise.variance(0.0)
+    return hot
+
+
+def pixel_flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) -> NDArray[Any]:
+    """Bits of `Flag` for pixels of these kinds, shape (rows, cols), uint32."""
+    flags = np.zeros(dead.shape, dtype=np.uint32)
+    for pixels, flag in ((dead, Flag.DEAD), (hot, Flag.HOT), (saturated, Flag.SATURATED)):
+        flags[pixels] |= np.uint32(flag | Flag.DO_NOT_USE)
+    return flags
+
+
+def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
+    """Take for each pixel the median of the 16×16 block that it lies in."""
+    rows, cols = image.shape
+    padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
+    blocks = padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK)
+    medians = np.median(blocks, axis=(1, 3))
+    return medians.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:rows, :cols]

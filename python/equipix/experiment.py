@@ -1,0 +1,336 @@
+"""A calibration experiment on disk, as experiment.toml describes it, and its evaluation."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+
+from equipix._manifest import find_files, read_manifest
+from equipix.calibration import calibrate, round_shifts
+from equipix.defects import dead_pixels, hot_pixels, pixel_flags
+from equipix.errors import FileError, InputError
+from equipix.frames import average
+from equipix.io import read_stack
+from equipix.noise import NoiseModel, photon_transfer
+from equipix.shifts import measure_shift
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from os import PathLike
+
+    from numpy.typing import NDArray
+
+    from equipix._manifest import Exposure, Manifest
+    from equipix.calibration import Calibration
+    from equipix.results import FrameStatistics
+    from equipix.shifts import ShiftMeasurement, Spot
+
+    Progress = Callable[[int, int, str], object]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Exposures of one steady beam at several sensor positions, as files on disk.
+
+    Attributes
+    ----------
+    path : Path
+        The experiment.toml.
+    manifest : Manifest
+        Its checked content.
+
+    See Also
+    --------
+    equipix.calibrate : The same for arrays in memory.
+
+    Notes
+    -----
+    Frames, dark frames and aperture images are named relative to the file: one file (a
+    multi-page TIFF holds many frames), a glob or a list. The position of an exposure is either
+    ``shift = [row, col]`` in pixels or follows from the one before it and from images of a small
+    aperture in the beam, taken before and after the move.
+    """
+
+    path: Path
+    manifest: Manifest
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read and check the description of an experiment.
+
+        Parameters
+        ----------
+        path : str or path
+            The experiment.toml.
+
+        Returns
+        -------
+        Experiment
+            What `run` evaluates.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, has an unknown key or a wrong value, or names a file that
+            does not exist.
+        """
+        experiment = cls(Path(path), read_manifest(Path(path)))
+        experiment.files()
+        return experiment
+
+    def files(self) -> list[Path]:
+        """All image files of the experiment, each once."""
+        entries = [self.manifest.dark.frames]
+        for exposure in self.manifest.exposure:
+            entries += [exposure.frames, exposure.aperture_before, exposure.aperture_after]
+        found = [find_files(self.path, entry) for entry in entries if entry is not None]
+        return list(dict.fromkeys(file for files in found for file in files))
+
+    def measure_shifts(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Shift of each exposure and its standard error.
+
+        Returns
+        -------
+        shifts : ndarray, shape (n, 2)
+            Absolute shifts (row, col) in pixels.
+        std : ndarray, shape (n, 2)
+            Standard errors; 0 for shifts that the file gives. Those of successive moves add in
+            quadrature.
+
+        Raises
+        ------
+        FileError
+            If an aperture image cannot be read or shows no usable spot.
+
+        Notes
+        -----
+        The aperture stands still in the beam, where it has the coordinate u = A p + t + d: with
+        its image at p_before and p_after, d_new = d_old + (A_old p_before + t_old) −
+        (A_new p_after + t_new).
+        """
+        shifts, variances = [np.zeros(2)], [np.zeros(2)]
+        first, *others = self.manifest.exposure
+        if first.shift is not None:
+            shifts[0] = np.array(first.shift)
+        for old, new in zip(self.manifest.exposure, others, strict=False):
+            if new.shift is not None:
+                shifts.append(np.array(new.shift))
+                variances.append(np.zeros(2))
+                continue
+            spots, shape = self._aperture(new)
+            u_before, variance_before = _in_beam(spots.before, old.rotation, shape)
+            u_after, variance_after = _in_beam(spots.after, new.rotation, shape)
+            shifts.append(shifts[-1] + u_before - u_after)
+            variances.append(variances[-1] + variance_before + variance_after)
+        return np.array(shifts), np.sqrt(variances)
+
+    def run(
+        self,
+        *,
+        method: Literal["coordinate-descent"] = "coordinate-descent",
+        tolerance: float = 1e-6,
+        max_sweeps: int | None = None,
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> Calibration:
+        """Calibrate the sensor from the files.
+
+        Parameters
+        ----------
+        method, tolerance, max_sweeps, workers, progress
+            As in `equipix.calibrate`.
+
+        Returns
+        -------
+        Calibration
+            With the dark frame, the flags of dead, hot and saturated pixels, and in `metadata`
+            the names, the options, the hashes of the files and the times.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read, or the images differ in size or depth.
+        InputError
+            If an option is out of range, or the exposures do not make a calibration.
+        """
+        started = datetime.now(UTC)
+        shifts, std = self.measure_shifts()
+        whole_shifts = round_shifts(shifts, std)
+        measured = self._average(workers, progress)
+        noise = self._noise(measured)
+        variances = _variances(measured, noise)
+        flags = pixel_flags(
+            dead_pixels(measured.signals, variances),
+            hot_pixels(measured.dark, noise),
+            measured.saturated,
+        )
+        solved = calibrate(
+            measured.signals,
+            whole_shifts,
+            variance=variances,
+            mask=flags != 0,
+            flux=self._flux(),
+            rotation=[exposure.rotation for exposure in self.manifest.exposure],
+            method=method,
+            tolerance=tolerance,
+            max_sweeps=max_sweeps,
+            workers=workers,
+            progress=progress,
+        )
+        return replace(
+            solved,
+            dark=measured.dark.mean.astype(np.float32),
+            flags=solved.flags | flags,
+            metadata=solved.metadata | self._metadata(started, shifts, std, noise),
+        )
+
+    def _aperture(self, exposure: Exposure) -> tuple[ShiftMeasurement, tuple[int, int]]:
+        """Spots before and after the move to `exposure`, and the shape of the sensor."""
+        before, after = (
+            read_stack(find_files(self.path, entry))
+            for entry in (exposure.aperture_before, exposure.aperture_after)
+            if entry is not None
+        )
+        try:
+            level = self.manifest.sensor.saturation_level
+            return measure_shift(before, after, saturation=level), before.shape[-2:]
+        except InputError as error:
+            raise type(error)(
+                f"{self.path}: move to exposure '{exposure.name}': {error}"
+            ) from error
+
+    def _average(self, workers: int | None, progress: Progress | None) -> _Measured:
+        """Mean signal of every exposure; the frames' other statistics are reduced at once."""
+        dark = self._statistics("dark", self.manifest.dark.frames, workers, progress)
+        shape = dark.mean.shape
+        exposures = self.manifest.exposure
+        measured = _Measured(
+            dark=dark,
+            signals=np.empty((len(exposures), *shape), dtype=np.float32),
+            saturated=dark.saturated > 0,
+            frames=[],
+            transfer=[_transfer(np.zeros(shape), dark)],
+        )
+        for k, exposure in enumerate(exposures):
+            frames = self._statistics(exposure.name, exposure.frames, workers, progress)
+            if frames.mean.shape != shape:
+                raise FileError(
+                    f"{self.path}: frames of exposure '{exposure.name}' have shape "
+                    f"{frames.mean.shape}, the dark frames {shape}"
+                )
+            signal = frames.mean - dark.mean
+            measured.signals[k] = signal
+            measured.saturated[frames.saturated > 0] = True
+            measured.frames.append(int(frames.count.max()))
+            measured.transfer.append(_transfer(signal, frames))
+        return measured
+
+    def _statistics(
+        self, name: str, entry: str | list[str], workers: int | None, progress: Progress | None
+    ) -> FrameStatistics:
+        def report(done: int, total: int, _: str) -> None:
+            if progress is not None:
+                progress(done, total, f"averaging {name}")
+
+        level = self.manifest.sensor.saturation_level
+        files = find_files(self.path, entry)
+        frames = average(files, saturation=level, workers=workers, progress=report)
+        if (frames.saturated > 0).all():
+            reached = "the largest value" if level is None else f"{level:g} DN"
+            raise FileError(
+                f"{self.path}: every pixel of '{name}' reaches the saturation level, {reached}: "
+                "correct 'bit_depth' or 'saturation' in [sensor], or expose less"
+            )
+        return frames
+
+    def _noise(self, measured: _Measured) -> NoiseModel | None:
+        """Noise model of all frames; None where single frames show no scatter."""
+        gain = self.manifest.sensor.gain_dn_per_e
+        dark, *exposures = measured.transfer
+        if not len(dark) or (gain is None and not any(map(len, exposures))):
+            return None
+        return NoiseModel.fit(np.concatenate(measured.transfer), gain=gain)
+
+    def _flux(self) -> list[float] | None:
+        flux = [exposure.flux for exposure in self.manifest.exposure]
+        return [value for value in flux if value is not None] or None
+
+    def _metadata(
+        self,
+        started: datetime,
+        shifts: NDArray[Any],
+        std: NDArray[Any],
+        noise: NoiseModel | None,
+    ) -> dict[str, Any]:
+        """Where the calibration comes from, as JSON values."""
+        folder = self.path.parent
+        files = [self.path, *self.files()]
+        return {
+            "experiment": str(self.path),
+            "sensor": self.manifest.sensor.model_dump(),
+            "exposures": [exposure.name for exposure in self.manifest.exposure],
+            "measured_shifts": shifts.tolist(),
+            "measured_shift_std": std.tolist(),
+            "noise": None if noise is None else asdict(noise),
+            "inputs": {os.path.relpath(file, folder): _sha256(file) for file in files},
+            "started": started.isoformat(timespec="seconds"),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What the solver needs of the frames.
+
+    `signals` (n, rows, cols) are dark-subtracted means, `saturated` (rows, cols) tells pixels that
+    ever were, `frames` (n) counts them, `transfer` holds the photon-transfer points of the dark
+    frames and of every exposure.
+    """
+
+    dark: FrameStatistics
+    signals: NDArray[Any]
+    saturated: NDArray[Any]
+    frames: list[int]
+    transfer: list[NDArray[Any]]
+
+
+def _transfer(signal: NDArray[Any], frames: FrameStatistics) -> NDArray[Any]:
+    usable = frames.saturated == 0
+    return photon_transfer(signal, frames.variance, usable, int(frames.count.max()))
+
+
+def _variances(measured: _Measured, noise: NoiseModel | None) -> NDArray[Any] | None:
+    """Variance of each dark-subtracted mean by the noise model, in DN²."""
+    if noise is None:
+        return None
+    variances = np.empty_like(measured.signals)
+    dark = noise.variance(0.0) / int(measured.dark.count.max())
+    for k, frames in enumerate(measured.frames):
+        variances[k] = noise.variance(measured.signals[k]) / frames + dark
+    return variances
+
+
+def _in_beam(
+    spot: Spot, rotation: int, shape: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Position A p + t of a spot on the sensor, at shift 0, and its variance."""
+    (row, col), (last_row, last_col) = spot.position, np.array(shape) - 1
+    position = {
+        0: (row, col),
+        90: (col, last_row - row),
+        180: (last_row - row, last_col - col),
+        270: (last_col - col, row),
+    }[rotation]
+    variance = np.square(spot.std)
+    return np.array(position), variance[::-1] if rotation in (90, 270) else variance
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,128 @@
+"""How noisy a pixel is at a given signal: the weights of a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+QUANTISATION = 1 / 12
+"""Variance of rounding to whole DN, in DN²."""
+
+_BINS = 64
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of one frame as a function of its mean signal.
+
+    Attributes
+    ----------
+    read_noise : float
+        Standard deviation of a frame without light, quantisation apart, in DN.
+    gain : float
+        Slope of the photon noise, in DN per electron.
+
+    Notes
+    -----
+    At mean signal μ (in DN, dark subtracted) the variance is ``read_noise² + 1/12 + gain · μ``:
+    read noise, quantisation and photon noise. Two parameters fitted over all pixels weight a
+    pixel better than its own sample variance, whose scatter would enter the weights.
+    """
+
+    read_noise: float
+    gain: float
+
+    def variance(self, signal: ArrayLike) -> NDArray[Any]:
+        """Variance of one frame, in DN², at the mean `signal`, in DN."""
+        return self.read_noise**2 + QUANTISATION + self.gain * np.maximum(signal, 0)
+
+    @classmethod
+    def fit(cls, points: NDArray[Any], *, gain: float | None = None) -> Self:
+        """Model that fits the photon-transfer curve best.
+
+        Parameters
+        ----------
+        points : ndarray, shape (points, 3)
+            Signal, variance and degrees of freedom, of the dark frames (signal 0) and of every
+            exposure, as `photon_transfer` gives them.
+        gain : float, optional
+            The gain where it is known, in DN per electron.
+
+        Returns
+        -------
+        NoiseModel
+            Weighted least squares; a variance s² of f degrees of freedom has variance 2s⁴/f.
+            Neither parameter is below 0.
+        """
+        signal, variance, degrees = points.T
+        excess = variance - QUANTISATION
+        weight = degrees / np.maximum(variance, QUANTISATION) ** 2
+        if gain is None:
+            x = signal - np.average(signal, weights=weight)
+            spread = np.sum(weight * x**2)
+            gain = max(0.0, float(np.sum(weight * x * excess) / spread)) if spread > 0 else 0.0
+        read_variance = np.average(excess - gain * signal, weights=weight)
+        return cls(read_noise=float(np.sqrt(max(0.0, read_variance))), gain=gain)
+
+
+def photon_transfer(
+    signal: NDArray[Any], variance: NDArray[Any], usable: NDArray[Any], frames: int
+) -> NDArray[Any]:
+    """Points of the photon-transfer curve that one exposure gives.
+
+    The usable pixels, in the order of their signal, are cut into bins of equal numbers. A pixel
+    whose variance lies beyond chance (`scatter_limit`) stays out of its bin's mean.
+
+    Parameters
+    ----------
+    signal, variance : ndarray, shape (rows, cols)
+        Mean and sample variance of the frames, in DN and DN².
+    usable : ndarray of bool, shape (rows, cols)
+        Which pixels count.
+    frames : int
+        Number of frames averaged; fewer than two give no point.
+
+    Returns
+    -------
+    ndarray, shape (points, 3)
+        Mean signal, mean variance and degrees of freedom of each bin.
+    """
+    if frames < 2:
+        return np.empty((0, 3))
+    pixels = np.flatnonzero(usable)
+    pixels = pixels[np.argsort(signal.ravel()[pixels])]
+    limit = scatter_limit(frames)
+    points = []
+    for chunk in np.array_split(pixels, min(_BINS, len(pixels)) or 1):
+        inliers = _inliers(variance.ravel()[chunk], limit)
+        if inliers.any():
+            bin_ = chunk[inliers]
+            mean = (signal.ravel()[bin_].mean(), variance.ravel()[bin_].mean())
+            points.append((*mean, len(bin_) * (frames - 1)))
+    return np.array(points).reshape(-1, 3)
+
+
+def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
+    """Largest ratio of a sample variance to the true one that chance explains.
+
+    Notes
+    -----
+    The quantile of χ²/f at `sigmas` standard deviations of a normal variable, f = frames − 1, in
+    the approximation of Wilson and Hilferty (1931): (1 − 2/(9f) + z·√(2/(9f)))³.
+    """
+    width = 2 / (9 * (frames - 1))
+    return float((1 - width + sigmas * np.sqrt(width)) ** 3)
+
+
+def _inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
+    """Which values are at most `limit` times the mean of those that are; found in a few rounds."""
+    keep = np.isfinite(values)
+    for _ in range(5):
+        if keep.any():
+            keep &= values <= limit * values[keep].mean()
+    return keep

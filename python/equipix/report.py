@@ -1,0 +1,120 @@
+"""Pictures of a calibration; they need matplotlib, the extra ``plot``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.errors import EquipixError
+from equipix.simulate import block_means
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from equipix.calibration import Calibration
+    from equipix.demo import Demo
+
+_CALIBRATION, _FLAT_FIELD, _PREDICTION = "C0", "C1", "black"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure of this size in inches, drawn without a display.
+
+    Raises
+    ------
+    EquipixError
+        If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise EquipixError(
+            "pictures need matplotlib, which is not installed: pip install 'equipix[plot]'"
+        ) from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def draw_demo(demo: Demo) -> Figure:
+    """Show what a calibration and a flat field found, and how far each is from the truth.
+
+    Parameters
+    ----------
+    demo : Demo
+        What `equipix.demo.run_demo` gave.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        First row: the sensitivities on a common scale. Second row: the errors of means over 16×16
+        pixels on a common scale, and their profile along the rows. Third row: the distribution
+        of the errors of single pixels and of block means, and the estimated error by sweep.
+    """
+    figure = new_figure(12.5, 10.5)
+    rows = figure.subplots(3, 3)
+    measured = demo.calibration.sensitivity / np.nanmean(demo.calibration.sensitivity)
+    low, high = np.nanpercentile(demo.truth, (0.1, 99.9))
+    sensitivities = {
+        "True sensitivity": demo.truth,
+        "Shift calibration": measured,
+        "Flat field, source uneven by 1 %": demo.flat_field,
+    }
+    for axes, (title, image) in zip(rows[0], sensitivities.items(), strict=True):
+        _map(axes, title, image, (low, high), cmap="gray")
+    errors = [100 * block_means(error) for error in (demo.error, demo.flat_field_error)]
+    limit = float(np.nanmax(np.abs(errors[1])))
+    _map(rows[1, 0], "Error of shift calibration, 16×16 means, %", errors[0], (-limit, limit))
+    _map(rows[1, 1], "Error of flat field, 16×16 means, %", errors[1], (-limit, limit))
+    _profiles(rows[1, 2], *errors)
+    predicted, predicted_blocks = (100 * value for value in demo.predicted)
+    pixels = [100 * error for error in (demo.error, demo.flat_field_error)]
+    _distributions(rows[2, 0], "Error of pixels, %", pixels, predicted)
+    _distributions(rows[2, 1], "Error of 16×16 means, %", errors, predicted_blocks)
+    _history(rows[2, 2], demo.calibration)
+    return figure
+
+
+def _map(
+    axes: Axes, title: str, image: NDArray[Any], limits: tuple[float, float], cmap: str = "RdBu_r"
+) -> None:
+    shown = axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=cmap, interpolation="nearest")
+    axes.set(title=title, xlabel="column", ylabel="row")
+    axes.figure.colorbar(shown, ax=axes, shrink=0.8)
+
+
+def _profiles(axes: Axes, calibration: NDArray[Any], flat_field: NDArray[Any]) -> None:
+    """Draw the errors of block means along the middle row of blocks."""
+    middle = len(calibration) // 2
+    axes.plot(flat_field[middle], color=_FLAT_FIELD, label="flat field")
+    axes.plot(calibration[middle], color=_CALIBRATION, label="shift calibration")
+    axes.axhline(0, color="gray", linewidth=0.5)
+    axes.set(title="Profile of both along the middle", xlabel="block of 16 columns", ylabel="%")
+    axes.legend()
+
+
+def _distributions(
+    axes: Axes, title: str, errors: list[NDArray[Any]], predicted: float
+) -> None:
+    """Draw histograms of errors of calibration and flat field, and what the noise predicts."""
+    both = np.concatenate([error[np.isfinite(error)] for error in errors])
+    limit = float(np.percentile(np.abs(both), 99.8))
+    edges = np.linspace(-limit, limit, 121)
+    for values, color, label in zip(
+        errors, (_CALIBRATION, _FLAT_FIELD), ("shift calibration", "flat field"), strict=True
+    ):
+        shown = values[np.isfinite(values)]
+        axes.hist(shown, edges, density=True, histtype="step", color=color, label=label)
+    normal = np.exp(-0.5 * (edges / predicted) ** 2) / (predicted * np.sqrt(2 * np.pi))
+    axes.plot(edges, normal, color=_PREDICTION, linestyle=":", label="noise predicts")
+    axes.set(title=title, yscale="log", ylabel="density", ylim=(normal.max() / 3e3, None))
+    axes.legend()
+
+
+def _history(axes: Axes, calibration: Calibration) -> None:
+    """Draw the estimated largest error of the sensitivity by sweep."""
+    sweeps, estimates = np.transpose(calibration.history)
+    axes.semilogy(sweeps, 100 * estimates, color=_CALIBRATION)
+    axes.set(title="Estimated largest error by sweep, %", xlabel="sweep", ylabel="%")
+    axes.grid(alpha=0.3)
