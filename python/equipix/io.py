@@ -343,7 +343,7 @@ def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) 
 
 
 def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         pages = {name: file[name] for name in file.files}
     return pages, str(pages.pop("metadata"))
 

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from equipix.results import FrameStatistics
     from numpy.typing import ArrayLike, NDArray
 
 QUANTISATION = 1 / 12
@@ -126,3 +129,33 @@ def _inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
         if keep.any():
             keep &= values <= limit * values[keep].mean()
     return keep
+
+
+def smoothed_variances(frames: Sequence[FrameStatistics]) -> NDArray[Any]:
+    """Variance of each mean by a noise model that is fitted over all pixels of all exposures.
+
+    Parameters
+    ----------
+    frames : sequence of FrameStatistics
+        Averaged exposures, dark subtracted.
+
+    Returns
+    -------
+    ndarray, shape (n, rows, cols), float64
+        The model's variance of one frame over the number of frames, plus what the mean's own
+        variance holds beyond that of its frames: the variance of the dark mean. 1 throughout
+        where no exposure has two frames, so that there is nothing to fit.
+    """
+    points = [
+        photon_transfer(f.mean, f.variance, f.saturated == 0, int(f.count.max())) for f in frames
+    ]
+    if not any(map(len, points)):
+        return np.ones((len(frames), *frames[0].mean.shape))
+    noise = NoiseModel.fit(np.concatenate(points))
+    return np.stack([noise.variance(f.mean) / np.maximum(f.count, 1) + _dark_part(f) for f in frames])
+
+
+def _dark_part(frames: FrameStatistics) -> float:
+    beyond = frames.variance_of_mean - frames.variance / np.maximum(frames.count, 1)
+    known = beyond[np.isfinite(beyond)]
+    return max(0.0, float(np.median(known))) if len(known) else 0.0
