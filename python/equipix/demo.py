@@ -68,7 +68,8 @@ class Demo:
         """Whether the errors are within 1.1 and 1.5 times what the noise predicts."""
         rms, block_rms = rms_at_both_scales(self.error)
         return (
-            rms <= RMS_LIMIT * self.predicted[0] and block_rms <= BLOCK_RMS_LIMIT * self.predicted[1]
+            rms <= RMS_LIMIT * self.predicted[0]
+            and block_rms <= BLOCK_RMS_LIMIT * self.predicted[1]
         )
 
     def figures(self) -> dict[str, Any]:
@@ -127,7 +128,12 @@ def run_demo(
     sensitivity = simulate.cosine_sensitivity(shape, rng=generator)
     beam = simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782))
     virtual = simulate.experiment(
-        sensitivity, beam, cross_pattern(11, 19), frames=frames, exposure_e=EXPOSURE_E, rng=generator
+        sensitivity,
+        beam,
+        cross_pattern(11, 19),
+        frames=frames,
+        exposure_e=EXPOSURE_E,
+        rng=generator,
     )
     manifest = virtual.write(folder, progress=progress)
     experiment = Experiment.load(manifest)

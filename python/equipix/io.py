@@ -316,6 +316,23 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     return pages, metadata
 
 
+def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, nbytes: int) -> None:
+    """Write frames as the pages of a TIFF file, holding one at a time.
+
+    Parameters
+    ----------
+    path : path
+        Output, written in place: give it a folder that nobody reads yet.
+    frames : iterable of ndarray, shape (rows, cols)
+        The frames.
+    nbytes : int
+        Bytes of all frames together; above 4 GB they need BigTIFF.
+    """
+    with tifffile.TiffWriter(path, bigtiff=nbytes > _TIFF_LIMIT) as file:
+        for frame in frames:
+            file.write(frame, photometric="minisblack", metadata=None)
+
+
 def _write_tiff(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
     big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
     with tifffile.TiffWriter(path, bigtiff=big) as file:

@@ -94,9 +94,7 @@ def _profiles(axes: Axes, calibration: NDArray[Any], flat_field: NDArray[Any]) -
     axes.legend()
 
 
-def _distributions(
-    axes: Axes, title: str, errors: list[NDArray[Any]], predicted: float
-) -> None:
+def _distributions(axes: Axes, title: str, errors: list[NDArray[Any]], predicted: float) -> None:
     """Draw histograms of errors of calibration and flat field, and what the noise predicts."""
     both = np.concatenate([error[np.isfinite(error)] for error in errors])
     limit = float(np.percentile(np.abs(both), 99.8))
