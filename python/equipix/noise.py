@@ -7,8 +7,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from equipix.errors import InputError
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix.results import FrameStatistics
 
 QUANTISATION = 1 / 12
 """Variance of rounding to whole DN, in DN²."""
@@ -105,6 +111,44 @@ def photon_transfer(
             mean = (signal.ravel()[bin_].mean(), variance.ravel()[bin_].mean())
             points.append((*mean, len(bin_) * (frames - 1)))
     return np.array(points).reshape(-1, 3)
+
+
+def smoothed_variances(frames: Sequence[FrameStatistics]) -> NDArray[Any]:
+    """Variance of each mean by a noise model fitted over all pixels of all exposures.
+
+    Parameters
+    ----------
+    frames : sequence of FrameStatistics
+        The exposures, dark subtracted. What the dark adds to `variance_of_mean` is taken as the
+        same in all pixels of an exposure: its median.
+
+    Returns
+    -------
+    ndarray, shape (n, rows, cols), float64
+        Variances in DN².
+
+    Raises
+    ------
+    InputError
+        If no exposure has two frames, so that nothing shows the scatter.
+    """
+    counts = [int(statistics.count.max()) for statistics in frames]
+    points = [
+        photon_transfer(statistics.mean, statistics.variance, statistics.saturated == 0, count)
+        for statistics, count in zip(frames, counts, strict=True)
+    ]
+    if not any(map(len, points)):
+        raise InputError(
+            "'frames' are single frames, which show no scatter: give their 'variance', or the "
+            "means alone for unit weights"
+        )
+    model = NoiseModel.fit(np.concatenate(points))
+    variances = np.empty((len(frames), *frames[0].mean.shape))
+    for variance, statistics, count in zip(variances, frames, counts, strict=True):
+        added = statistics.variance_of_mean - statistics.variance / count
+        dark = np.nanmedian(added) if count > 1 else 0.0
+        variance[:] = model.variance(statistics.mean) / count + max(0.0, float(dark))
+    return variances
 
 
 def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
