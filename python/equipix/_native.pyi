@@ -1,11 +1,34 @@
 """The compiled part of equipix: private; the docs stand in the Python modules that wrap it."""
 
-from collections.abc import Callable
-from typing import Any, final
+from collections.abc import Callable, Sequence
+from os import PathLike
+from typing import Any, TypeAlias, final
 
 from numpy.typing import NDArray
 
+_Statistics: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+
 __version__: str
+
+@final
+class Accumulator:
+    def __new__(
+        cls,
+        dtype: str,
+        shape: tuple[int, int],
+        saturation: float | None,
+        workers: int | None,
+    ) -> Accumulator: ...
+    def add(self, frames: NDArray[Any]) -> None: ...
+    def finish(self) -> _Statistics: ...
+
+def average_files(
+    paths: Sequence[str | PathLike[str]],
+    saturation: float | None,
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> _Statistics: ...
+def read_file(path: str | PathLike[str], workers: int | None) -> NDArray[Any]: ...
 
 @final
 class Solution:

@@ -17,6 +17,10 @@ class FileError(EquipixError, OSError):
     """A file cannot be read or written, or holds something else; the message names it."""
 
 
+class UnsupportedFileError(FileError):
+    """A file is of a kind that the compiled part does not decode, though tifffile may."""
+
+
 class InsufficientMemoryError(EquipixError, MemoryError):
     """The memory that the work needs cannot be had; the message names the bytes."""
 

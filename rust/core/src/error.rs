@@ -41,6 +41,14 @@ pub enum Error {
         #[source]
         source: Option<Box<dyn std::error::Error + Send + Sync>>,
     },
+    /// A file is of a kind that this crate does not decode, though another reader may.
+    #[error("{}: {feature} is not decoded here", path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// What the file has that the decoder lacks.
+        feature: String,
+    },
 
     // Control.
     /// The work was cancelled through its [`Control`](crate::control::Control).

@@ -8,8 +8,11 @@ pub mod error;
 pub mod estimate;
 pub mod frames;
 pub mod geometry;
+#[cfg(feature = "io")]
+pub mod io;
 pub mod model;
 pub mod parallel;
+pub mod statistics;
 mod transform;
 
 pub use error::{Error, Result};

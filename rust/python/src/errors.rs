@@ -9,6 +9,7 @@ pub(crate) fn exception(py: Python<'_>, error: &Error) -> PyErr {
     let class = match error {
         Error::Shape { .. } | Error::Value { .. } => "InputError",
         Error::File { .. } => "FileError",
+        Error::Unsupported { .. } => "UnsupportedFileError",
         Error::Cancelled => return PyKeyboardInterrupt::new_err(()),
         _ => "EquipixError",
     };

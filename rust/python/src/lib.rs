@@ -6,6 +6,7 @@
 //!
 //! Callers must not change an array from another thread while a call reads it.
 
+mod average;
 mod calibrate;
 mod errors;
 mod run;
@@ -18,6 +19,8 @@ mod _native {
     use super::{Bound, PyModule, PyResult};
     use pyo3::prelude::*;
 
+    #[pymodule_export]
+    use crate::average::{Accumulator, average_files, read_file};
     #[pymodule_export]
     use crate::calibrate::{PySolution, calibrate_frames};
 

@@ -1,0 +1,230 @@
+"""Averaging of repeated frames."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix import _native, io
+from equipix._arrays import as_array, as_floats, positive_workers
+from equipix.errors import InputError, UnsupportedFileError
+from equipix.results import FrameStatistics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+    from os import PathLike
+
+    from numpy.typing import ArrayLike, NDArray
+
+_BATCH = 16  # frames handed over at once
+_BATCH_BYTES = 2**26
+_SUMMABLE = ("uint8", "uint16", "float32", "float64")
+
+
+def average(
+    source: ArrayLike | Iterable[ArrayLike] | str | PathLike[str] | Iterable[str | PathLike[str]],
+    *,
+    dark: FrameStatistics | ArrayLike | None = None,
+    saturation: float | None = None,
+    workers: int | None = None,
+    progress: Callable[[int, int, str], object] | None = None,
+) -> FrameStatistics:
+    r"""Mean and variance of each pixel over repeated frames, however many.
+
+    Parameters
+    ----------
+    source : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
+        The frames, in DN. Of files, every page counts: grey TIFF, PNG, PGM and BMP, all of one
+        shape and depth. An iterable is taken one frame at a time and never collected, and files
+        are read in small batches, so memory does not grow with the number of frames.
+    dark : FrameStatistics or array of shape (rows, cols), optional
+        Dark mean, subtracted from the mean, in DN; the variance of a `FrameStatistics` dark mean
+        is added to that of the mean.
+    saturation : float, optional
+        Samples at or above this level are counted as saturated, in DN. By default the largest
+        value of an integer dtype (give 4095 for 12 bits in a 16-bit file); floating-point frames
+        are not tested then.
+    workers : int, optional
+        Number of threads; by default one for each processor. It changes no bit of the result.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` from time to time, in frames; `total` is a
+        forecast until all files have been opened.
+
+    Returns
+    -------
+    FrameStatistics
+        Mean, unbiased variance of one frame, variance of the mean, and counts.
+
+    Raises
+    ------
+    InputError
+        If an argument is not what is wanted.
+    FileError
+        If a file is missing, broken, in colour, or differs from the first in shape or depth.
+
+    Notes
+    -----
+    For n samples x of a pixel
+
+    .. math:: \bar x = \frac{1}{n} \sum x, \qquad s^2 = \frac{1}{n-1} \sum (x - \bar x)^2 .
+
+    Samples of 8 and 16 bits are summed exactly. Others are summed as float64 in batches that are
+    merged by Chan's formula [1]_, with a relative error of some ``n/16 + 16`` roundings at most.
+    Samples that are not finite do not count; saturated ones do, and are counted apart.
+
+    References
+    ----------
+    .. [1] T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance",
+       The American Statistician 37 (1983) 242-247.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> frames = np.array([[[1, 2]], [[3, 2]]], dtype=np.uint8)
+    >>> result = equipix.average(frames)
+    >>> result.mean, result.variance
+    (array([[2., 2.]]), array([[2., 0.]]))
+    """
+    workers = positive_workers(workers)
+    level = _level(saturation)
+    offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
+    frames = _paths_or_frames(source)
+    if isinstance(frames, list):
+        maps = _average_files(frames, level, workers, progress)
+    else:
+        maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
+    mean, variance, count, saturated = maps
+    return _subtract(FrameStatistics(mean, variance, variance / count, count, saturated), offset)
+
+
+def _level(saturation: float | None) -> float | None:
+    if saturation is None:
+        return None
+    try:
+        level = float(saturation)
+    except (TypeError, ValueError):
+        level = math.nan
+    if math.isnan(level):
+        raise InputError(f"'saturation' is {saturation!r}, expected a level in DN or None")
+    return level
+
+
+def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
+    """Paths as a list, an array as it is, other iterables as an iterator."""
+    if isinstance(source, np.ndarray):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return [source]
+    try:
+        items = iter(source)
+    except TypeError as error:
+        raise InputError(
+            f"'source' is a {type(source).__name__}, expected frames or the names of files"
+        ) from error
+    first = next(items, None)
+    if first is None:
+        raise InputError("'source' holds no frames")
+    items = itertools.chain([first], items)
+    return list(items) if isinstance(first, str | os.PathLike) else items
+
+
+def _length(source: Any) -> int:
+    return len(source) if hasattr(source, "__len__") else 0
+
+
+def _average_files(
+    names: list[Any],
+    level: float | None,
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> tuple[NDArray[Any], ...]:
+    paths = io.find_files(names)
+    try:
+        return _native.average_files(paths, level, workers, progress)
+    except UnsupportedFileError:
+        batches = (frames for _, frames in io.stream_frames(paths, workers=workers))
+        return _average_batches(batches, level, workers, progress, len(paths))
+
+
+def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
+    """Give the frames a few at a time: views of an array, copies of what an iterator gives."""
+    if isinstance(frames, np.ndarray):
+        if frames.ndim != 3 or 0 in frames.shape:
+            raise InputError(
+                f"'source' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
+            )
+        yield from (frames[start : start + _BATCH] for start in range(0, len(frames), _BATCH))
+        return
+    first = as_array("source[0]", next(frames), ndim=2)
+    size = max(1, min(_BATCH, _BATCH_BYTES // max(1, first.nbytes)))
+    batch = np.empty((size, *first.shape), first.dtype)
+    filled = 0
+    for index, item in enumerate(itertools.chain([first], frames)):
+        frame = as_array(f"source[{index}]", item, ndim=2)
+        if frame.shape != first.shape or frame.dtype != first.dtype:
+            raise InputError(
+                f"'source[{index}]' is {frame.dtype} of shape {frame.shape}, expected"
+                f" {first.dtype} of shape {first.shape} like the first"
+            )
+        batch[filled] = frame
+        filled += 1
+        if filled == size:
+            yield batch
+            filled = 0
+    if filled:
+        yield batch[:filled]
+
+
+def _average_batches(
+    batches: Iterator[NDArray[Any]],
+    level: float | None,
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+    total: int,
+) -> tuple[NDArray[Any], ...]:
+    sums: _native.Accumulator | None = None
+    done = 0
+    for batch in batches:
+        dtype = _sum_dtype(batch.dtype)
+        if sums is None:
+            if level is None and batch.dtype.kind in "iu":
+                level = float(np.iinfo(batch.dtype).max)
+            sums = _native.Accumulator(dtype.name, batch.shape[1:], level, workers)
+        sums.add(np.ascontiguousarray(batch, dtype=dtype))
+        done += len(batch)
+        if progress is not None:
+            progress(done, max(done, total), "average")
+    assert sums is not None
+    return sums.finish()
+
+
+def _sum_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Choose the dtype that frames are summed in: their own, or float64."""
+    if dtype.kind not in "buif":
+        raise InputError(f"'source' has dtype {dtype}, expected real numbers")
+    return np.dtype(dtype.name if dtype.name in _SUMMABLE else "float64")
+
+
+def _subtract(
+    statistics: FrameStatistics, dark: FrameStatistics | NDArray[Any] | None
+) -> FrameStatistics:
+    if dark is None:
+        return statistics
+    mean = dark.mean if isinstance(dark, FrameStatistics) else dark
+    if mean.shape != statistics.mean.shape:
+        raise InputError(
+            f"'dark' has shape {mean.shape}, expected {statistics.mean.shape} like the frames"
+        )
+    variance = dark.variance_of_mean if isinstance(dark, FrameStatistics) else 0.0
+    return FrameStatistics(
+        statistics.mean - mean,
+        statistics.variance,
+        statistics.variance_of_mean + variance,
+        statistics.count,
+        statistics.saturated,
+    )

@@ -1,0 +1,406 @@
+"""Frames, arrays and metadata to and from files: the only module that imports tifffile."""
+
+from __future__ import annotations
+
+import glob
+import json
+import logging
+import os
+import re
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tifffile
+
+from equipix import _native
+from equipix.errors import EquipixError, FileError, InputError, UnsupportedFileError
+from equipix.results import FrameStatistics
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from os import PathLike
+
+    from numpy.typing import NDArray
+
+_FORMAT = 1  # of averaged frames; files with a larger number are refused
+_KIND = "frame statistics"
+_PAGE_NAME = 285  # TIFF tag
+_SUBFILE_TYPE = 255  # TIFF tag
+_PHOTOMETRIC = 262  # TIFF tag
+_TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that still leave room for the directories
+
+
+def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> list[Path]:
+    """Files that a path, a glob or a list of these names; a glob's in natural order.
+
+    Parameters
+    ----------
+    source : path, or iterable of paths
+        A name with ``*``, ``?`` or ``[`` is a glob, unless a file has just that name.
+
+    Returns
+    -------
+    list of Path
+        At least one file; a list keeps its order, and ``f2`` stands before ``f10`` in a glob.
+
+    Raises
+    ------
+    FileError
+        If a file does not exist or a glob matches nothing.
+    """
+    if not isinstance(source, str | os.PathLike):
+        return [path for item in source for path in find_files(item)]
+    path = Path(source)
+    if path.is_dir():
+        raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
+    if path.exists():
+        return [path]
+    if not glob.has_magic(str(path)):
+        raise FileError(f"{path}: does not exist")
+    root = Path(path.anchor)
+    found = sorted(root.glob(str(path.relative_to(root))), key=_natural)
+    if not found:
+        raise FileError(f"{path}: no file matches")
+    return found
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"([0-9]+)", str(path))
+    return [(int(part), part) if part[:1].isdecimal() else (-1, part) for part in parts]
+
+
+def read_frames(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, workers: int | None = None
+) -> NDArray[Any]:
+    """All frames of some files at once; `equipix.average` takes them without holding them.
+
+    Parameters
+    ----------
+    source : path, glob, or list of these
+        Files as in `find_files`.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+
+    Returns
+    -------
+    ndarray, shape (n, rows, cols)
+        The numbers in the files, in their own dtype.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or differs from the first in shape or dtype.
+    """
+    return np.concatenate([frames for _, frames in stream_frames(source, workers=workers)])
+
+
+def stream_frames(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, workers: int | None = None
+) -> Iterator[tuple[Path, NDArray[Any]]]:
+    """Frames of some files, a few at a time, by whichever reader decodes them.
+
+    Parameters
+    ----------
+    source : path, glob, or list of these
+        Files as in `find_files`.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+
+    Yields
+    ------
+    path : Path
+        The file.
+    frames : ndarray, shape (n, rows, cols)
+        Some of its frames, in the file's order.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or differs from the first in shape or dtype.
+    """
+    first: tuple[Path, NDArray[Any]] | None = None
+    for path in find_files(source):
+        for frames in _frames(path, workers):
+            first = first or (path, frames[:1])
+            if frames.shape[1:] != first[1].shape[1:] or frames.dtype != first[1].dtype:
+                raise FileError(
+                    f"{path}: is {_format(frames)}, expected {_format(first[1])} as in {first[0]}"
+                )
+            yield path, frames
+
+
+def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
+    try:
+        yield _native.read_file(path, workers)
+    except UnsupportedFileError:
+        yield from _tiff_frames(path)
+
+
+def _format(frames: NDArray[Any]) -> str:
+    return f"{frames.shape[-2]} x {frames.shape[-1]} (rows x columns), {frames.dtype}"
+
+
+def _tiff_frames(path: Path) -> Iterator[NDArray[Any]]:
+    with _reading(path), tifffile.TiffFile(path) as file:
+        pages = len(file.pages)
+        for page in file.pages:
+            _check_page(path, page)
+        if pages == 1 and file.series[0].size > file.pages[0].size:
+            # A stack with a directory for its first frame only: mapped, not read at once.
+            yield from tifffile.memmap(path, mode="r")[..., None, :, :].reshape(
+                -1, 1, *file.pages[0].shape
+            )
+            return
+        for page in file.pages:
+            yield page.asarray()[None]
+
+
+def _check_page(path: Path, page: Any) -> None:
+    """Refuse what the compiled reader refuses: colour, white at 0, and what is no frame."""
+    old_type = page.tags.valueof(_SUBFILE_TYPE, default=1)
+    if page.is_reduced or page.is_mask or page.subifds or old_type == 2:
+        raise FileError(
+            f"{path}: holds a reduced copy or a mask beside its frames, expected frames only:"
+            " export them to a file of their own"
+        )
+    if _PHOTOMETRIC in page.tags and page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+        raise FileError(f"{path}: has white at 0 (MinIsWhite), expected black at 0")
+    grey = _PHOTOMETRIC not in page.tags or page.photometric == tifffile.PHOTOMETRIC.MINISBLACK
+    if not grey or page.samplesperpixel != 1 or page.ndim != 2:
+        raise FileError(
+            f"{path}: is {page.photometric.name} of shape {page.shape}, expected one grey channel"
+        )
+
+
+class _Complaints(logging.Handler):
+    """What tifffile logs instead of raising, such as a last page that it leaves out."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.thread = threading.get_ident()
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the message."""
+        if record.thread == self.thread:
+            self.messages.append(record.getMessage())
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn whatever a reader raises or logs about a broken file into an error that names it."""
+    complaints = _Complaints()
+    logger = logging.getLogger("tifffile")
+    logger.addHandler(complaints)
+    try:
+        yield
+    except EquipixError:
+        raise
+    except Exception as error:
+        hint = "; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
+        raise FileError(f"{path}: cannot be read: {error}{hint}") from error
+    finally:
+        logger.removeHandler(complaints)
+    if complaints.messages:
+        raise FileError(f"{path}: is broken: {complaints.messages[0]}")
+
+
+@contextmanager
+def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[Path]:
+    """Give a file's place to a new version in one step, when all of it is written.
+
+    Parameters
+    ----------
+    path : path
+        Where the file is to be.
+    force : bool, optional
+        Replace a file that is there.
+
+    Yields
+    ------
+    Path
+        Where to write it; moved to `path` at the end, removed after an exception.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    """
+    target = Path(path)
+    if target.exists() and not force:
+        raise FileError(f"{target}: exists already; force=True (--force) replaces it")
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    except EquipixError:
+        raise
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_pages(
+    path: str | PathLike[str],
+    pages: Mapping[str, NDArray[Any]],
+    metadata: Mapping[str, Any],
+    *,
+    force: bool = False,
+) -> None:
+    """Write named arrays and metadata to a .tif or .npz file, which appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Output; its suffix names the format.
+    pages : mapping of str to ndarray
+        Arrays by name, each kept in its own dtype; of shape (rows, cols) in a TIFF.
+    metadata : mapping
+        JSON values; in a TIFF they are the first page's description.
+    force : bool, optional
+        Replace a file that is there.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    InputError
+        If the suffix is unknown.
+    """
+    write = _WRITERS.get(Path(path).suffix.lower())
+    if write is None:
+        raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
+    description = json.dumps(dict(metadata))
+    with write_whole(path, force=force) as temporary:
+        write(temporary, pages, description)
+
+
+def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read what `save_pages` wrote.
+
+    Parameters
+    ----------
+    path : path
+        A .tif or .npz file.
+
+    Returns
+    -------
+    pages : dict of str to ndarray
+        The arrays by name.
+    metadata : dict
+        The metadata.
+
+    Raises
+    ------
+    FileError
+        If the file is not readable or was not written by `save_pages`.
+    InputError
+        If the suffix is unknown.
+    """
+    path = Path(path)
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(f"'path' is {str(path)!r}, expected the suffix .tif or .npz")
+    with _reading(path):
+        pages, description = read(path)
+    try:
+        metadata = json.loads(description)
+    except ValueError as error:
+        raise FileError(f"{path}: was not written by equipix: it lacks its metadata") from error
+    return pages, metadata
+
+
+def _write_tiff(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
+    big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
+    with tifffile.TiffWriter(path, bigtiff=big) as file:
+        for name, array in pages.items():
+            file.write(
+                array,
+                photometric="minisblack",
+                metadata=None,
+                description=description,
+                extratags=[(_PAGE_NAME, "s", 0, name, True)],
+            )
+            description = ""
+
+
+def _read_tiff(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    with tifffile.TiffFile(path) as file:
+        every: Sequence[Any] = file.pages
+        pages = {page.tags[_PAGE_NAME].value: page.asarray() for page in every}
+        return pages, every[0].description
+
+
+def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, metadata=np.array(description), **pages)
+
+
+def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    with np.load(path, allow_pickle=False) as file:
+        pages = {name: file[name] for name in file.files}
+    return pages, str(pages.pop("metadata"))
+
+
+_WRITERS = {".tif": _write_tiff, ".tiff": _write_tiff, ".npz": _write_npz}
+_READERS = {".tif": _read_tiff, ".tiff": _read_tiff, ".npz": _read_npz}
+
+
+def save_statistics(
+    path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
+) -> None:
+    """Write averaged frames to a .tif or .npz file.
+
+    Parameters
+    ----------
+    path : path
+        Output; its suffix names the format.
+    statistics : FrameStatistics
+        What `equipix.average` returned.
+    force : bool, optional
+        Replace a file that is there.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    """
+    save_pages(path, vars(statistics), {"format": _FORMAT, "kind": _KIND}, force=force)
+
+
+def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
+    """Read what `save_statistics` wrote.
+
+    Parameters
+    ----------
+    path : path
+        A .tif or .npz file.
+
+    Returns
+    -------
+    FrameStatistics
+        The averaged frames.
+
+    Raises
+    ------
+    FileError
+        If the file is not readable or holds something else.
+    """
+    pages, metadata = load_pages(path)
+    if not isinstance(metadata, dict) or metadata.get("kind") != _KIND:
+        raise FileError(f"{path}: holds something else than averaged frames")
+    if metadata["format"] > _FORMAT:
+        raise FileError(
+            f"{path}: has format {metadata['format']}, this version of equipix reads up to"
+            f" {_FORMAT}: install a newer one"
+        )
+    try:
+        return FrameStatistics(**pages)
+    except TypeError as error:
+        raise FileError(f"{path}: lacks a page of averaged frames: {error}") from error

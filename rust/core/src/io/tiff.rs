@@ -1,0 +1,173 @@
+//! Pages of TIFF files.
+
+use std::collections::HashSet;
+use std::io::{BufRead, BufReader};
+
+use tiff::decoder::{ChunkType, Decoder, DecodingSampleType, Limits};
+use tiff::tags::{CompressionMethod, PhotometricInterpretation, Tag};
+use tiff::{ColorType, TiffError};
+
+use super::source::Source;
+use super::{Depth, Format, Outcome, Problem};
+use crate::frames::Shape;
+
+/// Version number of TIFF files with 64-bit offsets, in either byte order.
+const BIG_TIFF_LITTLE: &[u8] = &[43, 0];
+const BIG_TIFF_BIG: &[u8] = &[0, 43];
+
+/// Directory entry of MetaMorph stacks, whose frames have no directories.
+const UIC2: Tag = Tag::Unknown(33629);
+
+/// Bits of `NewSubfileType`: a reduced copy of another page, or a mask.
+const NOT_A_FRAME: u32 = 0b101;
+
+impl From<TiffError> for Problem {
+    fn from(error: TiffError) -> Self {
+        match error {
+            TiffError::IoError(error) => error.into(),
+            // Limits are there against forged sizes, but a very large image may meet them too.
+            TiffError::UnsupportedError(_) | TiffError::LimitsExceeded => {
+                Self::Unsupported(error.to_string())
+            }
+            _ => Self::Bad(format!("is not a readable TIFF: {error}"), Some(error.into())),
+        }
+    }
+}
+
+type PageDecoder<'c> = Decoder<BufReader<Source<'c>>>;
+
+/// Offsets of all directories, which are the pages.
+pub(super) fn directories(source: Source) -> Outcome<Vec<u32>> {
+    let mut decoder = decoder(source)?;
+    let mut offsets = Vec::new();
+    let mut seen = HashSet::new();
+    let mut next = decoder.ifd_pointer();
+    while let Some(pointer) = next {
+        let offset = u32::try_from(pointer.0).map_err(|_| Problem::bad("has a page beyond 4 GiB"))?;
+        if !seen.insert(offset) {
+            return Err(Problem::bad("is broken: its pages follow one another in a circle"));
+        }
+        offsets.push(offset);
+        next = decoder.read_directory(pointer)?.next();
+    }
+    if hides_frames(&mut decoder, offsets.len()) {
+        return Err(Problem::Unsupported("a stack with a directory for its first frame only".into()));
+    }
+    Ok(offsets)
+}
+
+/// Some writers put many frames behind one directory and say so in words (ImageJ, tifffile) or in
+/// an entry of their own (MetaMorph).
+fn hides_frames(decoder: &mut PageDecoder, pages: usize) -> bool {
+    let description = decoder.get_tag_ascii_string(Tag::ImageDescription).unwrap_or_default();
+    let images = || description.lines().find_map(|line| line.strip_prefix("images=")?.parse().ok());
+    let imagej = description.starts_with("ImageJ=") && images().is_some_and(|n: usize| n > pages);
+    let shaped = description.starts_with('{') && description.contains("\"truncated\"");
+    imagej || shaped || decoder.image_ifd().find_entry(UIC2).is_some()
+}
+
+/// The decoder of a file's first page.
+fn decoder(source: Source) -> Outcome<PageDecoder> {
+    let length = source.length();
+    let mut reader = BufReader::new(source);
+    if matches!(reader.fill_buf()?.get(2..4), Some(BIG_TIFF_LITTLE | BIG_TIFF_BIG)) {
+        return Err(Problem::Unsupported("BigTIFF".into()));
+    }
+    let decoder = Decoder::new(reader)?;
+    let mut limits = Limits::default();
+    // A strip cannot be larger than the file, so this bounds memory as well as a fixed number.
+    limits.intermediate_buffer_size = length;
+    Ok(decoder.with_limits(limits))
+}
+
+/// A page of a TIFF file.
+pub(super) struct Picture<'c> {
+    decoder: PageDecoder<'c>,
+    format: Format,
+}
+
+impl<'c> Picture<'c> {
+    /// The first page that `source` shows.
+    pub(super) fn new(source: Source<'c>) -> Outcome<Self> {
+        let mut decoder = decoder(source)?;
+        check_role(&mut decoder)?;
+        let format = Format { shape: shape(&mut decoder)?, depth: depth(&mut decoder)? };
+        check_coding(&mut decoder, format)?;
+        Ok(Self { decoder, format })
+    }
+}
+
+impl super::Picture for Picture<'_> {
+    fn format(&self) -> Format {
+        self.format
+    }
+
+    fn decode(mut self: Box<Self>, bytes: &mut [u8]) -> Outcome<()> {
+        Ok(self.decoder.read_image_bytes(bytes)?)
+    }
+}
+
+/// Refuses what is no frame of its own, rather than leave it out of the mean or let it in.
+fn check_role(decoder: &mut PageDecoder) -> Outcome<()> {
+    let kind: u32 = decoder.find_tag_unsigned(Tag::NewSubfileType)?.unwrap_or(0);
+    let old_kind: u32 = decoder.find_tag_unsigned(Tag::SubfileType)?.unwrap_or(1);
+    let has_copies = decoder.image_ifd().find_entry(Tag::SubIfd).is_some();
+    if kind & NOT_A_FRAME != 0 || old_kind == 2 || has_copies {
+        return Err(Problem::bad(
+            "holds a reduced copy or a mask beside its frames, expected frames only: \
+             export them to a file of their own",
+        ));
+    }
+    Ok(())
+}
+
+fn shape(decoder: &mut PageDecoder) -> Outcome<Shape> {
+    let (cols, rows) = decoder.dimensions()?;
+    Ok(Shape::new(rows as usize, cols as usize))
+}
+
+fn depth(decoder: &mut PageDecoder) -> Outcome<Depth> {
+    match (decoder.colortype()?, decoder.image_buffer_layout()?.sample_type) {
+        (ColorType::Gray(8), Some(DecodingSampleType::U8)) => Ok(Depth::Eight),
+        (ColorType::Gray(16), Some(DecodingSampleType::U16)) => Ok(Depth::Sixteen),
+        (ColorType::Gray(bits), _) => Err(Problem::Unsupported(format!("this {bits}-bit format"))),
+        (colour, _) => Err(Problem::bad(format!("is {colour:?}, expected one grey channel"))),
+    }
+}
+
+/// Admits lossless codings that every reader decodes to the same numbers.
+fn check_coding(decoder: &mut PageDecoder, format: Format) -> Outcome<()> {
+    let photometric: Option<u16> = decoder.find_tag_unsigned(Tag::PhotometricInterpretation)?;
+    if photometric == Some(PhotometricInterpretation::WhiteIsZero.to_u16()) {
+        return Err(Problem::bad("has white at 0 (MinIsWhite), expected black at 0"));
+    }
+    if decoder.find_tag_unsigned::<u16>(Tag::FillOrder)?.unwrap_or(1) != 1 {
+        return Err(Problem::Unsupported("a reversed bit order".into()));
+    }
+    let number = decoder.find_tag_unsigned(Tag::Compression)?.unwrap_or(1);
+    match CompressionMethod::from_u16_exhaustive(number) {
+        CompressionMethod::None => check_sizes(decoder, format),
+        CompressionMethod::LZW
+        | CompressionMethod::Deflate
+        | CompressionMethod::OldDeflate
+        | CompressionMethod::PackBits => Ok(()),
+        method => Err(Problem::Unsupported(format!("compression {method:?}"))),
+    }
+}
+
+/// Refuses uncompressed strips and tiles that are too short: what follows them in the file would
+/// be taken for pixels.
+fn check_sizes(decoder: &mut PageDecoder, format: Format) -> Outcome<()> {
+    let strips = decoder.get_chunk_type() == ChunkType::Strip;
+    let tag = if strips { Tag::StripByteCounts } else { Tag::TileByteCounts };
+    let sizes: Vec<u64> = decoder.find_tag_unsigned_vec(tag)?.unwrap_or_default();
+    let sample = (format.bytes() / format.shape.len().max(1)) as u64;
+    for (index, &size) in sizes.iter().enumerate() {
+        let data = decoder.chunk_data_dimensions(index as u32);
+        let (cols, rows) = if strips { data } else { decoder.chunk_dimensions() };
+        if size < u64::from(cols) * u64::from(rows) * sample {
+            return Err(Problem::bad("is broken: a strip or tile is shorter than its pixels"));
+        }
+    }
+    Ok(())
+}

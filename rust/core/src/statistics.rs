@@ -1,0 +1,322 @@
+//! Mean and variance per pixel over frames that pass by, however many.
+//!
+//! Samples of 8 and 16 bits are summed exactly, so neither the order of the frames nor the way
+//! they are split into partial sums changes a bit of
+//!
+//! ```text
+//! x̄ = Σx / n        s² = (n Σx² − (Σx)²) / (n (n − 1))
+//! ```
+//!
+//! Floating-point samples are summed batch by batch in two passes, and partial sums a and b are
+//! merged by Chan's formula, with M = Σ(x − x̄)²:
+//!
+//! ```text
+//! n = nₐ + n_b    δ = x̄_b − x̄ₐ    x̄ = x̄ₐ + δ n_b/n    M = Mₐ + M_b + δ² nₐ n_b/n    s² = M / (n − 1)
+//! ```
+//!
+//! Samples that are not finite do not count. Saturated samples do: they are counted apart, and
+//! whoever uses the mean decides what to do with the pixel.
+//!
+//! T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance",
+//! The American Statistician 37 (1983) 242–247.
+
+use crate::control::Control;
+use crate::error::{Error, Result};
+use crate::frames::{Sample, Shape, Stack};
+use crate::parallel::Workers;
+
+/// Pixels of one block: their sums stay in the first-level cache while a batch passes.
+const BLOCK: usize = 1024;
+
+/// Frames of one batch: enough to hide the traffic of the sums behind that of the frames.
+const BATCH: usize = 16;
+
+/// Mean and scatter of repeated frames, pixel by pixel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Statistics {
+    /// Sizes of one frame.
+    pub shape: Shape,
+    /// Mean of the samples that count; NaN where none does.
+    pub mean: Vec<f64>,
+    /// Unbiased variance of one sample; NaN where fewer than two count.
+    pub variance: Vec<f64>,
+    /// Number of samples that count.
+    pub count: Vec<u32>,
+    /// Number of samples at or above the saturation level.
+    pub saturated: Vec<u32>,
+}
+
+/// A sample that can be summed.
+pub trait Summable: Sample {
+    /// The partial sums that suit it.
+    type Sums: PartialSums<Self>;
+    /// The level that no sample exceeds, where the type has one.
+    const FULL_SCALE: Option<f64>;
+}
+
+/// Partial sums of a block of pixels.
+pub trait PartialSums<T>: Clone + std::fmt::Debug + Send + Sync {
+    /// Sums of no samples at all for `pixels` pixels.
+    fn new(pixels: usize) -> Self;
+    /// Adds the same block of several frames.
+    fn add(&mut self, frames: &[&[T]], saturation: f64);
+    /// Adds what `other` has summed over the same pixels.
+    fn merge(&mut self, other: &Self);
+    /// Appends the block's pixels to `statistics`.
+    fn finish(&self, statistics: &mut Statistics);
+}
+
+macro_rules! summable {
+    ($($sample:ty: $sums:ty, $full_scale:expr;)*) => {$(
+        impl Summable for $sample {
+            type Sums = $sums;
+            const FULL_SCALE: Option<f64> = $full_scale;
+        }
+    )*};
+}
+
+summable! {
+    u8: ExactSums, Some(255.0);
+    u16: ExactSums, Some(65535.0);
+    f32: Moments, None;
+    f64: Moments, None;
+}
+
+/// Σx and Σx² in whole numbers: 2³² samples of 16 bits fill 64.
+#[derive(Clone, Debug)]
+pub struct ExactSums {
+    count: u32,
+    sum: Vec<u64>,
+    squares: Vec<u64>,
+    saturated: Vec<u32>,
+}
+
+impl<T: Sample + Into<u32>> PartialSums<T> for ExactSums {
+    fn new(pixels: usize) -> Self {
+        let zeros = || vec![0; pixels];
+        Self { count: 0, sum: zeros(), squares: zeros(), saturated: vec![0; pixels] }
+    }
+
+    #[inline(always)]
+    fn add(&mut self, frames: &[&[T]], saturation: f64) {
+        let level = saturation.ceil() as u32;
+        for samples in frames {
+            let sums = self.sum.iter_mut().zip(&mut self.squares).zip(&mut self.saturated);
+            for (((sum, squares), saturated), &sample) in sums.zip(*samples) {
+                let value: u32 = sample.into();
+                *sum += u64::from(value);
+                *squares += u64::from(value * value);
+                *saturated += u32::from(value >= level);
+            }
+        }
+        self.count += frames.len() as u32;
+    }
+
+    fn merge(&mut self, other: &Self) {
+        self.count += other.count;
+        self.sum.iter_mut().zip(&other.sum).for_each(|(a, b)| *a += b);
+        self.squares.iter_mut().zip(&other.squares).for_each(|(a, b)| *a += b);
+        self.saturated.iter_mut().zip(&other.saturated).for_each(|(a, b)| *a += b);
+    }
+
+    fn finish(&self, statistics: &mut Statistics) {
+        let n = u64::from(self.count);
+        let pairs = n as f64 * n.saturating_sub(1) as f64;
+        let variance = |(&sum, &squares): (&u64, &u64)| {
+            let scatter = u128::from(n) * u128::from(squares) - u128::from(sum).pow(2);
+            scatter as f64 / pairs // 0/0 = NaN below two samples
+        };
+        statistics.mean.extend(self.sum.iter().map(|&sum| sum as f64 / n as f64));
+        statistics.variance.extend(self.sum.iter().zip(&self.squares).map(variance));
+        statistics.count.resize(statistics.count.len() + self.sum.len(), self.count);
+        statistics.saturated.extend(&self.saturated);
+    }
+}
+
+/// Mean and Σ(x − x̄)² of floating-point samples.
+#[derive(Clone, Debug)]
+pub struct Moments {
+    count: Vec<u32>,
+    mean: Vec<f64>,
+    scatter: Vec<f64>,
+    saturated: Vec<u32>,
+}
+
+impl Moments {
+    /// The samples' mean, and which of them are saturated.
+    #[inline(always)]
+    fn add_means<T: Sample>(&mut self, frames: &[&[T]], saturation: f64) {
+        for samples in frames {
+            let sums = self.count.iter_mut().zip(&mut self.mean).zip(&mut self.saturated);
+            for (((count, sum), saturated), sample) in sums.zip(*samples) {
+                let value = sample.to_f64();
+                *count += u32::from(value.is_finite());
+                *sum += if value.is_finite() { value } else { 0.0 };
+                *saturated += u32::from(value >= saturation);
+            }
+        }
+        let sums = self.mean.iter_mut().zip(&self.count);
+        sums.for_each(|(sum, &count)| *sum /= f64::from(count.max(1)));
+    }
+
+    /// The samples' scatter about the mean that is already there.
+    #[inline(always)]
+    fn add_scatter<T: Sample>(&mut self, frames: &[&[T]]) {
+        for samples in frames {
+            for ((scatter, mean), sample) in self.scatter.iter_mut().zip(&self.mean).zip(*samples) {
+                let value = sample.to_f64();
+                let deviation = if value.is_finite() { value - mean } else { 0.0 };
+                *scatter += deviation * deviation;
+            }
+        }
+    }
+}
+
+impl<T: Sample> PartialSums<T> for Moments {
+    fn new(pixels: usize) -> Self {
+        let zeros = || vec![0.0; pixels];
+        let counts = || vec![0; pixels];
+        Self { count: counts(), mean: zeros(), scatter: zeros(), saturated: counts() }
+    }
+
+    #[inline(always)]
+    fn add(&mut self, frames: &[&[T]], saturation: f64) {
+        let mut batch = <Self as PartialSums<T>>::new(self.mean.len());
+        batch.add_means(frames, saturation);
+        batch.add_scatter(frames);
+        <Self as PartialSums<T>>::merge(self, &batch);
+    }
+
+    #[inline(always)]
+    fn merge(&mut self, other: &Self) {
+        for i in 0..self.mean.len() {
+            let (here, there) = (f64::from(self.count[i]), f64::from(other.count[i]));
+            let share = there / (here + there).max(1.0);
+            let delta = other.mean[i] - self.mean[i];
+            self.mean[i] += delta * share;
+            self.scatter[i] += other.scatter[i] + delta * delta * here * share;
+            self.count[i] += other.count[i];
+            self.saturated[i] += other.saturated[i];
+        }
+    }
+
+    fn finish(&self, statistics: &mut Statistics) {
+        let mean = |(&mean, &count): (&f64, &u32)| if count == 0 { f64::NAN } else { mean };
+        let variance = |(&scatter, &count): (&f64, &u32)| {
+            if count < 2 { f64::NAN } else { scatter / f64::from(count - 1) }
+        };
+        statistics.mean.extend(self.mean.iter().zip(&self.count).map(mean));
+        statistics.variance.extend(self.scatter.iter().zip(&self.count).map(variance));
+        statistics.count.extend(&self.count);
+        statistics.saturated.extend(&self.saturated);
+    }
+}
+
+/// Partial sums of frames of one shape; its size does not depend on their number.
+#[derive(Clone, Debug)]
+pub struct Accumulator<T: Summable> {
+    shape: Shape,
+    saturation: f64,
+    frames: u32,
+    blocks: Vec<T::Sums>,
+}
+
+impl<T: Summable> Accumulator<T> {
+    /// Sums of no frames; samples of `saturation` and above are counted as saturated, by default
+    /// those at the full scale of an integer type.
+    ///
+    /// # Errors
+    /// [`Error::Value`] if `saturation` is NaN; [`Error::Shape`] if a frame has no pixel.
+    pub fn new(shape: Shape, saturation: Option<f64>) -> Result<Self> {
+        Stack::<T>::new("frames", &[], 0, shape)?;
+        let saturation = saturation.or(T::FULL_SCALE).unwrap_or(f64::INFINITY);
+        if saturation.is_nan() {
+            return Err(Error::value("saturation", "is NaN, expected a level in DN"));
+        }
+        let blocks = (0..shape.len()).step_by(BLOCK);
+        let blocks = blocks.map(|start| T::Sums::new(BLOCK.min(shape.len() - start))).collect();
+        Ok(Self { shape, saturation, frames: 0, blocks })
+    }
+
+    /// Sizes of one frame.
+    #[must_use]
+    pub const fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Adds frames.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if they have another shape, [`Error::Value`] if there are more than
+    /// 2³² − 1 in all; nothing is added then. [`Error::Cancelled`]: a part has been added.
+    pub fn add(&mut self, frames: &Stack<T>, workers: &Workers, control: &Control) -> Result<()> {
+        self.fits(frames.shape())?;
+        self.frames = self.total(frames.count())?;
+        let all: Vec<&[T]> = (0..frames.count()).map(|index| frames.frame(index)).collect();
+        for batch in all.chunks(BATCH) {
+            workers.map_blocks(&mut self.blocks, 1, |index, block| {
+                if !control.is_cancelled() {
+                    add_block(&mut block[0], batch, index * BLOCK, self.saturation);
+                }
+            });
+            control.check()?;
+        }
+        Ok(())
+    }
+
+    /// Adds what `other` has summed.
+    ///
+    /// # Errors
+    /// As [`add`](Self::add), and [`Error::Value`] if the saturation levels differ.
+    pub fn merge(&mut self, other: &Self) -> Result<()> {
+        self.fits(other.shape)?;
+        if self.saturation != other.saturation {
+            let (here, there) = (self.saturation, other.saturation);
+            return Err(Error::value("saturation", format!("is {there}, expected {here} as here")));
+        }
+        self.frames = self.total(other.frames as usize)?;
+        self.blocks.iter_mut().zip(&other.blocks).for_each(|(a, b)| a.merge(b));
+        Ok(())
+    }
+
+    /// Mean and variance of all that was added.
+    #[must_use]
+    pub fn finish(&self) -> Statistics {
+        let size = self.shape.len();
+        let mut statistics = Statistics {
+            shape: self.shape,
+            mean: Vec::with_capacity(size),
+            variance: Vec::with_capacity(size),
+            count: Vec::with_capacity(size),
+            saturated: Vec::with_capacity(size),
+        };
+        self.blocks.iter().for_each(|block| block.finish(&mut statistics));
+        statistics
+    }
+
+    fn fits(&self, shape: Shape) -> Result<()> {
+        if shape == self.shape {
+            return Ok(());
+        }
+        Err(Error::Shape {
+            argument: "frames",
+            got: shape.to_string(),
+            wanted: format!("{} like the frames before", self.shape),
+        })
+    }
+
+    fn total(&self, more: usize) -> Result<u32> {
+        let total = u32::try_from(more).ok().and_then(|more| self.frames.checked_add(more));
+        total.ok_or_else(|| Error::value("frames", "are more than 4294967295 in all"))
+    }
+}
+
+/// Adds the pixels from `start` on of a batch of frames, by the widest vectors the processor has.
+fn add_block<T: Summable>(block: &mut T::Sums, batch: &[&[T]], start: usize, saturation: f64) {
+    let pieces: Vec<&[T]> =
+        batch.iter().map(|frame| &frame[start..frame.len().min(start + BLOCK)]).collect();
+    pulp::Arch::new().dispatch(
+        #[inline(always)]
+        || block.add(&pieces, saturation),
+    );
+}
