@@ -1,0 +1,177 @@
+"""Bad input to calibrate and correct: an error of the package that says what was wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix.errors import FileError, InputError
+
+CROSS = equipix.cross_pattern(2, 3)
+
+
+def frames(shape=(5, 8, 9)):
+    return np.random.default_rng(0).uniform(0.5, 1.5, shape)
+
+
+def changed(**options):
+    return {"frames": frames(), "shifts": CROSS} | options
+
+
+def with_value(array, place, value):
+    result = np.array(array, dtype=float)
+    result[place] = value
+    return result
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": frames((8, 9))}, r"'frames' has shape \(8, 9\)"),
+        ({"frames": frames((5, 0, 9))}, "'frames' has shape"),
+        ({"frames": "frame.tif"}, "'frames' has dtype"),
+        ({"frames": frames().astype(complex)}, "'frames' has dtype complex128"),
+        ({"frames": [frames()[0], frames()[0, :3]]}, "'frames' is not an array"),
+        ({"frames": frames((1, 8, 9)), "shifts": [(0, 0)]}, "at least two"),
+        ({"frames": frames((4, 8, 9))}, "'shifts' has 5 entries, expected 4"),
+        ({"shifts": CROSS[:, :1]}, r"'shifts' has shape \(5, 1\), expected \(n, 2\)"),
+        ({"shifts": CROSS.ravel()}, "'shifts' has shape"),
+        ({"shifts": with_value(CROSS, (2, 1), np.nan)}, "'shifts' of exposure 2 is .*nan"),
+        ({"shifts": with_value(CROSS, (3, 0), np.inf)}, "'shifts' of exposure 3 is .*inf"),
+        ({"shifts": with_value(CROSS, (4, 0), 8)}, "'shifts' of exposure 4 is .* row part"),
+        ({"shifts": with_value(CROSS, (4, 1), -1e300)}, "'shifts' of exposure 4 .* column part"),
+        ({"frames": np.full((5, 8, 9), np.nan)}, "'mask' leaves no measurement"),
+        ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
+        ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
+        ({"mask": np.ones((8, 9))}, "'mask' has dtype float64, expected bool"),
+        ({"mask": np.arange(5)[:, None, None] == np.full((5, 8, 9), 3)}, "nothing of exposure 3"),
+        ({"frames": with_value(frames(), 1, -0.1)}, "'frames' of exposure 1 have a median"),
+        ({"frames": with_value(frames(), 4, 0)}, "'frames' of exposure 4 have a median"),
+        ({"variance": np.ones(4)}, "'variance' has 4 entries"),
+        ({"variance": np.ones((5, 8, 8))}, "'variance' has shape"),
+        ({"variance": with_value(np.ones(5), 2, 0)}, "'variance' of exposure 2 is 0"),
+        ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), -1)}, "row 2, column 3 is -1"),
+        ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), np.nan)}, "row 2, column 3 is NaN"),
+        ({"flux": [1, 1, 1, 1]}, "'flux' has 4 entries"),
+        ({"flux": [1, 1, 0, 1, 1]}, "'flux' of exposure 2 is 0"),
+        ({"flux": [1, 1, 1, np.nan, 1]}, "'flux' of exposure 3 is NaN"),
+        ({"rotation": [0, 0, 45, 0, 0]}, "'rotation' is .*45"),
+        ({"method": "newton"}, "'method' is 'newton'"),
+        ({"tolerance": 0}, "'tolerance' is 0"),
+        ({"tolerance": np.nan}, "'tolerance' is NaN"),
+        ({"tolerance": "small"}, "'tolerance' is 'small'"),
+        ({"max_sweeps": 0}, "'max_sweeps' is 0"),
+        ({"max_sweeps": 2.5}, r"'max_sweeps' is 2\.5"),
+        ({"workers": 0}, "'workers' is 0"),
+        ({"workers": True}, "'workers' is True"),
+        ({"workers": 2**70}, "'workers' is"),
+    ],
+)
+def test_calibrate_names_what_is_wrong(options, message):
+    with pytest.raises(InputError, match=message):
+        equipix.calibrate(**changed(**options))
+
+
+def test_an_exception_in_the_progress_callback_stops_the_work_and_is_raised():
+    def stop(*_):
+        raise RuntimeError("stop here")
+
+    with pytest.raises(RuntimeError, match="stop here"):
+        equipix.calibrate(frames(), CROSS, tolerance=1e-12, progress=stop)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return equipix.calibrate(frames(), CROSS, tolerance=1e-3)
+
+
+class TestCorrect:
+    def test_divides_and_subtracts(self, calibration):
+        raw = np.full((3, 8, 9), 7, np.uint16)
+        corrected = calibration.correct(raw, dark=np.full((8, 9), 2))
+        assert corrected.dtype == np.float32
+        np.testing.assert_allclose(corrected[1], 5 / calibration.sensitivity, rtol=3e-7)
+
+    def test_into_an_array(self, calibration):
+        raw, out = frames((8, 9)), np.empty((8, 9))
+        assert calibration.correct(raw, dark=None, out=out) is out
+        np.testing.assert_array_equal(out, raw / calibration.sensitivity)
+
+    def test_flagged_pixels(self):
+        mask = np.zeros((8, 9), bool)
+        mask[2:5, 3] = True
+        cal = equipix.calibrate(frames(), CROSS, mask=mask, tolerance=1e-3)
+        flat = np.nan_to_num(cal.sensitivity, nan=3.0)
+        for flagged, wanted in (("nan", np.nan), ("keep", np.nan), ("replace", 1.0)):
+            corrected = cal.correct(flat, dark=None, flagged=flagged)
+            np.testing.assert_allclose(corrected[mask], wanted, rtol=1e-14)
+            np.testing.assert_allclose(corrected[~mask], 1.0, rtol=1e-14)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"frames": frames((9, 8))}, r"'frames' has shape \(9, 8\), the sensor \(8, 9\)"),
+            ({"frames": frames((2, 2, 8, 9))}, "'frames' has shape"),
+            ({"dark": "stored"}, "'dark' is 'stored'"),
+            ({"dark": "yes"}, "'dark' is 'yes'"),
+            ({"dark": np.zeros((2, 8, 9))}, "'dark' has shape"),
+            ({"dark": np.zeros(3)}, "'dark' has shape"),
+            ({"flagged": "drop"}, "'flagged' is 'drop'"),
+            ({"out": np.empty((9, 8))}, "'out' is float64"),
+            ({"out": np.empty((8, 9), int)}, "'out' is int64"),
+        ],
+    )
+    def test_names_what_is_wrong(self, calibration, options, message):
+        call = {"frames": frames((8, 9)), "dark": None} | options
+        with pytest.raises(InputError, match=message):
+            calibration.correct(call.pop("frames"), **call)
+
+
+class TestFiles:
+    @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+    def test_round_trip(self, calibration, tmp_path, suffix):
+        path = tmp_path / f"cal{suffix}"
+        calibration.save(path)
+        again = equipix.load(path)
+        for name in ("sensitivity", "beam", "flags", "component_labels", "shifts", "flux"):
+            old, new = getattr(calibration, name), getattr(again, name)
+            assert (old.dtype, old.tobytes()) == (new.dtype, new.tobytes())
+        for name in ("beam_origin", "objective", "reduced_chi2", "components", "sweeps"):
+            assert getattr(calibration, name) == getattr(again, name)
+        assert again.error_estimate == calibration.error_estimate
+        assert again.metadata == calibration.metadata
+        assert again.dark is None
+        np.testing.assert_array_equal(again.history.objective, calibration.history.objective)
+
+    def test_an_existing_file_is_kept(self, calibration, tmp_path):
+        path = tmp_path / "cal.tif"
+        path.write_bytes(b"precious")
+        with pytest.raises(FileError, match="cal.tif"):
+            calibration.save(path)
+        assert path.read_bytes() == b"precious"
+        calibration.save(path, force=True)
+        assert equipix.load(path).shape == (8, 9)
+
+    def test_an_unknown_suffix_is_refused(self, calibration, tmp_path):
+        with pytest.raises(InputError, match="cal.bmp"):
+            calibration.save(tmp_path / "cal.bmp")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_newer_format_is_refused(self, calibration, tmp_path, monkeypatch):
+        monkeypatch.setattr("equipix.calibration.FORMAT", 2)
+        calibration.save(tmp_path / "cal.npz")
+        with pytest.raises(FileError, match="format 2"):
+            equipix.load(tmp_path / "cal.npz")
+
+    @pytest.mark.parametrize("content", [b"", b"II*\0", b"PK\3\4", b"hello" * 100])
+    @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+    def test_something_else_is_refused(self, tmp_path, suffix, content):
+        path = tmp_path / f"other{suffix}"
+        path.write_bytes(content)
+        with pytest.raises(FileError, match="other"):
+            equipix.load(path)
+
+    def test_a_missing_file_is_named(self, tmp_path):
+        with pytest.raises(FileError, match="nothing.tif"):
+            equipix.load(tmp_path / "nothing.tif")

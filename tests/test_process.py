@@ -1,0 +1,58 @@
+"""A process around the solver: Ctrl-C, forked children, no panic."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+import equipix
+
+CROSS = equipix.cross_pattern(2, 3)
+
+ENDLESS = """
+import numpy as np, equipix
+frames = np.random.default_rng(0).uniform(1, 2, (5, {rows}, {cols})).astype(np.float32)
+print("ready", flush=True)
+try:
+    equipix.calibrate(frames, equipix.cross_pattern(2, 3), tolerance=1e-300)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+def seconds_to_stop(rows, cols):
+    code = ENDLESS.format(rows=rows, cols=cols)
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        start = time.monotonic()
+        assert process.stdout.readline() == "interrupted\n"
+        return time.monotonic() - start
+
+
+def test_ctrl_c_stops_the_solver():
+    assert seconds_to_stop(400, 500) < 0.5
+
+
+def test_ctrl_c_stops_the_solver_on_a_large_sensor():
+    assert seconds_to_stop(6000, 6000) < 0.5
+
+
+def calibrated(seed):
+    frames = np.random.default_rng(seed).uniform(1, 2, (5, 20, 30))
+    return equipix.calibrate(frames, CROSS, tolerance=1e-3).sensitivity
+
+
+def test_a_child_forked_after_first_use_works():
+    wanted = [calibrated(seed) for seed in range(2)]
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        got = pool.map_async(calibrated, range(2)).get(timeout=60)
+    np.testing.assert_array_equal(got, wanted)
