@@ -16,7 +16,7 @@ from equipix.calibration import calibrate, round_shifts
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
 from equipix.errors import FileError, InputError
 from equipix.frames import average
-from equipix.io import read_stack
+from equipix.io import read_frames
 from equipix.noise import NoiseModel, photon_transfer
 from equipix.shifts import measure_shift
 
@@ -193,7 +193,7 @@ class Experiment:
     def _aperture(self, exposure: Exposure) -> tuple[ShiftMeasurement, tuple[int, int]]:
         """Spots before and after the move to `exposure`, and the shape of the sensor."""
         before, after = (
-            read_stack(find_files(self.path, entry))
+            read_frames(find_files(self.path, entry))
             for entry in (exposure.aperture_before, exposure.aperture_after)
             if entry is not None
         )

@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from equipix.errors import InputError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from equipix.results import FrameStatistics
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix.results import FrameStatistics
 
 QUANTISATION = 1 / 12
 """Variance of rounding to whole DN, in DN²."""
@@ -110,6 +113,44 @@ def photon_transfer(
     return np.array(points).reshape(-1, 3)
 
 
+def smoothed_variances(frames: Sequence[FrameStatistics]) -> NDArray[Any]:
+    """Variance of each mean by a noise model fitted over all pixels of all exposures.
+
+    Parameters
+    ----------
+    frames : sequence of FrameStatistics
+        The exposures, dark subtracted. What the dark adds to `variance_of_mean` is taken as the
+        same in all pixels of an exposure: its median.
+
+    Returns
+    -------
+    ndarray, shape (n, rows, cols), float64
+        Variances in DN².
+
+    Raises
+    ------
+    InputError
+        If no exposure has two frames, so that nothing shows the scatter.
+    """
+    counts = [int(statistics.count.max()) for statistics in frames]
+    points = [
+        photon_transfer(statistics.mean, statistics.variance, statistics.saturated == 0, count)
+        for statistics, count in zip(frames, counts, strict=True)
+    ]
+    if not any(map(len, points)):
+        raise InputError(
+            "'frames' are single frames, which show no scatter: give their 'variance', or the "
+            "means alone for unit weights"
+        )
+    model = NoiseModel.fit(np.concatenate(points))
+    variances = np.empty((len(frames), *frames[0].mean.shape))
+    for variance, statistics, count in zip(variances, frames, counts, strict=True):
+        added = statistics.variance_of_mean - statistics.variance / count
+        dark = np.nanmedian(added) if count > 1 else 0.0
+        variance[:] = model.variance(statistics.mean) / count + max(0.0, float(dark))
+    return variances
+
+
 def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
     """Largest ratio of a sample variance to the true one that chance explains.
 
@@ -129,33 +170,3 @@ def _inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
         if keep.any():
             keep &= values <= limit * values[keep].mean()
     return keep
-
-
-def smoothed_variances(frames: Sequence[FrameStatistics]) -> NDArray[Any]:
-    """Variance of each mean by a noise model that is fitted over all pixels of all exposures.
-
-    Parameters
-    ----------
-    frames : sequence of FrameStatistics
-        Averaged exposures, dark subtracted.
-
-    Returns
-    -------
-    ndarray, shape (n, rows, cols), float64
-        The model's variance of one frame over the number of frames, plus what the mean's own
-        variance holds beyond that of its frames: the variance of the dark mean. 1 throughout
-        where no exposure has two frames, so that there is nothing to fit.
-    """
-    points = [
-        photon_transfer(f.mean, f.variance, f.saturated == 0, int(f.count.max())) for f in frames
-    ]
-    if not any(map(len, points)):
-        return np.ones((len(frames), *frames[0].mean.shape))
-    noise = NoiseModel.fit(np.concatenate(points))
-    return np.stack([noise.variance(f.mean) / np.maximum(f.count, 1) + _dark_part(f) for f in frames])
-
-
-def _dark_part(frames: FrameStatistics) -> float:
-    beyond = frames.variance_of_mean - frames.variance / np.maximum(frames.count, 1)
-    known = beyond[np.isfinite(beyond)]
-    return max(0.0, float(np.median(known))) if len(known) else 0.0

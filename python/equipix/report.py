@@ -112,7 +112,7 @@ def _distributions(axes: Axes, title: str, errors: list[NDArray[Any]], predicted
 
 def _history(axes: Axes, calibration: Calibration) -> None:
     """Draw the estimated largest error of the sensitivity by sweep."""
-    sweeps, estimates = np.transpose(calibration.history)
-    axes.semilogy(sweeps, 100 * estimates, color=_CALIBRATION)
+    history = calibration.history
+    axes.semilogy(history.sweep, 100 * history.error_estimate, color=_CALIBRATION)
     axes.set(title="Estimated largest error by sweep, %", xlabel="sweep", ylabel="%")
     axes.grid(alpha=0.3)
