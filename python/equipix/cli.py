@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from equipix import simulate as simulation
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration
 from equipix.errors import EquipixError, EquipixWarning
@@ -18,7 +17,6 @@ from equipix.experiment import Experiment
 from equipix.frames import average as average_frames
 from equipix.load import load
 from equipix.results import Flag
-from equipix.shifts import cross_pattern
 
 app = typer.Typer(
     name="equipix",
