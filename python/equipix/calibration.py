@@ -398,7 +398,9 @@ def _values_and_variances(
     if isinstance(frames, list | tuple) and any(isinstance(f, FrameStatistics) for f in frames):
         means = [f.mean for f in frames if isinstance(f, FrameStatistics)]
         if len(means) != len(frames) or len({mean.shape for mean in means}) != 1:
-            shapes = [getattr(frame, "shape", np.shape(getattr(frame, "mean", frame))) for frame in frames]
+            shapes = [
+                getattr(frame, "shape", np.shape(getattr(frame, "mean", frame))) for frame in frames
+            ]
             raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
         values = as_floats("frames", np.stack(means), ndim=3)
         if variance is None:

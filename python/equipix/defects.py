@@ -77,8 +77,12 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
 
 
 def pixel_flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) -> NDArray[Any]:
-    """Bits of `Flag` for pixels of these kinds, shape (rows, cols), uint32."""
+    """Bits of `Flag` for pixels of these kinds, shape (rows, cols), uint32.
+
+    What is clipped seems not to answer, so hot and saturated pixels do not count as dead.
+    """
     flags = np.zeros(dead.shape, dtype=np.uint32)
+    dead = dead & ~hot & ~saturated
     for pixels, flag in ((dead, Flag.DEAD), (hot, Flag.HOT), (saturated, Flag.SATURATED)):
         flags[pixels] |= np.uint32(flag | Flag.DO_NOT_USE)
     return flags

@@ -132,6 +132,26 @@ def stream_frames(
             yield path, frames
 
 
+def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
+    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or holds no grey image.
+    """
+    try:
+        *shape, bits = _native.file_format(path)
+    except UnsupportedFileError:
+        with _reading(path), tifffile.TiffFile(path) as file:
+            page: Any = file.pages[0]
+            _check_page(path, page)
+            count = max(len(file.pages), file.series[0].size // page.size)
+            return (count, *page.shape), page.dtype
+    count, rows, cols = shape
+    return (count, rows, cols), np.dtype(f"uint{bits}")
+
+
 def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
     try:
         yield _native.read_file(path, workers)
@@ -316,6 +336,39 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     return pages, metadata
 
 
+def save_frames(
+    path: str | PathLike[str],
+    frames: Iterable[NDArray[Any]],
+    *,
+    size: int,
+    force: bool = False,
+) -> None:
+    """Write frames to the pages of a TIFF, one at a time; it appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Output.
+    frames : iterable of ndarray, shape (rows, cols)
+        The frames, never collected.
+    size : int
+        Their bytes in all: above 4 GiB the file is a BigTIFF.
+    force : bool, optional
+        Replace a file that is there.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    """
+    with (
+        write_whole(path, force=force) as temporary,
+        tifffile.TiffWriter(temporary, bigtiff=size > _TIFF_LIMIT) as file,
+    ):
+        for frame in frames:
+            file.write(frame, photometric="minisblack", metadata=None)
+
+
 def _write_tiff(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
     big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
     with tifffile.TiffWriter(path, bigtiff=big) as file:
@@ -347,6 +400,9 @@ def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         pages = {name: file[name] for name in file.files}
     return pages, str(pages.pop("metadata"))
 
+
+SUFFIXES = (".tif", ".tiff", ".npz")
+"""Formats of `save_pages`."""
 
 _WRITERS = {".tif": _write_tiff, ".tiff": _write_tiff, ".npz": _write_npz}
 _READERS = {".tif": _read_tiff, ".tiff": _read_tiff, ".npz": _read_npz}
