@@ -1,5 +1,6 @@
 //! One sweep of coordinate descent: a plain loop beside the core's kernels, over sensor sizes.
 
+#![allow(clippy::unwrap_used, reason = "a bench has nobody to report to")]
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use equipix_core::control::Control;
 use equipix_core::descent::Descent;
@@ -63,13 +64,20 @@ fn sweep(criterion: &mut Criterion) {
         });
         for (name, count) in [("one worker", Some(1)), ("all workers", None)] {
             let workers = Workers::new(count.and_then(std::num::NonZeroUsize::new)).unwrap();
+            let control = Control::new();
             let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
             let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
-            let model =
-                Model::new(stack, geometry, &[1.0; 5], Variance::Unknown, Mask::None, &workers)
-                    .unwrap();
+            let model = Model::new(
+                stack,
+                geometry,
+                &[1.0; 5],
+                Variance::Unknown,
+                Mask::None,
+                &workers,
+                &control,
+            )
+            .unwrap();
             let mut descent = Descent::new(&model, &workers);
-            let control = Control::new();
             group.bench_function(BenchmarkId::new(name, shape), |bencher| {
                 bencher.iter(|| descent.sweep(&control).unwrap());
             });

@@ -201,7 +201,7 @@ class TestNoisePrediction:
             simulate.noise_prediction(self.sensitivity, self.beam, CROSS, np.ones(4), rng=1)
         with pytest.raises(InputError, match="must be above 0"):
             simulate.noise_prediction(self.sensitivity, self.beam, CROSS, 0.0, rng=1)
-        with pytest.raises(InputError, match="'mask' of shape .* leaves no pixel"):
+        with pytest.raises(InputError, match=r"'mask' of shape .* leaves no pixel"):
             simulate.noise_prediction(
                 self.sensitivity, self.beam, CROSS, 1.0, mask=np.ones((12, 17), bool), rng=1
             )

@@ -1,7 +1,27 @@
 """Pixel sensitivity of image sensors, measured without a uniform light source."""
 
+from equipix import errors, simulate
 from equipix._native import __version__
+from equipix.calibration import Calibration, History, calibrate
 from equipix.frames import average
-from equipix.results import FrameStatistics
+from equipix.load import load
+from equipix.results import Correction, Flag, FrameStatistics
+from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
 
-__all__ = ["FrameStatistics", "__version__", "average"]
+__all__ = [
+    "Calibration",
+    "Correction",
+    "Flag",
+    "FrameStatistics",
+    "History",
+    "ShiftMeasurement",
+    "Spot",
+    "__version__",
+    "average",
+    "calibrate",
+    "cross_pattern",
+    "errors",
+    "load",
+    "measure_shift",
+    "simulate",
+]

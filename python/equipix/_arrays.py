@@ -11,6 +11,8 @@ from equipix.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+_MOST_WORKERS = 1024
+
 
 def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:
     """Real numeric array of one of the ranks `ndim`, in native byte order and C order.
@@ -42,6 +44,9 @@ def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:
         return None
-    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or workers < 1:
-        raise InputError(f"'workers' is {workers!r}, expected a positive whole number or None")
+    whole = isinstance(workers, int | np.integer) and not isinstance(workers, bool)
+    if not whole or not 1 <= workers <= _MOST_WORKERS:
+        raise InputError(
+            f"'workers' is {workers!r}, expected a whole number from 1 to {_MOST_WORKERS} or None"
+        )
     return int(workers)

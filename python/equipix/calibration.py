@@ -36,6 +36,9 @@ FORMAT = 1
 _UNNOTICED = 0.02
 """Fraction of a pixel that a shift may be rounded by without a warning."""
 
+_BEYOND = 2**31
+"""More pixels than any sensor has along a side."""
+
 
 @dataclass(frozen=True, eq=False)
 class History:
@@ -56,7 +59,7 @@ class History:
     error_estimate: NDArray[Any]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """Calibrated sensor: the result of `calibrate`.
 
@@ -121,6 +124,14 @@ class Calibration:
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.sensitivity.shape
         return rows, cols
+
+    def __repr__(self) -> str:
+        """Short form: sizes and how far the solver came."""
+        state = "converged" if self.converged else "not converged"
+        return (
+            f"<Calibration of {self.shape[0]} x {self.shape[1]} pixels from {len(self.shifts)} "
+            f"exposures: {state}, error estimate {self.error_estimate:.1e}>"
+        )
 
     def correct(
         self,
@@ -376,8 +387,9 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
     if not np.isfinite(exact).all():
         k = int(np.flatnonzero(~np.isfinite(exact).all(axis=1))[0])
         raise InputError(f"'shifts' of exposure {k} is {exact[k].tolist()}, expected numbers")
-    limit = float(np.iinfo(np.int32).max)
-    whole = np.rint(np.clip(exact, -limit, limit))
+    # A shift beyond any sensor, which the solver refuses, must still fit an integer.
+    exact = np.clip(exact, -_BEYOND, _BEYOND)
+    whole = np.rint(exact)
     known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
     noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
     if noticeable.any():

@@ -12,7 +12,7 @@ import numpy as np
 
 from equipix.errors import EquipixError, FileError, InputError
 from equipix.frames import average
-from equipix.io import find_files, frame_format, save_frames, stream_frames
+from equipix.io import find_files, frame_format, stream_frames, write_frames, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -82,14 +82,15 @@ def correct_files(
 
     frame_bytes = 4 * correction.shape[0] * correction.shape[1]
     if output.suffix.lower() in (".tif", ".tiff"):
-        save_frames(output, corrected(files), size=total * frame_bytes, force=force)
+        with write_whole(output, force=force) as temporary:
+            write_frames(temporary, corrected(files), nbytes=total * frame_bytes)
         return total
     names = [f"{file.stem}.tif" for file in files]
     if repeated := [name for name in names if names.count(name) > 1]:
         raise FileError(f"{output}: two inputs would become '{repeated[0]}': correct them apart")
     with _whole_folder(output) as folder:
         for file, name in zip(files, names, strict=True):
-            save_frames(folder / name, corrected([file]), size=counts[file] * frame_bytes)
+            write_frames(folder / name, corrected([file]), nbytes=counts[file] * frame_bytes)
     return total
 
 

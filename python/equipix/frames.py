@@ -126,11 +126,10 @@ def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
         raise InputError(
             f"'source' is a {type(source).__name__}, expected frames or the names of files"
         ) from error
-    first = next(items, None)
-    if first is None:
-        raise InputError("'source' holds no frames")
-    items = itertools.chain([first], items)
-    return list(items) if isinstance(first, str | os.PathLike) else items
+    for first in items:
+        everything = itertools.chain([first], items)
+        return list(everything) if isinstance(first, str | os.PathLike) else everything
+    raise InputError("'source' holds no frames")
 
 
 def _length(source: Any) -> int:

@@ -141,14 +141,13 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
         If the file cannot be read or holds no grey image.
     """
     try:
-        *shape, bits = _native.file_format(path)
+        count, rows, cols, bits = _native.file_format(path)
     except UnsupportedFileError:
         with _reading(path), tifffile.TiffFile(path) as file:
             page: Any = file.pages[0]
             _check_page(path, page)
             count = max(len(file.pages), file.series[0].size // page.size)
             return (count, *page.shape), page.dtype
-    count, rows, cols = shape
     return (count, rows, cols), np.dtype(f"uint{bits}")
 
 
@@ -336,35 +335,19 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     return pages, metadata
 
 
-def save_frames(
-    path: str | PathLike[str],
-    frames: Iterable[NDArray[Any]],
-    *,
-    size: int,
-    force: bool = False,
-) -> None:
-    """Write frames to the pages of a TIFF, one at a time; it appears whole or not at all.
+def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, nbytes: int) -> None:
+    """Write frames as the pages of a TIFF file, holding one at a time.
 
     Parameters
     ----------
     path : path
-        Output.
+        Output, written in place: give it a folder that nobody reads yet.
     frames : iterable of ndarray, shape (rows, cols)
-        The frames, never collected.
-    size : int
-        Their bytes in all: above 4 GiB the file is a BigTIFF.
-    force : bool, optional
-        Replace a file that is there.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `force` is not set, or cannot be written.
+        The frames.
+    nbytes : int
+        Bytes of all frames together; above 4 GB they need BigTIFF.
     """
-    with (
-        write_whole(path, force=force) as temporary,
-        tifffile.TiffWriter(temporary, bigtiff=size > _TIFF_LIMIT) as file,
-    ):
+    with tifffile.TiffWriter(path, bigtiff=nbytes > _TIFF_LIMIT) as file:
         for frame in frames:
             file.write(frame, photometric="minisblack", metadata=None)
 
@@ -396,7 +379,7 @@ def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) 
 
 
 def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         pages = {name: file[name] for name in file.files}
     return pages, str(pages.pop("metadata"))
 

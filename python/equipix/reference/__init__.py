@@ -4,6 +4,7 @@ Nothing here is fast, and the package itself never imports it: it is what the fa
 checked against, so it shares no line with it.
 """
 
+from equipix.reference.average import average
 from equipix.reference.connectivity import components
 from equipix.reference.descent import Solution, coordinate_descent
 from equipix.reference.least_squares import solve_dense
@@ -11,6 +12,7 @@ from equipix.reference.model import exposures, grid_cells, objective
 
 __all__ = [
     "Solution",
+    "average",
     "components",
     "coordinate_descent",
     "exposures",

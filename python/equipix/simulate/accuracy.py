@@ -234,12 +234,12 @@ class ReducedSystem:
         energy, first = 0.0, 0.0
         while True:
             scaled = np.divide(residual, self._on_pixels, where=used, out=np.zeros_like(rhs))
-            previous, energy = energy, float(np.vdot(residual, scaled))
+            previous, energy = energy, float(np.sum(residual * scaled))
             first = first or energy
             if energy <= tolerance**2 * first:
                 return solution
             direction = scaled + (energy / previous if previous else 0.0) * direction
             image = self.product(direction)
-            length = energy / float(np.vdot(direction, image))
+            length = energy / float(np.sum(direction * image))
             solution += length * direction
             residual -= length * image

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import tifffile
 
 from equipix.errors import FileError
+from equipix.io import write_frames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 Progress: TypeAlias = "Callable[[int, int, str], None]"
 
-CLASSIC_TIFF_BYTES = 2**32 - 2**25
-"""Most bytes of pixels that fit the offsets of classic TIFF, with room for the directories."""
-
 
 def write_experiment(
     virtual: VirtualExperiment, target: Path, *, force: bool, progress: Progress | None
@@ -34,9 +31,10 @@ def write_experiment(
     streams = dict(_streams(virtual))
     frame_bytes = virtual.camera.response.size * (1 if virtual.camera.bit_depth == 8 else 2)
     with _new_folder(target, force) as folder:
-        writer = _Writer(folder, progress, sum(count for _, count in streams.values()))
+        counter = _Counter(progress, sum(count for _, count in streams.values()))
         for name, (frames, count) in streams.items():
-            writer.write(name, frames, big=count * frame_bytes > CLASSIC_TIFF_BYTES)
+            (folder / name).parent.mkdir(exist_ok=True)
+            write_frames(folder / name, counter.pass_on(frames), nbytes=count * frame_bytes)
         np.savez(folder / "truth.npz", **vars(virtual.truth))
         (folder / "experiment.toml").write_text(_manifest(virtual), encoding="utf-8")
     return target / "experiment.toml"
@@ -73,21 +71,19 @@ def _manifest(virtual: VirtualExperiment) -> str:
     return "\n".join(lines) + "\n"
 
 
-class _Writer:
-    """Writes multi-page TIFF files one frame at a time, counting the frames."""
+class _Counter:
+    """Reports frames as they pass."""
 
-    def __init__(self, folder: Path, progress: Progress | None, total: int) -> None:
-        self._folder, self._progress, self._total, self._done = folder, progress, total, 0
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
 
-    def write(self, name: str, frames: Iterator[NDArray[Any]], *, big: bool) -> None:
-        path = self._folder / name
-        path.parent.mkdir(exist_ok=True)
-        with tifffile.TiffWriter(path, bigtiff=big) as writer:
-            for frame in frames:
-                writer.write(frame, photometric="minisblack", metadata=None)
-                self._done += 1
-                if self._progress is not None:
-                    self._progress(self._done, self._total, "writing")
+    def pass_on(self, frames: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+        """Yield the frames, each reported when it has been dealt with."""
+        for frame in frames:
+            yield frame
+            self._done += 1
+            if self._progress is not None:
+                self._progress(self._done, self._total, "writing")
 
 
 @contextmanager

@@ -39,7 +39,7 @@ pub fn calibrate<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Solution> {
-    let components = Components::of(model);
+    let components = Components::of(model, control)?;
     let (descent, history) = descent::solve(model, stop, workers, control)?;
     let beam = descent.beam();
     let mut sensitivity = descent.sensitivity;

@@ -4,8 +4,13 @@
 //! for each used measurement. Within a connected component M is determined up to one factor;
 //! between components nothing is.
 
+use crate::control::Control;
+use crate::error::Result;
 use crate::frames::Real;
 use crate::model::Model;
+
+/// Pixels or cells between two looks at whether to stop.
+const CHECK_EVERY: usize = 1 << 20;
 
 /// Disjoint sets of 0, 1, … with the smallest member as the root of each.
 #[derive(Clone, Debug)]
@@ -57,17 +62,19 @@ pub struct Components {
 
 impl Components {
     /// Finds the components of the measurements that `model` uses.
-    #[must_use]
-    pub fn of<T: Real>(model: &Model<'_, T>) -> Self {
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+    pub fn of<T: Real>(model: &Model<'_, T>, control: &Control) -> Result<Self> {
         let geometry = &model.geometry;
         let pixels = geometry.sensor.len();
         let mut sets = DisjointSets::new(pixels + geometry.beam.len());
         let mut used = vec![false; pixels + geometry.beam.len()];
-        model.for_each_used(|pixel, cell| {
+        model.for_each_used(control, |pixel, cell| {
             sets.union(pixel, pixels + cell);
             used[pixel] = true;
             used[pixels + cell] = true;
-        });
+        })?;
         // Each component has a pixel, and pixels come before cells: so roots are pixels.
         let mut sizes = vec![0_usize; pixels];
         for pixel in (0..pixels).filter(|&pixel| used[pixel]) {
@@ -79,11 +86,16 @@ impl Components {
         for (label, &root) in roots.iter().enumerate() {
             labels[root] = label as i32;
         }
-        let mut label = |node: usize| if used[node] { labels[sets.find(node)] } else { NONE };
-        Self {
-            pixels: (0..pixels).map(&mut label).collect(),
-            cells: (pixels..pixels + geometry.beam.len()).map(&mut label).collect(),
+        let mut label = |node: usize| {
+            if node.is_multiple_of(CHECK_EVERY) {
+                control.check()?;
+            }
+            Ok(if used[node] { labels[sets.find(node)] } else { NONE })
+        };
+        Ok(Self {
+            pixels: (0..pixels).map(&mut label).collect::<Result<_>>()?,
+            cells: (pixels..used.len()).map(&mut label).collect::<Result<_>>()?,
             sizes: roots.iter().map(|&root| sizes[root]).collect(),
-        }
+        })
     }
 }

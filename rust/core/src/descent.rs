@@ -109,7 +109,7 @@ pub fn solve<'m, 'a, T: Real>(
         }
         let before = descent.sensitivity.clone();
         history.objective.push(descent.sweep(control)?);
-        let estimate = estimator.largest_error(descent.step_since(before), sweep);
+        let estimate = estimator.largest_error(descent.step_since(before), sweep, control)?;
         history.error_estimate.push((sweep, estimate));
         if estimate <= tolerance {
             break;
@@ -448,6 +448,7 @@ impl PixelSums {
 }
 
 #[inline(always)]
+#[expect(clippy::too_many_arguments, reason = "slices that the compiler knows not to overlap")]
 fn add_to_pixels<T: Real>(
     slope: &mut [f64],
     weight: &mut [f64],

@@ -22,6 +22,8 @@
 
 use std::f64::consts::PI;
 
+use crate::control::Control;
+use crate::error::Result;
 use crate::frames::{Real, Shape};
 use crate::model::Model;
 use crate::parallel::Workers;
@@ -90,13 +92,22 @@ impl<'m> Estimator<'m> {
     /// The largest relative error of M, from the `step` that sweep number `sweep` took.
     ///
     /// `step` is in units of the mean sensitivity, and 0 at pixels without measurements.
-    pub fn largest_error(&mut self, mut step: Vec<f64>, sweep: u64) -> f64 {
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+    pub fn largest_error(
+        &mut self,
+        mut step: Vec<f64>,
+        sweep: u64,
+        control: &Control,
+    ) -> Result<f64> {
         let largest_step = largest(&step);
         let rms = (step.iter().map(|s| s * s).sum::<f64>() / step.len() as f64).sqrt();
         let by_rate = largest_step / self.lost_per_sweep(sweep, rms);
         self.last = Some(LastStep { sweep, rms });
-        self.transform.filter(&mut step, |i, j| self.amplification(i, j), self.workers);
-        by_rate.max(largest(&step))
+        let amplification = |i, j| self.amplification(i, j);
+        self.transform.filter(&mut step, amplification, self.workers, control)?;
+        Ok(by_rate.max(largest(&step)))
     }
 
     /// 1 − the factor by which the steps have shrunk per sweep, never below what the symbol allows

@@ -9,6 +9,7 @@
 
 use std::ops::Range;
 
+use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::frames::{Real, Shape, Stack};
 use crate::geometry::Geometry;
@@ -71,7 +72,8 @@ impl<'a, T: Real> Model<'a, T> {
     /// # Errors
     /// [`Error::Shape`] if the arguments do not fit each other; [`Error::Value`] if a flux is not
     /// a positive number, the variance of a used measurement not positive, no measurement of an
-    /// exposure is used, or the median of an exposure is not above 0.
+    /// exposure is used, or the median of an exposure is not above 0; [`Error::Cancelled`] if
+    /// `control` asks to stop.
     pub fn new(
         frames: Stack<'a, T>,
         geometry: Geometry,
@@ -79,13 +81,14 @@ impl<'a, T: Real> Model<'a, T> {
         variance: Variance<'a, T>,
         mask: Mask<'a>,
         workers: &Workers,
+        control: &Control,
     ) -> Result<Self> {
         let flux = flux.to_vec();
         let mut model = Self { geometry, flux, frames, variance, mask, tallies: Vec::new() };
         model.check_shapes()?;
         model.check_flux()?;
         model.tallies = (0..frames.count())
-            .map(|exposure| model.tally(exposure, workers))
+            .map(|exposure| model.tally(exposure, workers, control))
             .collect::<Result<_>>()?;
         model.check_light()?;
         Ok(model)
@@ -116,12 +119,20 @@ impl<'a, T: Real> Model<'a, T> {
     }
 
     /// Calls `visit(pixel, cell)` for each used measurement.
-    pub fn for_each_used(&self, mut visit: impl FnMut(usize, usize)) {
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] if `control` asks to stop.
+    pub fn for_each_used(
+        &self,
+        control: &Control,
+        mut visit: impl FnMut(usize, usize),
+    ) -> Result<()> {
         let Shape { rows, cols } = self.sensor();
         let mut scratch = vec![0.0; cols];
         for (exposure, place) in self.geometry.exposures.iter().enumerate() {
             let cells = self.geometry.views[place.view].cells;
             for row in 0..rows {
+                control.check()?;
                 let stretch = self.stretch(exposure, row, 0..cols, &mut scratch);
                 for col in 0..cols {
                     let used = match &stretch {
@@ -134,6 +145,7 @@ impl<'a, T: Real> Model<'a, T> {
                 }
             }
         }
+        Ok(())
     }
 
     /// The measurements of `exposure` in columns `cols` of `row`; `scratch` has room for them.
@@ -233,9 +245,10 @@ impl<'a, T: Real> Model<'a, T> {
     }
 
     /// Counts one exposure's measurements and checks their variances.
-    fn tally(&self, exposure: usize, workers: &Workers) -> Result<Tally> {
+    fn tally(&self, exposure: usize, workers: &Workers, control: &Control) -> Result<Tally> {
         let Shape { rows, cols } = self.sensor();
         let by_row = workers.map(rows, |row| {
+            control.check()?;
             let mut scratch = vec![0.0; cols];
             let mut tally = Tally::default();
             if let Stretch::Weighted(values, weights) =

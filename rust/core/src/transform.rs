@@ -3,6 +3,8 @@
 use rustdct::{DctPlanner, TransformType2And3};
 use std::sync::Arc;
 
+use crate::control::Control;
+use crate::error::Result;
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
@@ -23,16 +25,22 @@ impl CosineTransform {
     }
 
     /// Multiplies each mode (i, j) of `image` by `factor(i, j)`.
+    ///
+    /// Fails only if `control` asks to stop; `image` then holds nothing of use.
     pub(crate) fn filter(
         &self,
         image: &mut Vec<f64>,
         factor: impl Fn(usize, usize) -> f64 + Sync,
         workers: &Workers,
-    ) {
+        control: &Control,
+    ) -> Result<()> {
         let Shape { rows, cols } = self.shape;
-        each_line(image, &*self.along_rows, Direction::Forward, workers);
+        let each_line = |image: &mut [f64], transform: &dyn TransformType2And3<f64>, direction| {
+            each_line(image, transform, direction, workers, control)
+        };
+        each_line(image, &*self.along_rows, Direction::Forward)?;
         let mut modes = transposed(image, self.shape, workers);
-        each_line(&mut modes, &*self.along_cols, Direction::Forward, workers);
+        each_line(&mut modes, &*self.along_cols, Direction::Forward)?;
         // Forward and back multiply by a quarter of the number of pixels.
         let scale = 4.0 / (rows * cols) as f64;
         workers.map_blocks(&mut modes, rows, |j, line| {
@@ -40,9 +48,9 @@ impl CosineTransform {
                 *mode *= scale * factor(i, j);
             }
         });
-        each_line(&mut modes, &*self.along_cols, Direction::Back, workers);
+        each_line(&mut modes, &*self.along_cols, Direction::Back)?;
         *image = transposed(&modes, self.shape.transposed(), workers);
-        each_line(image, &*self.along_rows, Direction::Back, workers);
+        each_line(image, &*self.along_rows, Direction::Back)
     }
 }
 
@@ -57,18 +65,23 @@ fn each_line(
     transform: &dyn TransformType2And3<f64>,
     direction: Direction,
     workers: &Workers,
-) {
+    control: &Control,
+) -> Result<()> {
     const LINES: usize = 16;
     let length = transform.len();
     workers.map_blocks(image, LINES * length, |_, lines| {
         let mut scratch = vec![0.0; transform.get_scratch_len()];
         for line in lines.chunks_exact_mut(length) {
+            if control.is_cancelled() {
+                return;
+            }
             match direction {
                 Direction::Forward => transform.process_dct2_with_scratch(line, &mut scratch),
                 Direction::Back => transform.process_dct3_with_scratch(line, &mut scratch),
             }
         }
     });
+    control.check()
 }
 
 /// The transposed image, in square tiles so that both sides stay in cache.
@@ -107,7 +120,8 @@ mod tests {
                 .collect();
             let mut image = mode.clone();
             let factor = |a: usize, b: usize| 1.0 + a as f64 + 100.0 * b as f64;
-            CosineTransform::new(shape).filter(&mut image, factor, &workers);
+            let transform = CosineTransform::new(shape);
+            transform.filter(&mut image, factor, &workers, &Control::new()).unwrap();
             let wanted = factor(i, j);
             for (got, mode) in image.iter().zip(&mode) {
                 assert!((got - wanted * mode).abs() < 1e-12 * wanted, "{shape}");

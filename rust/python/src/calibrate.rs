@@ -130,7 +130,8 @@ fn solve<T: Real>(
     let rotations = setting.rotation.iter().map(|&degrees| rotation(degrees));
     let rotations = rotations.collect::<Result<Vec<_>>>()?;
     let geometry = Geometry::new(frames.shape(), &setting.shifts, &rotations)?;
-    let model = Model::new(frames, geometry, &setting.flux, variance, setting.mask, &workers)?;
+    let model =
+        Model::new(frames, geometry, &setting.flux, variance, setting.mask, &workers, control)?;
     let solution = calibrate(&model, setting.stop, &workers, control)?;
     Ok((solution, model.geometry))
 }

@@ -173,7 +173,8 @@ impl<'c> Bmp<'c> {
         if head[14] < 40 || head[28..34] != [8, 0, 0, 0, 0, 0] {
             return Err(Problem::bad("is no uncompressed BMP file of 8 bits, as was expected"));
         }
-        let grey = |(level, colour): (usize, &[u8; 3])| colour.iter().all(|&c| usize::from(c) == level);
+        let grey =
+            |(level, colour): (usize, &[u8; 3])| colour.iter().all(|&c| usize::from(c) == level);
         if !decoder.get_palette().is_some_and(|palette| palette.iter().enumerate().all(grey)) {
             return Err(Problem::bad("has a palette of colours, expected the 256 greys in order"));
         }

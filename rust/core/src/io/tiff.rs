@@ -43,7 +43,8 @@ pub(super) fn directories(source: Source) -> Outcome<Vec<u32>> {
     let mut seen = HashSet::new();
     let mut next = decoder.ifd_pointer();
     while let Some(pointer) = next {
-        let offset = u32::try_from(pointer.0).map_err(|_| Problem::bad("has a page beyond 4 GiB"))?;
+        let offset =
+            u32::try_from(pointer.0).map_err(|_| Problem::bad("has a page beyond 4 GiB"))?;
         if !seen.insert(offset) {
             return Err(Problem::bad("is broken: its pages follow one another in a circle"));
         }
@@ -51,7 +52,9 @@ pub(super) fn directories(source: Source) -> Outcome<Vec<u32>> {
         next = decoder.read_directory(pointer)?.next();
     }
     if hides_frames(&mut decoder, offsets.len()) {
-        return Err(Problem::Unsupported("a stack with a directory for its first frame only".into()));
+        return Err(Problem::Unsupported(
+            "a stack with a directory for its first frame only".into(),
+        ));
     }
     Ok(offsets)
 }

@@ -1,0 +1,441 @@
+"""Files: every format against other readers, hostile input, interruption, whole output."""
+
+from __future__ import annotations
+
+import io as stdio
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import textwrap
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+import equipix
+from equipix import io
+from equipix.errors import EquipixError, FileError, InputError
+
+RNG = np.random.default_rng(20)
+WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)
+NARROW = RNG.integers(0, 256, (5, 23, 37), dtype=np.uint8)
+
+
+def assert_averages(source: object, frames: np.ndarray) -> None:
+    """The average of files is, to the bit, that of the frames that were written."""
+    result, wanted = equipix.average(source), equipix.average(frames)  # type: ignore[arg-type]
+    for name, values in vars(wanted).items():
+        np.testing.assert_array_equal(getattr(result, name), values, err_msg=name)
+
+
+@pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+@pytest.mark.parametrize("layout", [{}, {"rowsperstrip": 4}, {"tile": (16, 32)}], ids=str)
+@pytest.mark.parametrize("compression", [None, "zlib", "lzw", "packbits"])
+@pytest.mark.parametrize("predictor", [False, True])
+def test_tiff(
+    tmp_path: Path,
+    frames: np.ndarray,
+    byteorder: str,
+    layout: dict[str, object],
+    compression: str | None,
+    predictor: bool,
+) -> None:
+    if predictor and compression not in ("zlib", "lzw"):
+        pytest.skip("no such files")
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(
+        path,
+        frames,
+        byteorder=byteorder,
+        compression=compression,
+        predictor=predictor,
+        photometric="minisblack",
+        **layout,
+    )
+    assert_averages(path, frames)
+    np.testing.assert_array_equal(equipix._native.read_file(path, None), frames)
+    np.testing.assert_array_equal(np.concatenate(list(io._tiff_frames(path))), frames)
+
+
+@pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
+def test_files_of_one_image(tmp_path: Path, frames: np.ndarray) -> None:
+    wide = frames.dtype == np.uint16
+    for suffix in ("png", "pgm", "tif") if wide else ("png", "pgm", "tif", "bmp", "BMP", "TIFF"):
+        for index, frame in enumerate(frames):
+            path = tmp_path / f"{suffix}{index}.{suffix}"
+            if suffix == "pgm":
+                header = b"P5 # made here\n37 23\n%d\n" % (65535 if wide else 255)
+                path.write_bytes(header + frame.astype(">u2" if wide else "u1").tobytes())
+            else:
+                Image.fromarray(frame).save(path)
+        np.testing.assert_array_equal(np.asarray(Image.open(path)), frames[-1])
+        assert_averages(tmp_path / f"{suffix}*.{suffix}", frames)
+
+
+def test_plain_pgm_and_12_bits_keep_their_numbers(tmp_path: Path) -> None:
+    frame = WIDE[0] % 4096
+    numbers = " ".join(map(str, frame.ravel()))
+    (tmp_path / "plain.pgm").write_text(f"P2\n37 23\n4095\n{numbers}\n")
+    (tmp_path / "raw.pgm").write_bytes(b"P5 37 23 4095\n" + frame.astype(">u2").tobytes())
+    tifffile.imwrite(tmp_path / "t.tif", frame)
+    Image.fromarray(frame).save(tmp_path / "p.png")
+    for path in tmp_path.iterdir():
+        np.testing.assert_array_equal(io.read_frames(path)[0], frame)
+    assert_averages(sorted(tmp_path.iterdir()), np.stack([frame] * 4))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "options"),
+    [
+        ("float32", {}),
+        ("float64", {"compression": "zlib"}),
+        ("int16", {}),
+        ("uint32", {}),
+        ("uint16", {"bigtiff": True}),
+        ("uint8", {"compression": "zstd"}),
+        ("uint16", {"compression": "lzma"}),
+    ],
+)
+def test_other_tiffs_are_left_to_tifffile(
+    tmp_path: Path, dtype: str, options: dict[str, object]
+) -> None:
+    frames = (NARROW // 2).astype(dtype)
+    for index in range(2):
+        tifffile.imwrite(tmp_path / f"{index}.tif", frames, photometric="minisblack", **options)
+    with pytest.raises(FileError, match="is not decoded here"):
+        equipix._native.read_file(tmp_path / "0.tif", None)
+    result = equipix.average(tmp_path / "*.tif")
+    wanted = equipix.average(np.concatenate([frames, frames]))
+    # The batches differ, so sums of floating-point numbers may differ by their rounding.
+    np.testing.assert_allclose(result.mean, wanted.mean, rtol=1e-14)
+    np.testing.assert_allclose(result.variance, wanted.variance, rtol=1e-12)
+    np.testing.assert_array_equal(result.count, 10)
+
+
+@pytest.mark.parametrize("options", [{"imagej": True}, {"metadata": {"axes": "TYX"}}], ids=str)
+def test_stack_behind_one_directory_is_read_whole(
+    tmp_path: Path, options: dict[str, object]
+) -> None:
+    path = tmp_path / "stack.tif"
+    with tifffile.TiffWriter(path, imagej="imagej" in options) as file:
+        file.write(
+            WIDE,
+            photometric="minisblack",
+            contiguous=True,
+            truncate=True,
+            metadata={"axes": "TYX"},
+        )
+    with tifffile.TiffFile(path) as file:
+        assert len(file.pages) == 1
+    assert_averages(path, WIDE)
+
+
+def test_tiff_that_needs_a_codec_says_which_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "z.tif"
+    tifffile.imwrite(path, WIDE[0], compression="zstd")
+
+    def missing(*_: object, **__: object) -> None:
+        raise ValueError("<COMPRESSION.ZSTD: 50000> requires the 'imagecodecs' package")
+
+    monkeypatch.setattr(tifffile.TiffPage, "asarray", missing)
+    with pytest.raises(FileError, match=r"z\.tif.*ZSTD.*pip install 'equipix\[codecs\]'"):
+        equipix.average(path)
+
+
+def png(frame: np.ndarray, **options: object) -> bytes:
+    buffer = stdio.BytesIO()
+    Image.fromarray(frame).save(buffer, "png", **options)
+    return buffer.getvalue()
+
+
+def tiff(frames: np.ndarray, **options: object) -> bytes:
+    buffer = stdio.BytesIO()
+    tifffile.imwrite(buffer, frames, **{"photometric": "minisblack", **options})
+    return buffer.getvalue()
+
+
+def pages(*writes: tuple[np.ndarray, dict[str, object]], **options: object) -> bytes:
+    buffer = stdio.BytesIO()
+    with tifffile.TiffWriter(buffer, **options) as file:
+        for frame, details in writes:
+            file.write(frame, metadata=None, **{"photometric": "minisblack", **details})
+    return buffer.getvalue()
+
+
+def other(image: Image.Image, kind: str, **options: object) -> bytes:
+    buffer = stdio.BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+RGB = np.zeros((23, 37, 3), np.uint8)
+NARROW_IMAGE = Image.fromarray(NARROW[0])
+PAM = b"P7\nWIDTH 2\nHEIGHT 1\nDEPTH 1\nMAXVAL 255\nTUPLTYPE GRAYSCALE\nENDHDR\nab"
+GREY_APNG = {"save_all": True, "append_images": [Image.fromarray(NARROW[1])]}
+
+
+@pytest.mark.parametrize("both", [{}, {"bigtiff": True}], ids=["core", "tifffile"])
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (lambda o: pages((RGB, {"photometric": "rgb"}), **o), "RGB.*expected one grey channel"),
+        (lambda o: pages((WIDE[0], {"photometric": "miniswhite"}), **o), "white at 0"),
+        (lambda o: pages((WIDE[0], {}), (WIDE[1, 1:], {}), **o), "22 x 37.*expected 23 x 37"),
+        (lambda o: pages((WIDE[0], {}), (NARROW[1], {}), **o), "8.*expected 23 x 37.*16"),
+        (lambda o: pages((WIDE[0], {}), (WIDE[1], {"subfiletype": 1}), **o), "reduced copy"),
+        (lambda o: pages((WIDE[0], {"subifds": 1}), (WIDE[1], {}), **o), "reduced copy"),
+    ],
+)
+def test_pages_that_are_no_frames_are_refused_both_ways(
+    tmp_path: Path, content: object, message: str, both: dict[str, object]
+) -> None:
+    (tmp_path / "bad.tif").write_bytes(content(both))  # type: ignore[operator]
+    with pytest.raises(FileError, match=rf"bad\.tif: .*{message}"):
+        equipix.average(tmp_path / "bad.tif")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("empty.tif", b"", "is empty"),
+        ("empty.png", b"", "is empty"),
+        ("text.tif", b"not an image at all, only words", "not a readable TIFF"),
+        ("text.png", b"not an image at all, only words", "not a readable image"),
+        ("text.pgm", b"not an image at all, only words", "not a readable image"),
+        ("text.bmp", b"not an image at all, only words, and too few of them", ""),
+        ("a.jpg", other(NARROW_IMAGE, "jpeg"), "expected .tif"),
+        ("nosuffix", png(NARROW[0]), "expected .tif"),
+        ("rgb.png", png(RGB), "expected one grey channel"),
+        ("rgb.bmp", other(Image.fromarray(RGB), "bmp"), "BMP file of 8 bits"),
+        ("rgb.pgm", b"P6 1 1 255\nabc", "expected a PGM"),
+        ("pam.pgm", PAM, "expected a PGM"),
+        ("palette.png", other(NARROW_IMAGE.convert("P"), "png"), "expected one grey channel"),
+        ("palette.bmp", other(NARROW_IMAGE.convert("RGB").quantize(9), "bmp"), "palette"),
+        ("alpha.png", other(NARROW_IMAGE.convert("LA"), "png"), "expected one grey channel"),
+        ("clear.png", png(NARROW[0], transparency=3), "expected one grey channel"),
+        ("one.png", other(NARROW_IMAGE.convert("1"), "png"), "1 bits, expected 8 or 16"),
+        ("moving.png", other(NARROW_IMAGE, "png", **GREY_APNG), "animation"),
+        ("two.pgm", b"P5 2 1 255\nabP5 2 1 255\ncd", "goes on after its image"),
+        ("short.pgm", b"P5 2 2 255\nabc", "truncated"),
+        ("short.pgm", b"P2 2 2 255\n1 2 3", "truncated"),
+        ("words.pgm", b"P2 2 1 255\n1 x", "whole numbers"),
+        ("much.pgm", b"P2 2 1 255\n1 256", "whole numbers"),
+        ("bomb.pgm", b"P5 60000 60000 65535\n1", "claims 60000 x 60000"),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileError, match=rf"{name}: .*{message}"):
+        equipix.average(tmp_path / name)
+
+
+def test_files_that_differ_are_named_with_what_was_wanted(tmp_path: Path) -> None:
+    for name, frame in {"0.png": WIDE[0], "1.png": WIDE[1, 1:], "2.png": NARROW[0]}.items():
+        Image.fromarray(frame).save(tmp_path / name)
+    with pytest.raises(FileError, match=r"1\.png.*22 x 37.*expected 23 x 37.*as in .*0\.png"):
+        equipix.average([tmp_path / "0.png", tmp_path / "1.png"])
+    with pytest.raises(FileError, match=r"2\.png.*8 bits, expected .*16 bits"):
+        equipix.average([tmp_path / "0.png", tmp_path / "2.png"])
+    (tmp_path / "3.png").symlink_to(os.devnull)
+    with pytest.raises(FileError, match=r"3\.png"):
+        equipix.average([tmp_path / "0.png", tmp_path / "3.png"])
+
+
+HOSTILE = {
+    "raw.tif": tiff(WIDE),
+    "deflate.tif": tiff(WIDE, compression="zlib", predictor=True),
+    "lzw.tif": tiff(WIDE, compression="lzw"),
+    "tiled.tif": tiff(WIDE, tile=(16, 16)),
+    "float.tif": tiff(WIDE.astype(np.float32)),
+    "big.tif": tiff(WIDE, bigtiff=True),
+    "wide.png": png(WIDE[0]),
+    "narrow.bmp": other(NARROW_IMAGE, "bmp"),
+    "wide.pgm": b"P5 37 23 65535\n" + WIDE[0].astype(">u2").tobytes(),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_truncated_files_never_lose_a_page(tmp_path: Path, name: str) -> None:
+    whole, path = HOSTILE[name], tmp_path / name
+    path.write_bytes(whole)
+    frames = io.read_frames(path)
+    for size in sorted({*range(1, 300, 7), *range(1, len(whole), len(whole) // 60)}):
+        path.write_bytes(whole[:size])
+        try:
+            result = equipix.average(path)
+        except FileError as error:
+            assert name in str(error)
+        else:
+            # What was cut off held no pixels: the trailer of a PNG or of a TIFF.
+            np.testing.assert_array_equal(result.mean, equipix.average(frames).mean)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_flipped_bytes_give_an_error_of_the_package_or_an_average(
+    tmp_path: Path, name: str
+) -> None:
+    whole, path = HOSTILE[name], tmp_path / name
+    rng = np.random.default_rng(sum(name.encode()))
+    for trial in range(150):
+        content = bytearray(whole)
+        reach = 400 if trial % 2 else len(whole)
+        for position in rng.integers(0, min(reach, len(whole)), 1 + trial % 5):
+            content[position] ^= 1 << rng.integers(8)
+        path.write_bytes(content)
+        try:
+            result = equipix.average(path)
+        except EquipixError as error:
+            assert name in str(error)
+            assert "internal error" not in str(error)
+        else:
+            assert np.all(result.count >= 1)
+            if name.endswith("png"):  # its checksums find every change that matters
+                np.testing.assert_array_equal(result.mean, WIDE[0])
+
+
+def endless_tiff(path: Path, count: int) -> None:
+    """A TIFF of many pages that all share one deflated strip."""
+    frame = np.random.default_rng(0).integers(0, 4096, (582, 782), dtype=np.uint16)
+    strip = zlib.compress(frame.tobytes(), 1)
+    start = 8 + len(strip) + len(strip) % 2
+    entries = [(256, 782), (257, 582), (258, 16), (259, 8), (262, 1), (273, 8), (277, 1)]
+    entries += [(278, 582), (279, len(strip))]
+    body = struct.pack("<H", len(entries))
+    body += b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
+    size = len(body) + 4
+    following = [start + size * (index + 1) for index in range(count - 1)] + [0]
+    directories = b"".join(body + struct.pack("<I", offset) for offset in following)
+    header = struct.pack("<2sHI", b"II", 42, start)
+    path.write_bytes((header + strip).ljust(start, b"\0") + directories)
+
+
+@pytest.mark.parametrize("kind", ["pages", "files", "array"])
+def test_ctrl_c_stops_within_half_a_second(tmp_path: Path, kind: str) -> None:
+    endless_tiff(tmp_path / "long.tif", 10_000 if kind == "pages" else 1)
+    script = """
+        import sys, time
+        import numpy as np, equipix
+        path, kind = sys.argv[1:]
+        source = {
+            "pages": path,
+            "files": [path] * 10_000,
+            "array": np.broadcast_to(np.ones((2000, 1500)), (2000, 2000, 1500)),
+        }[kind]
+        started = False
+        def progress(done, total, stage):
+            global started
+            if not started and done < total / 2:
+                started = True
+                print("started", flush=True)
+        try:
+            equipix.average(source, progress=progress)
+        except KeyboardInterrupt:
+            print(time.time(), flush=True)
+        """
+    command = [sys.executable, "-c", textwrap.dedent(script), tmp_path / "long.tif", kind]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "started\n"
+        sent = time.time()
+        child.send_signal(signal.SIGINT)
+        stopped = float(child.stdout.readline())
+    assert stopped - sent < 0.5
+    assert [path.name for path in tmp_path.iterdir()] == ["long.tif"]
+
+
+def test_globs_are_in_natural_order(tmp_path: Path) -> None:
+    for name in ("f10.png", "f9.png", "f1.png", "g.txt"):
+        (tmp_path / name).touch()
+    found = io.find_files(tmp_path / "f*.png")
+    assert [path.name for path in found] == ["f1.png", "f9.png", "f10.png"]
+    literal = tmp_path / "a[1].png"
+    literal.touch()
+    assert io.find_files(str(literal)) == [literal]
+
+
+PAGES = {
+    "mean": RNG.normal(size=(4, 5)),
+    "labels": RNG.integers(-5, 5, (4, 5), dtype=np.int32),
+    "other shape": RNG.random((2, 3), dtype=np.float32),
+    "count": RNG.integers(0, 2**32, (4, 5), dtype=np.uint32),
+}
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".tiff", ".npz"])
+def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"pages{suffix}"
+    metadata = {"format": 1, "name": "Müller", "list": [1, 2.5, None]}
+    io.save_pages(path, PAGES, metadata)
+    pages, found = io.load_pages(path)
+    assert found == metadata
+    assert list(pages) == list(PAGES)
+    for name, array in PAGES.items():
+        assert pages[name].dtype == array.dtype
+        np.testing.assert_array_equal(pages[name], array)
+    if suffix != ".npz":
+        with tifffile.TiffFile(path) as file:
+            assert file.pages[1].tags["PageName"].value == "labels"
+            assert json.loads(file.pages[0].description) == metadata
+
+
+def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "out.tif"
+    io.save_pages(path, PAGES, {})
+    before = path.read_bytes()
+    with pytest.raises(FileError, match=r"out\.tif: exists already; force=True"):
+        io.save_pages(path, PAGES, {})
+    broken = {**PAGES, "bad": np.array([object()])}
+    for target in (path, tmp_path / "new.tif"):
+        with pytest.raises((ValueError, TypeError)):
+            io.save_pages(target, broken, {}, force=True)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+    io.save_pages(path, {"mean": PAGES["mean"]}, {}, force=True)
+    assert list(io.load_pages(path)[0]) == ["mean"]
+    with pytest.raises(FileError, match=r"none.*cannot be written"):
+        io.save_pages(tmp_path / "none" / "out.tif", PAGES, {})
+    with pytest.raises(InputError, match=r"expected the suffix \.tif or \.npz"):
+        io.save_pages(tmp_path / "out.jpg", PAGES, {})
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"dark{suffix}"
+    wanted = equipix.average(WIDE)
+    io.save_statistics(path, wanted)
+    for name, values in vars(io.load_statistics(path)).items():
+        np.testing.assert_array_equal(values, getattr(wanted, name))
+        assert values.dtype == getattr(wanted, name).dtype
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(FileError, match=f"a{suffix}"):
+        io.load_statistics(path)
+    io.save_pages(path, PAGES, {"kind": "something"})
+    with pytest.raises(FileError, match="something else than averaged frames"):
+        io.load_statistics(path)
+    io.save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
+    with pytest.raises(FileError, match="has format 99.*install a newer one"):
+        io.load_statistics(path)
+    io.save_statistics(path, equipix.average(WIDE), force=True)
+    whole = path.read_bytes()
+    for size in range(0, len(whole) - 1, len(whole) // 40):
+        path.write_bytes(whole[:size])
+        with pytest.raises(FileError, match=f"a{suffix}"):
+            io.load_statistics(path)
+    tifffile.imwrite(tmp_path / "plain.tif", WIDE[0])
+    with pytest.raises(FileError, match=r"plain\.tif"):
+        io.load_pages(tmp_path / "plain.tif")

@@ -1,0 +1,176 @@
+"""Stukachev and Kozhevatov (2011), sections 2 and 3, reproduced.
+
+The paper solves for M on a sensor of 320×240 pixels, M = 1 + ξ with abs(ξ) ≤ 0.05, in a Gaussian
+beam of width 1000, from five exposures in a cross with arms from {5, 7, 11, 19, 23}, under
+additive noise whose largest value is 1e-3 or 1e-2. It claims that the relative error of M stays
+below the largest noise, vanishes with it, and does not depend on the form of the beam; and that
+three experiments with different shifts agree within the noise.
+
+Figures wanted here are those of a solver at the least-squares optimum. The solver's tolerance
+is 1/100 of the noise or less, which adds under 0.1 % to an rms error of a third of the noise.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+
+SHAPE = (240, 320)
+ARMS = (11, 19)
+SEEDS = 30
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def uniform(rng, shape, largest):
+    return rng.uniform(-largest, largest, shape)
+
+
+def gaussian(rng, shape, largest):
+    noise = rng.standard_normal(shape)
+    return noise * (largest / abs(noise).max())
+
+
+def error_of_calibration(seed, *, draw=uniform, largest=1e-3, arms=ARMS, beam=None, tolerance=None):
+    """Relative error of M after a calibration of the paper's sensor."""
+    rng = np.random.default_rng(seed)
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng)
+    shifts = equipix.cross_pattern(*arms)
+    frames = simulate.exposures(truth, beam or simulate.gaussian_beam(SHAPE), shifts)
+    frames += draw(rng, frames.shape, largest)
+    result = equipix.calibrate(frames, shifts, tolerance=tolerance or largest / 100)
+    assert result.converged
+    return simulate.relative_error(result.sensitivity, truth)
+
+
+@pytest.fixture(scope="module")
+def errors():
+    """Absolute errors of thirty sensors, each with noise uniform in ±1e-3."""
+    return np.stack([abs(error_of_calibration(seed, tolerance=1e-6)) for seed in range(SEEDS)])
+
+
+class TestUniformNoise:
+    def test_rms_error(self, errors):
+        for error in errors:
+            assert rms(error) == pytest.approx(3.21e-4, abs=0.05e-4)
+
+    def test_nearly_all_pixels_stay_within_the_noise(self, errors):
+        assert ((errors < 1e-3).mean(axis=(1, 2)) > 0.997).all()
+
+    def test_largest_error_of_the_frame(self, errors):
+        """Between 1.3e-3 and 1.75e-3 in thirty other draws."""
+        largest = errors.max(axis=(1, 2))
+        assert 1.3e-3 < np.median(largest) < 1.75e-3
+        # The range of 30 draws holds a further draw with probability 29/31: 28 of 30 are
+        # expected within it, less three binomial deviations of 1.4.
+        assert ((largest > 1.3e-3) & (largest < 1.75e-3)).sum() >= 24
+
+    def test_most_rows_stay_within_the_noise_entirely(self, errors):
+        within = (errors < 1e-3).all(axis=2)
+        assert (within.mean(axis=1) > 0.55).all()
+        assert (within.mean(axis=1) < 0.75).all()
+        # Row 120 is one row in 30 draws: 21 of them, within three binomial deviations of 2.5.
+        assert within[:, 120].sum() == pytest.approx(21, abs=7.5)
+
+
+def test_gaussian_noise_keeps_the_whole_frame_below_its_largest_value():
+    largest = [abs(error_of_calibration(seed, draw=gaussian)).max() for seed in range(10)]
+    assert max(largest) < 1e-3
+    assert 0.45e-3 < np.median(largest) < 0.66e-3
+
+
+def test_without_noise_the_error_goes_down_to_rounding():
+    error = error_of_calibration(1, largest=0.0, tolerance=1e-12)
+    # The estimate is within a factor 10 of the true error, and sums of five products round 1e-15.
+    assert abs(error).max() < 1e-11
+
+
+@pytest.mark.parametrize("draw", [uniform, gaussian])
+def test_ten_times_the_noise_gives_ten_times_the_error(draw):
+    error = error_of_calibration(1, draw=draw, largest=1e-2)
+    if draw is uniform:
+        assert rms(error) == pytest.approx(3.21e-3, abs=0.05e-3)
+        assert (abs(error) < 1e-2).mean() > 0.997
+    else:
+        assert abs(error).max() < 1e-2
+
+
+@pytest.mark.parametrize("arms", list(combinations((5, 7, 11, 19, 23), 2)))
+def test_any_pair_of_arms_does(arms):
+    truth = simulate.paper_sensitivity(SHAPE, rng=1)
+    beam, shifts = simulate.gaussian_beam(SHAPE), equipix.cross_pattern(*arms)
+    predicted, _ = simulate.noise_prediction(truth, beam, shifts, 1e-6 / 3, rng=2)
+    assert predicted == pytest.approx(3.21e-4, abs=0.05e-4)
+    error = error_of_calibration(1, arms=arms)
+    assert rms(error) == pytest.approx(predicted, abs=0.05e-4)
+    assert (abs(error) < 1e-3).mean() > 0.997
+
+
+@pytest.mark.parametrize("form", [simulate.striped_beam, simulate.tilted_beam])
+@pytest.mark.parametrize("largest", [1e-3, 1e-2])
+def test_the_form_of_the_beam_plays_no_part(form, largest):
+    error = error_of_calibration(1, beam=form(SHAPE), largest=largest)
+    assert rms(error) == pytest.approx(0.321 * largest, abs=0.005 * largest)
+    assert (abs(error) < largest).mean() > 0.997
+
+
+def virtual_experiment(truth, arms, rng):
+    beam, shifts = simulate.gaussian_beam(truth.shape), equipix.cross_pattern(*arms)
+    return simulate.experiment(truth, beam, shifts, frames=50, dead=0, hot=0, rng=rng)
+
+
+def measured_shifts(virtual):
+    """Add up the moves that the images of the hole show, to whole pixels."""
+    moves = [np.zeros(2)]
+    for k in range(1, len(virtual.positions)):
+        before = np.stack(list(virtual.aperture_before(k)))
+        after = np.stack(list(virtual.aperture_after(k)))
+        moves.append(equipix.measure_shift(before, after).shift)
+    return np.rint(np.cumsum(moves, axis=0))
+
+
+def calibrated(virtual):
+    """Average, subtract the dark, measure the shifts, calibrate."""
+    dark = equipix.average(virtual.dark())
+    means = [
+        equipix.average(virtual.frames(k), dark=dark).mean for k in range(len(virtual.positions))
+    ]
+    return equipix.calibrate(
+        np.stack(means),
+        measured_shifts(virtual),
+        variance=virtual.variance_of_mean(),
+        tolerance=1e-5,
+    ).sensitivity
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3])
+def outcome(request):
+    """Truth, the maps of three experiments and the rms error that noise predicts for each."""
+    rng = np.random.default_rng(request.param)
+    truth = simulate.cosine_sensitivity((120, 160), rng=rng)
+    experiments = [virtual_experiment(truth, arms, rng) for arms in [(11, 19), (7, 23), (5, 13)]]
+    maps = [calibrated(virtual) for virtual in experiments]
+    return truth, maps, [virtual.noise_prediction(rng=rng)[0] for virtual in experiments]
+
+
+class TestThreeExperiments:
+    """One sensor of 160×120 pixels, calibrated three times with different shifts."""
+
+    def test_each_map_is_as_near_the_truth_as_noise_lets_it(self, outcome):
+        truth, maps, predictions = outcome
+        for found, predicted in zip(maps, predictions, strict=True):
+            assert rms(simulate.relative_error(found, truth)) < 1.1 * predicted
+
+    def test_any_two_maps_differ_by_their_noise(self, outcome):
+        _, maps, predictions = outcome
+        for first, second in combinations(range(3), 2):
+            difference = simulate.relative_error(maps[first], maps[second])
+            expected = np.hypot(predictions[first], predictions[second])
+            assert rms(difference) == pytest.approx(expected, rel=0.05)
