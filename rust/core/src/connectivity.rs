@@ -1,4 +1,4 @@
-//! Connected components: what the measurements can and cannot compare.
+//! Connected components: of measurements (what they can and cannot compare), of pixels in a spot.
 //!
 //! ln y_k(p) = ln L(u_k(p)) + ln M(p) is a bipartite graph of pixels and beam cells with an edge
 //! for each used measurement. Within a connected component M is determined up to one factor;
@@ -6,7 +6,7 @@
 
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
 use crate::model::Model;
 
 /// Pixels or cells between two looks at whether to stop.
@@ -97,5 +97,124 @@ impl Components {
             cells: (pixels..used.len()).map(&mut label).collect::<Result<_>>()?,
             sizes: roots.iter().map(|&root| sizes[root]).collect(),
         })
+    }
+}
+
+/// The 8-connected component of each pixel of `mask`, numbered in the order of their first pixels;
+/// [`NONE`] outside the mask.
+///
+/// Eight neighbours, not four: a spot's outline is ragged with noise and a slit may lie obliquely,
+/// and pixels that touch at a corner only are still the same light.
+///
+/// # Errors
+/// [`Error::Cancelled`](crate::Error::Cancelled).
+pub fn label_pixels(mask: &[bool], shape: Shape, control: &Control) -> Result<Vec<i32>> {
+    let mut sets = DisjointSets::new(mask.len());
+    for row in 0..shape.rows {
+        control.check()?;
+        for col in (0..shape.cols).filter(|col| mask[row * shape.cols + col]) {
+            let pixel = row * shape.cols + col;
+            for neighbour in earlier_neighbours(row, col, shape).filter(|&other| mask[other]) {
+                sets.union(pixel, neighbour);
+            }
+        }
+    }
+    number_sets(&mut sets, mask, shape, control)
+}
+
+/// The neighbours of a pixel that come before it, row by row: west, north-west, north, north-east.
+fn earlier_neighbours(row: usize, col: usize, shape: Shape) -> impl Iterator<Item = usize> {
+    let pixel = row * shape.cols + col;
+    let above = |step: usize, inside: bool| (row > 0 && inside).then(|| pixel + step - shape.cols);
+    let west = (col > 0).then(|| pixel - 1);
+    let north_west = if col > 0 { above(0, true).map(|north| north - 1) } else { None };
+    [west, north_west, above(0, true), above(1, col + 1 < shape.cols)].into_iter().flatten()
+}
+
+fn number_sets(
+    sets: &mut DisjointSets,
+    mask: &[bool],
+    shape: Shape,
+    control: &Control,
+) -> Result<Vec<i32>> {
+    let mut labels = vec![NONE; mask.len()];
+    let mut count = 0;
+    for row in 0..shape.rows {
+        control.check()?;
+        for pixel in (row * shape.cols..(row + 1) * shape.cols).filter(|&pixel| mask[pixel]) {
+            let root = sets.find(pixel);
+            // The root is the smallest number of its set, so it has its label already.
+            if root == pixel {
+                labels[pixel] = count;
+                count += 1;
+            } else {
+                labels[pixel] = labels[root];
+            }
+        }
+    }
+    Ok(labels)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn labels(mask: &[bool], rows: usize, cols: usize) -> Vec<i32> {
+        label_pixels(mask, Shape::new(rows, cols), &Control::new()).unwrap()
+    }
+
+    /// Spreads the smallest index of a component until nothing changes.
+    fn spread(mask: &[bool], rows: usize, cols: usize) -> Vec<usize> {
+        let mut smallest: Vec<usize> = (0..mask.len()).collect();
+        loop {
+            let former = smallest.clone();
+            for (a, b) in (0..mask.len()).flat_map(|a| (0..mask.len()).map(move |b| (a, b))) {
+                let near = (a / cols).abs_diff(b / cols) <= 1 && (a % cols).abs_diff(b % cols) <= 1;
+                if near && mask[a] && mask[b] {
+                    smallest[a] = smallest[a].min(smallest[b]);
+                }
+            }
+            if smallest == former {
+                assert!(rows * cols == mask.len());
+                return smallest;
+            }
+        }
+    }
+
+    #[test]
+    fn the_smallest_number_is_the_root() {
+        let mut sets = DisjointSets::new(6);
+        sets.union(5, 3);
+        sets.union(3, 1);
+        sets.union(4, 2);
+        assert_eq!((0..6).map(|i| sets.find(i)).collect::<Vec<_>>(), [0, 1, 2, 1, 2, 1]);
+    }
+
+    #[test]
+    fn corners_connect() {
+        assert_eq!(labels(&[true, false, false, true], 2, 2), [0, NONE, NONE, 0]);
+        assert_eq!(labels(&[false, true, true, false], 2, 2), [NONE, 0, 0, NONE]);
+        assert_eq!(labels(&[true, false, true], 1, 3), [0, NONE, 1]);
+        assert_eq!(labels(&[], 0, 0), [NONE; 0]);
+    }
+
+    proptest! {
+        #[test]
+        fn labels_are_the_components(
+            (cols, mask) in (1_usize..7, 1_usize..7).prop_flat_map(|(rows, cols)| {
+                (Just(cols), prop::collection::vec(any::<bool>(), rows * cols))
+            })
+        ) {
+            let rows = mask.len() / cols;
+            let got = labels(&mask, rows, cols);
+            let smallest = spread(&mask, rows, cols);
+            let roots: Vec<usize> = (0..mask.len()).filter(|&i| mask[i] && smallest[i] == i).collect();
+            for pixel in 0..mask.len() {
+                let number = roots.iter().position(|&root| mask[pixel] && root == smallest[pixel]);
+                prop_assert_eq!(got[pixel], number.map_or(NONE, |number| number as i32));
+            }
+        }
     }
 }

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use crate::frames::Shape;
+
 /// The result of everything in this crate that can fail.
 pub type Result<T> = std::result::Result<T, Error>;
 
@@ -27,6 +29,16 @@ pub enum Error {
         argument: &'static str,
         /// What is wrong with it, what was wanted, what to do.
         problem: String,
+    },
+
+    // Validation: spot.
+    /// An image has no spot that can be measured.
+    #[error("'{argument}' has {problem}")]
+    Spot {
+        /// The argument's name.
+        argument: &'static str,
+        /// What is wrong with the spot.
+        problem: SpotProblem,
     },
 
     // Input and output.
@@ -61,6 +73,66 @@ pub enum Error {
         workers: usize,
         /// The system's reason.
         reason: String,
+    },
+}
+
+/// Why a spot cannot be measured; places are (row, column) in pixels.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum SpotProblem {
+    /// Nothing stands out of the background.
+    #[error(
+        "no spot: its brightest area stands {level:.3} above the background, where more than \
+         {wanted:.3} (8 standard deviations of the smoothed background) is wanted; is the hole in \
+         the beam?"
+    )]
+    Missing {
+        /// Level of the brightest area above the background.
+        level: f64,
+        /// Level that a spot must exceed.
+        wanted: f64,
+    },
+    /// The spot, with its blurred outline and some background, does not lie wholly on the sensor.
+    #[error(
+        "a spot cut by the edge: with its blur and 3 pixels of background the spot at \
+         ({:.1}, {:.1}) needs rows {} to {} and columns {} to {} of a {shape} sensor; move it \
+         inwards", centre[0], centre[1], rows[0], rows[1], cols[0], cols[1]
+    )]
+    Cut {
+        /// Centre of the part that is seen.
+        centre: [f64; 2],
+        /// First and last row needed.
+        rows: [i64; 2],
+        /// First and last column needed.
+        cols: [i64; 2],
+        /// Sizes of the sensor.
+        shape: Shape,
+    },
+    /// Two spots of comparable size.
+    #[error(
+        "a doubled spot: {} pixels around ({:.1}, {:.1}) and {} pixels around ({:.1}, {:.1}); \
+         leave one hole open and shield reflections",
+        areas[0], first[0], first[1], areas[1], second[0], second[1]
+    )]
+    Doubled {
+        /// Centre of the largest spot.
+        first: [f64; 2],
+        /// Centre of the second largest.
+        second: [f64; 2],
+        /// Their areas in pixels.
+        areas: [usize; 2],
+    },
+    /// Pixels of the spot reached the saturation level.
+    #[error(
+        "a saturated spot: {pixels} of its pixels reach {level}, the first at ({}, {}); expose it \
+         less", first[0], first[1]
+    )]
+    Saturated {
+        /// Number of pixels.
+        pixels: usize,
+        /// The first of them.
+        first: [i64; 2],
+        /// The saturation level.
+        level: f64,
     },
 }
 

@@ -1,6 +1,7 @@
 //! Pixel sensitivity of image sensors, measured without a uniform light source.
 
 pub mod calibrate;
+pub mod centroid;
 pub mod connectivity;
 pub mod control;
 pub mod descent;

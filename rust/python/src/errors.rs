@@ -8,6 +8,7 @@ use pyo3::prelude::*;
 pub(crate) fn exception(py: Python<'_>, error: &Error) -> PyErr {
     let class = match error {
         Error::Shape { .. } | Error::Value { .. } => "InputError",
+        Error::Spot { .. } => "SpotError",
         Error::File { .. } => "FileError",
         Error::Unsupported { .. } => "UnsupportedFileError",
         Error::Cancelled => return PyKeyboardInterrupt::new_err(()),

@@ -8,6 +8,7 @@
 
 mod average;
 mod calibrate;
+mod centroid;
 mod errors;
 mod run;
 
@@ -23,6 +24,8 @@ mod _native {
     use crate::average::{Accumulator, average_files, file_format, read_file};
     #[pymodule_export]
     use crate::calibrate::{PySolution, calibrate_frames};
+    #[pymodule_export]
+    use crate::centroid::locate_spots;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -1,0 +1,276 @@
+"""Centroid of a spot in its plainest form: NumPy, whole arrays, no speed.
+
+The method is told in the docs of the compiled core's module ``centroid``; the steps here bear the
+same names and stand in the same order.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Image = NDArray[np.float64]
+    Box = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1
+
+BLOCKS = 16
+SPOT_PIXELS = 16
+DETECTION = 8.0
+COMPARABLE = 0.25
+CLIPPING = 5.0
+NORMAL_MAD = 1.4826022185056018
+NORMAL_MEDIAN_SQUARE = 0.454936423119572
+OUTLIER = 4.0
+
+
+class Spot(NamedTuple):
+    """Centroid of a spot and its standard error, (row, column) in pixels."""
+
+    position: Image
+    std: Image
+
+
+class Shift(NamedTuple):
+    """Move of the sensor and its standard error, (row, column) in pixels."""
+
+    shift: Image
+    std: Image
+    before: Spot
+    after: Spot
+
+
+def measure_shift(before: ArrayLike, after: ArrayLike, *, saturation: float | None = None) -> Shift:
+    """Move of the sensor between two images of a spot that stands still in the beam."""
+    first, second = locate(before, saturation=saturation), locate(after, saturation=saturation)
+    shift = first.position - second.position
+    return Shift(shift, np.hypot(first.std, second.std), first, second)
+
+
+def locate(frames: ArrayLike, *, saturation: float | None = None) -> Spot:
+    """Centroid of the one spot in `frames`, shape (rows, cols) or (n, rows, cols)."""
+    raw = np.asarray(frames)
+    if saturation is None:
+        saturation = np.iinfo(raw.dtype).max if raw.dtype.kind in "iu" else np.inf
+    stack = raw.astype(np.float64)
+    stack = stack[np.newaxis] if stack.ndim == 2 else stack
+    mean = stack.sum(axis=0) / len(stack)
+    window, level = find_window(mean)
+    patch = widen(window, max(3, min(window[1] - window[0], window[3] - window[2]) // 4))
+    patch = clip(patch, mean.shape)
+    values, replaced = clean(cut(mean, patch))
+    inside = in_window(values.shape, patch, window)
+    if np.any(cut(stack.max(axis=0), patch)[inside & ~replaced] >= saturation):
+        raise ValueError("saturated")
+    rows, cols = np.indices(values.shape, dtype=np.float64)
+    rows += patch[0] - (window[0] + window[1] - 1) / 2  # from the window's centre
+    cols += patch[2] - (window[2] + window[3] - 1) / 2
+    basis = powers(rows / values.shape[0], cols / values.shape[1])
+    surface, ring = fit_clipped(basis[:, ~inside], values[~inside])
+    signal = values - np.tensordot(surface, basis, axes=1)
+    if len(stack) > 1:
+        variance = cut(stack.var(axis=0, ddof=1) / len(stack), patch)
+        variance = np.where(replaced, neighbours_median(variance), variance)
+    else:
+        variance = variance_of_one(values, signal, inside, level)
+    if signal[inside].sum() <= 0:
+        raise ValueError("missing")
+    centroid, std = moments(rows, cols, basis, signal, variance, inside, ring)
+    centre = np.array([window[0] + window[1] - 1, window[2] + window[3] - 1]) / 2
+    return Spot(centre + centroid, std)
+
+
+def moments(
+    rows: Image,
+    cols: Image,
+    basis: Image,
+    signal: Image,
+    variance: Image,
+    inside: Any,
+    ring: Any,
+) -> tuple[Image, Image]:
+    """First moments of the signal in the window, and their standard errors."""
+    flux = signal[inside].sum()
+    kept = basis[:, ~inside][:, ring]
+    normal = kept @ kept.T
+    centroid, std = np.empty(2), np.empty(2)
+    for axis, place in enumerate((rows, cols)):
+        centroid[axis] = (place * signal)[inside].sum() / flux
+        lever = np.where(inside, place - centroid[axis], 0.0)
+        through = np.linalg.solve(normal, (basis * lever).sum(axis=(1, 2)))
+        own = (lever**2 * variance).sum()
+        background = ((through @ kept) ** 2 * variance[~inside][ring]).sum()
+        std[axis] = np.sqrt(own + background) / flux
+    return centroid, std
+
+
+def variance_of_one(values: Image, signal: Image, inside: Any, level: float) -> Image:
+    """Variance per pixel, background + factor * signal, from the roughness of a single image."""
+    rough = roughness(values)
+    inner = np.zeros_like(inside)
+    inner[1:-1, 1:-1] = True
+    background = np.median(rough[inner & ~inside])
+    bright = inside & (signal > level / 2)
+    factor = np.median((rough[bright] - background) / signal[bright])
+    return background + max(factor, 0.0) * np.maximum(signal, 0.0)
+
+
+def roughness(values: Image) -> Image:
+    """Square of the second difference along both axes, scaled to have the median of a variance."""
+    padded = np.pad(values, 1, mode="edge")
+    along = padded[:-2] - 2 * padded[1:-1] + padded[2:]
+    both = along[:, :-2] - 2 * along[:, 1:-1] + along[:, 2:]
+    return both**2 / (36 * NORMAL_MEDIAN_SQUARE)
+
+
+def find_window(mean: Image) -> tuple[Box, float]:
+    """Window that holds the spot and its blur, and the spot's level above the background."""
+    excess = median_of_nine(mean) - background(mean)
+    centres, noises = [], []
+    for block in blocks(excess):
+        centres.append(np.median(block))
+        noises.append(NORMAL_MAD * np.median(np.abs(block - centres[-1])))
+    noise = float(np.median(noises))
+    level = float(np.sort(excess, axis=None)[-SPOT_PIXELS])
+    if not level > DETECTION * noise:
+        raise ValueError("missing")
+    labels = label_pixels(excess > level / 2)
+    areas = np.bincount(labels.ravel())[1:]
+    order = np.argsort(-areas, kind="stable")
+    if len(areas) > 1 and areas[order[1]] >= COMPARABLE * areas[order[0]]:
+        raise ValueError("doubled")
+    rows, cols = np.nonzero(labels == order[0] + 1)
+    box = (int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1)
+    window = widen(box, int(np.ceil(4 * blur(excess, box, len(rows), level, noise))) + 2)
+    if not fits(widen(window, 3), mean.shape):
+        raise ValueError("cut")
+    return window, level
+
+
+def blur(excess: Image, box: Box, area: int, level: float, noise: float) -> float:
+    """Width of the spot's edge, as the standard deviation of a Gaussian with that slope."""
+    radius = np.sqrt(area / np.pi)
+    low = max(level / 10, 3 * noise)
+    around = widen(box, int(np.ceil(radius)))
+    wide = np.sqrt(np.sum(cut(excess, clip(around, excess.shape)) > low) / np.pi)
+    steps = np.sqrt(2 * np.log(level / low)) - np.sqrt(2 * np.log(2))
+    return float(max(wide - radius, 0.0) / steps)
+
+
+def background(mean: Image) -> Image:
+    """Smooth background: a quadratic surface through the medians of blocks, spots clipped."""
+    rows, cols = np.indices(mean.shape, dtype=np.float64)
+    rows, cols = (2 * rows + 1) / mean.shape[0] - 1, (2 * cols + 1) / mean.shape[1] - 1
+    medians = [
+        np.array([np.median(block) for block in blocks(image)]) for image in (rows, cols, mean)
+    ]
+    surface, _ = fit_clipped(powers(*medians[:2]), medians[2])
+    return np.tensordot(surface, powers(rows, cols), axes=1)
+
+
+def blocks(image: Image) -> list[Image]:
+    """The image cut into 16 by 16 blocks of nearly equal size."""
+    row_edges = [image.shape[0] * k // BLOCKS for k in range(BLOCKS + 1)]
+    col_edges = [image.shape[1] * k // BLOCKS for k in range(BLOCKS + 1)]
+    return [
+        image[top:bottom, left:right]
+        for top, bottom in zip(row_edges, row_edges[1:], strict=False)
+        for left, right in zip(col_edges, col_edges[1:], strict=False)
+    ]
+
+
+def fit_clipped(basis: Image, values: Image) -> tuple[Image, Any]:
+    """Least-squares polynomial of the points that stand within 5 robust deviations of it."""
+    surface = np.zeros(len(basis))
+    surface[0] = np.median(values)
+    kept = np.ones(len(values), dtype=bool)
+    for _ in range(5):
+        residual = values - surface @ basis
+        kept = np.abs(residual) <= CLIPPING * NORMAL_MAD * np.median(np.abs(residual))
+        used = basis[:, kept]
+        surface = surface + np.linalg.solve(used @ used.T, used @ residual[kept])
+    return surface, kept
+
+
+def powers(rows: Any, cols: Any) -> Image:
+    """The terms 1, row, column, row², row * column, column²."""
+    return np.stack([np.ones_like(rows), rows, cols, rows * rows, rows * cols, cols * cols])
+
+
+def median_of_nine(image: Image) -> Image:
+    """Median of every pixel and its eight neighbours; the border repeats the outermost pixels."""
+    padded = np.pad(image, 1, mode="edge")
+    views = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    return np.median(views, axis=(2, 3))
+
+
+def sorted_neighbours(image: Image) -> Image:
+    """The eight neighbours of every pixel, sorted along the last axis."""
+    padded = np.pad(image, 1, mode="edge")
+    views = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*image.shape, 9)
+    return np.sort(np.delete(views, 4, axis=2), axis=2)
+
+
+def neighbours_median(image: Image) -> Image:
+    """Median of the eight neighbours of every pixel."""
+    ranked = sorted_neighbours(image)
+    return (ranked[..., 3] + ranked[..., 4]) / 2
+
+
+def clean(values: Image) -> tuple[Image, Any]:
+    """Hot and dead pixels replaced by the median of their neighbours; the border stays."""
+    ranked = sorted_neighbours(values)
+    low, high = ranked[..., 1], ranked[..., 6]
+    outlier = np.zeros(values.shape, dtype=bool)
+    beyond = np.maximum(values - high, low - values) > OUTLIER * (high - low)
+    outlier[1:-1, 1:-1] = beyond[1:-1, 1:-1]
+    return np.where(outlier, neighbours_median(values), values), outlier
+
+
+def label_pixels(mask: Any) -> NDArray[np.int64]:
+    """Number of the 8-connected component of every pixel, from 1; 0 outside the mask."""
+    labels = np.zeros(mask.shape, dtype=np.int64)
+    count = 0
+    for start in zip(*np.nonzero(mask), strict=True):
+        if labels[start]:
+            continue
+        count += 1
+        labels[start] = count
+        todo = [start]
+        while todo:
+            row, col = todo.pop()
+            near = (slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2))
+            for r, c in zip(*np.nonzero(mask[near] & (labels[near] == 0)), strict=True):
+                place = (near[0].start + r, near[1].start + c)
+                labels[place] = count
+                todo.append(place)
+    return labels
+
+
+def widen(box: Box, margin: int) -> Box:
+    """The box with `margin` more pixels on every side."""
+    return (box[0] - margin, box[1] + margin, box[2] - margin, box[3] + margin)
+
+
+def clip(box: Box, shape: tuple[int, ...]) -> Box:
+    """The part of the box that lies in the image."""
+    return (max(box[0], 0), min(box[1], shape[0]), max(box[2], 0), min(box[3], shape[1]))
+
+
+def fits(box: Box, shape: tuple[int, ...]) -> bool:
+    """Whether the whole box lies in the image."""
+    return clip(box, shape) == box
+
+
+def cut(image: Image, box: Box) -> Image:
+    """The pixels of the box."""
+    return image[box[0] : box[1], box[2] : box[3]]
+
+
+def in_window(shape: tuple[int, ...], patch: Box, window: Box) -> Any:
+    """Which pixels of the patch belong to the window."""
+    inside = np.zeros(shape, dtype=bool)
+    cut(inside, (window[0] - patch[0], window[1] - patch[0], window[2] - patch[2], window[3] - patch[2]))[...] = True
+    return inside

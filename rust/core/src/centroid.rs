@@ -1,0 +1,226 @@
+//! Centroid of a spot, the image of a hole that stands still in the beam, with its standard error.
+//!
+//! 1. **Detection** (on a copy smoothed by a 3×3 median, which removes single and paired hot and
+//!    dead pixels): a quadratic surface through the medians of 16×16 blocks is the background, the
+//!    16th highest pixel above it the spot's level. The largest set of connected pixels above half
+//!    of this level is the spot.
+//! 2. **Window**: the spot's bounding box and 4σ + 2 pixels on every side, σ the Gaussian width of
+//!    its outline. What is left outside is below 1e-5 of the signal: the noise moves the window
+//!    by a pixel now and then, and this must not move the centroid.
+//! 3. **Background** b: a quadratic surface fitted to the ring around the window. A plane would not
+//!    do: of a background of 60 DN that falls by 30 % to the corners, its curvature moved the
+//!    centroid of a spot of 2000 DN by 0.003 pixel.
+//! 4. **Centroid**: x̂ = Σ x (y − b) / F with F = Σ (y − b), over all pixels of the window, since a
+//!    sum over pixels above a threshold is biased towards whole pixels.
+//!
+//! The **standard error** is that of random noise, independent between pixels, propagated through
+//! both: with φ the six terms of the surface and G = Σ φφᵀ over the ring,
+//!
+//! > σ² = F⁻² [ Σ_window (x − x̂)² v + Σ_ring (hᵀG⁻¹φ)² v ],   h = Σ_window (x − x̂) φ.
+//!
+//! The variance v of a pixel's mean comes from the scatter of the frames at that pixel. A single
+//! image tells less: v = v₀ + κ·signal, both from its roughness, so that non-uniformity counts as
+//! noise and the standard error comes out too large (1.5 times at 3 % rms).
+//!
+//! **Limits.** In simulation (spots of 4 to 32 pixels across, 1 to 16 frames, vignetted background)
+//! the errors' spread is 0.92 to 1.06 standard errors of 250 draws. The bias over fractions of a
+//! pixel is below 1e-6 pixel for outlines at least 0.8 pixel wide (σ), 1e-3 at 0.5. Not in the
+//! standard error: non-uniformity (5 % of it moves a spot of 50 pixels across by about 0.01 pixel),
+//! vibration, and lamp flicker, which only makes it too large.
+
+mod detect;
+mod patch;
+mod region;
+mod surface;
+
+use self::detect::{BLOCKS, Detection, RIM};
+use self::patch::Patch;
+use self::region::Region;
+use self::surface::{Point, Surface, Terms, dot, solve, terms};
+use crate::control::Control;
+use crate::error::{Error, Result, SpotProblem};
+use crate::frames::{Sample, Shape, Stack};
+
+/// Values stay below this, so that no sum of squares overflows.
+const LARGEST: f64 = 1e100;
+
+/// Where a spot is, (row, column) in pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spot {
+    /// Centroid; the centre of the first pixel is (0, 0).
+    pub position: [f64; 2],
+    /// Its standard error.
+    pub std: [f64; 2],
+}
+
+/// Finds the one spot in the mean of `frames`, called `argument` in errors.
+///
+/// # Errors
+/// [`Error::Spot`] for a spot that is missing, cut by the edge, doubled, or has samples that reach
+/// `saturation`; [`Error::Shape`] without frames or with images below 16×16 pixels;
+/// [`Error::Value`] for values that are not finite, or 1e100 and more; [`Error::Cancelled`].
+pub fn locate<T: Sample>(
+    argument: &'static str,
+    frames: Stack<'_, T>,
+    saturation: Option<f64>,
+    control: &Control,
+) -> Result<Spot> {
+    let image = Image::mean(argument, frames, control)?;
+    let Detection { window, level, wanted } = detect::detect(&image, control)?;
+    let ring = (window.height().min(window.width()) / 4).max(RIM as usize);
+    let region = window.widened(ring as i64).clipped(Region::of(image.shape));
+    let patch = Patch::mended(&image.values, image.shape, region, control)?;
+    if let Some(saturation) = saturation {
+        check_saturation(&image, &patch, window, frames, saturation)?;
+    }
+    let aperture = Aperture::new(&patch, window);
+    // A bright ring around the detected spot turns the sum's sign.
+    if aperture.flux <= 0.0 {
+        return Err(
+            image.missing(aperture.flux / (window.height() * window.width()) as f64, wanted)
+        );
+    }
+    let variance = if frames.count() > 1 {
+        patch.variance_of_frames(frames, &image.values, control)?
+    } else {
+        patch.variance_of_one(&aperture.signal, window, level / 2.0)
+    };
+    let [row, col] = [0, 1].map(|axis| aperture.centroid(axis, &variance));
+    Ok(Spot { position: [row.0, col.0], std: [row.1, col.1] })
+}
+
+/// An image, with the name that errors give it.
+#[derive(Debug)]
+struct Image {
+    argument: &'static str,
+    values: Vec<f64>,
+    shape: Shape,
+}
+
+impl Image {
+    /// The mean of frames whose values are all below [`LARGEST`] in size.
+    fn mean<T: Sample>(
+        argument: &'static str,
+        frames: Stack<'_, T>,
+        control: &Control,
+    ) -> Result<Self> {
+        let shape = frames.shape();
+        if frames.count() == 0 || shape.rows.min(shape.cols) < BLOCKS {
+            return Err(Error::Shape {
+                argument,
+                got: format!("({}, {}, {})", frames.count(), shape.rows, shape.cols),
+                wanted: format!("at least one frame of {BLOCKS} rows and columns"),
+            });
+        }
+        let mut values = vec![0.0; shape.len()];
+        for index in 0..frames.count() {
+            for (row, sums) in values.chunks_mut(shape.cols).enumerate() {
+                control.check()?;
+                for (col, (sum, value)) in sums.iter_mut().zip(frames.row(index, row)).enumerate() {
+                    let value = value.to_f64();
+                    if value.is_nan() || value.abs() >= LARGEST {
+                        let place = format!("is {value} at frame {index}, row {row}, column {col}");
+                        let wanted = format!(": numbers below {LARGEST:e} in size are wanted");
+                        return Err(Error::value(argument, place + &wanted));
+                    }
+                    *sum += value;
+                }
+            }
+        }
+        values.iter_mut().for_each(|sum| *sum /= frames.count() as f64);
+        Ok(Self { argument, values, shape })
+    }
+
+    fn missing(&self, level: f64, wanted: f64) -> Error {
+        self.problem(SpotProblem::Missing { level, wanted })
+    }
+
+    fn problem(&self, problem: SpotProblem) -> Error {
+        Error::Spot { argument: self.argument, problem }
+    }
+}
+
+/// Refuses a window in which any frame reaches the saturation level, mended pixels aside.
+fn check_saturation<T: Sample>(
+    image: &Image,
+    patch: &Patch,
+    window: Region,
+    frames: Stack<'_, T>,
+    level: f64,
+) -> Result<()> {
+    let reaches = |row: i64, col: i64| {
+        let pixel = row as usize * image.shape.cols + col as usize;
+        (0..frames.count()).any(|index| frames.frame(index)[pixel].to_f64() >= level)
+    };
+    let mut saturated = patch.region.pixels().zip(&patch.mended).filter_map(|(place, &mended)| {
+        let counts = !mended && window.contains(place.0, place.1) && reaches(place.0, place.1);
+        counts.then_some(place)
+    });
+    let Some((row, col)) = saturated.next() else { return Ok(()) };
+    let pixels = 1 + saturated.count();
+    Err(image.problem(SpotProblem::Saturated { pixels, first: [row, col], level }))
+}
+
+/// The signal in the window, and the background around it.
+struct Aperture {
+    window: Region,
+    pixels: Vec<Pixel>,
+    /// Background-subtracted values of the patch.
+    signal: Vec<f64>,
+    flux: f64,
+    surface: Surface,
+}
+
+/// A pixel of the patch.
+struct Pixel {
+    /// Place from the window's centre.
+    place: [f64; 2],
+    /// The surface's terms at this place, divided by the patch's sizes.
+    terms: Terms,
+    inside: bool,
+}
+
+impl Aperture {
+    fn new(patch: &Patch, window: Region) -> Self {
+        let centre = window.centre();
+        let size = [patch.region.height() as f64, patch.region.width() as f64];
+        let pixel = |(row, col): (i64, i64)| {
+            let place = [row as f64 - centre[0], col as f64 - centre[1]];
+            let terms = terms([place[0] / size[0], place[1] / size[1]]);
+            Pixel { place, terms, inside: window.contains(row, col) }
+        };
+        let pixels: Vec<Pixel> = patch.region.pixels().map(pixel).collect();
+        let outside = pixels.iter().zip(&patch.values).filter(|(pixel, _)| !pixel.inside);
+        let points: Vec<Point> =
+            outside.map(|(pixel, &value)| Point { terms: pixel.terms, value }).collect();
+        let surface = Surface::fit(&points);
+        let above =
+            |(pixel, value): (&Pixel, &f64)| value - dot(&surface.coefficients, &pixel.terms);
+        let signal: Vec<f64> = pixels.iter().zip(&patch.values).map(above).collect();
+        let inside = pixels.iter().zip(&signal).filter(|(pixel, _)| pixel.inside);
+        let flux = inside.map(|(_, signal)| signal).sum();
+        Self { window, pixels, signal, flux, surface }
+    }
+
+    /// Centroid and standard error along an axis.
+    fn centroid(&self, axis: usize, variance: &[f64]) -> (f64, f64) {
+        let window = || (0..self.pixels.len()).filter(|&index| self.pixels[index].inside);
+        let ring = (0..self.pixels.len()).filter(|&index| !self.pixels[index].inside);
+        let place = |index: usize| self.pixels[index].place[axis];
+        let moment: f64 = window().map(|index| place(index) * self.signal[index]).sum();
+        let offset = moment / self.flux;
+
+        let mut lever = Terms::default();
+        let mut sum = 0.0;
+        for index in window() {
+            let arm = place(index) - offset;
+            sum += arm * arm * variance[index];
+            lever.iter_mut().zip(self.pixels[index].terms).for_each(|(h, term)| *h += arm * term);
+        }
+        let through = solve(&self.surface.normal, lever);
+        for (index, _) in ring.zip(&self.surface.kept).filter(|(_, kept)| **kept) {
+            sum += dot(&through, &self.pixels[index].terms).powi(2) * variance[index];
+        }
+        (self.window.centre()[axis] + offset, sum.sqrt() / self.flux)
+    }
+}

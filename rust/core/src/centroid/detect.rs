@@ -1,0 +1,268 @@
+//! Finds the spot: where it is, how high, and the window that holds it with its blur.
+
+use std::f64::consts::PI;
+
+use super::Image;
+use super::region::Region;
+use super::surface::{Point, Surface, dot, median, robust_deviation, terms};
+use crate::connectivity::{NONE, label_pixels};
+use crate::control::Control;
+use crate::error::{Result, SpotProblem};
+use crate::frames::Shape;
+
+/// Background and noise are taken from this many blocks along each axis.
+pub(super) const BLOCKS: usize = 16;
+
+/// A spot has at least this many pixels: its level is that of the lowest of its brightest 16.
+const SPOT_PIXELS: usize = 16;
+
+/// A spot stands out by more than this many standard deviations of the smoothed background.
+const DETECTION: f64 = 8.0;
+
+/// A second spot counts as comparable from this part of the first one's area.
+const COMPARABLE: f64 = 0.25;
+
+/// Background that the window leaves on every side at least.
+pub(super) const RIM: i64 = 3;
+
+/// Where the spot is.
+#[derive(Debug)]
+pub(super) struct Detection {
+    /// Holds the spot and its blur.
+    pub(super) window: Region,
+    /// Level of the spot above the background.
+    pub(super) level: f64,
+    /// Level that it had to exceed.
+    pub(super) wanted: f64,
+}
+
+/// Finds the largest connected spot.
+pub(super) fn detect(image: &Image, control: &Control) -> Result<Detection> {
+    let excess = excess(image, control)?;
+    let noise = noise(&excess, image.shape, control)?;
+    let level = level(&excess);
+    let wanted = DETECTION * noise;
+    let found = if level > wanted {
+        components(&excess, image.shape, level / 2.0, control)?
+    } else {
+        Vec::new()
+    };
+    let spot = match found[..] {
+        [] => return Err(image.missing(level, wanted)),
+        [first, second, ..] if second.area as f64 >= COMPARABLE * first.area as f64 => {
+            return Err(image.problem(SpotProblem::Doubled {
+                first: first.centre(),
+                second: second.centre(),
+                areas: [first.area, second.area],
+            }));
+        }
+        [first, ..] => first,
+    };
+    let margin = 4.0 * blur(&excess, image.shape, &spot, level, noise);
+    let window = spot.region.widened(margin.ceil() as i64 + 2);
+    let needed = window.widened(RIM);
+    if needed.clipped(Region::of(image.shape)) != needed {
+        return Err(image.problem(SpotProblem::Cut {
+            centre: spot.centre(),
+            rows: [needed.top, needed.bottom - 1],
+            cols: [needed.left, needed.right - 1],
+            shape: image.shape,
+        }));
+    }
+    Ok(Detection { window, level, wanted })
+}
+
+/// The image, each pixel the median of itself and its neighbours, above the smooth background.
+fn excess(image: &Image, control: &Control) -> Result<Vec<f64>> {
+    let shape = image.shape;
+    let background = background(image, control)?;
+    let scaled = |index: usize, count: usize| (2 * index + 1) as f64 / count as f64 - 1.0;
+    let mut excess = Vec::with_capacity(shape.len());
+    for row in 0..shape.rows {
+        control.check()?;
+        let smooth = median_of_nine(image, row);
+        excess.extend(smooth.enumerate().map(|(col, value)| {
+            let place = terms([scaled(row, shape.rows), scaled(col, shape.cols)]);
+            value - dot(&background, &place)
+        }));
+    }
+    Ok(excess)
+}
+
+/// Row `row` of the median filter over 3×3 pixels, the outermost pixels repeated at the border:
+/// single hot and dead pixels, and pairs of them, vanish.
+fn median_of_nine(image: &Image, row: usize) -> impl Iterator<Item = f64> {
+    let shape = image.shape;
+    let line = |row: usize| &image.values[row * shape.cols..][..shape.cols];
+    let rows = [row.saturating_sub(1), row, (row + 1).min(shape.rows - 1)].map(line);
+    let columns: Vec<[f64; 3]> =
+        (0..shape.cols).map(|col| sorted(rows[0][col], rows[1][col], rows[2][col])).collect();
+    (0..shape.cols).map(move |col| {
+        let near = [col.saturating_sub(1), col, (col + 1).min(shape.cols - 1)];
+        let [a, b, c] = near.map(|col| columns[col]);
+        // The middle of the highest low, the middle of the middles and the lowest high.
+        let low = a[0].max(b[0]).max(c[0]);
+        let high = a[2].min(b[2]).min(c[2]);
+        sorted(low, sorted(a[1], b[1], c[1])[1], high)[1]
+    })
+}
+
+fn sorted(a: f64, b: f64, c: f64) -> [f64; 3] {
+    let (low, high) = (a.min(b), a.max(b));
+    [low.min(c), low.max(high.min(c)), high.max(c)]
+}
+
+/// Quadratic surface through the medians of blocks, those with the spot clipped, in coordinates
+/// from −1 to 1.
+fn background(image: &Image, control: &Control) -> Result<[f64; 6]> {
+    let shape = image.shape;
+    let scaled = |first: i64, end: i64, count: usize| (first + end) as f64 / count as f64 - 1.0;
+    let mut points = Vec::with_capacity(BLOCKS * BLOCKS);
+    for block in blocks(shape) {
+        control.check()?;
+        let mut values = block.rows(&image.values, shape).collect::<Vec<_>>().concat();
+        let place = [
+            scaled(block.top, block.bottom, shape.rows),
+            scaled(block.left, block.right, shape.cols),
+        ];
+        points.push(Point { terms: terms(place), value: median(&mut values) });
+    }
+    Ok(Surface::fit(&points).coefficients)
+}
+
+fn blocks(shape: Shape) -> impl Iterator<Item = Region> {
+    let edge = |index: usize, count: usize| (index * count / BLOCKS) as i64;
+    (0..BLOCKS * BLOCKS).map(move |index| {
+        let (i, j) = (index / BLOCKS, index % BLOCKS);
+        Region {
+            top: edge(i, shape.rows),
+            bottom: edge(i + 1, shape.rows),
+            left: edge(j, shape.cols),
+            right: edge(j + 1, shape.cols),
+        }
+    })
+}
+
+/// Standard deviation within blocks, the median over the blocks.
+fn noise(excess: &[f64], shape: Shape, control: &Control) -> Result<f64> {
+    let mut noises = Vec::with_capacity(BLOCKS * BLOCKS);
+    for block in blocks(shape) {
+        control.check()?;
+        let mut values = block.rows(excess, shape).collect::<Vec<_>>().concat();
+        noises.push(robust_deviation(&mut values));
+    }
+    Ok(median(&mut noises))
+}
+
+/// The lowest of the [`SPOT_PIXELS`] highest values: clusters of fewer bad pixels do not count.
+fn level(excess: &[f64]) -> f64 {
+    let mut highest = [f64::NEG_INFINITY; SPOT_PIXELS];
+    for &value in excess {
+        if value > highest[0] {
+            highest[0] = value;
+            highest.sort_unstable_by(f64::total_cmp);
+        }
+    }
+    highest[0]
+}
+
+/// A connected set of pixels.
+#[derive(Clone, Copy, Debug)]
+struct Component {
+    area: usize,
+    region: Region,
+    sum: [f64; 2],
+}
+
+impl Component {
+    fn centre(&self) -> [f64; 2] {
+        self.sum.map(|sum| sum / self.area as f64)
+    }
+}
+
+/// The sets of connected pixels above `threshold`, the largest first.
+fn components(
+    excess: &[f64],
+    shape: Shape,
+    threshold: f64,
+    control: &Control,
+) -> Result<Vec<Component>> {
+    let mask: Vec<bool> = excess.iter().map(|&value| value > threshold).collect();
+    let labels = label_pixels(&mask, shape, control)?;
+    let mut found: Vec<Component> = Vec::new();
+    for (&label, (row, col)) in labels.iter().zip(Region::of(shape).pixels()) {
+        if label == NONE {
+            continue;
+        }
+        if label as usize == found.len() {
+            let region = Region { top: row, bottom: row, left: col, right: col };
+            found.push(Component { area: 0, region, sum: [0.0; 2] });
+        }
+        let component = &mut found[label as usize];
+        component.area += 1;
+        component.region = component.region.joined(row, col);
+        component.sum = [component.sum[0] + row as f64, component.sum[1] + col as f64];
+    }
+    found.sort_by_key(|component| std::cmp::Reverse(component.area));
+    Ok(found)
+}
+
+/// Width σ of the spot's outline, as if it were a Gaussian's.
+///
+/// The radii of equal area at half the level and at a lower level q are, for a Gaussian,
+/// σ√(2 ln 2) and σ√(2 ln(level/q)); q is a tenth of the level or, in noise, more.
+fn blur(excess: &[f64], shape: Shape, spot: &Component, level: f64, noise: f64) -> f64 {
+    let radius = (spot.area as f64 / PI).sqrt();
+    let low = (level / 10.0).max(3.0 * noise);
+    let around = spot.region.widened(radius.ceil() as i64).clipped(Region::of(shape));
+    let area = around.rows(excess, shape).flatten().filter(|&&value| value > low).count();
+    let wide = (area as f64 / PI).sqrt();
+    let steps = (2.0 * (level / low).ln()).sqrt() - (2.0 * 2.0_f64.ln()).sqrt();
+    (wide - radius).max(0.0) / steps
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn median_of_nine_is_the_fifth(
+            values in prop::collection::vec(-9_i8..9, 16 * 17)
+        ) {
+            let shape = Shape::new(16, 17);
+            let values = values.into_iter().map(f64::from).collect();
+            let image = Image { argument: "frames", values, shape };
+            for row in 0..16 {
+                for (col, got) in median_of_nine(&image, row).enumerate() {
+                    let near = |at: usize, step: usize, end: usize| (at + step).clamp(1, end) - 1;
+                    let mut nine: Vec<f64> = (0..9)
+                        .map(|k| near(row, k / 3, 16) * 17 + near(col, k % 3, 17))
+                        .map(|pixel| image.values[pixel])
+                        .collect();
+                    prop_assert_eq!(got, median(&mut nine));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_window_follows_the_blur() {
+        let shape = Shape::new(96, 128);
+        for width in [2.0, 4.0] {
+            let value = |(row, col): (i64, i64)| {
+                let r2 = (row as f64 - 40.0).powi(2) + (col as f64 - 70.0).powi(2);
+                1000.0 * (-r2 / (2.0 * width * width)).exp() + 20.0
+            };
+            let values = Region::of(shape).pixels().map(value).collect();
+            let image = Image { argument: "frames", values, shape };
+            let found = detect(&image, &Control::new()).unwrap();
+            assert_eq!(found.window.centre(), [40.0, 70.0]);
+            // Half maximum at 1.18 widths, then 4 widths and 2 pixels; the level is below the top.
+            let half = found.window.height() as f64 / 2.0;
+            assert!((5.1 * width..5.6 * width + 3.0).contains(&half), "{half} for {width}");
+        }
+    }
+}

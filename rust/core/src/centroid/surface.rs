@@ -1,0 +1,153 @@
+//! Medians, and the quadratic surface that stands for a smooth background.
+
+/// Median absolute deviation of a normal distribution, as a factor that makes it σ.
+const NORMAL_MAD: f64 = 1.482_602_218_505_601_8;
+
+/// Points farther from the surface than this many robust standard deviations do not count.
+const CLIPPING: f64 = 5.0;
+
+/// How often the surface is fitted anew to the points that count.
+const FITS: usize = 5;
+
+/// Median, the mean of the middle two for an even number; `values` get reordered. NaN if empty.
+pub(super) fn median(values: &mut [f64]) -> f64 {
+    let half = values.len() / 2;
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let odd = values.len() % 2 == 1;
+    let (low, upper, _) = values.select_nth_unstable_by(half, f64::total_cmp);
+    if odd {
+        return *upper;
+    }
+    (low.iter().copied().fold(f64::NEG_INFINITY, f64::max) + *upper) / 2.0
+}
+
+/// Standard deviation of normal values of which a minority may be anything.
+pub(super) fn robust_deviation(values: &mut [f64]) -> f64 {
+    let centre = median(values);
+    values.iter_mut().for_each(|value| *value = (*value - centre).abs());
+    NORMAL_MAD * median(values)
+}
+
+/// The terms of a quadratic surface: 1, r, c, r², rc, c².
+pub(super) type Terms = [f64; 6];
+
+pub(super) fn terms([row, col]: [f64; 2]) -> Terms {
+    [1.0, row, col, row * row, row * col, col * col]
+}
+
+pub(super) fn dot(a: &Terms, b: &Terms) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// A value at the place whose terms are `terms`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Point {
+    pub(super) terms: Terms,
+    pub(super) value: f64,
+}
+
+/// A surface through points, without those that stand out.
+#[derive(Debug)]
+pub(super) struct Surface {
+    /// The factors of the terms.
+    pub(super) coefficients: Terms,
+    /// Σ φφᵀ over the points that count.
+    pub(super) normal: [Terms; 6],
+    /// Which points count.
+    pub(super) kept: Vec<bool>,
+}
+
+impl Surface {
+    /// Least squares over the points within [`CLIPPING`] robust standard deviations of the
+    /// surface, beginning with the constant that is their median: so up to half of them may belong
+    /// to a spot. At least half are kept, too many to lie on one conic: the fit is determined.
+    pub(super) fn fit(points: &[Point]) -> Self {
+        let mut values: Vec<f64> = points.iter().map(|point| point.value).collect();
+        let mut surface = Self {
+            coefficients: [median(&mut values), 0.0, 0.0, 0.0, 0.0, 0.0],
+            normal: [[0.0; 6]; 6],
+            kept: vec![true; points.len()],
+        };
+        for _ in 0..FITS {
+            surface.refine(points, &mut values);
+        }
+        surface
+    }
+
+    fn refine(&mut self, points: &[Point], scratch: &mut [f64]) {
+        let residual = |point: &Point| point.value - dot(&self.coefficients, &point.terms);
+        for (slot, point) in scratch.iter_mut().zip(points) {
+            *slot = residual(point).abs();
+        }
+        let limit = CLIPPING * NORMAL_MAD * median(scratch);
+        let mut right = [0.0; 6];
+        self.normal = [[0.0; 6]; 6];
+        for (kept, point) in self.kept.iter_mut().zip(points) {
+            let distance = residual(point);
+            *kept = distance.abs() <= limit;
+            if *kept {
+                for (i, row) in self.normal.iter_mut().enumerate() {
+                    right[i] += point.terms[i] * distance;
+                    for (entry, term) in row.iter_mut().zip(&point.terms) {
+                        *entry += point.terms[i] * term;
+                    }
+                }
+            }
+        }
+        let step = solve(&self.normal, right);
+        self.coefficients.iter_mut().zip(step).for_each(|(value, step)| *value += step);
+    }
+}
+
+/// Solves a symmetric positive definite system by Gaussian elimination.
+pub(super) fn solve(matrix: &[Terms; 6], right: Terms) -> Terms {
+    let mut rows = *matrix;
+    let mut x = right;
+    for pivot in 0..6 {
+        let (upper, lower) = rows.split_at_mut(pivot + 1);
+        for (below, row) in lower.iter_mut().enumerate() {
+            let ratio = row[pivot] / upper[pivot][pivot];
+            row.iter_mut().zip(&upper[pivot]).for_each(|(entry, above)| *entry -= ratio * above);
+            x[pivot + 1 + below] -= ratio * x[pivot];
+        }
+    }
+    for pivot in (0..6).rev() {
+        let known: f64 = (pivot + 1..6).map(|col| rows[pivot][col] * x[col]).sum();
+        x[pivot] = (x[pivot] - known) / rows[pivot][pivot];
+    }
+    x
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians() {
+        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(&mut [4.0, 1.0, 2.0, 3.0]), 2.5);
+        assert!(median(&mut []).is_nan());
+        assert_eq!(robust_deviation(&mut [-1.0, 0.0, 1.0, 1e9, 0.5]), 0.5 * NORMAL_MAD);
+    }
+
+    #[test]
+    fn a_third_of_the_points_may_be_anything() {
+        let truth = [100.0, 3.0, -2.0, -20.0, 1.0, -15.0];
+        let places = |i: usize| [(i / 16) as f64 / 8.0 - 1.0, (i % 16) as f64 / 8.0 - 1.0];
+        let points: Vec<Point> = (0..256)
+            .map(|i| {
+                let terms = terms(places(i));
+                let spoilt = if (60..145).contains(&i) { 1e4 } else { 0.0 };
+                Point { terms, value: dot(&truth, &terms) + spoilt }
+            })
+            .collect();
+        let surface = Surface::fit(&points);
+        // 5 fits; the normal matrix has a condition below 100.
+        for (got, wanted) in surface.coefficients.iter().zip(truth) {
+            assert!((got - wanted).abs() <= 5.0 * 100.0 * 100.0 * f64::EPSILON, "{got} {wanted}");
+        }
+        assert_eq!(surface.kept.iter().filter(|&&kept| kept).count(), 256 - 85);
+    }
+}
