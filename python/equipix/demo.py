@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix.calibration import Calibration
-    from equipix.simulate import Camera, VirtualExperiment
+    from equipix.simulate import Camera
 
     Progress = Callable[[int, int, str], None]
 
