@@ -28,7 +28,7 @@ _BLOCK = 16
 
 
 def dead_pixels(signals: NDArray[Any], variances: NDArray[Any] | None) -> NDArray[Any]:
-    """Pixels that answer to light with less than half of what their neighbours do.
+    """Find pixels that answer to light with less than half of what their neighbours do.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def dead_pixels(signals: NDArray[Any], variances: NDArray[Any] | None) -> NDArra
 
 
 def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
-    """Pixels whose dark level or dark noise is far above that of the others.
+    """Find pixels whose dark level or dark noise is far above that of the others.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
 
 
 def pixel_flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) -> NDArray[Any]:
-    """Bits of `Flag` for pixels of these kinds, shape (rows, cols), uint32.
+    """Set the bits of `Flag` for pixels of these kinds, shape (rows, cols), uint32.
 
     What is clipped seems not to answer, so hot and saturated pixels do not count as dead.
     """

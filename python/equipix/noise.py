@@ -79,7 +79,7 @@ class NoiseModel:
 def photon_transfer(
     signal: NDArray[Any], variance: NDArray[Any], usable: NDArray[Any], frames: int
 ) -> NDArray[Any]:
-    """Points of the photon-transfer curve that one exposure gives.
+    """Give the points of the photon-transfer curve that one exposure contributes.
 
     The usable pixels, in the order of their signal, are cut into bins of equal numbers. A pixel
     whose variance lies beyond chance (`scatter_limit`) stays out of its bin's mean.
