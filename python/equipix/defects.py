@@ -93,5 +93,5 @@ def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
     rows, cols = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
     blocks = padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK)
-    medians = np.median(blocks, axis=(1, 3))
+    medians: NDArray[Any] = np.median(blocks, axis=(1, 3))
     return medians.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:rows, :cols]

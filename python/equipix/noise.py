@@ -165,7 +165,7 @@ def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
 
 def _inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
     """Which values are at most `limit` times the mean of those that are; found in a few rounds."""
-    keep = np.isfinite(values)
+    keep: NDArray[Any] = np.isfinite(values)
     for _ in range(5):
         if keep.any():
             keep &= values <= limit * values[keep].mean()
