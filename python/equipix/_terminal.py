@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
-from equipix.errors import FileError
+from equipix.errors import FileError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -23,10 +22,13 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def progress_bars() -> Iterator[Report | None]:
-    """Bars on a terminal's stderr, one for each stage of the work; nothing in a pipe."""
+def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
+    """Show bars on a terminal's stderr, one for each stage of the work, and none in a pipe.
+
+    With `announce`, a pipe gets the name of each stage instead, on a line of its own.
+    """
     if not sys.stderr.isatty():
-        yield None
+        yield _Announcer() if announce else None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     console = Console(stderr=True)
@@ -39,6 +41,18 @@ def progress_bars() -> Iterator[Report | None]:
             bars.update(stages[stage], completed=done, total=total)
 
         yield report
+
+
+class _Announcer:
+    """Writes the name of each stage once."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+
+    def __call__(self, done: int, total: int, stage: str) -> None:  # noqa: ARG002
+        if stage != self._stage:
+            print(f"equipix: {stage}", file=sys.stderr, flush=True)  # noqa: T201
+            self._stage = stage
 
 
 def say(kind: str, message: object) -> None:
@@ -57,20 +71,23 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print(json.dumps(_json_value(result), allow_nan=False))  # noqa: T201
         return
-    table = Table(box=None, show_header=False, pad_edge=False)
+    width = max(map(len, result))
     for name, value in result.items():
-        table.add_row(name.replace("_", " "), _words(value))
-    Console(soft_wrap=True).print(table)
+        print(f"{name.replace('_', ' '):<{width}}  {_words(value)}")  # noqa: T201
 
 
-def check_output(path: Path, *, force: bool) -> None:
+def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = ()) -> None:
     """Refuse an output that cannot be written, before the work starts.
 
     Raises
     ------
     FileError
         If `path` exists and `force` is not given, or its folder does not exist or is closed.
+    InputError
+        If `path` ends in none of `suffixes`.
     """
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(f"'{path}' ends in none of {', '.join(suffixes)}, which name the format")
     if path.exists() and not force:
         raise FileError(f"'{path}' exists: name another output, or replace it with --force")
     if not path.parent.is_dir():

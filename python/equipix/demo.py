@@ -1,4 +1,4 @@
-"""The main job on a virtual camera whose truth is known: how good is the result, and against what?"""
+"""The main job on a virtual camera, its result beside the truth and beside a flat field."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix.calibration import Calibration
-    from equipix.simulate import Camera
+    from equipix.simulate import Camera, VirtualExperiment
 
     Progress = Callable[[int, int, str], None]
 
@@ -73,7 +73,7 @@ class Demo:
         )
 
     def figures(self) -> dict[str, Any]:
-        """The figures of merit, as JSON values."""
+        """Give the figures of merit as JSON values."""
         rms, block_rms = rms_at_both_scales(self.error)
         flat_rms, flat_block_rms = rms_at_both_scales(self.flat_field_error)
         return {
@@ -90,6 +90,42 @@ class Demo:
         }
 
 
+def virtual_experiment(
+    shape: tuple[int, int], *, frames: int, bit_depth: int = 12, rng: int
+) -> VirtualExperiment:
+    """Prepare the demo's experiment: the hard case of plain coordinate descent.
+
+    The sensor carries white spread of 5 % and a cosine of 5 % over its whole size; the beam is
+    Gaussian, the positions make the cross (11, 19).
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Sizes of the sensor (rows, cols).
+    frames : int
+        Frames of each exposure and of the dark.
+    bit_depth : int
+        Bits of the ADC.
+    rng : int
+        Seed of the simulation.
+
+    Returns
+    -------
+    VirtualExperiment
+        The experiment, in memory.
+    """
+    generator = np.random.default_rng(rng)
+    return simulate.experiment(
+        simulate.cosine_sensitivity(shape, rng=generator),
+        simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782)),
+        cross_pattern(11, 19),
+        frames=frames,
+        exposure_e=EXPOSURE_E,
+        bit_depth=bit_depth,
+        rng=generator,
+    )
+
+
 def run_demo(
     folder: Path,
     *,
@@ -98,7 +134,8 @@ def run_demo(
     tolerance: float = 3e-5,
     workers: int | None = None,
     progress: Progress | None = None,
-    rng: int = 8,
+    rng: int = 0,
+    force: bool = False,
 ) -> Demo:
     """Write an experiment into `folder`, calibrate from its files, and compare with the truth.
 
@@ -110,42 +147,35 @@ def run_demo(
         Sizes of the sensor (rows, cols).
     frames : int
         Frames of each exposure, of the dark and of the flat field.
-    tolerance, workers, progress
-        As in `equipix.calibrate`.
+    tolerance : float
+        Largest relative error of the sensitivity, noise apart, at which the solver stops.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then.
     rng : int
         Seed of the simulation.
+    force : bool
+        Whether an experiment in `folder` may be replaced.
 
     Returns
     -------
     Demo
         The calibration, the truth and the flat field.
-
-    Notes
-    -----
-    The sensor carries white spread and the 5 % cosine, which plain coordinate descent finds last.
     """
-    generator = np.random.default_rng(rng)
-    sensitivity = simulate.cosine_sensitivity(shape, rng=generator)
-    beam = simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782))
-    virtual = simulate.experiment(
-        sensitivity,
-        beam,
-        cross_pattern(11, 19),
-        frames=frames,
-        exposure_e=EXPOSURE_E,
-        rng=generator,
-    )
-    manifest = virtual.write(folder, progress=progress)
+    virtual = virtual_experiment(shape, frames=frames, rng=rng)
+    camera = virtual.camera
+    manifest = virtual.write(folder, force=force, progress=progress)
     experiment = Experiment.load(manifest)
     calibration = experiment.run(tolerance=tolerance, workers=workers, progress=progress)
     _tell(progress, "flat field")
-    flat_field = _flat_field(virtual.camera, calibration.dark, frames, generator)
+    flat_field = _flat_field(camera, virtual.truth.dark, frames, rng)
     _tell(progress, "prediction")
     return Demo(
         calibration=calibration,
-        truth=np.where(virtual.camera.good, sensitivity, np.nan),
+        truth=np.where(camera.good, camera.response, np.nan),
         flat_field=flat_field,
-        predicted=virtual.noise_prediction(rng=generator),
+        predicted=virtual.noise_prediction(rng=rng),
     )
 
 
@@ -155,15 +185,15 @@ def rms_at_both_scales(error: NDArray[Any]) -> tuple[float, float]:
     return float(np.sqrt(np.nanmean(error**2))), float(np.sqrt(np.nanmean(blocks**2)))
 
 
-def _flat_field(
-    camera: Camera, dark: NDArray[Any], frames: int, rng: np.random.Generator
-) -> NDArray[Any]:
+def _flat_field(camera: Camera, dark: NDArray[Any], frames: int, rng: int) -> NDArray[Any]:
     """Sensitivity as the mean of frames of a source taken for uniform, which it is not."""
     rows, cols = camera.shape
     slope = np.add.outer(np.linspace(-0.25, 0.25, rows), np.linspace(-0.25, 0.25, cols))
     light = EXPOSURE_E * (1 + SOURCE_UNEVENNESS * slope)
     signal = average(camera.frames(light, frames, rng=rng)).mean - dark
-    return np.where(camera.good, signal, np.nan) / signal[camera.good].mean()
+    signal[~camera.good] = np.nan
+    normalised: NDArray[Any] = signal / np.nanmean(signal)
+    return normalised
 
 
 def _tell(progress: Progress | None, stage: str) -> None:

@@ -16,7 +16,7 @@ from equipix.calibration import calibrate, round_shifts
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
 from equipix.errors import FileError, InputError
 from equipix.frames import average
-from equipix.io import read_frames
+from equipix.io import frame_format, read_frames
 from equipix.noise import NoiseModel, photon_transfer
 from equipix.shifts import measure_shift
 
@@ -86,11 +86,29 @@ class Experiment:
 
     def files(self) -> list[Path]:
         """All image files of the experiment, each once."""
-        entries = [self.manifest.dark.frames]
+        entries: list[str | list[str] | None] = [self.manifest.dark.frames]
         for exposure in self.manifest.exposure:
             entries += [exposure.frames, exposure.aperture_before, exposure.aperture_after]
         found = [find_files(self.path, entry) for entry in entries if entry is not None]
         return list(dict.fromkeys(file for files in found for file in files))
+
+    def check_formats(self) -> None:
+        """Read the files' headers: all images must be of one shape and depth.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read or differs from the first dark frames.
+        """
+        first, *others = self.files()
+        wanted, wanted_dtype = frame_format(first)
+        for file in others:
+            shape, dtype = frame_format(file)
+            if shape[1:] != wanted[1:] or dtype != wanted_dtype:
+                raise FileError(
+                    f"{file}: holds {dtype} frames of shape {shape[1:]}, expected {wanted_dtype} "
+                    f"of shape {wanted[1:]} as in {first}"
+                )
 
     def measure_shifts(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Shift of each exposure and its standard error.
@@ -143,8 +161,16 @@ class Experiment:
 
         Parameters
         ----------
-        method, tolerance, max_sweeps, workers, progress
-            As in `equipix.calibrate`.
+        method : {"coordinate-descent"}
+            How to minimise the objective.
+        tolerance : float
+            Largest relative error of the sensitivity at which the solver stops.
+        max_sweeps : int, optional
+            Most passes over the data.
+        workers : int, optional
+            Number of threads; by default one for each processor.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` now and then.
 
         Returns
         -------
@@ -160,6 +186,7 @@ class Experiment:
             If an option is out of range, or the exposures do not make a calibration.
         """
         started = datetime.now(UTC)
+        self.check_formats()
         shifts, std = self.measure_shifts()
         whole_shifts = round_shifts(shifts, std)
         measured = self._average(workers, progress)
@@ -191,7 +218,7 @@ class Experiment:
         )
 
     def _aperture(self, exposure: Exposure) -> tuple[ShiftMeasurement, tuple[int, int]]:
-        """Spots before and after the move to `exposure`, and the shape of the sensor."""
+        """Find the spots of the move to `exposure`, and the shape of the sensor."""
         before, after = (
             read_frames(find_files(self.path, entry))
             for entry in (exposure.aperture_before, exposure.aperture_after)
@@ -219,11 +246,6 @@ class Experiment:
         )
         for k, exposure in enumerate(exposures):
             frames = self._statistics(exposure.name, exposure.frames, workers, progress)
-            if frames.mean.shape != shape:
-                raise FileError(
-                    f"{self.path}: frames of exposure '{exposure.name}' have shape "
-                    f"{frames.mean.shape}, the dark frames {shape}"
-                )
             signal = frames.mean - dark.mean
             measured.signals[k] = signal
             measured.saturated[frames.saturated > 0] = True

@@ -143,6 +143,25 @@ def stream_frames(
             yield path, frames
 
 
+def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
+    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or holds no grey image.
+    """
+    try:
+        count, rows, cols, bits = _native.file_format(path)
+    except UnsupportedFileError:
+        with _reading(path), tifffile.TiffFile(path) as file:
+            page: Any = file.pages[0]
+            _check_page(path, page)
+            count = max(len(file.pages), file.series[0].size // page.size)
+            return (count, *page.shape), page.dtype
+    return (count, rows, cols), np.dtype(f"uint{bits}")
+
+
 def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
     try:
         yield _native.read_file(path, workers)
@@ -388,6 +407,9 @@ def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         pages = {name: file[name] for name in file.files}
     return pages, str(pages.pop("metadata"))
 
+
+SUFFIXES = (".tif", ".tiff", ".npz")
+"""Formats of `save_pages`."""
 
 _WRITERS = {".tif": _write_tiff, ".tiff": _write_tiff, ".npz": _write_npz}
 _READERS = {".tif": _read_tiff, ".tiff": _read_tiff, ".npz": _read_npz}

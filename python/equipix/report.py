@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.errors import EquipixError
-from equipix.simulate import block_means
+from equipix.errors import EquipixError, InputError
+from equipix.io import write_whole
+from equipix.simulate.accuracy import BLOCK, block_means
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
@@ -37,6 +40,33 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def check_picture(path: Path) -> None:
+    """Refuse a picture that cannot be drawn, before the work starts.
+
+    Raises
+    ------
+    EquipixError
+        If matplotlib is not installed.
+    InputError
+        If it does not know the suffix.
+    """
+    formats = new_figure(1, 1).canvas.get_supported_filetypes()
+    if path.suffix.lower().removeprefix(".") not in formats:
+        raise InputError(f"'{path}' is no name of a picture: end it in {', '.join(formats)}")
+
+
+def save_figure(figure: Figure, path: Path, *, force: bool = False) -> None:
+    """Write a figure to a file whose suffix names the format; it appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    """
+    with write_whole(path, force=force) as temporary:
+        figure.savefig(temporary)
+
+
 def draw_demo(demo: Demo) -> Figure:
     """Show what a calibration and a flat field found, and how far each is from the truth.
 
@@ -62,24 +92,45 @@ def draw_demo(demo: Demo) -> Figure:
         "Flat field, source uneven by 1 %": demo.flat_field,
     }
     for axes, (title, image) in zip(rows[0], sensitivities.items(), strict=True):
-        _map(axes, title, image, (low, high), cmap="gray")
+        _map(axes, title, image, (low, high), "gray")
     errors = [100 * block_means(error) for error in (demo.error, demo.flat_field_error)]
     limit = float(np.nanmax(np.abs(errors[1])))
-    _map(rows[1, 0], "Error of shift calibration, 16×16 means, %", errors[0], (-limit, limit))
-    _map(rows[1, 1], "Error of flat field, 16×16 means, %", errors[1], (-limit, limit))
+    _map(
+        rows[1, 0],
+        "Error of shift calibration, %\n(16×16 means)",
+        errors[0],
+        (-limit, limit),
+        "RdBu_r",
+        BLOCK,
+    )
+    _map(
+        rows[1, 1],
+        "Error of flat field, %\n(16×16 means)",
+        errors[1],
+        (-limit, limit),
+        "RdBu_r",
+        BLOCK,
+    )
     _profiles(rows[1, 2], *errors)
     predicted, predicted_blocks = (100 * value for value in demo.predicted)
     pixels = [100 * error for error in (demo.error, demo.flat_field_error)]
-    _distributions(rows[2, 0], "Error of pixels, %", pixels, predicted)
-    _distributions(rows[2, 1], "Error of 16×16 means, %", errors, predicted_blocks)
+    _distributions(rows[2, 0], "Errors of pixels, %", pixels, predicted)
+    _distributions(rows[2, 1], "Errors of 16×16 means, %", errors, predicted_blocks)
     _history(rows[2, 2], demo.calibration)
     return figure
 
 
 def _map(
-    axes: Axes, title: str, image: NDArray[Any], limits: tuple[float, float], cmap: str = "RdBu_r"
+    axes: Axes,
+    title: str,
+    image: NDArray[Any],
+    limits: tuple[float, float],
+    cmap: str,
+    step: int = 1,
 ) -> None:
-    shown = axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=cmap, interpolation="nearest")
+    rows, cols = (step * size for size in image.shape)
+    extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
+    shown = axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=cmap, extent=extent)
     axes.set(title=title, xlabel="column", ylabel="row")
     axes.figure.colorbar(shown, ax=axes, shrink=0.8)
 
@@ -87,32 +138,33 @@ def _map(
 def _profiles(axes: Axes, calibration: NDArray[Any], flat_field: NDArray[Any]) -> None:
     """Draw the errors of block means along the middle row of blocks."""
     middle = len(calibration) // 2
-    axes.plot(flat_field[middle], color=_FLAT_FIELD, label="flat field")
-    axes.plot(calibration[middle], color=_CALIBRATION, label="shift calibration")
+    cols = BLOCK * (np.arange(calibration.shape[1]) + 0.5)
+    axes.plot(cols, flat_field[middle], color=_FLAT_FIELD, label="flat field")
+    axes.plot(cols, calibration[middle], color=_CALIBRATION, label="shift calibration")
     axes.axhline(0, color="gray", linewidth=0.5)
-    axes.set(title="Profile of both along the middle", xlabel="block of 16 columns", ylabel="%")
+    axes.set(title="Both along the middle row, %", xlabel="column")
     axes.legend()
 
 
 def _distributions(axes: Axes, title: str, errors: list[NDArray[Any]], predicted: float) -> None:
     """Draw histograms of errors of calibration and flat field, and what the noise predicts."""
-    both = np.concatenate([error[np.isfinite(error)] for error in errors])
-    limit = float(np.percentile(np.abs(both), 99.8))
-    edges = np.linspace(-limit, limit, 121)
+    edges = predicted * np.linspace(-6, 6, 61)
     for values, color, label in zip(
         errors, (_CALIBRATION, _FLAT_FIELD), ("shift calibration", "flat field"), strict=True
     ):
-        shown = values[np.isfinite(values)]
-        axes.hist(shown, edges, density=True, histtype="step", color=color, label=label)
+        density = np.histogram(values, edges)[0] / np.isfinite(values).sum() / np.diff(edges)
+        axes.stairs(density, edges, color=color, label=label)
     normal = np.exp(-0.5 * (edges / predicted) ** 2) / (predicted * np.sqrt(2 * np.pi))
     axes.plot(edges, normal, color=_PREDICTION, linestyle=":", label="noise predicts")
-    axes.set(title=title, yscale="log", ylabel="density", ylim=(normal.max() / 3e3, None))
-    axes.legend()
+    axes.set(
+        title=title, ylabel="density", yscale="log", ylim=(normal.max() / 1e4, 30 * normal.max())
+    )
+    axes.legend(loc="upper right", fontsize="small")
 
 
 def _history(axes: Axes, calibration: Calibration) -> None:
     """Draw the estimated largest error of the sensitivity by sweep."""
     history = calibration.history
     axes.semilogy(history.sweep, 100 * history.error_estimate, color=_CALIBRATION)
-    axes.set(title="Estimated largest error by sweep, %", xlabel="sweep", ylabel="%")
+    axes.set(title="Estimated distance from the optimum, %", xlabel="sweep", ylabel="%")
     axes.grid(alpha=0.3)

@@ -83,6 +83,16 @@ pub fn read(path: &Path, workers: &Workers, control: &Control) -> Result<AnyFram
     })
 }
 
+/// Number of pages of a file, and sizes and bits per sample of the first; none is decoded.
+///
+/// # Errors
+/// [`Error::File`] or [`Error::Unsupported`], as in [`average`].
+pub fn describe(path: &Path, control: &Control) -> Result<(usize, Shape, u32)> {
+    let Format { shape, depth } = format(path, control)?;
+    let bits = if depth == Depth::Eight { 8 } else { 16 };
+    Ok((pages(path, control)?.len(), shape, bits))
+}
+
 /// What all frames of a job have in common.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Format {

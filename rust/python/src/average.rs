@@ -124,6 +124,14 @@ pub(crate) fn read_file(
     }
 }
 
+/// Number of pages of a file, and rows, columns and bits per sample of the first.
+#[pyfunction]
+pub(crate) fn file_format(py: Python<'_>, path: PathBuf) -> PyResult<(usize, usize, usize, u32)> {
+    let described = run::interruptible(py, None, |control| io::describe(&path, control))?;
+    let (count, shape, bits) = described;
+    Ok((count, shape.rows, shape.cols, bits))
+}
+
 fn stack<T: Element>(py: Python<'_>, frames: Frames<T>) -> PyResult<Bound<'_, PyAny>> {
     let Frames { count, shape, data } = frames;
     Ok(data.into_pyarray(py).reshape([count, shape.rows, shape.cols])?.into_any())

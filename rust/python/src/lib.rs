@@ -21,7 +21,7 @@ mod _native {
     use pyo3::prelude::*;
 
     #[pymodule_export]
-    use crate::average::{Accumulator, average_files, read_file};
+    use crate::average::{Accumulator, average_files, file_format, read_file};
     #[pymodule_export]
     use crate::calibrate::{PySolution, calibrate_frames};
     #[pymodule_export]

@@ -1,0 +1,128 @@
+"""Corrections applied to frames in files, however many."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from equipix.errors import EquipixError, FileError, InputError
+from equipix.frames import average
+from equipix.io import find_files, frame_format, stream_frames, write_frames, write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from equipix.results import Correction
+
+    Progress = Callable[[int, int, str], object]
+    Flagged = Literal["nan", "keep", "replace"]
+
+
+def correct_files(
+    correction: Correction,
+    source: list[str],
+    output: Path,
+    *,
+    dark: str = "stored",
+    flagged: Flagged = "nan",
+    force: bool = False,
+    progress: Progress | None = None,
+) -> int:
+    """Correct the frames of files, a few at a time.
+
+    Parameters
+    ----------
+    correction : Correction
+        What to apply.
+    source : list of str
+        Image files or globs.
+    output : Path
+        A name that ends in .tif: one file of all frames. Another: a folder to make, with a TIFF
+        for each input file.
+    dark : str
+        "stored", "none", or a file or glob of dark frames.
+    flagged : {"nan", "keep", "replace"}
+        What becomes of flagged pixels.
+    force : bool
+        Whether an existing file may be replaced; of a folder, the files of the same names.
+    progress : callable, optional
+        Called as ``progress(frames done, frames in all, "correcting")``.
+
+    Returns
+    -------
+    int
+        Number of frames.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written, or two outputs would have the same name.
+    InputError
+        If the frames have another shape than the correction.
+    """
+    files = find_files(source)
+    counts = {file: _count(file, correction) for file in files}
+    level = _dark_frame(dark)
+    total, done = sum(counts.values()), 0
+
+    def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
+        nonlocal done
+        for _, frames in stream_frames(inputs):
+            yield from correction.correct(frames, dark=level, flagged=flagged)
+            done += len(frames)
+            if progress is not None:
+                progress(done, total, "correcting")
+
+    frame_bytes = 4 * correction.shape[0] * correction.shape[1]
+    if output.suffix.lower() in (".tif", ".tiff"):
+        with write_whole(output, force=force) as temporary:
+            write_frames(temporary, corrected(files), nbytes=total * frame_bytes)
+        return total
+    names = [f"{file.stem}.tif" for file in files]
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise FileError(f"{output}: two inputs would become '{repeated[0]}': correct them apart")
+    with _whole_folder(output) as folder:
+        for file, name in zip(files, names, strict=True):
+            write_frames(folder / name, corrected([file]), nbytes=counts[file] * frame_bytes)
+    return total
+
+
+def _count(file: Path, correction: Correction) -> int:
+    """Count the frames of a file; they must be of the sensor's shape."""
+    (count, *shape), _ = frame_format(file)
+    if tuple(shape) != correction.shape:
+        raise InputError(
+            f"{file}: frames of shape {tuple(shape)}, the calibrated sensor has {correction.shape}"
+        )
+    return count
+
+
+def _dark_frame(dark: str) -> Literal["stored"] | NDArray[Any] | None:
+    if dark == "stored":
+        return "stored"
+    return None if dark == "none" else average(dark).mean.astype(np.float32)
+
+
+@contextmanager
+def _whole_folder(target: Path) -> Iterator[Path]:
+    """Make a folder whose files move to the target when all are written."""
+    partial = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        partial.mkdir()
+        yield partial
+        target.mkdir(exist_ok=True)
+        for file in partial.iterdir():
+            file.replace(target / file.name)
+    except EquipixError:
+        raise
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
