@@ -1,5 +1,7 @@
 //! Mean and variance of a stack of 16-bit frames: a plain loop beside the core, over sensor sizes.
 
+#![expect(clippy::unwrap_used, reason = "a bench that cannot start says so by a panic")]
+
 use std::hint::black_box;
 use std::num::NonZeroUsize;
 

@@ -350,13 +350,18 @@ def test_ctrl_c_stops_within_half_a_second(tmp_path: Path, kind: str) -> None:
 
 
 def test_globs_are_in_natural_order(tmp_path: Path) -> None:
-    for name in ("f10.png", "f9.png", "f1.png", "g.txt"):
+    for name in ("f10.png", "f9.png", "f1.png", "g.txt", ".f2.png"):
         (tmp_path / name).touch()
-    found = io.find_files(tmp_path / "f*.png")
+    found = io.find_files(tmp_path / "*.png")
     assert [path.name for path in found] == ["f1.png", "f9.png", "f10.png"]
     literal = tmp_path / "a[1].png"
     literal.touch()
     assert io.find_files(str(literal)) == [literal]
+    assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
+    with pytest.raises(InputError, match="'source' holds 3, expected names"):
+        equipix.average([literal, 3])  # type: ignore[list-item]
+    with pytest.raises(InputError, match="'source' names no file"):
+        io.read_frames([])
 
 
 PAGES = {

@@ -51,21 +51,31 @@ def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> l
     ------
     FileError
         If a file does not exist or a glob matches nothing.
+    InputError
+        If there is no name, or something else than a name.
     """
-    if not isinstance(source, str | os.PathLike):
-        return [path for item in source for path in find_files(item)]
-    path = Path(source)
+    names = [source] if isinstance(source, str | os.PathLike) else source
+    found = [path for name in names for path in _matches(name)]
+    if not found:
+        raise InputError("'source' names no file")
+    return found
+
+
+def _matches(name: str | PathLike[str]) -> list[Path]:
+    if not isinstance(name, str | os.PathLike):
+        raise InputError(f"'source' holds {name!r}, expected names of files only")
+    path = Path(name)
     if path.is_dir():
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
     if path.exists():
         return [path]
     if not glob.has_magic(str(path)):
         raise FileError(f"{path}: does not exist")
-    root = Path(path.anchor)
-    found = sorted(root.glob(str(path.relative_to(root))), key=_natural)
+    # Unlike Path.glob, this leaves out hidden files, as a shell does.
+    found = glob.glob(str(path), recursive=True)  # noqa: PTH207
     if not found:
         raise FileError(f"{path}: no file matches")
-    return found
+    return sorted(map(Path, found), key=_natural)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
