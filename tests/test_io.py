@@ -20,8 +20,8 @@ import tifffile
 from PIL import Image
 
 import equipix
-from equipix import io
-from equipix.errors import EquipixError, FileError, InputError
+from equipix import FrameStatistics, io
+from equipix.errors import FileError, InputError
 
 RNG = np.random.default_rng(20)
 WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)
@@ -38,25 +38,25 @@ def assert_averages(source: object, frames: np.ndarray) -> None:
 @pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
 @pytest.mark.parametrize("byteorder", ["<", ">"])
 @pytest.mark.parametrize("layout", [{}, {"rowsperstrip": 4}, {"tile": (16, 32)}], ids=str)
-@pytest.mark.parametrize("compression", [None, "zlib", "lzw", "packbits"])
-@pytest.mark.parametrize("predictor", [False, True])
+@pytest.mark.parametrize(
+    ("compression", "predictor"),
+    [(None, 0), ("packbits", 0), ("zlib", 0), ("zlib", 1), ("lzw", 0), ("lzw", 1)],
+)
 def test_tiff(
     tmp_path: Path,
     frames: np.ndarray,
     byteorder: str,
     layout: dict[str, object],
     compression: str | None,
-    predictor: bool,
+    predictor: int,
 ) -> None:
-    if predictor and compression not in ("zlib", "lzw"):
-        pytest.skip("no such files")
     path = tmp_path / "a.tif"
     tifffile.imwrite(
         path,
         frames,
         byteorder=byteorder,
         compression=compression,
-        predictor=predictor,
+        predictor=bool(predictor),
         photometric="minisblack",
         **layout,
     )
@@ -110,14 +110,9 @@ def test_other_tiffs_are_left_to_tifffile(
     frames = (NARROW // 2).astype(dtype)
     for index in range(2):
         tifffile.imwrite(tmp_path / f"{index}.tif", frames, photometric="minisblack", **options)
-    with pytest.raises(FileError, match="is not decoded here"):
+    with pytest.raises(FileError, match="not decoded here"):
         equipix._native.read_file(tmp_path / "0.tif", None)
-    result = equipix.average(tmp_path / "*.tif")
-    wanted = equipix.average(np.concatenate([frames, frames]))
-    # The batches differ, so sums of floating-point numbers may differ by their rounding.
-    np.testing.assert_allclose(result.mean, wanted.mean, rtol=1e-14)
-    np.testing.assert_allclose(result.variance, wanted.variance, rtol=1e-12)
-    np.testing.assert_array_equal(result.count, 10)
+    assert_averages(tmp_path / "*.tif", np.concatenate([frames, frames]))
 
 
 @pytest.mark.parametrize("options", [{"imagej": True}, {"metadata": {"axes": "TYX"}}], ids=str)
@@ -264,6 +259,16 @@ HOSTILE = {
 }
 
 
+def average_or_error(path: Path) -> FrameStatistics | None:
+    """The average, or None where the file is refused by an error that names it."""
+    try:
+        return equipix.average(path)
+    except FileError as error:
+        message = str(error)
+    assert path.name in message
+    return None
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_truncated_files_never_lose_a_page(tmp_path: Path, name: str) -> None:
     whole, path = HOSTILE[name], tmp_path / name
@@ -271,12 +276,9 @@ def test_truncated_files_never_lose_a_page(tmp_path: Path, name: str) -> None:
     frames = io.read_frames(path)
     for size in sorted({*range(1, 300, 7), *range(1, len(whole), len(whole) // 60)}):
         path.write_bytes(whole[:size])
-        try:
-            result = equipix.average(path)
-        except FileError as error:
-            assert name in str(error)
-        else:
-            # What was cut off held no pixels: the trailer of a PNG or of a TIFF.
+        result = average_or_error(path)
+        if result is not None:  # what was cut off held no pixels, such as the trailer of a PNG
+            np.testing.assert_array_equal(result.count, len(frames))
             np.testing.assert_array_equal(result.mean, equipix.average(frames).mean)
 
 
@@ -292,15 +294,9 @@ def test_flipped_bytes_give_an_error_of_the_package_or_an_average(
         for position in rng.integers(0, min(reach, len(whole)), 1 + trial % 5):
             content[position] ^= 1 << rng.integers(8)
         path.write_bytes(content)
-        try:
-            result = equipix.average(path)
-        except EquipixError as error:
-            assert name in str(error)
-            assert "internal error" not in str(error)
-        else:
-            assert np.all(result.count >= 1)
-            if name.endswith("png"):  # its checksums find every change that matters
-                np.testing.assert_array_equal(result.mean, WIDE[0])
+        result = average_or_error(path)
+        if result is not None and name.endswith("png"):  # its checksums find what matters
+            np.testing.assert_array_equal(result.mean, WIDE[0])
 
 
 def endless_tiff(path: Path, count: int) -> None:
@@ -354,13 +350,18 @@ def test_ctrl_c_stops_within_half_a_second(tmp_path: Path, kind: str) -> None:
 
 
 def test_globs_are_in_natural_order(tmp_path: Path) -> None:
-    for name in ("f10.png", "f9.png", "f1.png", "g.txt"):
+    for name in ("f10.png", "f9.png", "f1.png", "g.txt", ".f2.png"):
         (tmp_path / name).touch()
-    found = io.find_files(tmp_path / "f*.png")
+    found = io.find_files(tmp_path / "*.png")
     assert [path.name for path in found] == ["f1.png", "f9.png", "f10.png"]
     literal = tmp_path / "a[1].png"
     literal.touch()
     assert io.find_files(str(literal)) == [literal]
+    assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
+    with pytest.raises(InputError, match="'source' holds 3, expected names"):
+        equipix.average([literal, 3])  # type: ignore[list-item]
+    with pytest.raises(InputError, match="'source' names no file"):
+        io.read_frames([])
 
 
 PAGES = {
@@ -396,7 +397,7 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
         io.save_pages(path, PAGES, {})
     broken = {**PAGES, "bad": np.array([object()])}
     for target in (path, tmp_path / "new.tif"):
-        with pytest.raises((ValueError, TypeError)):
+        with pytest.raises(InputError, match="page 'bad' is object"):
             io.save_pages(target, broken, {}, force=True)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -428,7 +429,7 @@ def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> No
     with pytest.raises(FileError, match="something else than averaged frames"):
         io.load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
-    with pytest.raises(FileError, match="has format 99.*install a newer one"):
+    with pytest.raises(FileError, match=r"has format 99.*install a newer one"):
         io.load_statistics(path)
     io.save_statistics(path, equipix.average(WIDE), force=True)
     whole = path.read_bytes()

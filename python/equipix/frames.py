@@ -146,7 +146,8 @@ def _average_files(
     try:
         return _native.average_files(paths, level, workers, progress)
     except UnsupportedFileError:
-        batches = (frames for _, frames in io.stream_frames(paths, workers=workers))
+        stream = io.stream_frames(paths, workers=workers)
+        batches = _batches(frame for _, frames in stream for frame in frames)
         return _average_batches(batches, level, workers, progress, len(paths))
 
 
@@ -157,11 +158,11 @@ def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
             raise InputError(
                 f"'source' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
             )
-        yield from (frames[start : start + _BATCH] for start in range(0, len(frames), _BATCH))
+        size = _batch_size(frames[0])
+        yield from (frames[start : start + size] for start in range(0, len(frames), size))
         return
     first = as_array("source[0]", next(frames), ndim=2)
-    size = max(1, min(_BATCH, _BATCH_BYTES // max(1, first.nbytes)))
-    batch = np.empty((size, *first.shape), first.dtype)
+    batch = np.empty((_batch_size(first), *first.shape), first.dtype)
     filled = 0
     for index, item in enumerate(itertools.chain([first], frames)):
         frame = as_array(f"source[{index}]", item, ndim=2)
@@ -172,11 +173,15 @@ def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
             )
         batch[filled] = frame
         filled += 1
-        if filled == size:
+        if filled == len(batch):
             yield batch
             filled = 0
     if filled:
         yield batch[:filled]
+
+
+def _batch_size(frame: NDArray[Any]) -> int:
+    return max(1, min(_BATCH, _BATCH_BYTES // max(1, frame.nbytes)))
 
 
 def _average_batches(
@@ -186,19 +191,17 @@ def _average_batches(
     progress: Callable[[int, int, str], object] | None,
     total: int,
 ) -> tuple[NDArray[Any], ...]:
-    sums: _native.Accumulator | None = None
+    first = next(batches)
+    dtype = _sum_dtype(first.dtype)
+    if level is None and first.dtype.kind in "iu":
+        level = float(np.iinfo(first.dtype).max)
+    sums = _native.Accumulator(dtype.name, first.shape[1:], level, workers)
     done = 0
-    for batch in batches:
-        dtype = _sum_dtype(batch.dtype)
-        if sums is None:
-            if level is None and batch.dtype.kind in "iu":
-                level = float(np.iinfo(batch.dtype).max)
-            sums = _native.Accumulator(dtype.name, batch.shape[1:], level, workers)
+    for batch in itertools.chain([first], batches):
         sums.add(np.ascontiguousarray(batch, dtype=dtype))
         done += len(batch)
         if progress is not None:
             progress(done, max(done, total), "average")
-    assert sums is not None
     return sums.finish()
 
 

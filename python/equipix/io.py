@@ -30,6 +30,7 @@ _KIND = "frame statistics"
 _PAGE_NAME = 285  # TIFF tag
 _SUBFILE_TYPE = 255  # TIFF tag
 _PHOTOMETRIC = 262  # TIFF tag
+_MAX_COMPRESSION = 4096  # no lossless coding packs tighter
 _TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that still leave room for the directories
 
 
@@ -50,21 +51,31 @@ def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> l
     ------
     FileError
         If a file does not exist or a glob matches nothing.
+    InputError
+        If there is no name, or something else than a name.
     """
-    if not isinstance(source, str | os.PathLike):
-        return [path for item in source for path in find_files(item)]
-    path = Path(source)
+    names = [source] if isinstance(source, str | os.PathLike) else source
+    found = [path for name in names for path in _matches(name)]
+    if not found:
+        raise InputError("'source' names no file")
+    return found
+
+
+def _matches(name: str | PathLike[str]) -> list[Path]:
+    if not isinstance(name, str | os.PathLike):
+        raise InputError(f"'source' holds {name!r}, expected names of files only")
+    path = Path(name)
     if path.is_dir():
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
     if path.exists():
         return [path]
     if not glob.has_magic(str(path)):
         raise FileError(f"{path}: does not exist")
-    root = Path(path.anchor)
-    found = sorted(root.glob(str(path.relative_to(root))), key=_natural)
+    # Unlike Path.glob, this leaves out hidden files, as a shell does.
+    found = glob.glob(str(path), recursive=True)  # noqa: PTH207
     if not found:
         raise FileError(f"{path}: no file matches")
-    return found
+    return sorted(map(Path, found), key=_natural)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -165,8 +176,10 @@ def _format(frames: NDArray[Any]) -> str:
 def _tiff_frames(path: Path) -> Iterator[NDArray[Any]]:
     with _reading(path), tifffile.TiffFile(path) as file:
         pages = len(file.pages)
+        if pages == 0:
+            raise FileError(f"{path}: is broken: it has no pages")
         for page in file.pages:
-            _check_page(path, page)
+            _check_page(path, page, file.filehandle.size)
         if pages == 1 and file.series[0].size > file.pages[0].size:
             # A stack with a directory for its first frame only: mapped, not read at once.
             yield from tifffile.memmap(path, mode="r")[..., None, :, :].reshape(
@@ -174,10 +187,13 @@ def _tiff_frames(path: Path) -> Iterator[NDArray[Any]]:
             )
             return
         for page in file.pages:
-            yield page.asarray()[None]
+            frame = page.asarray()
+            if frame.shape != page.shape:  # tifffile's way to say that the pixels are not there
+                raise FileError(f"{path}: is broken: a page has no pixels")
+            yield frame[None]
 
 
-def _check_page(path: Path, page: Any) -> None:
+def _check_page(path: Path, page: Any, length: int) -> None:
     """Refuse what the compiled reader refuses: colour, white at 0, and what is no frame."""
     old_type = page.tags.valueof(_SUBFILE_TYPE, default=1)
     if page.is_reduced or page.is_mask or page.subifds or old_type == 2:
@@ -192,6 +208,8 @@ def _check_page(path: Path, page: Any) -> None:
         raise FileError(
             f"{path}: is {page.photometric.name} of shape {page.shape}, expected one grey channel"
         )
+    if page.nbytes > _MAX_COMPRESSION * length:
+        raise FileError(f"{path}: claims {page.nbytes} bytes of pixels in a file of {length}")
 
 
 class _Complaints(logging.Handler):
@@ -290,11 +308,17 @@ def save_pages(
     FileError
         If the file exists and `force` is not set, or cannot be written.
     InputError
-        If the suffix is unknown.
+        If the suffix is unknown or a page is not an array of numbers in two dimensions.
     """
     write = _WRITERS.get(Path(path).suffix.lower())
     if write is None:
         raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
+    for name, array in pages.items():
+        if array.ndim != 2 or array.dtype.kind not in "iuf":
+            raise InputError(
+                f"page '{name}' is {array.dtype} of shape {array.shape}, expected numbers in two"
+                " dimensions"
+            )
     description = json.dumps(dict(metadata))
     with write_whole(path, force=force) as temporary:
         write(temporary, pages, description)

@@ -52,7 +52,7 @@ pub enum Error {
         source: Option<Box<dyn std::error::Error + Send + Sync>>,
     },
     /// A file is of a kind that this crate does not decode, though another reader may.
-    #[error("{}: {feature} is not decoded here", path.display())]
+    #[error("{}: not decoded here: {feature}", path.display())]
     Unsupported {
         /// The file.
         path: PathBuf,

@@ -26,9 +26,8 @@ impl From<TiffError> for Problem {
         match error {
             TiffError::IoError(error) => error.into(),
             // Limits are there against forged sizes, but a very large image may meet them too.
-            TiffError::UnsupportedError(_) | TiffError::LimitsExceeded => {
-                Self::Unsupported(error.to_string())
-            }
+            TiffError::LimitsExceeded => Self::Unsupported("a page this large".into()),
+            TiffError::UnsupportedError(error) => Self::Unsupported(error.to_string()),
             _ => Self::Bad(format!("is not a readable TIFF: {error}"), Some(error.into())),
         }
     }

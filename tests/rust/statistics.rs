@@ -1,0 +1,124 @@
+//! Laws of the partial sums, and their agreement with sums in the plainest form.
+
+#![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
+
+use std::num::NonZeroUsize;
+
+use equipix_core::control::Control;
+use equipix_core::frames::{Sample, Shape, Stack};
+use equipix_core::parallel::Workers;
+use equipix_core::statistics::{Accumulator, Statistics, Summable};
+use equipix_core::{Error, Result};
+use proptest::prelude::*;
+
+/// The sums of `frames`, added in the pieces that end at `cuts` and merged in their order.
+fn merged<T: Summable>(
+    frames: &[T],
+    shape: Shape,
+    cuts: &[usize],
+    workers: usize,
+) -> Result<Statistics> {
+    let workers = Workers::new(NonZeroUsize::new(workers))?;
+    let mut total = Accumulator::<T>::new(shape, None)?;
+    let count = frames.len() / shape.len();
+    let mut start = 0;
+    for &end in cuts.iter().chain([&count]) {
+        let end = end.clamp(start, count);
+        let mut part = Accumulator::<T>::new(shape, None)?;
+        let piece = &frames[start * shape.len()..end * shape.len()];
+        part.add(&Stack::new("frames", piece, end - start, shape)?, &workers, &Control::new())?;
+        total.merge(&part)?;
+        start = end;
+    }
+    Ok(total.finish())
+}
+
+/// Mean and unbiased variance of the finite samples of a pixel, in two passes.
+fn naive<T: Sample>(frames: &[T], shape: Shape, pixel: usize) -> (f64, f64) {
+    let all = frames.iter().skip(pixel).step_by(shape.len()).map(|sample| sample.to_f64());
+    let samples: Vec<f64> = all.filter(|value| value.is_finite()).collect();
+    let n = samples.len() as f64;
+    let mean = samples.iter().sum::<f64>() / n;
+    let scatter: f64 = samples.iter().map(|sample| (sample - mean).powi(2)).sum();
+    (mean, if n < 2.0 { f64::NAN } else { scatter / (n - 1.0) })
+}
+
+/// Equal up to the rounding of n terms of size `top`, or both NaN.
+fn close(a: f64, b: f64, n: usize, top: f64) -> bool {
+    (a.is_nan() && b.is_nan()) || (a - b).abs() <= 4.0 * (n + 8) as f64 * f64::EPSILON * top
+}
+
+/// Sizes past those of a block, frames past those of a batch, and where to cut between frames.
+fn stacks<T: std::fmt::Debug>(
+    sample: impl Strategy<Value = T> + Clone,
+) -> impl Strategy<Value = (Vec<T>, Shape, Vec<usize>)> {
+    let cuts = prop::collection::vec(0..40_usize, 0..4);
+    (0..40_usize, 1..40_usize, 1..60_usize, cuts).prop_flat_map(
+        move |(count, rows, cols, mut cuts)| {
+            cuts.sort_unstable();
+            let size = count * rows * cols;
+            let data = prop::collection::vec(sample.clone(), size);
+            (data, Just(Shape::new(rows, cols)), Just(cuts))
+        },
+    )
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn merging_integers_changes_no_bit((frames, shape, cuts) in stacks(any::<u16>())) {
+        let whole = merged(&frames, shape, &[], 1).unwrap();
+        let parts = merged(&frames, shape, &cuts, 2).unwrap();
+        prop_assert_eq!(format!("{whole:?}"), format!("{parts:?}"));
+        let count = frames.len() / shape.len();
+        for pixel in 0..shape.len() {
+            let (mean, variance) = naive(&frames, shape, pixel);
+            prop_assert!(close(whole.mean[pixel], mean, count, 65535.0));
+            prop_assert!(close(whole.variance[pixel], variance, count, 65535.0_f64.powi(2)));
+        }
+    }
+
+    #[test]
+    fn merging_floats_agrees_up_to_rounding(
+        (frames, shape, cuts) in stacks(prop_oneof![9 => -1e3..1e3, 1 => Just(f64::NAN)]),
+    ) {
+        let parts = merged(&frames, shape, &cuts, 2).unwrap();
+        let count = frames.len() / shape.len();
+        for pixel in 0..shape.len() {
+            let (mean, variance) = naive(&frames, shape, pixel);
+            prop_assert!(close(parts.mean[pixel], mean, count, 1e3));
+            prop_assert!(close(parts.variance[pixel], variance, count, 4e6));
+        }
+    }
+
+    #[test]
+    fn workers_change_no_bit((frames, shape, _) in stacks(any::<f32>())) {
+        let one = merged(&frames, shape, &[], 1).unwrap();
+        let three = merged(&frames, shape, &[], 3).unwrap();
+        prop_assert_eq!(format!("{one:?}"), format!("{three:?}"));
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let workers = Workers::new(None).unwrap();
+    let mut sums = Accumulator::<u8>::new(Shape::new(2, 3), None).unwrap();
+    let other = Stack::new("frames", &[0; 6], 1, Shape::new(3, 2)).unwrap();
+    let refused = sums.add(&other, &workers, &Control::new());
+    assert!(matches!(refused, Err(Error::Shape { .. })));
+    let low = Accumulator::<u8>::new(Shape::new(2, 3), Some(9.0)).unwrap();
+    assert!(matches!(sums.merge(&low), Err(Error::Value { .. })));
+    assert!(matches!(Accumulator::<u8>::new(Shape::new(0, 3), None), Err(Error::Shape { .. })));
+    assert!(Accumulator::<u8>::new(Shape::new(2, 3), Some(f64::NAN)).is_err());
+}
+
+#[test]
+fn cancelled_work_stops() {
+    let workers = Workers::new(None).unwrap();
+    let mut sums = Accumulator::<u8>::new(Shape::new(1, 1), None).unwrap();
+    let control = Control::new();
+    control.cancel();
+    let frame = Stack::new("frames", &[1], 1, Shape::new(1, 1)).unwrap();
+    assert!(matches!(sums.add(&frame, &workers, &control), Err(Error::Cancelled)));
+}
