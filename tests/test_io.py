@@ -22,6 +22,7 @@ from PIL import Image
 import equipix
 from equipix import FrameStatistics, io
 from equipix.errors import FileError, InputError
+from equipix.frames import load_statistics, save_statistics
 
 RNG = np.random.default_rng(20)
 WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)
@@ -414,8 +415,8 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"dark{suffix}"
     wanted = equipix.average(WIDE)
-    io.save_statistics(path, wanted)
-    for name, values in vars(io.load_statistics(path)).items():
+    save_statistics(path, wanted)
+    for name, values in vars(load_statistics(path)).items():
         np.testing.assert_array_equal(values, getattr(wanted, name))
         assert values.dtype == getattr(wanted, name).dtype
 
@@ -424,19 +425,19 @@ def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
 def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with pytest.raises(FileError, match=f"a{suffix}"):
-        io.load_statistics(path)
+        load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "something"})
     with pytest.raises(FileError, match="something else than averaged frames"):
-        io.load_statistics(path)
+        load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
     with pytest.raises(FileError, match=r"has format 99.*install a newer one"):
-        io.load_statistics(path)
-    io.save_statistics(path, equipix.average(WIDE), force=True)
+        load_statistics(path)
+    save_statistics(path, equipix.average(WIDE), force=True)
     whole = path.read_bytes()
     for size in range(0, len(whole) - 1, len(whole) // 40):
         path.write_bytes(whole[:size])
         with pytest.raises(FileError, match=f"a{suffix}"):
-            io.load_statistics(path)
+            load_statistics(path)
     tifffile.imwrite(tmp_path / "plain.tif", WIDE[0])
     with pytest.raises(FileError, match=r"plain\.tif"):
         io.load_pages(tmp_path / "plain.tif")

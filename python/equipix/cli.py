@@ -21,7 +21,8 @@ from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError, EquipixWarning
 from equipix.experiment import Experiment
 from equipix.frames import average as average_frames
-from equipix.io import SUFFIXES, save_statistics
+from equipix.frames import save_statistics
+from equipix.io import SUFFIXES
 from equipix.load import load
 from equipix.report import check_picture, draw_demo, save_figure
 from equipix.results import Flag

@@ -1,4 +1,4 @@
-"""Averaging of repeated frames."""
+"""Averaging of repeated frames, and files of the result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from equipix import _native, io
 from equipix._arrays import as_array, as_floats, positive_workers
-from equipix.errors import InputError, UnsupportedFileError
+from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _BATCH = 16  # frames handed over at once
 _BATCH_BYTES = 2**26
+_FORMAT = 1  # of saved statistics; files with a larger number are refused
+_KIND = "frame statistics"
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
@@ -100,6 +102,60 @@ def average(
         maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
     mean, variance, count, saturated = maps
     return _subtract(FrameStatistics(mean, variance, variance / count, count, saturated), offset)
+
+
+def save_statistics(
+    path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
+) -> None:
+    """Write averaged frames to a .tif or .npz file.
+
+    Parameters
+    ----------
+    path : path
+        Output; its suffix names the format.
+    statistics : FrameStatistics
+        What `equipix.average` returned.
+    force : bool, optional
+        Replace a file that is there.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    """
+    io.save_pages(path, vars(statistics), {"format": _FORMAT, "kind": _KIND}, force=force)
+
+
+def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
+    """Read what `save_statistics` wrote.
+
+    Parameters
+    ----------
+    path : path
+        A .tif or .npz file.
+
+    Returns
+    -------
+    FrameStatistics
+        The averaged frames.
+
+    Raises
+    ------
+    FileError
+        If the file is not readable or holds something else.
+    """
+    pages, metadata = io.load_pages(path)
+    if not isinstance(metadata, dict) or metadata.get("kind") != _KIND:
+        raise FileError(f"{path}: holds something else than averaged frames")
+    if metadata["format"] > _FORMAT:
+        raise FileError(
+            f"{path}: has format {metadata['format']}, this version of equipix reads up to"
+            f" {_FORMAT}: install a newer one"
+        )
+    try:
+        return FrameStatistics(**pages)
+    except TypeError as error:
+        raise FileError(f"{path}: lacks a page of averaged frames: {error}") from error
 
 
 def _level(saturation: float | None) -> float | None:

@@ -17,7 +17,6 @@ import tifffile
 
 from equipix import _native
 from equipix.errors import EquipixError, FileError, InputError, UnsupportedFileError
-from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,8 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_FORMAT = 1  # of averaged frames; files with a larger number are refused
-_KIND = "frame statistics"
 _PAGE_NAME = 285  # TIFF tag
 _SUBFILE_TYPE = 255  # TIFF tag
 _PHOTOMETRIC = 262  # TIFF tag
@@ -413,57 +410,3 @@ SUFFIXES = (".tif", ".tiff", ".npz")
 
 _WRITERS = {".tif": _write_tiff, ".tiff": _write_tiff, ".npz": _write_npz}
 _READERS = {".tif": _read_tiff, ".tiff": _read_tiff, ".npz": _read_npz}
-
-
-def save_statistics(
-    path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
-) -> None:
-    """Write averaged frames to a .tif or .npz file.
-
-    Parameters
-    ----------
-    path : path
-        Output; its suffix names the format.
-    statistics : FrameStatistics
-        What `equipix.average` returned.
-    force : bool, optional
-        Replace a file that is there.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `force` is not set, or cannot be written.
-    """
-    save_pages(path, vars(statistics), {"format": _FORMAT, "kind": _KIND}, force=force)
-
-
-def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
-    """Read what `save_statistics` wrote.
-
-    Parameters
-    ----------
-    path : path
-        A .tif or .npz file.
-
-    Returns
-    -------
-    FrameStatistics
-        The averaged frames.
-
-    Raises
-    ------
-    FileError
-        If the file is not readable or holds something else.
-    """
-    pages, metadata = load_pages(path)
-    if not isinstance(metadata, dict) or metadata.get("kind") != _KIND:
-        raise FileError(f"{path}: holds something else than averaged frames")
-    if metadata["format"] > _FORMAT:
-        raise FileError(
-            f"{path}: has format {metadata['format']}, this version of equipix reads up to"
-            f" {_FORMAT}: install a newer one"
-        )
-    try:
-        return FrameStatistics(**pages)
-    except TypeError as error:
-        raise FileError(f"{path}: lacks a page of averaged frames: {error}") from error

@@ -2,8 +2,6 @@
 
 use std::path::PathBuf;
 
-use crate::frames::Shape;
-
 /// The result of everything in this crate that can fail.
 pub type Result<T> = std::result::Result<T, Error>;
 
@@ -94,8 +92,9 @@ pub enum SpotProblem {
     /// The spot, with its blurred outline and some background, does not lie wholly on the sensor.
     #[error(
         "a spot cut by the edge: with its blur and 3 pixels of background the spot at \
-         ({:.1}, {:.1}) needs rows {} to {} and columns {} to {} of a {shape} sensor; move it \
-         inwards", centre[0], centre[1], rows[0], rows[1], cols[0], cols[1]
+         ({:.1}, {:.1}) needs rows {} to {} and columns {} to {} of a ({}, {}) sensor; \
+         move it inwards", centre[0], centre[1], rows[0], rows[1], cols[0], cols[1], shape[0],
+         shape[1]
     )]
     Cut {
         /// Centre of the part that is seen.
@@ -105,7 +104,7 @@ pub enum SpotProblem {
         /// First and last column needed.
         cols: [i64; 2],
         /// Sizes of the sensor.
-        shape: Shape,
+        shape: [usize; 2],
     },
     /// Two spots of comparable size.
     #[error(

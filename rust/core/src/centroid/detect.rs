@@ -66,7 +66,7 @@ pub(super) fn detect(image: &Image, control: &Control) -> Result<Detection> {
             centre: spot.centre(),
             rows: [needed.top, needed.bottom - 1],
             cols: [needed.left, needed.right - 1],
-            shape: image.shape,
+            shape: [image.shape.rows, image.shape.cols],
         }));
     }
     Ok(Detection { window, level, wanted })
