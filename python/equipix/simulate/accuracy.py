@@ -51,7 +51,7 @@ def relative_error(sensitivity: ArrayLike, truth: ArrayLike) -> Floats:
 
 
 def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:
-    """Means over square blocks: what is left of an error at large scales.
+    """Average over square blocks: what is left of an error at large scales.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class ReducedSystem:
     Parameters
     ----------
     weights : ndarray, shape (n, rows, cols)
-        ω of each measurement.
+        Weight ω of each measurement.
     corners : ndarray of int, shape (n, 2)
         First beam cell (row, col) that each exposure sees; the smallest is (0, 0).
     """

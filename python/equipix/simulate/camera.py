@@ -93,7 +93,7 @@ class Camera:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
+        """Shape (rows, cols) of the sensor."""
         rows, cols = self.response.shape
         return rows, cols
 
@@ -134,12 +134,12 @@ class Camera:
         Returns
         -------
         ndarray, shape (rows, cols), float64
-            gain²·(light·M + read noise²) + 1/12, in DN²; the last term is the rounding.
+            In DN²: gain²·(light·M + read noise²) + 1/12; the last term is the rounding.
         """
         return self.gain_dn_per_e**2 * (light * self.response + self.read_noise_e**2) + 1 / 12
 
     def frames(self, light: Floats, count: int, *, rng: Rng) -> Iterator[NDArray[Any]]:
-        """Frames of a steady light, made one at a time.
+        """Make frames of a steady light, one at a time.
 
         Parameters
         ----------

@@ -110,20 +110,20 @@ class VirtualExperiment:
         )
 
     def frames(self, k: int) -> Iterator[NDArray[Any]]:
-        """Frames of exposure `k`, one at a time."""
+        """Make the frames of exposure `k`, one at a time."""
         return self._stream(self.beam, k, self.count, _FRAMES, k)
 
     def dark(self) -> Iterator[NDArray[Any]]:
-        """Dark frames, one at a time."""
+        """Make the dark frames, one at a time."""
         rng = np.random.default_rng([self.entropy, _DARK])
         return self.camera.frames(np.zeros(self.camera.shape), self.dark_count, rng=rng)
 
     def aperture_before(self, k: int) -> Iterator[NDArray[Any]]:
-        """Frames of the hole before the move to exposure `k`, from 1 on."""
+        """Make the frames of the hole before the move to exposure `k`, from 1 on."""
         return self._stream(self.hole, k - 1, self.aperture_count, _BEFORE, k)
 
     def aperture_after(self, k: int) -> Iterator[NDArray[Any]]:
-        """Frames of the hole after the move to exposure `k`, from 1 on."""
+        """Make the frames of the hole after the move to exposure `k`, from 1 on."""
         return self._stream(self.hole, k, self.aperture_count, _AFTER, k)
 
     def _stream(

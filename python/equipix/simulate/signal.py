@@ -297,7 +297,7 @@ def window(beam: Beam, shape: tuple[int, ...], shift: Floats, rotation: float = 
 
 
 def checked_shifts(shifts: ArrayLike) -> Floats:
-    """Shifts (n, 2) as finite float64."""
+    """Check that shifts are finite and (n, 2); return them as float64."""
     positions = as_array("shifts", shifts, ndim=2).astype(np.float64)
     if positions.shape[1] != 2:
         raise InputError(f"'shifts' has shape {positions.shape}, expected (n, 2)")
