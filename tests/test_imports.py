@@ -11,6 +11,7 @@ import re
 import sys
 import tomllib
 from graphlib import TopologicalSorter
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -120,11 +121,11 @@ def core_allows(module: str) -> set[str]:
     """The core modules that a core module may use."""
     order = [names.split() for names in CHAIN]
     if module in BESIDE:
-        return BESIDE[module] | set(sum(order[CHAIN.index("geometry") + 1 :], []))
+        return BESIDE[module] | set(chain.from_iterable(order[CHAIN.index("geometry") + 1 :]))
     place = [index for index, names in enumerate(order) if module in names]
     assert place, f"'{module}' stands nowhere: give it a place in CHAIN or BESIDE"
     beside = {"parallel"} if module == "transform" else set()
-    return set(sum(order[place[0] + 1 :], [])) | beside
+    return set(chain.from_iterable(order[place[0] + 1 :])) | beside
 
 
 def rust_code(source: str) -> str:
