@@ -3,6 +3,7 @@
 from equipix import errors, simulate
 from equipix._native import __version__
 from equipix.calibration import Calibration, History, calibrate
+from equipix.experiment import Experiment
 from equipix.frames import average
 from equipix.load import load
 from equipix.results import Correction, Flag, FrameStatistics
@@ -11,6 +12,7 @@ from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
 __all__ = [
     "Calibration",
     "Correction",
+    "Experiment",
     "Flag",
     "FrameStatistics",
     "History",
