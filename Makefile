@@ -7,7 +7,7 @@ SOURCES := $(shell find rust python -name '*.rs' -o -name '*.py') Cargo.toml Car
 .PHONY: demo test bench figures docs lint build clean
 
 demo: build
-	$(BIN)/equipix demo
+	$(BIN)/equipix demo --force
 
 test: PROFILE = ci
 test: build

@@ -22,7 +22,6 @@ from equipix import simulate
 
 SHAPE = (240, 320)
 ARMS = (11, 19)
-SEEDS = 30
 
 
 def rms(values):
@@ -50,34 +49,24 @@ def error_of_calibration(seed, *, draw=uniform, largest=1e-3, arms=ARMS, beam=No
     return simulate.relative_error(result.sensitivity, truth)
 
 
-@pytest.fixture(scope="module")
-def errors():
-    """Absolute errors of thirty sensors, each with noise uniform in ±1e-3."""
-    return np.stack([abs(error_of_calibration(seed, tolerance=1e-6)) for seed in range(SEEDS)])
+def test_uniform_noise_on_thirty_sensors():
+    errors = np.stack([abs(error_of_calibration(seed, tolerance=1e-6)) for seed in range(30)])
+    for error in errors:
+        assert rms(error) == pytest.approx(3.21e-4, abs=0.05e-4)
+    assert ((errors < 1e-3).mean(axis=(1, 2)) > 0.997).all()
 
+    # The largest error of a frame lay between 1.3e-3 and 1.75e-3 in 30 other draws. The range of
+    # 30 draws holds a further one with probability 29/31: 28 of 30 are expected within it, less
+    # three binomial deviations of 1.4.
+    largest = errors.max(axis=(1, 2))
+    assert 1.3e-3 < np.median(largest) < 1.75e-3
+    assert ((largest > 1.3e-3) & (largest < 1.75e-3)).sum() >= 24
 
-class TestUniformNoise:
-    def test_rms_error(self, errors):
-        for error in errors:
-            assert rms(error) == pytest.approx(3.21e-4, abs=0.05e-4)
-
-    def test_nearly_all_pixels_stay_within_the_noise(self, errors):
-        assert ((errors < 1e-3).mean(axis=(1, 2)) > 0.997).all()
-
-    def test_largest_error_of_the_frame(self, errors):
-        """Between 1.3e-3 and 1.75e-3 in thirty other draws."""
-        largest = errors.max(axis=(1, 2))
-        assert 1.3e-3 < np.median(largest) < 1.75e-3
-        # The range of 30 draws holds a further draw with probability 29/31: 28 of 30 are
-        # expected within it, less three binomial deviations of 1.4.
-        assert ((largest > 1.3e-3) & (largest < 1.75e-3)).sum() >= 24
-
-    def test_most_rows_stay_within_the_noise_entirely(self, errors):
-        within = (errors < 1e-3).all(axis=2)
-        assert (within.mean(axis=1) > 0.55).all()
-        assert (within.mean(axis=1) < 0.75).all()
-        # Row 120 is one row in 30 draws: 21 of them, within three binomial deviations of 2.5.
-        assert within[:, 120].sum() == pytest.approx(21, abs=7.5)
+    rows_within = (errors < 1e-3).all(axis=2)
+    assert (rows_within.mean(axis=1) > 0.55).all()
+    assert (rows_within.mean(axis=1) < 0.75).all()
+    # Row 120 is one row in 30 draws: 21 of them, within three binomial deviations of 2.5.
+    assert rows_within[:, 120].sum() == pytest.approx(21, abs=7.5)
 
 
 def test_gaussian_noise_keeps_the_whole_frame_below_its_largest_value():
@@ -150,27 +139,17 @@ def calibrated(virtual):
     ).sensitivity
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3])
-def outcome(request):
-    """Truth, the maps of three experiments and the rms error that noise predicts for each."""
-    rng = np.random.default_rng(request.param)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_three_experiments_agree_within_their_noise(seed):
+    """One sensor of 160×120 pixels, calibrated three times with different shifts."""
+    rng = np.random.default_rng(seed)
     truth = simulate.cosine_sensitivity((120, 160), rng=rng)
     experiments = [virtual_experiment(truth, arms, rng) for arms in [(11, 19), (7, 23), (5, 13)]]
     maps = [calibrated(virtual) for virtual in experiments]
-    return truth, maps, [virtual.noise_prediction(rng=rng)[0] for virtual in experiments]
-
-
-class TestThreeExperiments:
-    """One sensor of 160×120 pixels, calibrated three times with different shifts."""
-
-    def test_each_map_is_as_near_the_truth_as_noise_lets_it(self, outcome):
-        truth, maps, predictions = outcome
-        for found, predicted in zip(maps, predictions, strict=True):
-            assert rms(simulate.relative_error(found, truth)) < 1.1 * predicted
-
-    def test_any_two_maps_differ_by_their_noise(self, outcome):
-        _, maps, predictions = outcome
-        for first, second in combinations(range(3), 2):
-            difference = simulate.relative_error(maps[first], maps[second])
-            expected = np.hypot(predictions[first], predictions[second])
-            assert rms(difference) == pytest.approx(expected, rel=0.05)
+    predicted = [virtual.noise_prediction(rng=rng)[0] for virtual in experiments]
+    for found, prediction in zip(maps, predicted, strict=True):
+        assert rms(simulate.relative_error(found, truth)) < 1.1 * prediction
+    for first, second in combinations(range(3), 2):
+        difference = simulate.relative_error(maps[first], maps[second])
+        expected = np.hypot(predicted[first], predicted[second])
+        assert rms(difference) == pytest.approx(expected, rel=0.05)

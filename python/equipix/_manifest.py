@@ -131,7 +131,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
-    """Files that an entry of `manifest` (a file, a glob or a list of them) stands for."""
+    """Find the files that an entry of `manifest` (a file, a glob or a list) stands for."""
     folder = manifest.parent
     found: list[Path] = []
     for pattern in [entry] if isinstance(entry, str) else entry:

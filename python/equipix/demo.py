@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix.calibration import Calibration
-    from equipix.simulate import Camera
+    from equipix.simulate import Camera, VirtualExperiment
 
     Progress = Callable[[int, int, str], None]
 
@@ -147,8 +147,12 @@ def run_demo(
         Sizes of the sensor (rows, cols).
     frames : int
         Frames of each exposure, of the dark and of the flat field.
-    tolerance, workers, progress
-        As in `equipix.calibrate`.
+    tolerance : float
+        Largest relative error of the sensitivity, noise apart, at which the solver stops.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then.
     rng : int
         Seed of the simulation.
     force : bool
@@ -188,7 +192,8 @@ def _flat_field(camera: Camera, dark: NDArray[Any], frames: int, rng: int) -> ND
     light = EXPOSURE_E * (1 + SOURCE_UNEVENNESS * slope)
     signal = average(camera.frames(light, frames, rng=rng)).mean - dark
     signal[~camera.good] = np.nan
-    return signal / np.nanmean(signal)
+    normalised: NDArray[Any] = signal / np.nanmean(signal)
+    return normalised
 
 
 def _tell(progress: Progress | None, stage: str) -> None:

@@ -86,7 +86,7 @@ class Experiment:
 
     def files(self) -> list[Path]:
         """All image files of the experiment, each once."""
-        entries = [self.manifest.dark.frames]
+        entries: list[str | list[str] | None] = [self.manifest.dark.frames]
         for exposure in self.manifest.exposure:
             entries += [exposure.frames, exposure.aperture_before, exposure.aperture_after]
         found = [find_files(self.path, entry) for entry in entries if entry is not None]
@@ -161,8 +161,16 @@ class Experiment:
 
         Parameters
         ----------
-        method, tolerance, max_sweeps, workers, progress
-            As in `equipix.calibrate`.
+        method : {"coordinate-descent"}
+            How to minimise the objective.
+        tolerance : float
+            Largest relative error of the sensitivity at which the solver stops.
+        max_sweeps : int, optional
+            Most passes over the data.
+        workers : int, optional
+            Number of threads; by default one for each processor.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` now and then.
 
         Returns
         -------
@@ -210,7 +218,7 @@ class Experiment:
         )
 
     def _aperture(self, exposure: Exposure) -> tuple[ShiftMeasurement, tuple[int, int]]:
-        """Spots before and after the move to `exposure`, and the shape of the sensor."""
+        """Find the spots of the move to `exposure`, and the shape of the sensor."""
         before, after = (
             read_frames(find_files(self.path, entry))
             for entry in (exposure.aperture_before, exposure.aperture_after)

@@ -79,7 +79,7 @@ class NoiseModel:
 def photon_transfer(
     signal: NDArray[Any], variance: NDArray[Any], usable: NDArray[Any], frames: int
 ) -> NDArray[Any]:
-    """Points of the photon-transfer curve that one exposure gives.
+    """Give the points of the photon-transfer curve that one exposure contributes.
 
     The usable pixels, in the order of their signal, are cut into bins of equal numbers. A pixel
     whose variance lies beyond chance (`scatter_limit`) stays out of its bin's mean.
@@ -165,7 +165,7 @@ def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
 
 def _inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
     """Which values are at most `limit` times the mean of those that are; found in a few rounds."""
-    keep = np.isfinite(values)
+    keep: NDArray[Any] = np.isfinite(values)
     for _ in range(5):
         if keep.any():
             keep &= values <= limit * values[keep].mean()

@@ -1,7 +1,5 @@
 //! Laws of the partial sums, and their agreement with sums in the plainest form.
 
-#![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
-
 use std::num::NonZeroUsize;
 
 use equipix_core::control::Control;

@@ -272,5 +272,8 @@ def cut(image: Image, box: Box) -> Image:
 def in_window(shape: tuple[int, ...], patch: Box, window: Box) -> Any:
     """Which pixels of the patch belong to the window."""
     inside = np.zeros(shape, dtype=bool)
-    cut(inside, (window[0] - patch[0], window[1] - patch[0], window[2] - patch[2], window[3] - patch[2]))[...] = True
+    cut(
+        inside,
+        (window[0] - patch[0], window[1] - patch[0], window[2] - patch[2], window[3] - patch[2]),
+    )[...] = True
     return inside

@@ -12,7 +12,7 @@
 //! twenty sweeps, an error of the sensor's own size in (size/shift)² sweeps: see
 //! [`estimate`](crate::estimate) for how to tell.
 //!
-//! M is updated in the form M += Σ w c L r / Σ w c² L² with the residuals r = y − c L M, which
+//! Both are updated in the form M += Σ w c L r / Σ w c² L² with the residuals r = y − c L M, which
 //! gives F in the same pass and keeps its accuracy when the residuals become small.
 
 use std::ops::Range;
@@ -21,7 +21,7 @@ use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::estimate::Estimator;
 use crate::frames::{Real, Shape};
-use crate::geometry::View;
+use crate::geometry::{Placement, View};
 use crate::model::{Model, Stretch};
 use crate::parallel::Workers;
 
@@ -29,8 +29,10 @@ use crate::parallel::Workers;
 const CHECK_EVERY: u64 = 16;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
-/// Columns that a kernel works on at a time: its sums stay in the first-level cache.
-const BLOCK: usize = 400;
+/// Most columns that a kernel takes at once: their weights stay in the first-level cache.
+const STRETCH: usize = 512;
+/// Neighbouring values that are solved side by side in vector registers.
+const LANES: usize = 8;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug)]
@@ -126,7 +128,6 @@ pub fn solve<'m, 'a, T: Real>(
 pub struct Descent<'m, 'a, T> {
     model: &'m Model<'a, T>,
     workers: &'m Workers,
-    arch: pulp::Arch,
     /// M, row by row; 1 where no measurement tells.
     pub sensitivity: Vec<f64>,
     /// L in each of the geometry's views; 0 where no measurement tells.
@@ -141,7 +142,6 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         Self {
             model,
             workers,
-            arch: pulp::Arch::new(),
             sensitivity: vec![1.0; model.sensor().len()],
             beams: vec![vec![0.0; cells]; model.geometry.views.len()],
         }
@@ -150,19 +150,30 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     /// One sweep: all L, then all M. Returns F after it.
     ///
     /// # Errors
-    /// [`Error::Cancelled`](crate::Error::Cancelled); the state is then no whole sweep's.
+    /// [`Error::Cancelled`]; the state is then no whole sweep's.
     pub fn sweep(&mut self, control: &Control) -> Result<f64> {
-        self.update_beam(control)?;
-        self.update_sensitivity(control)
+        if self.beams.len() == 1 {
+            self.update_beam(control);
+        } else {
+            self.update_turned_beams(control);
+        }
+        control.check()?;
+        let objective = self.update_sensitivity(control);
+        control.check()?;
+        Ok(objective)
     }
 
     /// L on the beam grid, row by row; 0 where no measurement tells.
     #[must_use]
     pub fn beam(&self) -> Vec<f64> {
-        let view = &self.model.geometry.views[0];
-        let places = (0..self.model.geometry.beam.rows)
-            .flat_map(|row| (0..self.model.geometry.beam.cols).map(move |col| (row, col)));
-        places.map(|(row, col)| self.beams[0][view.places.at(row, col)]).collect()
+        let geometry = &self.model.geometry;
+        let mut beam = vec![0.0; geometry.beam.len()];
+        self.workers.map_blocks(&mut beam, geometry.beam.cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell = self.beams[0][geometry.views[0].places.at(row, col)];
+            }
+        });
+        beam
     }
 
     /// The change of M since it was `before`, in units of the mean of M.
@@ -175,109 +186,92 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         step
     }
 
-    fn update_beam(&mut self, control: &Control) -> Result<()> {
-        if let [beam] = &mut self.beams[..] {
-            let cols = self.model.geometry.views[0].shape.cols;
-            let (model, arch, sensitivity) = (self.model, self.arch, &self.sensitivity[..]);
-            self.workers.map_blocks(beam, BAND * cols, |band, rows| {
-                let mut sums = BeamSums::default();
-                for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
-                    if control.is_cancelled() {
-                        return;
-                    }
-                    for (block, cells) in row.chunks_mut(BLOCK).enumerate() {
-                        let first = block * BLOCK;
-                        let stretch = first..first + cells.len();
-                        let row = band * BAND + index;
-                        arch.dispatch(
-                            #[inline(always)]
-                            || {
-                                sums.fill(model, 0, row, stretch, sensitivity);
-                                sums.divide(cells);
-                            },
-                        );
-                    }
+    fn update_beam(&mut self, control: &Control) {
+        let cols = self.model.geometry.views[0].shape.cols;
+        let (model, sensitivity) = (self.model, &self.sensitivity[..]);
+        self.workers.map_blocks(&mut self.beams[0], BAND * cols, |band, rows| {
+            let mut scratch = Scratch::new(model.count());
+            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
                 }
-            });
-        } else {
-            self.update_turned_beams(control);
-        }
-        control.check()
+                let seen = BeamRow { model, sensitivity, view: 0, row: band * BAND + index };
+                seen.for_each_stretch(&mut scratch, |lines, cells| {
+                    improve(lines, &mut row[cells]);
+                });
+            }
+        });
     }
 
     /// The update of L where exposures are turned against each other: the sums of each view are
     /// brought together on the beam grid, and the new beam is turned into each view.
     fn update_turned_beams(&mut self, control: &Control) {
-        let (model, workers) = (self.model, self.workers);
-        let views = &model.geometry.views;
+        let (views, beams) = (&self.model.geometry.views, &self.beams);
         let sums: Vec<_> = (0..views.len()).map(|view| self.view_sums(view, control)).collect();
-        let Shape { rows, cols } = model.geometry.beam;
+        let Shape { rows, cols } = self.model.geometry.beam;
         let mut beam = vec![0.0; rows * cols];
-        workers.map_blocks(&mut beam, cols, |row, cells| {
+        self.workers.map_blocks(&mut beam, cols, |row, cells| {
             for (col, cell) in cells.iter_mut().enumerate() {
-                let [mut signal, mut weight] = [0.0; 2];
+                *cell = beams[0][views[0].places.at(row, col)];
+                let [mut slope, mut weight] = [0.0; 2];
                 for (view, sums) in views.iter().zip(&sums) {
-                    let [more_signal, more_weight] = sums[view.places.at(row, col)];
-                    signal += more_signal;
-                    weight += more_weight;
+                    let more = &sums[view.places.at(row, col)];
+                    slope += more[0];
+                    weight += more[1];
                 }
-                *cell = if weight > 0.0 { signal / weight } else { 0.0 };
+                *cell += quotient(slope, weight);
             }
         });
         for (view, turned) in views.iter().zip(&mut self.beams) {
-            turn(view, &beam, turned, workers);
+            turn(view, &beam, turned, self.workers);
         }
     }
 
-    /// Σ w c M y and Σ w c² M² of one view's exposures, for each of its cells.
+    /// Slope and weight of one view's exposures, for each of its cells.
     fn view_sums(&self, view: usize, control: &Control) -> Vec<[f64; 2]> {
-        let shape = self.model.geometry.views[view].shape;
+        let (model, sensitivity, beam) = (self.model, &self.sensitivity[..], &self.beams[view]);
+        let shape = model.geometry.views[view].shape;
         let mut result = vec![[0.0; 2]; shape.len()];
-        self.workers.map_blocks(&mut result, shape.cols, |row, cells| {
-            if control.is_cancelled() {
-                return;
-            }
-            let mut sums = BeamSums::default();
-            for (block, cells) in cells.chunks_mut(BLOCK).enumerate() {
-                let stretch = block * BLOCK..block * BLOCK + cells.len();
-                self.arch.dispatch(
-                    #[inline(always)]
-                    || sums.fill(self.model, view, row, stretch, &self.sensitivity),
-                );
-                for (index, cell) in cells.iter_mut().enumerate() {
-                    *cell = [sums.signal[index], sums.weight[index]];
+        self.workers.map_blocks(&mut result, BAND * shape.cols, |band, rows| {
+            let mut scratch = Scratch::new(model.count());
+            for (index, sums) in rows.chunks_exact_mut(shape.cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
                 }
+                let row = band * BAND + index;
+                let sought = &beam[row * shape.cols..][..shape.cols];
+                let seen = BeamRow { model, sensitivity, view, row };
+                seen.for_each_stretch(&mut scratch, |lines, cells| {
+                    for (index, sum) in sums[cells.clone()].iter_mut().enumerate() {
+                        let found = Sums::<1>::over(lines, index, &[sought[cells.start + index]]);
+                        *sum = [found.slope[0], found.weight[0]];
+                    }
+                });
             }
         });
         result
     }
 
-    fn update_sensitivity(&mut self, control: &Control) -> Result<f64> {
+    fn update_sensitivity(&mut self, control: &Control) -> f64 {
         let cols = self.model.sensor().cols;
-        let (model, arch, beams) = (self.model, self.arch, &self.beams[..]);
+        let (model, beams) = (self.model, &self.beams[..]);
         let bands = self.workers.map_blocks(&mut self.sensitivity, BAND * cols, |band, rows| {
-            let mut sums = PixelSums::default();
+            let mut scratch = Scratch::new(model.count());
             let mut objective = 0.0;
-            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
+            for (index, pixels) in rows.chunks_exact_mut(cols).enumerate() {
                 if control.is_cancelled() {
                     return objective;
                 }
-                for (block, pixels) in row.chunks_mut(BLOCK).enumerate() {
-                    let stretch = block * BLOCK..block * BLOCK + pixels.len();
-                    let row = band * BAND + index;
-                    objective += arch.dispatch(
-                        #[inline(always)]
-                        || {
-                            sums.fill(model, row, stretch, beams, pixels);
-                            sums.step(pixels)
-                        },
-                    );
+                let row = band * BAND + index;
+                for start in (0..cols).step_by(STRETCH) {
+                    let stretch = start..(start + STRETCH).min(cols);
+                    let lines = pixel_lines(model, beams, row, stretch.clone(), &mut scratch);
+                    objective += improve(&lines, &mut pixels[stretch]);
                 }
             }
             objective
         });
-        control.check()?;
-        Ok(bands.into_iter().sum())
+        bands.into_iter().sum()
     }
 }
 
@@ -290,199 +284,208 @@ fn turn(view: &View, beam: &[f64], turned: &mut [f64], workers: &Workers) {
     });
 }
 
-/// The sums that give L in one block of cells, with scratch space for weights.
-struct BeamSums {
-    signal: [f64; BLOCK],
-    weight: [f64; BLOCK],
-    scratch: [f64; BLOCK],
-}
-
-impl Default for BeamSums {
-    fn default() -> Self {
-        Self { signal: [0.0; BLOCK], weight: [0.0; BLOCK], scratch: [0.0; BLOCK] }
-    }
-}
-
-impl BeamSums {
-    /// Sums over the exposures of `view` that see `cells` of its row `row`.
-    #[inline(always)]
-    fn fill<T: Real>(
-        &mut self,
-        model: &Model<'_, T>,
-        view: usize,
-        row: usize,
-        cells: Range<usize>,
-        sensitivity: &[f64],
-    ) {
-        let Shape { rows, cols } = model.sensor();
-        self.signal[..cells.len()].fill(0.0);
-        self.weight[..cells.len()].fill(0.0);
-        for (exposure, place) in model.geometry.exposures.iter().enumerate() {
-            if place.view != view || row < place.row || row >= place.row + rows {
-                continue;
-            }
-            let start = cells.start.max(place.col);
-            let end = cells.end.min(place.col + cols);
-            if start >= end {
-                continue;
-            }
-            let pixels = start - place.col..end - place.col;
-            let sums = start - cells.start..end - cells.start;
-            let signal = &mut self.signal[sums.clone()];
-            let weight = &mut self.weight[sums];
-            let flux = model.flux[exposure];
-            let row = row - place.row;
-            let pixel_row = &sensitivity[row * cols..][pixels.clone()];
-            match model.stretch(exposure, row, pixels, &mut self.scratch) {
-                Stretch::Uniform(values, w) => {
-                    add_to_cells(signal, weight, values, pixel_row, flux, |_| w);
-                }
-                Stretch::Weighted(values, w) => {
-                    add_to_cells(signal, weight, values, pixel_row, flux, |i| w[i]);
-                }
-            }
-        }
-    }
-
-    /// L = Σ w c M y / Σ w c² M²
-    #[inline(always)]
-    fn divide(&self, cells: &mut [f64]) {
-        for ((cell, &signal), &weight) in cells.iter_mut().zip(&self.signal).zip(&self.weight) {
-            *cell = if weight > 0.0 { signal / weight } else { 0.0 };
-        }
-    }
-}
-
-#[inline(always)]
-fn add_to_cells<T: Real>(
-    signal: &mut [f64],
-    weight: &mut [f64],
-    values: &[T],
-    sensitivity: &[f64],
+/// One exposure's part in a stretch of a row: its values and the factor that is held fixed.
+struct Line<'s, T> {
+    measured: Stretch<'s, T>,
+    known: &'s [f64],
     flux: f64,
-    weight_of: impl Fn(usize) -> f64,
-) {
-    let length = values.len();
-    let (signal, weight) = (&mut signal[..length], &mut weight[..length]);
-    let sensitivity = &sensitivity[..length];
-    for i in 0..length {
-        let w = weight_of(i);
-        let response = flux * sensitivity[i];
-        signal[i] += w * response * value_of(values[i], w);
-        weight[i] += w * response * response;
+}
+
+/// Room for the weights of every exposure along one stretch.
+struct Scratch {
+    weights: Vec<[f64; STRETCH]>,
+}
+
+impl Scratch {
+    fn new(exposures: usize) -> Self {
+        Self { weights: vec![[0.0; STRETCH]; exposures] }
     }
 }
 
-/// The value of a measurement, 0 where its weight is 0 (it may be NaN).
-#[inline(always)]
-fn value_of<T: Real>(value: T, weight: f64) -> f64 {
-    if weight > 0.0 { value.to_f64() } else { 0.0 }
+/// The exposures along a stretch of a row of pixels, with the beam that they see.
+fn pixel_lines<'s, T: Real>(
+    model: &Model<'s, T>,
+    beams: &'s [Vec<f64>],
+    row: usize,
+    cols: Range<usize>,
+    scratch: &'s mut Scratch,
+) -> Vec<Line<'s, T>> {
+    let exposures = model.geometry.exposures.iter().zip(&model.flux).enumerate();
+    exposures
+        .zip(&mut scratch.weights)
+        .map(|((exposure, (place, &flux)), weights)| {
+            let view_cols = model.geometry.views[place.view].shape.cols;
+            let first = (row + place.row) * view_cols + place.col + cols.start;
+            let known = &beams[place.view][first..][..cols.len()];
+            Line { measured: model.stretch(exposure, row, cols.clone(), weights), known, flux }
+        })
+        .collect()
 }
 
-/// The sums that give M in one block of pixels, with scratch space for weights.
-struct PixelSums {
-    slope: [f64; BLOCK],
-    weight: [f64; BLOCK],
-    objective: [f64; BLOCK],
-    scratch: [f64; BLOCK],
+/// One row of beam cells, in one view, and what the exposures there see of it.
+struct BeamRow<'r, 'a, T> {
+    model: &'r Model<'a, T>,
+    sensitivity: &'r [f64],
+    view: usize,
+    row: usize,
 }
 
-impl Default for PixelSums {
-    fn default() -> Self {
-        let zero = [0.0; BLOCK];
-        Self { slope: zero, weight: zero, objective: zero, scratch: zero }
-    }
-}
-
-impl PixelSums {
-    /// Sums over the exposures of the pixels in `cols` of `row`, whose sensitivity is given.
-    #[inline(always)]
-    fn fill<T: Real>(
-        &mut self,
-        model: &Model<'_, T>,
-        row: usize,
-        cols: Range<usize>,
-        beams: &[Vec<f64>],
-        sensitivity: &[f64],
+impl<T: Real> BeamRow<'_, '_, T> {
+    /// Calls `work(lines, cells)` for each stretch of cells that the same exposures see.
+    fn for_each_stretch(
+        &self,
+        scratch: &mut Scratch,
+        mut work: impl FnMut(&[Line<'_, T>], Range<usize>),
     ) {
-        let length = cols.len();
-        self.slope[..length].fill(0.0);
-        self.weight[..length].fill(0.0);
-        self.objective[..length].fill(0.0);
-        for (exposure, place) in model.geometry.exposures.iter().enumerate() {
-            let first = (row + place.row) * model.geometry.views[place.view].shape.cols + place.col;
-            let beam = &beams[place.view][first + cols.start..][..length];
-            let flux = model.flux[exposure];
-            let slope = &mut self.slope[..length];
-            let weight = &mut self.weight[..length];
-            let objective = &mut self.objective[..length];
-            match model.stretch(exposure, row, cols.clone(), &mut self.scratch) {
-                Stretch::Uniform(values, w) => {
-                    add_to_pixels(slope, weight, objective, values, beam, sensitivity, flux, |_| w);
-                }
-                Stretch::Weighted(values, w) => {
-                    add_to_pixels(slope, weight, objective, values, beam, sensitivity, flux, |i| {
-                        w[i]
-                    });
-                }
+        let edges = self.edges();
+        for pair in edges.windows(2) {
+            for start in (pair[0]..pair[1]).step_by(STRETCH) {
+                let cells = start..(start + STRETCH).min(pair[1]);
+                let lines = self.lines(cells.clone(), scratch);
+                work(&lines, cells);
             }
         }
     }
 
-    /// Takes the step to the closed form of M; returns the block's share of F after it.
-    ///
-    /// Along M, F is a parabola: a step of s = slope/weight lowers it by s·slope.
+    /// Where windows of exposures begin and end along the row, rising.
+    fn edges(&self) -> Vec<usize> {
+        let cols = self.model.sensor().cols;
+        let ends = self.exposures().flat_map(|(_, place)| [place.col, place.col + cols]);
+        let mut edges: Vec<usize> = ends.collect();
+        edges.sort_unstable();
+        edges.dedup();
+        edges
+    }
+
+    /// The exposures whose windows reach this row.
+    fn exposures(&self) -> impl Iterator<Item = (usize, &Placement)> {
+        let rows = self.model.sensor().rows;
+        let places = self.model.geometry.exposures.iter().enumerate();
+        places.filter(move |(_, place)| {
+            place.view == self.view && (place.row..place.row + rows).contains(&self.row)
+        })
+    }
+
+    /// The exposures that see `cells`, with the sensitivities of the pixels that do.
+    fn lines<'s>(&'s self, cells: Range<usize>, scratch: &'s mut Scratch) -> Vec<Line<'s, T>> {
+        let cols = self.model.sensor().cols;
+        let seeing = self
+            .exposures()
+            .filter(|(_, place)| place.col <= cells.start && cells.end <= place.col + cols);
+        seeing
+            .zip(&mut scratch.weights)
+            .map(|((exposure, place), weights)| {
+                let row = self.row - place.row;
+                let pixels = cells.start - place.col..cells.end - place.col;
+                let known = &self.sensitivity[row * cols..][pixels.clone()];
+                let measured = self.model.stretch(exposure, row, pixels, weights);
+                Line { measured, known, flux: self.model.flux[exposure] }
+            })
+            .collect()
+    }
+}
+
+/// Takes each of `sought` to the minimum of F along it; returns their share of F after that.
+///
+/// L and M enter the model alike: this is the step of both.
+fn improve<T: Real>(lines: &[Line<'_, T>], sought: &mut [f64]) -> f64 {
+    pulp::Arch::new().dispatch(Improve { lines, sought })
+}
+
+/// [`improve`] in a form that the compiler inlines into code for the CPU at hand.
+struct Improve<'l, 's, T> {
+    lines: &'l [Line<'s, T>],
+    sought: &'l mut [f64],
+}
+
+impl<T: Real> pulp::NullaryFnOnce for Improve<'_, '_, T> {
+    type Output = f64;
+
     #[inline(always)]
-    fn step(&mut self, pixels: &mut [f64]) -> f64 {
-        let length = pixels.len();
-        let (slope, weight) = (&self.slope[..length], &self.weight[..length]);
-        let objective = &mut self.objective[..length];
-        for i in 0..length {
-            let step = if weight[i] > 0.0 { slope[i] / weight[i] } else { 0.0 };
-            pixels[i] += step;
-            // Below 0 only by rounding, where a pixel is fitted exactly.
-            objective[i] = (objective[i] - step * slope[i]).max(0.0);
+    fn call(self) -> f64 {
+        let (chunks, rest) = self.sought.as_chunks_mut::<LANES>();
+        let whole = chunks.len() * LANES;
+        let mut objective = [0.0; LANES];
+        for (index, chunk) in chunks.iter_mut().enumerate() {
+            let before = *chunk;
+            let left = Sums::over(self.lines, index * LANES, &before).step(chunk);
+            for (sum, left) in objective.iter_mut().zip(left) {
+                *sum += left;
+            }
         }
-        sum(objective)
+        let mut total: f64 = objective.iter().sum();
+        for (index, one) in rest.iter_mut().enumerate() {
+            let one = std::array::from_mut(one);
+            let before = *one;
+            total += Sums::over(self.lines, whole + index, &before).step(one)[0];
+        }
+        total
     }
 }
 
-#[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "slices that the compiler knows not to overlap")]
-fn add_to_pixels<T: Real>(
-    slope: &mut [f64],
-    weight: &mut [f64],
-    objective: &mut [f64],
-    values: &[T],
-    beam: &[f64],
-    sensitivity: &[f64],
-    flux: f64,
-    weight_of: impl Fn(usize) -> f64,
-) {
-    let length = values.len();
-    let (slope, weight) = (&mut slope[..length], &mut weight[..length]);
-    let objective = &mut objective[..length];
-    let (beam, sensitivity) = (&beam[..length], &sensitivity[..length]);
-    for i in 0..length {
-        let w = weight_of(i);
-        let light = flux * beam[i];
-        let residual = value_of(values[i], w) - light * sensitivity[i];
-        slope[i] += w * light * residual;
-        weight[i] += w * light * light;
-        objective[i] += w * residual * residual;
+/// What the measurements say of `N` neighbouring values of L or M, the other one held fixed.
+struct Sums<const N: usize> {
+    /// Σ w a r: half the slope of −F, with a = c·(the factor held fixed) and the residual r.
+    slope: [f64; N],
+    /// Σ w a²: half the curvature of F.
+    weight: [f64; N],
+    /// Σ w r²: the share of F.
+    objective: [f64; N],
+}
+
+impl<const N: usize> Sums<N> {
+    #[inline(always)]
+    fn over<T: Real>(lines: &[Line<'_, T>], first: usize, sought: &[f64; N]) -> Self {
+        let mut sums = Self { slope: [0.0; N], weight: [0.0; N], objective: [0.0; N] };
+        for line in lines {
+            let known = &line.known[first..first + N];
+            match line.measured {
+                Stretch::Uniform(values, weight) => {
+                    let values = &values[first..first + N];
+                    for i in 0..N {
+                        let factor = line.flux * known[i];
+                        let residual = values[i].to_f64() - factor * sought[i];
+                        sums.add(i, weight, factor, residual);
+                    }
+                }
+                Stretch::Weighted(values, weights) => {
+                    let (values, weights) = (&values[first..first + N], &weights[first..first + N]);
+                    for i in 0..N {
+                        // A value of weight 0 may be NaN.
+                        let value = if weights[i] > 0.0 { values[i].to_f64() } else { 0.0 };
+                        let factor = line.flux * known[i];
+                        sums.add(i, weights[i], factor, value - factor * sought[i]);
+                    }
+                }
+            }
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn add(&mut self, i: usize, weight: f64, factor: f64, residual: f64) {
+        let weighted = weight * factor;
+        self.slope[i] += weighted * residual;
+        self.weight[i] += weighted * factor;
+        self.objective[i] += weight * residual * residual;
+    }
+
+    /// Steps to the minimum; returns F there. F is a parabola: a step s lowers it by s·slope.
+    #[inline(always)]
+    fn step(self, sought: &mut [f64; N]) -> [f64; N] {
+        let mut left = self.objective;
+        for i in 0..N {
+            let step = quotient(self.slope[i], self.weight[i]);
+            sought[i] += step;
+            // Below 0 only by rounding, where everything is fitted exactly.
+            left[i] = (left[i] - step * self.slope[i]).max(0.0);
+        }
+        left
     }
 }
 
-/// A sum in eight interleaved parts, which a vector unit can add.
+/// slope/weight, or 0 where no measurement tells.
 #[inline(always)]
-fn sum(values: &[f64]) -> f64 {
-    let mut parts = [0.0; 8];
-    let chunks = values.chunks_exact(8);
-    let rest: f64 = chunks.remainder().iter().sum();
-    for chunk in chunks {
-        for (part, value) in parts.iter_mut().zip(chunk) {
-            *part += value;
-        }
-    }
-    parts.iter().sum::<f64>() + rest
+fn quotient(slope: f64, weight: f64) -> f64 {
+    if weight > 0.0 { slope / weight } else { 0.0 }
 }

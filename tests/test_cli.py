@@ -1,0 +1,301 @@
+"""The command line: exit status, outputs whole or none, words for people and for machines."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from equipix import average, cli, load, simulate
+from equipix.io import load_statistics, read_frames
+
+SHAPE = (64, 80)
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    sensitivity = simulate.cosine_sensitivity(SHAPE, rng=1)
+    beam = simulate.gaussian_beam(SHAPE, width=200)
+    shifts = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
+    virtual = simulate.experiment(sensitivity, beam, shifts, frames=6, rng=5)
+    return virtual.write(tmp_path_factory.mktemp("cli") / "experiment")
+
+
+@pytest.fixture(scope="module")
+def calibration(experiment):
+    path = experiment.parent / "cal.tif"
+    with pytest.raises(SystemExit) as done:
+        cli.main(["calibrate", str(experiment), "-o", str(path), "--tolerance", "1e-4"])
+    assert done.value.code == 0
+    return path
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command; its exit status, stdout and stderr."""
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as done:
+            cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return done.value.code or 0, captured.out, captured.err
+
+    return call
+
+
+def refused(result, *words):
+    """A failed job says why in one line on stderr, and nothing on stdout."""
+    status, out, err = result
+    assert (status, out) == (1, "")
+    assert err.startswith("equipix: error: ")
+    assert err.count("\n") == 1
+    for word in words:
+        assert str(word) in err
+
+
+# Each command
+
+
+@pytest.mark.parametrize(
+    "command", ["demo", "simulate", "average", "calibrate", "correct", "inspect"]
+)
+def test_help_has_an_example(run, command):
+    status, out, _ = run(command, "--help")
+    assert status == 0
+    assert f"Example: equipix {command} " in out
+
+
+def test_calibrate_reports_what_it_saved(run, experiment, tmp_path):
+    output = tmp_path / "cal.npz"
+    status, out, err = run(
+        "calibrate", experiment, "-o", output, "--tolerance", "1e-4", "--workers", "1", "--json"
+    )
+    assert (status, err) == (0, "")
+    result = json.loads(out)
+    saved = load(output)
+    assert result["sweeps"] == saved.sweeps
+    assert result["converged"] is True
+    assert result["shape"] == list(SHAPE)
+    assert result["flagged_pixels"]["DEAD"] == 4
+    assert result["flagged_pixels"]["DO_NOT_USE"] == 8
+    assert saved.metadata["options"]["tolerance"] == 1e-4
+
+
+def test_warnings_are_one_line_each(run, experiment, tmp_path):
+    status, out, err = run(
+        "calibrate", experiment, "-o", tmp_path / "cal.tif", "--max-sweeps", "2", "--json"
+    )
+    assert status == 0
+    assert json.loads(out)["converged"] is False
+    assert re.fullmatch(r"equipix: warning: stopped after 2 sweeps[^\n]*\n", err)
+
+
+def test_inspect_shows_the_calibration(run, calibration):
+    status, out, _ = run("inspect", calibration)
+    assert status == 0
+    for line in (r"shape +64 × 80", r"converged +yes", r"flagged pixels +DO_NOT_USE 8"):
+        assert re.search(line, out)
+    _, out, _ = run("inspect", calibration, "--json")
+    assert json.loads(out)["metadata"]["sensor"]["bit_depth"] == 12
+
+
+def test_average_writes_statistics(run, experiment, tmp_path):
+    frames, dark = experiment.parent / "frames", experiment.parent / "dark/dark.tif"
+    output = tmp_path / "mean.tif"
+    status, out, _ = run(
+        "average", frames / "p0.tif", frames / "p1.tif", "--dark", dark, "-o", output,
+        "--saturation", "4095", "--json",
+    )  # fmt: skip
+    assert status == 0
+    assert json.loads(out)["frames"] == 12
+    expected = average([frames / "p0.tif", frames / "p1.tif"], dark=average(dark), saturation=4095)
+    saved = load_statistics(output)
+    for name, values in vars(expected).items():
+        np.testing.assert_array_equal(getattr(saved, name), values)
+
+
+def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_path):
+    inputs = [experiment.parent / f"frames/p{k}.tif" for k in range(2)]
+    expected = load(calibration).correct(read_frames(inputs), flagged="replace")
+    one, folder = tmp_path / "all.tif", tmp_path / "corrected"
+    for output in (one, folder):
+        status, out, _ = run(
+            "correct", calibration, *inputs, "-o", output, "--flagged", "replace", "--json"
+        )
+        assert status == 0
+        assert json.loads(out)["frames"] == 12
+    np.testing.assert_array_equal(read_frames(one), expected)
+    assert sorted(path.name for path in folder.iterdir()) == ["p0.tif", "p1.tif"]
+    np.testing.assert_array_equal(read_frames(folder / "p1.tif"), expected[6:])
+
+
+def test_correct_takes_another_dark(run, experiment, calibration, tmp_path):
+    frames, dark = experiment.parent / "frames/p0.tif", experiment.parent / "dark/dark.tif"
+    for choice in ("none", dark):
+        output = tmp_path / f"{choice is dark}.tif"
+        assert run("correct", calibration, frames, "-o", output, "--dark", choice)[0] == 0
+    plain, dark_subtracted = (read_frames(tmp_path / f"{given}.tif") for given in (False, True))
+    assert np.nanmean(plain - dark_subtracted) == pytest.approx(60, abs=10)
+
+
+def test_simulate_writes_an_experiment(run, tmp_path):
+    output = tmp_path / "experiment"
+    command = ("simulate", "-o", output, "--shape", "64", "80", "--frames", "2", "--rng", "3")
+    assert run(*command)[0] == 0
+    assert (output / "experiment.toml").is_file()
+    refused(run(*command), output, "exists")
+    assert run(*command, "--force")[0] == 0
+
+
+@pytest.mark.data
+def test_photon_transfer_gain_of_a_real_camera(run, data_dir, tmp_path):
+    """K = slope of the variance over the mean; the EMVA reference gives 0.280 DN/e-."""
+    folder = data_dir / "emva1288-set001-ccd-12bit"
+    bright, dark = (levels[:50:3] for levels in exposures_of(folder))
+    means, variances = [], []
+    for k, (frames, darks) in enumerate(zip(bright, dark, strict=True)):
+        output, offset = tmp_path / f"{k}.npz", tmp_path / f"{k}-dark.npz"
+        assert run("average", *frames, *with_dark(darks), "-o", output)[0] == 0
+        assert run("average", *darks, "-o", offset)[0] == 0
+        signal, dark_signal = load_statistics(output), load_statistics(offset)
+        means.append(signal.mean.mean())
+        variances.append(signal.variance.mean() - dark_signal.variance.mean())
+    means, variances = np.array(means), np.array(variances)
+    # As EMVA 1288 says: from 0 to 70 % of the saturation capacity, where the variance peaks.
+    linear = means <= 0.7 * means[np.argmax(variances)]
+    gain = np.sum(means[linear] * variances[linear]) / np.sum(means[linear] ** 2)
+    assert gain == pytest.approx(0.280, rel=0.02)
+
+
+def exposures_of(folder):
+    """Paths of the bright and of the dark frames of each exposure, by the descriptor."""
+    bright, dark = [], []
+    for line in (folder / "EMVA1288_Data.txt").read_text().splitlines():
+        kind, _, rest = line.strip().partition(" ")
+        if kind in ("b", "d"):
+            (bright if kind == "b" else dark).append(frames := [])
+        elif kind == "i":
+            frames.append(folder / rest.strip().replace("\\", "/"))
+    return bright, dark
+
+
+def with_dark(paths):
+    return [word for path in paths for word in ("--dark", path)]
+
+
+# Failures
+
+
+def test_usage_errors_have_status_2(run, experiment, tmp_path):
+    assert run()[0] == 2
+    assert run("calibrate")[0] == 2
+    assert run("calibrate", experiment, "-o", tmp_path / "c.tif", "--workers", "0")[0] == 2
+    assert run("calibrate", experiment, "-o", tmp_path / "c.tif", "--method", "magic")[0] == 2
+    assert run("nothing")[0] == 2
+
+
+@pytest.mark.parametrize("command", ["calibrate", "average", "correct", "demo"])
+def test_an_existing_output_is_refused_before_the_work(run, tmp_path, command):
+    suffix = ".png" if command == "demo" else ".tif"
+    output = tmp_path / f"precious{suffix}"
+    output.write_text("precious")
+    # The inputs do not exist: were the work begun, the message would name them.
+    inputs = {"calibrate": ["x.toml"], "average": ["x"], "correct": ["x", "y"], "demo": []}
+    refused(run(command, *inputs[command], "-o", output), output, "--force")
+    assert output.read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["no/folder/cal.tif", "cal.jpg", "cal"])
+def test_an_impossible_output_is_refused_before_the_work(run, tmp_path, name):
+    refused(run("calibrate", "x.toml", "-o", tmp_path / name), tmp_path / name)
+
+
+def test_force_replaces(run, experiment, tmp_path):
+    output = tmp_path / "mean.tif"
+    output.write_text("old")
+    frames = experiment.parent / "frames/p0.tif"
+    assert run("average", frames, "-o", output, "--force")[0] == 0
+    assert load_statistics(output).mean.shape == SHAPE
+
+
+def test_a_failed_job_leaves_nothing(run, experiment, calibration, tmp_path):
+    truncated = tmp_path / "truncated.tif"
+    truncated.write_bytes((experiment.parent / "frames/p0.tif").read_bytes()[:999])
+    before = sorted(tmp_path.iterdir())
+    refused(run("average", truncated, "-o", tmp_path / "mean.tif"), truncated)
+    refused(run("correct", calibration, truncated, "-o", tmp_path / "folder"), truncated)
+    refused(run("calibrate", tmp_path / "none.toml", "-o", tmp_path / "cal.tif"), "none.toml")
+    refused(run("inspect", truncated), truncated)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_frames_of_another_sensor_are_refused(run, calibration, tmp_path, data_dir):
+    frames = data_dir / "experiment-320x240/frames/p0.tif"
+    refused(run("correct", calibration, frames, "-o", tmp_path / "c.tif"), frames, "(240, 320)")
+
+
+# A process of its own
+
+
+def command_line(*arguments):
+    return [sys.executable, "-c", "from equipix.cli import main; main()", *map(str, arguments)]
+
+
+def test_a_pipe_sees_no_bars(experiment, tmp_path):
+    command = command_line("average", experiment.parent / "frames/p0.tif", "-o", tmp_path / "m.tif")
+    done = subprocess.run(command, capture_output=True, check=True)
+    assert done.stderr == b""
+    assert b"\x1b" not in done.stdout
+
+
+def test_a_terminal_sees_bars(experiment, tmp_path):
+    command = command_line(
+        "calibrate", experiment, "-o", tmp_path / "cal.tif", "--tolerance", "1e-3"
+    )
+    main, terminal = pty.openpty()
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=terminal, env=os.environ | {"TERM": "xterm"}
+    )
+    os.close(terminal)
+    seen = b""
+    while chunk := read(main):
+        seen += chunk
+    assert process.wait() == 0
+    assert b"averaging p0" in seen
+
+
+def read(descriptor):
+    try:
+        return os.read(descriptor, 4096)
+    except OSError:  # Linux says so when the other end is closed
+        return b""
+
+
+def test_ctrl_c_stops_the_solver_at_once(tmp_path, experiment):
+    output = tmp_path / "cal.tif"
+    command = command_line("calibrate", experiment, "-o", output, "--tolerance", "1e-30")
+    command += ["--max-sweeps", "1000000000"]
+    # The best of three: the machine may be busy with something else.
+    waits = [interrupted(command) for _ in range(3)]
+    assert min(waits) < 0.5
+    assert list(tmp_path.iterdir()) == []
+
+
+def interrupted(command):
+    """Seconds from Ctrl-C to the end of a process that runs at least a second without it."""
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(1.5)
+        started = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=10) == 130
+        ended = time.monotonic()
+        assert "Traceback" not in process.stderr.read()
+    return ended - started

@@ -1,0 +1,358 @@
+"""Experiments on disk: what is measured from the files, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+import numpy as np
+import pytest
+
+from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
+from equipix.defects import dead_pixels, hot_pixels
+from equipix.noise import NoiseModel, photon_transfer, scatter_limit, smoothed_variances
+
+SHAPE = (64, 80)
+SHIFTS = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
+
+
+@pytest.fixture(scope="module")
+def virtual():
+    sensitivity = simulate.cosine_sensitivity(SHAPE, rng=1)
+    beam = simulate.gaussian_beam(SHAPE, width=200)
+    return simulate.experiment(sensitivity, beam, SHIFTS, frames=12, rng=5)
+
+
+@pytest.fixture(scope="module")
+def manifest(virtual, tmp_path_factory):
+    return virtual.write(tmp_path_factory.mktemp("experiment") / "whole")
+
+
+@pytest.fixture(scope="module")
+def calibration(manifest):
+    return Experiment.load(manifest).run(tolerance=1e-5)
+
+
+@pytest.fixture
+def edited(manifest, tmp_path):
+    """The manifest with one text replaced by another, its files where they were."""
+
+    def edit(old, new):
+        text = manifest.read_text()
+        assert old in text
+        text = re.sub(r'"(\w+/[^"]*\.tif)"', rf'"{manifest.parent}/\1"', text.replace(old, new, 1))
+        path = tmp_path / "experiment.toml"
+        path.write_text(text)
+        return path
+
+    return edit
+
+
+def rms(error):
+    return np.sqrt(np.nanmean(error**2))
+
+
+# What comes out
+
+
+def test_truth_is_found_within_the_noise(calibration, virtual):
+    truth = np.where(virtual.camera.good, virtual.truth.sensitivity, np.nan)
+    error = simulate.relative_error(calibration.sensitivity, truth)
+    # 5112 pixels: the rms of the error scatters by 1/sqrt(2 * 5112) = 1 %, that of 20 blocks by
+    # 16 %, and the prediction of four draws by half of that: 5 and 4 standard deviations.
+    predicted, predicted_blocks = virtual.noise_prediction(rng=3)
+    assert rms(error) == pytest.approx(predicted, rel=0.06)
+    assert rms(simulate.block_means(error)) < 1.7 * predicted_blocks
+
+
+def test_bad_pixels_are_flagged_and_no_others(calibration, virtual):
+    flags = calibration.flags.ravel()
+    bad = np.union1d(virtual.truth.dead, virtual.truth.hot)
+    np.testing.assert_array_equal(np.flatnonzero(flags), bad)
+    assert (flags[bad] & Flag.DO_NOT_USE).all()
+    assert (flags[virtual.truth.dead] & Flag.DEAD).all()
+    assert (flags[virtual.truth.hot] & Flag.HOT).all()
+    assert np.isnan(calibration.sensitivity.ravel()[bad]).all()
+
+
+def test_noise_of_the_camera_is_recovered(calibration, virtual):
+    noise, camera = calibration.metadata["noise"], virtual.camera
+    # The variance of one pixel of 12 frames scatters by sqrt(2/11) = 0.43; over 5120 pixels that
+    # is 0.6 % of the dark variance, and over 5 exposures 0.27 % of the photon noise: 5 of these.
+    assert noise["gain"] == pytest.approx(camera.gain_dn_per_e, rel=0.014)
+    read_noise = camera.gain_dn_per_e * camera.read_noise_e
+    assert noise["read_noise"] == pytest.approx(read_noise, rel=0.015)
+    # So the model explains the residuals: 3 * 5112 - ... degrees of freedom, 5 deviations.
+    assert calibration.reduced_chi2 == pytest.approx(1, abs=0.05)
+
+
+def test_origin_is_stored(calibration, manifest):
+    metadata = calibration.metadata
+    assert metadata["exposures"] == ["p0", "p1", "p2", "p3", "p4"]
+    assert len(metadata["inputs"]) == 1 + 1 + 5 + 8
+    digest = hashlib.sha256((manifest.parent / "frames/p3.tif").read_bytes()).hexdigest()
+    assert metadata["inputs"]["frames/p3.tif"] == digest
+    assert metadata["options"]["tolerance"] == 1e-5
+    assert metadata["started"] <= metadata["finished"]
+
+
+def test_stored_dark_corrects_frames(calibration, virtual, tmp_path):
+    calibration.save(tmp_path / "cal.tif")
+    loaded = load(tmp_path / "cal.tif")
+    frame = next(virtual.frames(0))
+    np.testing.assert_array_equal(loaded.correct(frame), calibration.correct(frame))
+    good = virtual.camera.good
+    np.testing.assert_allclose(calibration.dark[good], virtual.truth.dark[good], atol=6)
+
+
+def test_measured_shifts_are_the_stage_s(manifest, virtual):
+    shifts, std = Experiment.load(manifest).measure_shifts()
+    assert (std[0] == 0).all()
+    # Errors of successive moves add in quadrature.
+    assert (np.diff(std, axis=0) > 0).all()
+    # Non-uniformity of 5 % moves a spot by hundredths of a pixel beside the random error.
+    np.testing.assert_allclose(shifts, virtual.truth.shifts, atol=0.1)
+
+
+def test_turned_exposures_are_placed_by_the_aperture():
+    """Numbers of the rotation formula: the same hole before and after a turn."""
+    from equipix.experiment import _in_beam
+    from equipix.shifts import Spot
+
+    shape, hole, shift = (30, 40), np.array([20.0, 25.0]), np.array([3.0, 5.0])
+    for turns in range(4):
+        window = (shape[1], shape[0]) if turns % 2 else shape
+        beam = np.zeros((80, 80))
+        beam[20, 25] = 1
+        seen = np.rot90(beam[3 : 3 + window[0], 5 : 5 + window[1]], turns)
+        assert seen.shape == shape
+        position = np.argwhere(seen)[0].astype(float)
+        spot = Spot(position, np.array([0.1, 0.2]))
+        u, variance = _in_beam(spot, 90 * turns, shape)
+        np.testing.assert_array_equal(u + shift, hole)
+        expected = [0.04, 0.01] if turns % 2 else [0.01, 0.04]
+        np.testing.assert_allclose(variance, expected)
+
+
+def test_given_shifts_and_fluxes_are_used(edited, manifest):
+    text = manifest.read_text()
+    for k, (row, col) in enumerate(SHIFTS):
+        text = text.replace(
+            f'frames = "frames/p{k}.tif"',
+            f'frames = ["frames/p{k}.tif"]\nflux = {1 + k / 10}\nshift = [{row}, {col}.0]',
+        )
+    text = re.sub(r"aperture_\w+ = .*\n", "", text)
+    path = edited(manifest.read_text(), text)
+    with pytest.warns(errors.ConvergenceWarning):
+        calibration = Experiment.load(path).run(max_sweeps=2)
+    np.testing.assert_array_equal(calibration.shifts, SHIFTS)
+    np.testing.assert_allclose(calibration.flux, [1, 1.1, 1.2, 1.3, 1.4])
+
+
+def test_a_fraction_of_a_pixel_is_rounded_with_a_warning(edited):
+    path = edited('aperture_before = "aperture/p1-before.tif"', "shift = [0.0, 5.3]")
+    path.write_text(re.sub(r"aperture_after = .*p1-after.*\n", "", path.read_text()))
+    with (
+        pytest.warns(errors.ShiftRoundingWarning, match=r"rounded to whole pixels"),
+        pytest.warns(errors.ConvergenceWarning),
+    ):
+        Experiment.load(path).run(max_sweeps=2)
+
+
+def test_progress_names_the_stages(manifest):
+    stages = []
+    with pytest.warns(errors.ConvergenceWarning):
+        Experiment.load(manifest).run(
+            max_sweeps=3, progress=lambda *report: stages.append(report[2])
+        )
+    assert {"averaging dark", "averaging p0", "averaging p4"} < set(stages)
+
+
+@pytest.mark.data
+def test_real_input(data_dir):
+    """The figures wanted of data/experiment-320x240, in the gauge mean 1 over good pixels."""
+    truth = np.load(data_dir / "experiment-320x240-truth.npz")
+    experiment = Experiment.load(data_dir / "experiment-320x240/experiment.toml")
+    calibration = experiment.run(tolerance=1e-5)
+    bad = np.union1d(truth["dead"], truth["hot"])
+    np.testing.assert_array_equal(np.flatnonzero(calibration.flags), bad)
+    error = simulate.relative_error(calibration.sensitivity, truth["sensitivity"])
+    assert rms(error) < 1.30e-3
+    assert rms(simulate.block_means(error)) < 1.8e-4
+    np.testing.assert_array_equal(calibration.shifts, truth["shifts"])
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[sensor]", "[sensro]", r"unknown key 'sensro'"),
+        ("bit_depth", "bits", r"unknown key 'bits' in \[sensor\]"),
+        ('name = "p1"', 'name = "p1"\nshift_std = 1', r"'shift_std' in exposure 2 \('p1'\)"),
+        ('name = "p1"', 'name = "p1"\nflux_std = 1', r"unknown key 'flux_std'"),
+        ('name = "p1"', 'name = "p1"\ntime = 1', r"unknown key 'time'"),
+        ('name = "p2"', "", r"key 'name' is missing in exposure 3"),
+        ("bit_depth = 12", "bit_depth = 17", r"holds 17, expected a whole number from 1 to 16"),
+        ("bit_depth = 12", "saturation = -1", r"'saturation' in \[sensor\] holds -1"),
+        ("bit_depth = 12", "gain_dn_per_e = 'x'", r"'gain_dn_per_e' in \[sensor\] holds 'x'"),
+        ('name = "p1"', 'name = "p1"\nrotation = 45', r"holds 45, expected 0, 90, 180 or 270"),
+        ('name = "p1"', 'name = "p1"\nflux = 0', r"'flux' in exposure 2 \('p1'\) holds 0"),
+        ('name = "p1"', 'name = "p1"\nflux = 1', r"'flux' is missing in exposure 'p0'"),
+        ('name = "p1"', 'name = "p0"', r"two exposures have the name 'p0'"),
+        ('name = "p1"', 'name = "p1"\nshift = [1, 2]', r"not both in exposure 2 \('p1'\)"),
+        ('name = "p0"', 'name = "p0"\nshift = [1]', r"\[row, col\] in pixels"),
+        ('name = "p0"', 'name = "p0"\nshift = [1, nan]', r"holds nan, expected \[row, col\]"),
+        ('aperture_after = "aperture/p1-after.tif"', "", r"both 'aperture_before' and"),
+        ("# calibration", "format = 2\n# calibration", r"'format' holds 2, expected 1"),
+        ("[dark]", "[dark", r"is not valid TOML"),
+        ('frames = "dark/dark.tif"', "", r"key 'frames' is missing in \[dark\]"),
+        ('"frames/p1.tif"', "[]", r"'frames' in exposure 2 \('p1'\) holds \[\]"),
+        ('"frames/p1.tif"', '"frames/none.tif"', r"no file '.*frames/none\.tif'"),
+        ('"frames/p1.tif"', '"frames/none*.tif"', r"no file '.*frames/none\*\.tif'"),
+    ],
+)
+def test_a_wrong_manifest_is_refused_by_name(edited, old, new, message):
+    path = edited(old, new)
+    with pytest.raises(errors.FileError, match=message) as caught:
+        Experiment.load(path)
+    assert str(path) in str(caught.value)
+    assert "pydantic" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_exposure_is_not_enough(manifest, tmp_path):
+    path = tmp_path / "experiment.toml"
+    path.write_text(f'[dark]\nframes = "{manifest.parent}/dark/dark.tif"\n[[exposure]]\nname = "a"')
+    with pytest.raises(errors.FileError, match="frames"):
+        Experiment.load(path)
+
+
+@pytest.mark.parametrize("make", ["absent", "folder", "binary"])
+def test_no_manifest_at_all(tmp_path, make):
+    path = tmp_path / "experiment.toml"
+    if make == "folder":
+        path.mkdir()
+    elif make == "binary":
+        path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
+    with pytest.raises(errors.FileError, match=re.escape(str(path))):
+        Experiment.load(path)
+
+
+def write_tiff(path, array):
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(path, array, photometric="minisblack")
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (np.zeros((2, 10, 12), np.uint16), r"\(10, 12\).*\(64, 80\)"),
+        (np.zeros((2, *SHAPE), np.uint8), r"uint8.*uint16"),
+        (np.full((2, *SHAPE), 4095, np.uint16), r"every pixel of 'p1' reaches .* 4095 DN"),
+        (b"", r"empty"),
+        (b"II*\0 nothing more", r"bad\.tif"),
+    ],
+)
+def test_bad_images_are_named(edited, tmp_path, frames, message):
+    path = edited('"frames/p1.tif"', '"bad.tif"')
+    if isinstance(frames, bytes):
+        (tmp_path / "bad.tif").write_bytes(frames)
+    else:
+        write_tiff(tmp_path / "bad.tif", frames)
+    with pytest.raises(errors.FileError, match=message):
+        Experiment.load(path).run()
+
+
+def test_a_missing_spot_names_the_move(edited):
+    path = edited('"aperture/p2-after.tif"', '"dark/dark.tif"')
+    with pytest.raises(errors.SpotError, match=r"move to exposure 'p2'.*after"):
+        Experiment.load(path).run()
+
+
+def test_an_exposure_without_light_is_refused(edited):
+    path = edited('"frames/p3.tif"', '"dark/dark.tif"')
+    with pytest.raises(errors.InputError, match="median"):
+        Experiment.load(path).run()
+
+
+# The noise model and the flags by themselves
+
+
+def statistics(rng, signal, *, gain, read_noise, frames):
+    """Mean and variance of frames drawn from the model, quantised like an ADC's."""
+    sigma = np.sqrt(gain * signal + read_noise**2)
+    drawn = np.rint(signal + sigma * rng.standard_normal((frames, *signal.shape)))
+    variance = drawn.var(axis=0, ddof=1)
+    count = np.full(signal.shape, frames, np.uint32)
+    zeros = np.zeros(signal.shape, np.uint32)
+    return FrameStatistics(drawn.mean(axis=0), variance, variance / frames, count, zeros)
+
+
+@pytest.mark.parametrize("frames", [2, 5, 50])
+def test_fit_recovers_the_model(frames):
+    rng = np.random.default_rng(frames)
+    exposures = [
+        statistics(rng, level * np.ones((200, 200)), gain=0.3, read_noise=2.0, frames=frames)
+        for level in (0.0, 300.0, 2000.0)
+    ]
+    # Random-telegraph pixels must not count.
+    exposures[1].variance[:2] *= 1000
+    points = np.concatenate(
+        [photon_transfer(e.mean, e.variance, e.saturated == 0, frames) for e in exposures]
+    )
+    model = NoiseModel.fit(points)
+    # Standard error of a mean variance over 40 000 pixels: sqrt(2/(frames - 1)/40000); the gain
+    # has that of two levels, the read noise half of that of its square. Five of each.
+    error = np.sqrt(2 / (frames - 1) / 40_000)
+    assert model.gain == pytest.approx(0.3, rel=5 * error)
+    assert model.read_noise == pytest.approx(2.0, rel=5 * error)
+    known = NoiseModel.fit(points[:1], gain=0.3)
+    assert known.gain == 0.3
+
+
+def test_variances_are_a_smooth_function_of_the_mean():
+    rng = np.random.default_rng(1)
+    levels = np.tile(np.linspace(500, 3000, 100), (100, 1))
+    exposures = [statistics(rng, levels, gain=0.3, read_noise=2.0, frames=8) for _ in range(3)]
+    variances = smoothed_variances(exposures)
+    expected = (0.3 * np.stack([e.mean for e in exposures]) + 4 + 1 / 12) / 8
+    # Standard errors as above, for 30 000 pixels and 7 degrees of freedom; twice for two
+    # parameters, five of these.
+    np.testing.assert_allclose(variances, expected, rtol=10 * np.sqrt(2 / 7 / 30_000))
+
+
+def test_single_frames_have_no_variance():
+    ones, none = np.ones((4, 4)), np.full((4, 4), np.nan)
+    single = FrameStatistics(ones, none, none, ones.astype(np.uint32), np.zeros((4, 4), np.uint32))
+    with pytest.raises(errors.InputError, match="single frames"):
+        smoothed_variances([single, single])
+
+
+@pytest.mark.parametrize("frames", [2, 3, 10, 100])
+def test_scatter_limit_is_beyond_chance(frames):
+    rng = np.random.default_rng(frames)
+    ratios = rng.chisquare(frames - 1, 1_000_000) / (frames - 1)
+    # Three standard deviations leave 0.135 %; Wilson and Hilferty are within a third of that.
+    beyond = np.mean(ratios > scatter_limit(frames, sigmas=3.0))
+    assert beyond == pytest.approx(0.00135, rel=0.35)
+
+
+def test_faint_light_makes_no_dead_pixels():
+    rng = np.random.default_rng(4)
+    signals = 3 + 1.5 * rng.standard_normal((5, 100, 100))
+    variances = np.full_like(signals, 1.5**2)
+    assert (signals < 1.5).any(axis=0).any()
+    assert not dead_pixels(signals, variances).any()
+    signals = 100 + 1.5 * rng.standard_normal((5, 100, 100))
+    signals[:, 7, 9] = 49 - 6 * 1.5 - 8
+    assert np.argwhere(dead_pixels(signals, variances)).tolist() == [[7, 9]]
+
+
+def test_noisy_pixels_are_hot():
+    dark = statistics(np.random.default_rng(5), np.zeros((90, 90)), gain=0, read_noise=2, frames=9)
+    assert not hot_pixels(dark, NoiseModel(2.0, 0.3)).any()
+    dark.variance[3, 4] *= 60
+    dark.mean[6, 7] += 30
+    assert np.argwhere(hot_pixels(dark, NoiseModel(2.0, 0.3))).tolist() == [[3, 4], [6, 7]]
