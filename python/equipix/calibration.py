@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
@@ -159,7 +159,7 @@ class Calibration:
         Returns
         -------
         ndarray, of the frames' shape
-            float64 for float64 frames, else float32; or `out`.
+            Of dtype float64 for float64 frames, else float32; or `out`.
 
         Raises
         ------
@@ -407,18 +407,13 @@ def _values_and_variances(
     frames: ArrayLike | Sequence[FrameStatistics], variance: ArrayLike | None
 ) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Frames as (n, rows, cols) and their variances in a dtype that fits."""
-    if isinstance(frames, list | tuple) and any(isinstance(f, FrameStatistics) for f in frames):
-        means = [f.mean for f in frames if isinstance(f, FrameStatistics)]
-        if len(means) != len(frames) or len({mean.shape for mean in means}) != 1:
-            shapes = [
-                getattr(frame, "shape", np.shape(getattr(frame, "mean", frame))) for frame in frames
-            ]
-            raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
-        values = as_floats("frames", np.stack(means), ndim=3)
+    statistics = _statistics(frames)
+    if statistics:
+        values = as_floats("frames", np.stack([each.mean for each in statistics]), ndim=3)
         if variance is None:
-            return values, as_floats("variance", smoothed_variances(frames), ndim=3)
+            return values, smoothed_variances(statistics).astype(values.dtype, copy=False)
     else:
-        values = as_floats("frames", frames, ndim=3)
+        values = as_floats("frames", cast("ArrayLike", frames), ndim=3)
     if 0 in values.shape[1:]:
         raise InputError(f"'frames' has shape {values.shape}, expected at least one pixel")
     if variance is None:
@@ -430,6 +425,19 @@ def _values_and_variances(
     if variances.shape != values.shape:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
     return values, variances.astype(values.dtype, copy=False)
+
+
+def _statistics(frames: object) -> list[FrameStatistics]:
+    """The frames as a list, if that is what they are; an empty one for arrays."""
+    if not isinstance(frames, list | tuple):
+        return []
+    statistics = [each for each in frames if isinstance(each, FrameStatistics)]
+    if statistics and len(statistics) != len(frames):
+        raise InputError("'frames' mixes FrameStatistics and arrays, expected either")
+    shapes = [each.mean.shape for each in statistics]
+    if len(set(shapes)) > 1:
+        raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
+    return statistics
 
 
 def _boolean_mask(mask: ArrayLike) -> NDArray[np.bool_]:

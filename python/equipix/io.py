@@ -153,7 +153,7 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     except UnsupportedFileError:
         with _reading(path), tifffile.TiffFile(path) as file:
             page: Any = file.pages[0]
-            _check_page(path, page)
+            _check_page(path, page, file.filehandle.size)
             count = max(len(file.pages), file.series[0].size // page.size)
             return (count, *page.shape), page.dtype
     return (count, rows, cols), np.dtype(f"uint{bits}")

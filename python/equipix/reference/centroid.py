@@ -6,6 +6,7 @@ same names and stand in the same order.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -176,8 +177,8 @@ def blocks(image: Image) -> list[Image]:
     col_edges = [image.shape[1] * k // BLOCKS for k in range(BLOCKS + 1)]
     return [
         image[top:bottom, left:right]
-        for top, bottom in zip(row_edges, row_edges[1:], strict=False)
-        for left, right in zip(col_edges, col_edges[1:], strict=False)
+        for top, bottom in itertools.pairwise(row_edges)
+        for left, right in itertools.pairwise(col_edges)
     ]
 
 
