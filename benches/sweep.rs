@@ -10,21 +10,11 @@ use equipix_core::model::{Mask, Model, Variance};
 use equipix_core::parallel::Workers;
 use std::hint::black_box;
 
-const SHIFTS: [[i64; 2]; 5] = [[0, 0], [0, 11], [0, 19], [11, 0], [19, 0]];
-const PAD: usize = 19;
+mod common;
+use common::{SHIFTS, frames};
 
-/// Five exposures of a Gaussian beam on a sensor with a 5 % ripple.
-fn frames(shape: Shape) -> Vec<f32> {
-    let width = 1000.0 * (shape.cols as f64 / 782.0).max(1.0);
-    let gaussian = |x: f64, size: usize| (-((x - size as f64 / 2.0) / width).powi(2)).exp();
-    let pixels = || (0..shape.rows).flat_map(|r| (0..shape.cols).map(move |c| (r, c)));
-    let signal = |[down, right]: [i64; 2], (r, c): (usize, usize)| {
-        let beam = gaussian(r as f64 + down as f64, shape.rows)
-            * gaussian(c as f64 + right as f64, shape.cols);
-        (beam * (1.0 + 0.05 * ((r * 7 + c * 13) as f64).sin())) as f32
-    };
-    SHIFTS.into_iter().flat_map(|shift| pixels().map(move |p| signal(shift, p))).collect()
-}
+/// How far the beam grid reaches beyond the sensor.
+const PAD: usize = 19;
 
 /// The same sweep as one would write it down: M and L updated in place, whole images at a time.
 fn naive_sweep(frames: &[f32], shape: Shape, sensitivity: &mut [f64], beam: &mut [f64]) {

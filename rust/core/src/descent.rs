@@ -29,10 +29,12 @@ use crate::parallel::Workers;
 const CHECK_EVERY: u64 = 16;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
+/// Bytes of data that may be expected to stay in the last-level cache.
+const IN_CACHE: usize = 1 << 24;
 /// Most columns that a kernel takes at once: their weights stay in the first-level cache.
-const STRETCH: usize = 512;
+const STRETCH: usize = 1024;
 /// Neighbouring values that are solved side by side in vector registers.
-const LANES: usize = 8;
+const LANES: usize = 16;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug)]
@@ -152,15 +154,33 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     /// # Errors
     /// [`Error::Cancelled`]; the state is then no whole sweep's.
     pub fn sweep(&mut self, control: &Control) -> Result<f64> {
+        let Shape { rows, cols } = self.model.sensor();
+        let mut bands = Vec::with_capacity(rows.div_ceil(BAND));
         if self.beams.len() == 1 {
-            self.update_beam(control);
+            let places = self.model.geometry.exposures.iter();
+            let reach = places.map(|place| place.row).max().unwrap_or(0);
+            let mut done = 0;
+            for start in (0..rows).step_by(self.rows_in_cache()) {
+                let end = (start + self.rows_in_cache()).min(rows);
+                self.update_beam(done..end + reach, control);
+                done = end + reach;
+                bands.extend(self.update_sensitivity(start * cols..end * cols, control));
+            }
         } else {
             self.update_turned_beams(control);
+            bands.extend(self.update_sensitivity(0..rows * cols, control));
         }
         control.check()?;
-        let objective = self.update_sensitivity(control);
-        control.check()?;
-        Ok(objective)
+        Ok(bands.into_iter().sum())
+    }
+
+    /// Rows whose data are still in cache when M is updated, right after the cells of L that see
+    /// them. The cells of the rows that follow still see the old M, so nothing changes but the
+    /// number of times that the data come from memory: once a sweep, not twice.
+    fn rows_in_cache(&self) -> usize {
+        let Shape { cols, .. } = self.model.sensor();
+        let row = cols * self.model.count() * size_of::<T>();
+        (IN_CACHE / row).max(4 * BAND * self.workers.count()).next_multiple_of(BAND)
     }
 
     /// L on the beam grid, row by row; 0 where no measurement tells.
@@ -186,16 +206,20 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         step
     }
 
-    fn update_beam(&mut self, control: &Control) {
+    /// Updates some rows of the beam, which has one view.
+    fn update_beam(&mut self, rows: Range<usize>, control: &Control) {
         let cols = self.model.geometry.views[0].shape.cols;
         let (model, sensitivity) = (self.model, &self.sensitivity[..]);
-        self.workers.map_blocks(&mut self.beams[0], BAND * cols, |band, rows| {
+        let first = rows.start;
+        let cells = &mut self.beams[0][rows.start * cols..rows.end * cols];
+        self.workers.map_blocks(cells, BAND * cols, |band, rows| {
             let mut scratch = Scratch::new(model.count());
             for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
                 if control.is_cancelled() {
                     return;
                 }
-                let seen = BeamRow { model, sensitivity, view: 0, row: band * BAND + index };
+                let row_of_view = first + band * BAND + index;
+                let seen = BeamRow { model, sensitivity, view: 0, row: row_of_view };
                 seen.for_each_stretch(&mut scratch, |lines, cells| {
                     improve(lines, &mut row[cells]);
                 });
@@ -252,17 +276,20 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         result
     }
 
-    fn update_sensitivity(&mut self, control: &Control) -> f64 {
+    /// Updates M in a range of pixels, whole rows; returns the share of F of each band of them.
+    fn update_sensitivity(&mut self, pixels: Range<usize>, control: &Control) -> Vec<f64> {
         let cols = self.model.sensor().cols;
         let (model, beams) = (self.model, &self.beams[..]);
-        let bands = self.workers.map_blocks(&mut self.sensitivity, BAND * cols, |band, rows| {
+        let first = pixels.start / cols;
+        let pixels = &mut self.sensitivity[pixels];
+        self.workers.map_blocks(pixels, BAND * cols, |band, rows| {
             let mut scratch = Scratch::new(model.count());
             let mut objective = 0.0;
             for (index, pixels) in rows.chunks_exact_mut(cols).enumerate() {
                 if control.is_cancelled() {
                     return objective;
                 }
-                let row = band * BAND + index;
+                let row = first + band * BAND + index;
                 for start in (0..cols).step_by(STRETCH) {
                     let stretch = start..(start + STRETCH).min(cols);
                     let lines = pixel_lines(model, beams, row, stretch.clone(), &mut scratch);
@@ -270,8 +297,7 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                 }
             }
             objective
-        });
-        bands.into_iter().sum()
+        })
     }
 }
 

@@ -1,0 +1,79 @@
+//! The rate of one sweep beside the machine's copy rate, measured in turn; prints a line of JSON
+//! for each size. A sweep reads its data twice, so it is held against a copy of the data: as many
+//! bytes, half of them read and half written, by as many threads.
+
+#![allow(clippy::unwrap_used, reason = "a bench has nobody to report to")]
+
+mod common;
+
+use std::time::Instant;
+
+use common::{SHIFTS, frames};
+use equipix_core::control::Control;
+use equipix_core::descent::Descent;
+use equipix_core::frames::{Shape, Stack};
+use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::model::{Mask, Model, Variance};
+use equipix_core::parallel::Workers;
+
+/// Values that one thread copies at a time.
+const BLOCK: usize = 1 << 16;
+
+fn main() {
+    let smoke = std::env::args().any(|argument| argument == "--test");
+    let shapes = [Shape::new(582, 782), Shape::new(4096, 4096)];
+    for shape in if smoke { &shapes[..1] } else { &shapes[..] } {
+        measure(*shape, if smoke { 2 } else { 15 });
+    }
+}
+
+fn measure(shape: Shape, repetitions: usize) {
+    let workers = Workers::new(None).unwrap();
+    let control = Control::new();
+    let data = frames(shape);
+    let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
+    let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
+    let (variance, mask) = (Variance::Unknown, Mask::None);
+    let model = Model::new(stack, geometry, &[1.0; 5], variance, mask, &workers, &control).unwrap();
+    let mut descent = Descent::new(&model, &workers);
+    let mut target = vec![0.0_f32; data.len()];
+    // Enough rounds that the clock's and the threads' start do not count.
+    let rounds = (1 << 25) / data.len() + 1;
+    let (mut sweeps, mut copies) = (Vec::new(), Vec::new());
+    for _ in 0..repetitions + 1 {
+        copies.push(seconds(rounds, || {
+            workers.map_blocks(&mut target, BLOCK, |index, block| {
+                block.copy_from_slice(&data[index * BLOCK..][..block.len()]);
+            });
+        }));
+        sweeps.push(seconds(rounds, || {
+            descent.sweep(&control).unwrap();
+        }));
+    }
+    // The first of each touches its memory for the first time.
+    let ratios = copies.iter().zip(&sweeps).skip(1).map(|(copy, sweep)| copy / sweep);
+    println!(
+        "{{\"rows\": {}, \"cols\": {}, \"threads\": {}, \"sweep_s\": {:.3e}, \"copy_s\": {:.3e}, \
+         \"copy_gb_per_s\": {:.2}, \"share_of_copy_rate\": {:.4}}}",
+        shape.rows,
+        shape.cols,
+        workers.count(),
+        median(sweeps[1..].to_vec()),
+        median(copies[1..].to_vec()),
+        (8 * data.len()) as f64 / median(copies[1..].to_vec()) / 1e9,
+        median(ratios.collect()),
+    );
+}
+
+fn seconds(rounds: usize, mut work: impl FnMut()) -> f64 {
+    let start = Instant::now();
+    for _ in 0..rounds {
+        work();
+    }
+    start.elapsed().as_secs_f64() / rounds as f64
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
