@@ -32,9 +32,9 @@ const BAND: usize = 8;
 /// Bytes of data that may be expected to stay in the last-level cache.
 const IN_CACHE: usize = 1 << 24;
 /// Most columns that a kernel takes at once: their weights stay in the first-level cache.
-const STRETCH: usize = 512;
+const STRETCH: usize = 1024;
 /// Neighbouring values that are solved side by side in vector registers.
-const LANES: usize = 8;
+const LANES: usize = 16;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug)]

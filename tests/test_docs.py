@@ -1,0 +1,126 @@
+"""What the words say holds: README, docstrings and examples run."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import os
+import pkgutil
+import re
+import runpy
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer.main
+
+import equipix
+from equipix import simulate
+from equipix._manifest import Manifest
+from equipix.cli import app
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+PAGES = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md")
+MODULES = [module.name for module in pkgutil.walk_packages(equipix.__path__, "equipix.")]
+
+
+def blocks(language: str) -> list[str]:
+    """The code blocks of the README in a language."""
+    return re.findall(rf"^ *```{language}\n(.*?)^ *```", README, re.DOTALL | re.MULTILINE)
+
+
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec("\n".join(blocks("python")), names)
+    cal, truth = equipix.load("cal.tif"), names["truth"]
+    error = simulate.relative_error(cal.sensitivity, truth)
+    # The largest of 19 200 normal values of this rms stays below 6 of them.
+    assert np.abs(error).max() < 6 * names["camera"].noise_prediction(rng=1)[0]
+    assert names["equal"].shape == truth.shape
+
+
+def test_the_commands_of_the_readme_run(tmp_path):
+    (script,) = [block for block in blocks("sh") if block.startswith("equipix")]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(
+        ["bash", "-euc", script],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": path},
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )
+    assert equipix.load(tmp_path / "cal.tif").converged
+    assert len(list((tmp_path / "corrected").glob("*.tif"))) == 5
+
+
+def test_the_experiment_of_the_readme_is_one():
+    (text,) = blocks("toml")
+    assert len(Manifest.model_validate(tomllib.loads(text)).exposure) == 3
+
+
+def test_the_make_targets_of_the_readme_exist():
+    targets = re.findall(r"^make (\w+)", "\n".join(blocks("sh")), re.MULTILINE)
+    makefile = (ROOT / "Makefile").read_text()
+    assert targets == ["demo", "test"]
+    assert all(f"\n{target}:" in makefile for target in targets)
+
+
+def test_the_readme_names_every_command():
+    named = re.findall(r"^\| `equipix (\w+)", README, re.MULTILINE)
+    assert sorted(named) == sorted(typer.main.get_command(app).commands)
+
+
+def test_the_readme_names_attributes_that_exist():
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert "sensitivity" in named
+    assert named <= set(equipix.Calibration.__dataclass_fields__)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    path = ROOT / page
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text())
+    assert [link for link in links if not (path.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_the_examples_of_docstrings_run(module):
+    result = doctest.testmod(importlib.import_module(module))
+    assert result.failed == 0
+
+
+def test_docstrings_have_examples_to_run():
+    finder = doctest.DocTestFinder()
+    examples = [
+        test.name
+        for module in MODULES
+        for test in finder.find(importlib.import_module(module))
+        if test.examples
+    ]
+    assert {"equipix.calibration.calibrate", "equipix.shifts.measure_shift"} <= set(examples)
+
+
+@pytest.mark.parametrize("name", [name for name in equipix.__all__ if not name.startswith("_")])
+def test_public_names_are_documented(name):
+    thing = getattr(equipix, name)
+    assert inspect.getdoc(thing)
+    # A class without words of its own would show those of its base.
+    if inspect.isclass(thing):
+        assert thing.__doc__
+
+
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["calibrate.py", str(tmp_path / "cal.tif")])
+    runpy.run_path(str(ROOT / "examples/calibrate.py"), run_name="__main__")
+    rms, predicted = re.findall(r"\d\.\d+e-\d+", capsys.readouterr().out.splitlines()[-1])
+    # 19 192 errors: their rms scatters by 0.5 %, the prediction's mean of four draws by half that.
+    assert float(rms) < 1.03 * float(predicted)
+    assert equipix.load(tmp_path / "cal.tif").converged
