@@ -271,7 +271,8 @@ def calibrate(
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Most passes over the data; unless given, five times what theory says is needed.
+        Most passes over the data; unless given, as many as it takes, as long as the error
+        estimate falls.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.

@@ -40,7 +40,7 @@ pub fn calibrate<T: Real>(
     control: &Control,
 ) -> Result<Solution> {
     let components = Components::of(model, control)?;
-    let (descent, history) = descent::solve(model, stop, workers, control)?;
+    let (descent, history) = descent::solve(model, components.sizes.len(), stop, workers, control)?;
     let beam = descent.beam();
     let mut sensitivity = descent.sensitivity;
     let means = component_means(&sensitivity, &components);

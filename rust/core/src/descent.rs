@@ -19,7 +19,7 @@ use std::ops::Range;
 
 use crate::control::Control;
 use crate::error::{Error, Result};
-use crate::estimate::Estimator;
+use crate::estimate::{Estimate, Estimator, ROUNDING};
 use crate::frames::{Real, Shape};
 use crate::geometry::{Placement, View};
 use crate::model::{Model, Stretch};
@@ -27,6 +27,8 @@ use crate::parallel::Workers;
 
 /// Sweeps between two estimates of the error, at first; later a sixteenth of those made.
 const CHECK_EVERY: u64 = 16;
+/// A step that may be rounding alone, where some pixels are much brighter than others.
+const TINY_STEP: f64 = 1e-11;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
 /// Bytes of data that may be expected to stay in the last-level cache.
@@ -41,7 +43,7 @@ const LANES: usize = 16;
 pub struct Stop {
     /// The largest relative error of M that is wanted.
     pub tolerance: f64,
-    /// The most sweeps to make; `None` means five times as many as the slowest mode should need.
+    /// The most sweeps to make; `None` means as many as it takes.
     pub max_sweeps: Option<u64>,
 }
 
@@ -51,7 +53,7 @@ pub struct History {
     /// F after each sweep.
     pub objective: Vec<f64>,
     /// The estimated largest error of M at those sweeps where it was estimated.
-    pub error_estimate: Vec<(u64, f64)>,
+    pub error_estimate: Vec<Estimate>,
 }
 
 impl History {
@@ -64,15 +66,24 @@ impl History {
     /// The last estimate of the largest relative error of M.
     #[must_use]
     pub fn last_estimate(&self) -> f64 {
-        self.error_estimate.last().map_or(f64::INFINITY, |&(_, estimate)| estimate)
+        self.error_estimate.last().map_or(f64::INFINITY, |estimate| estimate.error)
+    }
+
+    /// Whether only rounding is left to see: no step can be told from it, or the steps are tiny and
+    /// the estimate is no smaller than it was at half the sweeps.
+    fn stalled(&self) -> bool {
+        let [earlier @ .., last] = &self.error_estimate[..] else { return false };
+        let half = earlier.iter().find(|estimate| 2 * estimate.sweep >= last.sweep);
+        let falling = half.is_none_or(|half| last.error < half.error);
+        last.step < ROUNDING || (last.step < TINY_STEP && !falling)
     }
 
     /// How many sweeps it will be until `tolerance` is met, if errors go on to fade as they did
     /// between the last two estimates, or by `rate` a sweep where there are no two.
     fn forecast(&self, tolerance: f64, rate: f64) -> u64 {
         let rate = match self.error_estimate[..] {
-            [.., (from, before), (to, after)] if after < before => {
-                (before / after).ln() / (to - from) as f64
+            [.., from, to] if to.error < from.error => {
+                (from.error / to.error).ln() / (to.sweep - from.sweep) as f64
             }
             _ => rate,
         };
@@ -81,13 +92,17 @@ impl History {
     }
 }
 
-/// Sweeps until the estimated error of M is at most the tolerance, or the sweeps are used up.
+/// Sweeps until the estimated error of M is at most the tolerance, the sweeps are used up, or the
+/// estimate no longer falls.
+///
+/// `components` is the number of connected components of the measurements.
 ///
 /// # Errors
 /// [`Error::Value`] for a tolerance that is not a positive number or a limit of 0 sweeps,
 /// [`Error::Cancelled`] if `control` asks to stop.
 pub fn solve<'m, 'a, T: Real>(
     model: &'m Model<'a, T>,
+    components: usize,
     stop: Stop,
     workers: &'m Workers,
     control: &Control,
@@ -100,9 +115,8 @@ pub fn solve<'m, 'a, T: Real>(
     if max_sweeps == Some(0) {
         return Err(Error::value("max_sweeps", "is 0: at least one sweep is needed"));
     }
-    let mut estimator = Estimator::new(model, workers);
-    let enough = 5.0 * (1.0 / tolerance).ln().max(1.0) / estimator.slowest();
-    let limit = max_sweeps.unwrap_or(enough.ceil().max(100.0) as u64);
+    let mut estimator = Estimator::new(model, components, workers);
+    let limit = max_sweeps.unwrap_or(u64::MAX);
     let mut descent = Descent::new(model, workers);
     let mut history = History::default();
     let mut next_check = limit.min(CHECK_EVERY);
@@ -114,13 +128,13 @@ pub fn solve<'m, 'a, T: Real>(
         let before = descent.sensitivity.clone();
         history.objective.push(descent.sweep(control)?);
         let estimate = estimator.largest_error(descent.step_since(before), sweep, control)?;
-        history.error_estimate.push((sweep, estimate));
-        if estimate <= tolerance {
+        history.error_estimate.push(estimate);
+        if estimate.error <= tolerance || history.stalled() {
             break;
         }
         // An estimate costs several sweeps: rarer checks as the run grows longer.
         next_check = limit.min(sweep + CHECK_EVERY.max(sweep / CHECK_EVERY));
-        let total = history.forecast(tolerance, estimator.slowest());
+        let total = history.forecast(tolerance, estimator.longest());
         control.report("calibrate", sweep, total.min(limit));
     }
     Ok((descent, history))

@@ -29,12 +29,31 @@ use crate::model::Model;
 use crate::parallel::Workers;
 use crate::transform::CosineTransform;
 
+/// A symbol or a rate this small cannot be told from 0.
+const NOTHING: f64 = 1e-8;
+/// What a step may be by rounding alone, M being close to 1.
+pub(crate) const ROUNDING: f64 = 16.0 * f64::EPSILON;
+
+/// What one look at the error of M found.
+#[derive(Clone, Copy, Debug)]
+pub struct Estimate {
+    /// The sweep after which it was taken.
+    pub sweep: u64,
+    /// The largest relative error of M.
+    pub error: f64,
+    /// The largest step that this sweep took.
+    pub step: f64,
+}
+
 /// Estimates the error of M from the steps that sweeps take.
 pub struct Estimator<'m> {
     workers: &'m Workers,
     transform: CosineTransform,
     waves: Vec<Waves>,
-    slowest: f64,
+    /// The symbol of the longest wave along either side of the sensor.
+    longest: f64,
+    /// No symbol counts as less than this.
+    least: f64,
     last: Option<LastStep>,
 }
 
@@ -62,31 +81,37 @@ struct Complex {
 }
 
 impl<'m> Estimator<'m> {
-    /// Prepares the symbol of an experiment.
+    /// Prepares the symbol of an experiment whose measurements form so many `components`.
     #[must_use]
-    pub fn new<T: Real>(model: &Model<'_, T>, workers: &'m Workers) -> Self {
+    pub fn new<T: Real>(model: &Model<'_, T>, components: usize, workers: &'m Workers) -> Self {
         let shape = model.sensor();
         let mut estimator = Self {
             workers,
             transform: CosineTransform::new(shape),
             waves: waves(model),
-            slowest: 1.0,
+            longest: 1.0,
+            least: NOTHING,
             last: None,
         };
         let lowest =
             [(1, 0), (0, 1)].into_iter().filter(|&(i, j)| i < shape.rows && j < shape.cols);
-        estimator.slowest = lowest
+        estimator.longest = lowest
             .map(|(i, j)| estimator.symbol(i, j, 1.0))
             // An axis along which nothing was shifted couples nothing, at whatever scale.
-            .filter(|&symbol| symbol > f64::EPSILON.sqrt())
+            .filter(|&symbol| symbol > NOTHING)
             .fold(1.0, f64::min);
+        if components > 1 {
+            // Each component has a null mode, which need not lie on the transform's grid: close to
+            // one the symbol says nothing. Within a component errors fade as on the open sensor.
+            estimator.least = estimator.longest;
+        }
         estimator
     }
 
-    /// The share of the slowest error that one sweep removes, as the symbol has it.
+    /// The share of the longest wave that one sweep removes, as the symbol has it.
     #[must_use]
-    pub const fn slowest(&self) -> f64 {
-        self.slowest
+    pub const fn longest(&self) -> f64 {
+        self.longest
     }
 
     /// The largest relative error of M, from the `step` that sweep number `sweep` took.
@@ -100,33 +125,32 @@ impl<'m> Estimator<'m> {
         mut step: Vec<f64>,
         sweep: u64,
         control: &Control,
-    ) -> Result<f64> {
+    ) -> Result<Estimate> {
         let largest_step = largest(&step);
         let rms = (step.iter().map(|s| s * s).sum::<f64>() / step.len() as f64).sqrt();
-        let by_rate = largest_step / self.lost_per_sweep(sweep, rms);
+        // Steps that are nothing but rounding do not shrink, and are no series.
+        let by_rate = (largest_step - ROUNDING).max(0.0) / self.lost_per_sweep(sweep, rms);
         self.last = Some(LastStep { sweep, rms });
         let amplification = |i, j| self.amplification(i, j);
         self.transform.filter(&mut step, amplification, self.workers, control)?;
-        Ok(by_rate.max(largest(&step)))
+        Ok(Estimate { sweep, error: by_rate.max(largest(&step)), step: largest_step })
     }
 
-    /// 1 − the factor by which the steps have shrunk per sweep, never below what the symbol allows
-    /// by an order of magnitude: steps that are nothing but rounding do not shrink at all.
+    /// 1 − the factor by which the steps have shrunk per sweep since the last look.
     fn lost_per_sweep(&self, sweep: u64, rms: f64) -> f64 {
         let lost = self
             .last
             .map_or(1.0, |last| 1.0 - (rms / last.rms).powf(1.0 / (sweep - last.sweep) as f64));
-        lost.clamp(0.1 * self.slowest, 1.0)
+        lost.clamp(NOTHING, 1.0)
     }
 
     /// n/λ of a cosine mode: the mean over the two plane waves that it is made of. The constant
-    /// belongs to the gauge. A component of its own has null modes of its own; near one, as near
-    /// the constant, no error fades more slowly than the slowest mode of the sensor.
+    /// belongs to the gauge.
     fn amplification(&self, i: usize, j: usize) -> f64 {
         if (i, j) == (0, 0) {
             return 0.0;
         }
-        let inverse = |sign| 1.0 / self.symbol(i, j, sign).max(self.slowest);
+        let inverse = |sign| 1.0 / self.symbol(i, j, sign).max(self.least);
         0.5 * (inverse(1.0) + inverse(-1.0))
     }
 

@@ -178,7 +178,7 @@ fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PyS
         component_labels: image(py, solution.components.pixels, geometry.sensor)?,
         components: solution.components.sizes.len(),
         objective: history.objective.into_pyarray(py).unbind(),
-        estimates: history.error_estimate,
+        estimates: history.error_estimate.iter().map(|e| (e.sweep, e.error)).collect(),
         degrees_of_freedom: solution.degrees_of_freedom,
         converged: solution.converged,
     })
