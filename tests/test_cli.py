@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from equipix import average, cli, load, simulate
-from equipix.io import load_statistics, read_frames
+from equipix.frames import load_statistics
+from equipix.io import read_frames
 
 SHAPE = (64, 80)
 

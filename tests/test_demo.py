@@ -15,13 +15,13 @@ pytest.importorskip("matplotlib")
 # The hole's image is small on so small a sensor, and non-uniformity moves its centroid.
 pytestmark = pytest.mark.filterwarnings("ignore::equipix.errors.ShiftRoundingWarning")
 
-SHAPE = (96, 128)
+SHAPE = (160, 208)
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "experiment"
-    return demo.run_demo(folder, shape=SHAPE, frames=10, rng=1)
+    return demo.run_demo(folder, shape=SHAPE, frames=10, rng=3)
 
 
 def test_error_is_what_the_noise_predicts(result):
@@ -56,7 +56,7 @@ def test_picture_shows_all(result):
 def test_command_leaves_a_picture_only(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as done:
-        cli.main(["demo", "--shape", "96", "128", "--frames", "4", "--json"])
+        cli.main(["demo", "--shape", "160", "208", "--frames", "4", "--json"])
     assert done.value.code == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["passed"] is True
@@ -68,7 +68,7 @@ def test_command_fails_when_the_errors_are_too_large(tmp_path, capsys, monkeypat
     monkeypatch.setattr(demo, "BLOCK_RMS_LIMIT", 0.1)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as done:
-        cli.main(["demo", "--shape", "96", "128", "--frames", "4", "--keep", "kept"])
+        cli.main(["demo", "--shape", "160", "208", "--frames", "4", "--keep", "kept"])
     assert done.value.code == 1
     captured = capsys.readouterr()
     assert "noise predicts" in captured.out

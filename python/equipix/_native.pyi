@@ -6,6 +6,7 @@ from typing import Any, TypeAlias, final
 
 from numpy.typing import NDArray
 
+_Spot: TypeAlias = tuple[list[float], list[float]]
 _Statistics: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 __version__: str
@@ -67,3 +68,8 @@ def calibrate_frames(
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
 ) -> Solution: ...
+def locate_spots(
+    before: NDArray[Any],
+    after: NDArray[Any],
+    saturations: tuple[float | None, float | None],
+) -> tuple[_Spot, _Spot]: ...

@@ -6,7 +6,7 @@ same names and stand in the same order.
 
 from __future__ import annotations
 
-import itertools
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -58,10 +58,10 @@ def locate(frames: ArrayLike, *, saturation: float | None = None) -> Spot:
     stack = raw.astype(np.float64)
     stack = stack[np.newaxis] if stack.ndim == 2 else stack
     mean = stack.sum(axis=0) / len(stack)
-    window, level = find_window(mean)
-    patch = widen(window, max(3, min(window[1] - window[0], window[3] - window[2]) // 4))
+    window, level, departure = find_window(mean)
+    patch = widen(window, max(3, 3 * min(window[1] - window[0], window[3] - window[2]) // 8))
     patch = clip(patch, mean.shape)
-    values, replaced = clean(cut(mean, patch))
+    values, replaced = clean(cut(mean, patch), departure)
     inside = in_window(values.shape, patch, window)
     if np.any(cut(stack.max(axis=0), patch)[inside & ~replaced] >= saturation):
         raise ValueError("saturated")
@@ -73,7 +73,7 @@ def locate(frames: ArrayLike, *, saturation: float | None = None) -> Spot:
     signal = values - np.tensordot(surface, basis, axes=1)
     if len(stack) > 1:
         variance = cut(stack.var(axis=0, ddof=1) / len(stack), patch)
-        variance = np.where(replaced, neighbours_median(variance), variance)
+        variance = np.where(replaced, predicted(variance), variance)
     else:
         variance = variance_of_one(values, signal, inside, level)
     if signal[inside].sum() <= 0:
@@ -84,8 +84,8 @@ def locate(frames: ArrayLike, *, saturation: float | None = None) -> Spot:
 
 
 def moments(
-    rows: Image,
-    cols: Image,
+    rows: Any,
+    cols: Any,
     basis: Image,
     signal: Image,
     variance: Image,
@@ -115,7 +115,8 @@ def variance_of_one(values: Image, signal: Image, inside: Any, level: float) -> 
     background = np.median(rough[inner & ~inside])
     bright = inside & (signal > level / 2)
     factor = np.median((rough[bright] - background) / signal[bright])
-    return background + max(factor, 0.0) * np.maximum(signal, 0.0)
+    variance: Image = background + max(factor, 0.0) * np.maximum(signal, 0.0)
+    return variance
 
 
 def roughness(values: Image) -> Image:
@@ -126,8 +127,8 @@ def roughness(values: Image) -> Image:
     return both**2 / (36 * NORMAL_MEDIAN_SQUARE)
 
 
-def find_window(mean: Image) -> tuple[Box, float]:
-    """Window that holds the spot and its blur, and the spot's level above the background."""
+def find_window(mean: Image) -> tuple[Box, float, float]:
+    """Window of the spot and its blur, its level, and how far light departs from neighbours."""
     excess = median_of_nine(mean) - background(mean)
     centres, noises = [], []
     for block in blocks(excess):
@@ -144,10 +145,13 @@ def find_window(mean: Image) -> tuple[Box, float]:
         raise ValueError("doubled")
     rows, cols = np.nonzero(labels == order[0] + 1)
     box = (int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1)
-    window = widen(box, int(np.ceil(4 * blur(excess, box, len(rows), level, noise))) + 2)
+    sigma = blur(excess, box, len(rows), level, noise)
+    window = widen(box, int(np.ceil(3.5 * sigma)) + 1)
     if not fits(widen(window, 3), mean.shape):
         raise ValueError("cut")
-    return window, level
+    with np.errstate(divide="ignore"):  # an outline without any blur departs by any amount
+        departure = excess.max() * (0.2 + 0.75 * np.float64(sigma) ** -2) + 15 * noise
+    return window, level, departure
 
 
 def blur(excess: Image, box: Box, area: int, level: float, noise: float) -> float:
@@ -161,7 +165,7 @@ def blur(excess: Image, box: Box, area: int, level: float, noise: float) -> floa
 
 
 def background(mean: Image) -> Image:
-    """Smooth background: a quadratic surface through the medians of blocks, spots clipped."""
+    """Smooth background: a cubic surface through the medians of blocks, spots clipped."""
     rows, cols = np.indices(mean.shape, dtype=np.float64)
     rows, cols = (2 * rows + 1) / mean.shape[0] - 1, (2 * cols + 1) / mean.shape[1] - 1
     medians = [
@@ -172,13 +176,13 @@ def background(mean: Image) -> Image:
 
 
 def blocks(image: Image) -> list[Image]:
-    """The image cut into 16 by 16 blocks of nearly equal size."""
+    """Cut the image into 16 by 16 blocks of nearly equal size."""
     row_edges = [image.shape[0] * k // BLOCKS for k in range(BLOCKS + 1)]
     col_edges = [image.shape[1] * k // BLOCKS for k in range(BLOCKS + 1)]
     return [
         image[top:bottom, left:right]
-        for top, bottom in itertools.pairwise(row_edges)
-        for left, right in itertools.pairwise(col_edges)
+        for top, bottom in pairwise(row_edges)
+        for left, right in pairwise(col_edges)
     ]
 
 
@@ -196,8 +200,8 @@ def fit_clipped(basis: Image, values: Image) -> tuple[Image, Any]:
 
 
 def powers(rows: Any, cols: Any) -> Image:
-    """The terms 1, row, column, row², row * column, column²."""
-    return np.stack([np.ones_like(rows), rows, cols, rows * rows, rows * cols, cols * cols])
+    """Terms r^i c^j of a cubic surface."""
+    return np.stack([rows**i * cols**j for i in range(4) for j in range(4 - i)])
 
 
 def median_of_nine(image: Image) -> Image:
@@ -207,31 +211,32 @@ def median_of_nine(image: Image) -> Image:
     return np.median(views, axis=(2, 3))
 
 
-def sorted_neighbours(image: Image) -> Image:
-    """The eight neighbours of every pixel, sorted along the last axis."""
+def predicted(image: Image) -> Image:
+    """Median of the means of the four pairs of opposite neighbours of every pixel."""
+    near = neighbours(image)
+    return np.median((near[..., :4] + near[..., :3:-1]) / 2, axis=2)
+
+
+def neighbours(image: Image) -> Image:
+    """Eight neighbours of every pixel along the last axis, row by row."""
     padded = np.pad(image, 1, mode="edge")
     views = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*image.shape, 9)
-    return np.sort(np.delete(views, 4, axis=2), axis=2)
+    return np.delete(views, 4, axis=2)
 
 
-def neighbours_median(image: Image) -> Image:
-    """Median of the eight neighbours of every pixel."""
-    ranked = sorted_neighbours(image)
-    return (ranked[..., 3] + ranked[..., 4]) / 2
-
-
-def clean(values: Image) -> tuple[Image, Any]:
-    """Hot and dead pixels replaced by the median of their neighbours; the border stays."""
-    ranked = sorted_neighbours(values)
+def clean(values: Image, departure: float) -> tuple[Image, Any]:
+    """Hot and dead pixels replaced by what their neighbours predict; the border stays."""
+    ranked = np.sort(neighbours(values), axis=2)
     low, high = ranked[..., 1], ranked[..., 6]
-    outlier = np.zeros(values.shape, dtype=bool)
     beyond = np.maximum(values - high, low - values) > OUTLIER * (high - low)
+    beyond |= np.abs(values - predicted(values)) > departure
+    outlier = np.zeros(values.shape, dtype=bool)
     outlier[1:-1, 1:-1] = beyond[1:-1, 1:-1]
-    return np.where(outlier, neighbours_median(values), values), outlier
+    return np.where(outlier, predicted(values), values), outlier
 
 
 def label_pixels(mask: Any) -> NDArray[np.int64]:
-    """Number of the 8-connected component of every pixel, from 1; 0 outside the mask."""
+    """Label the 8-connected components of the mask from 1; pixels outside have 0."""
     labels = np.zeros(mask.shape, dtype=np.int64)
     count = 0
     for start in zip(*np.nonzero(mask), strict=True):
@@ -251,12 +256,12 @@ def label_pixels(mask: Any) -> NDArray[np.int64]:
 
 
 def widen(box: Box, margin: int) -> Box:
-    """The box with `margin` more pixels on every side."""
+    """Add `margin` pixels to the box on every side."""
     return (box[0] - margin, box[1] + margin, box[2] - margin, box[3] + margin)
 
 
 def clip(box: Box, shape: tuple[int, ...]) -> Box:
-    """The part of the box that lies in the image."""
+    """Part of the box that lies in the image."""
     return (max(box[0], 0), min(box[1], shape[0]), max(box[2], 0), min(box[3], shape[1]))
 
 
@@ -266,7 +271,7 @@ def fits(box: Box, shape: tuple[int, ...]) -> bool:
 
 
 def cut(image: Image, box: Box) -> Image:
-    """The pixels of the box."""
+    """Pixels of the box."""
     return image[box[0] : box[1], box[2] : box[3]]
 
 

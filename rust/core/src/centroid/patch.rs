@@ -18,17 +18,21 @@ const NORMAL_MEDIAN_SQUARE: f64 = 0.454_936_423_119_572;
 pub(super) struct Patch {
     pub(super) region: Region,
     pub(super) values: Vec<f64>,
-    /// Which pixels were hot or dead, and are now the median of their neighbours.
+    /// Which pixels were hot or dead, and are now what their neighbours predict.
     pub(super) mended: Vec<bool>,
 }
 
 impl Patch {
     /// The part `region` of `image`, hot and dead pixels mended. The outermost pixels stay as they
     /// are: they are background, where the fit of the surface copes with them.
+    ///
+    /// A pixel is hot or dead if it lies far beyond its neighbours, or farther from what they
+    /// predict than `departure`, which finds the worst on the spot's steep outline too.
     pub(super) fn mended(
         image: &[f64],
         shape: Shape,
         region: Region,
+        departure: f64,
         control: &Control,
     ) -> Result<Self> {
         let raw = region.rows(image, shape).collect::<Vec<_>>().concat();
@@ -37,12 +41,11 @@ impl Patch {
         for row in 1..height - 1 {
             control.check()?;
             for pixel in row * width + 1..(row + 1) * width - 1 {
-                let near = sorted_neighbours(&raw, width, pixel);
-                let (low, high) = (near[1], near[6]);
-                let beyond = (raw[pixel] - high).max(low - raw[pixel]);
-                if beyond > OUTLIER * (high - low) {
+                let predicted = predicted(&raw, width, pixel);
+                let far = (raw[pixel] - predicted).abs() > departure;
+                if far || stands_out(&raw, width, pixel) {
                     patch.mended[pixel] = true;
-                    patch.values[pixel] = (near[3] + near[4]) / 2.0;
+                    patch.values[pixel] = predicted;
                 }
             }
         }
@@ -74,8 +77,7 @@ impl Patch {
     fn mend_variance(&self, raw: Vec<f64>) -> Vec<f64> {
         let mut variance = raw.clone();
         for pixel in (0..raw.len()).filter(|&pixel| self.mended[pixel]) {
-            let near = sorted_neighbours(&raw, self.region.width(), pixel);
-            variance[pixel] = (near[3] + near[4]) / 2.0;
+            variance[pixel] = predicted(&raw, self.region.width(), pixel);
         }
         variance
     }
@@ -114,11 +116,22 @@ impl Patch {
     }
 }
 
-/// The eight neighbours of an inner pixel in rising order.
-fn sorted_neighbours(values: &[f64], width: usize, pixel: usize) -> [f64; 8] {
-    let (above, below) = (pixel - width, pixel + width);
-    let mut near = [above - 1, above, above + 1, pixel - 1, pixel + 1, below - 1, below, below + 1]
-        .map(|neighbour| values[neighbour]);
+/// Whether an inner pixel lies far beyond its neighbours; one bad neighbour does no harm.
+fn stands_out(values: &[f64], width: usize, pixel: usize) -> bool {
+    let [[a, b], [c, d], [e, f], [g, h]] = opposite_neighbours(values, width, pixel);
+    let mut near = [a, b, c, d, e, f, g, h];
     near.sort_unstable_by(f64::total_cmp);
-    near
+    let (low, high) = (near[1], near[6]);
+    (values[pixel] - high).max(low - values[pixel]) > OUTLIER * (high - low)
+}
+
+/// Value of an inner pixel by its neighbours: the median of the means of opposite ones, which
+/// follows a slope and is not harmed by one bad neighbour.
+fn predicted(values: &[f64], width: usize, pixel: usize) -> f64 {
+    let mut means = opposite_neighbours(values, width, pixel).map(|[a, b]| (a + b) / 2.0);
+    median(&mut means)
+}
+
+fn opposite_neighbours(values: &[f64], width: usize, pixel: usize) -> [[f64; 2]; 4] {
+    [1, width - 1, width, width + 1].map(|step| [values[pixel - step], values[pixel + step]])
 }

@@ -1,0 +1,203 @@
+//! Coordinate descent beside the same sweep in its plainest form, and the laws it must obey.
+
+use std::num::NonZeroUsize;
+
+use equipix_core::Result;
+use equipix_core::control::Control;
+use equipix_core::descent::Descent;
+use equipix_core::frames::{Shape, Stack};
+use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::model::{Mask, Model, Variance};
+use equipix_core::parallel::Workers;
+use proptest::prelude::*;
+
+/// Everything that one small experiment consists of.
+#[derive(Clone, Debug)]
+struct Experiment {
+    shape: Shape,
+    shifts: Vec<[i64; 2]>,
+    rotations: Vec<Rotation>,
+    flux: Vec<f64>,
+    frames: Vec<f64>,
+    variance: Vec<f64>,
+    mask: Vec<bool>,
+}
+
+impl Experiment {
+    /// Calls `visit` with the model of this experiment.
+    fn with_model<R>(
+        &self,
+        workers: &Workers,
+        visit: impl FnOnce(&Model<'_, f64>) -> Result<R>,
+    ) -> Result<R> {
+        let (count, shape) = (self.shifts.len(), self.shape);
+        let frames = Stack::new("frames", &self.frames, count, shape)?;
+        let variance = Stack::new("variance", &self.variance, count, shape)?;
+        let geometry = Geometry::new(shape, &self.shifts, &self.rotations)?;
+        let (variance, mask) = (Variance::Measurements(variance), Mask::Measurements(&self.mask));
+        let control = Control::new();
+        visit(&Model::new(frames, geometry, &self.flux, variance, mask, workers, &control)?)
+    }
+
+    /// F after each sweep, and M and L after the last.
+    fn swept(&self, sweeps: usize, workers: usize) -> Result<(Vec<f64>, Vec<f64>, Vec<f64>)> {
+        let workers = Workers::new(NonZeroUsize::new(workers))?;
+        self.with_model(&workers, |model| {
+            let mut descent = Descent::new(model, &workers);
+            let objective = (0..sweeps).map(|_| descent.sweep(&Control::new()));
+            let objective = objective.collect::<Result<_>>()?;
+            let beam = descent.beam();
+            Ok((objective, descent.sensitivity, beam))
+        })
+    }
+
+    /// The same from the closed forms of L and M, measurement by measurement.
+    fn naively_swept(&self, sweeps: usize) -> Result<(Vec<f64>, Vec<f64>, Vec<f64>)> {
+        let geometry = Geometry::new(self.shape, &self.shifts, &self.rotations)?;
+        let mut sensitivity = vec![1.0; self.shape.len()];
+        let mut beam = vec![0.0; geometry.beam.len()];
+        let mut objective = Vec::new();
+        let used = self.measurements(&geometry);
+        for _ in 0..sweeps {
+            let mut sums = vec![[0.0; 2]; beam.len()];
+            for &(y, w, c, pixel, cell) in &used {
+                sums[cell][0] += w * c * sensitivity[pixel] * y;
+                sums[cell][1] += w * (c * sensitivity[pixel]).powi(2);
+            }
+            replace(&mut beam, &sums);
+            let mut sums = vec![[0.0; 2]; sensitivity.len()];
+            for &(y, w, c, pixel, cell) in &used {
+                sums[pixel][0] += w * c * beam[cell] * y;
+                sums[pixel][1] += w * (c * beam[cell]).powi(2);
+            }
+            replace(&mut sensitivity, &sums);
+            let residual = |&(y, w, c, pixel, cell): &(f64, f64, f64, usize, usize)| {
+                w * (y - c * beam[cell] * sensitivity[pixel]).powi(2)
+            };
+            objective.push(used.iter().map(residual).sum());
+        }
+        Ok((objective, sensitivity, beam))
+    }
+
+    /// Value, weight, flux, pixel and cell of each used measurement.
+    fn measurements(&self, geometry: &Geometry) -> Vec<(f64, f64, f64, usize, usize)> {
+        let mut used = Vec::new();
+        for (k, place) in geometry.exposures.iter().enumerate() {
+            for pixel in 0..self.shape.len() {
+                let index = k * self.shape.len() + pixel;
+                let (row, col) = (pixel / self.shape.cols, pixel % self.shape.cols);
+                let cell = geometry.views[place.view].cells.at(row + place.row, col + place.col);
+                if !self.mask[index] && self.frames[index].is_finite() {
+                    let weight = 1.0 / self.variance[index];
+                    used.push((self.frames[index], weight, self.flux[k], pixel, cell));
+                }
+            }
+        }
+        used
+    }
+}
+
+fn replace(values: &mut [f64], sums: &[[f64; 2]]) {
+    for (value, &[signal, weight]) in values.iter_mut().zip(sums) {
+        if weight > 0.0 {
+            *value = signal / weight;
+        }
+    }
+}
+
+/// Small sensors and ones longer than a vector, with gaps, noise and any rotation.
+fn experiments() -> impl Strategy<Value = Experiment> {
+    let rotation = prop::sample::select(vec![
+        Rotation::None,
+        Rotation::Quarter,
+        Rotation::Half,
+        Rotation::ThreeQuarters,
+    ]);
+    let sizes = (1..12_usize, 1..40_usize, 2..6_usize, any::<bool>());
+    sizes.prop_flat_map(move |(rows, cols, count, turned)| {
+        let side = rows.min(cols) as i64 - 1;
+        let reach = if turned { [side, side] } else { [rows as i64 - 1, cols as i64 - 1] };
+        let shift = (-reach[0]..=reach[0], -reach[1]..=reach[1]).prop_map(|(r, c)| [r, c]);
+        let rotation = if turned { rotation.clone().boxed() } else { Just(Rotation::None).boxed() };
+        let size = rows * cols * count;
+        let value = prop_oneof![12 => 0.5..1.5, 1 => Just(f64::NAN)];
+        let each = (
+            prop::collection::vec(shift, count),
+            prop::collection::vec(rotation, count),
+            prop::collection::vec(0.5..2.0, count),
+            prop::collection::vec(value, size),
+            prop::collection::vec(0.5..2.0, size),
+            prop::collection::vec(prop::bool::weighted(0.1), size),
+        );
+        each.prop_map(move |(shifts, rotations, flux, frames, variance, mask)| {
+            let shape = Shape::new(rows, cols);
+            Experiment { shape, shifts, rotations, flux, frames, variance, mask }
+        })
+    })
+}
+
+/// Rounding of `sweeps` sweeps: each takes two quotients of sums of some n + 3 roundings of
+/// numbers of one sign, whose errors the next sweep averages.
+fn close(got: &[f64], wanted: &[f64], sweeps: usize) -> bool {
+    let rounding = (8 * sweeps * 9) as f64 * f64::EPSILON;
+    got.iter().zip(wanted).all(|(a, b)| (a - b).abs() <= rounding * b.abs())
+}
+
+/// What rounding leaves of F where everything is fitted exactly: the residuals are not 0 then.
+fn rounding_of_objective(experiment: &Experiment) -> f64 {
+    experiment.frames.len() as f64 * (10.0 * f64::EPSILON).powi(2)
+}
+
+proptest! {
+    #[test]
+    fn the_kernels_do_what_the_closed_forms_say(
+        experiment in experiments(), sweeps in 1..6_usize,
+    ) {
+        // An exposure may be left without any measurement, which the model refuses.
+        if let Ok((objective, sensitivity, beam)) = experiment.swept(sweeps, 2) {
+            let wanted = experiment.naively_swept(sweeps).unwrap();
+            prop_assert!(close(&sensitivity, &wanted.1, sweeps));
+            prop_assert!(close(&beam, &wanted.2, sweeps));
+            let floor = rounding_of_objective(&experiment);
+            for (got, wanted) in objective.iter().zip(wanted.0) {
+                prop_assert!((got - wanted).abs() <= 1e-9 * wanted + floor);
+            }
+        }
+    }
+
+    #[test]
+    fn the_objective_never_rises(experiment in experiments()) {
+        if let Ok((objective, ..)) = experiment.swept(20, 1) {
+            let rounding = 1e-14 * objective[0] + rounding_of_objective(&experiment);
+            prop_assert!(objective.windows(2).all(|pair| pair[1] <= pair[0] + rounding));
+        }
+    }
+
+    #[test]
+    fn any_number_of_workers_gives_the_same_bytes(experiment in experiments()) {
+        if let Ok(one) = experiment.swept(3, 1) {
+            prop_assert_eq!(one, experiment.swept(3, 3).unwrap());
+        }
+    }
+}
+
+#[test]
+fn rows_that_do_not_fit_the_cache_make_no_difference() {
+    // Wide enough that one sweep takes the rows in several parts.
+    let shape = Shape::new(200, 60_000);
+    let frames: Vec<f32> =
+        (0..2 * shape.len()).map(|i| 1.0 + 0.1 * ((i % 977) as f32).sin()).collect();
+    let shifts = [[0, 0], [3, 5]];
+    let swept = |workers| {
+        let workers = Workers::new(NonZeroUsize::new(workers)).unwrap();
+        let stack = Stack::new("frames", &frames, 2, shape).unwrap();
+        let geometry = Geometry::new(shape, &shifts, &[Rotation::None; 2]).unwrap();
+        let (variance, mask, control) = (Variance::Unknown, Mask::None, Control::new());
+        let model =
+            Model::new(stack, geometry, &[1.0; 2], variance, mask, &workers, &control).unwrap();
+        let mut descent = Descent::new(&model, &workers);
+        (descent.sweep(&control).unwrap().to_bits(), descent.sensitivity)
+    };
+    // Three workers take more rows at a time than one.
+    assert!(swept(1) == swept(3));
+}
