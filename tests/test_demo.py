@@ -18,6 +18,13 @@ pytestmark = pytest.mark.filterwarnings("ignore::equipix.errors.ShiftRoundingWar
 SHAPE = (160, 208)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _shorter_arms():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "ARMS", (11, 19))
+        yield
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "experiment"

@@ -6,6 +6,17 @@ from typing import Any, TypeAlias, final
 
 from numpy.typing import NDArray
 
+__all__ = [
+    "Accumulator",
+    "Solution",
+    "__version__",
+    "average_files",
+    "calibrate_frames",
+    "file_format",
+    "locate_spots",
+    "read_file",
+]
+
 _Spot: TypeAlias = tuple[list[float], list[float]]
 _Statistics: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
