@@ -4,7 +4,7 @@ BIN := .venv/bin
 PROFILE ?= release
 SOURCES := $(shell find rust python -name '*.rs' -o -name '*.py') Cargo.toml Cargo.lock pyproject.toml
 
-.PHONY: demo test bench figures docs lint build clean
+.PHONY: demo test bench figures docs lint audit build clean
 
 demo: build
 	$(BIN)/equipix demo --force
@@ -32,6 +32,12 @@ lint: build docs
 	$(BIN)/mypy
 	$(BIN)/python -m mypy.stubtest equipix._native
 	find python/equipix -name '*.py' | xargs $(BIN)/numpydoc lint
+
+audit:
+	@if command -v cargo-deny; then cargo deny --locked check; \
+	else echo "no cargo-deny: cargo install --locked cargo-deny"; fi
+	@if command -v pip-audit; then pip-audit -r requirements-dev.txt; \
+	else echo "no pip-audit: pipx install pip-audit"; fi
 
 build: $(BIN)/.built-$(PROFILE)
 

@@ -38,7 +38,7 @@ def main(output: str = "cal.tif") -> None:
 
     # The stage makes whole steps: what the centroid adds to them is its error and the stage's.
     cal = equipix.calibrate(exposures, shifts.round(), mask=saturated | dim)
-    cal.save(output, force=True)
+    cal.save(output)
     print(cal)
 
     raw = next(camera.frames(0))
