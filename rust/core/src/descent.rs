@@ -25,14 +25,14 @@ use crate::geometry::{Placement, View};
 use crate::model::{Model, Stretch};
 use crate::parallel::Workers;
 
-/// Sweeps between two estimates of the error, at first; later a sixteenth of those made.
+/// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
 /// A step that may be rounding alone, where some pixels are much brighter than others.
 const TINY_STEP: f64 = 1e-11;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
 /// Bytes of data that may be expected to stay in the last-level cache.
-const IN_CACHE: usize = 1 << 24;
+const IN_CACHE: usize = 1 << 25;
 /// Most columns that a kernel takes at once: their weights stay in the first-level cache.
 const STRETCH: usize = 1024;
 /// Neighbouring values that are solved side by side in vector registers.
@@ -132,10 +132,11 @@ pub fn solve<'m, 'a, T: Real>(
         if estimate.error <= tolerance || history.stalled() {
             break;
         }
-        // An estimate costs several sweeps: rarer checks as the run grows longer.
-        next_check = limit.min(sweep + CHECK_EVERY.max(sweep / CHECK_EVERY));
-        let total = history.forecast(tolerance, estimator.longest());
-        control.report("calibrate", sweep, total.min(limit));
+        let total = history.forecast(tolerance, estimator.longest()).min(limit);
+        control.report("calibrate", sweep, total);
+        // Rarer as the run grows longer, but not far beyond the sweep that may be the last.
+        let wait = (total - sweep).min(sweep / 4).max(CHECK_EVERY);
+        next_check = limit.min(sweep + wait);
     }
     Ok((descent, history))
 }

@@ -66,6 +66,40 @@ pub(crate) enum Stretch<'a, T> {
     Weighted(&'a [T], &'a [f64]),
 }
 
+/// Fills in the weights of a stretch, in a form that the compiler inlines into code for the CPU at
+/// hand.
+struct Weigh<'s, T> {
+    values: &'s [T],
+    variance: Option<&'s [T]>,
+    mask: Option<&'s [bool]>,
+    same: f64,
+    weights: &'s mut [f64],
+}
+
+impl<T: Real> pulp::NullaryFnOnce for Weigh<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let weights = self.weights;
+        if let Some(variance) = self.variance {
+            for (weight, variance) in weights.iter_mut().zip(variance) {
+                *weight = 1.0 / variance.to_f64();
+            }
+        } else {
+            weights.fill(self.same);
+        }
+        for (weight, value) in weights.iter_mut().zip(self.values) {
+            *weight = if value.to_f64().is_finite() { *weight } else { 0.0 };
+        }
+        if let Some(mask) = self.mask {
+            for (weight, &masked) in weights.iter_mut().zip(mask) {
+                *weight = if masked { 0.0 } else { *weight };
+            }
+        }
+    }
+}
+
 impl<'a, T: Real> Model<'a, T> {
     /// Checks the measurements of an experiment and views them.
     ///
@@ -149,7 +183,6 @@ impl<'a, T: Real> Model<'a, T> {
     }
 
     /// The measurements of `exposure` in columns `cols` of `row`; `scratch` has room for them.
-    #[inline(always)]
     pub(crate) fn stretch<'s>(
         &self,
         exposure: usize,
@@ -166,23 +199,13 @@ impl<'a, T: Real> Model<'a, T> {
             return Stretch::Uniform(values, self.exposure_weight(exposure));
         }
         let weights = &mut scratch[..values.len()];
-        match self.variance {
-            Variance::Measurements(variance) => {
-                let variance = &variance.row(exposure, row)[cols.clone()];
-                for (weight, &variance) in weights.iter_mut().zip(variance) {
-                    *weight = 1.0 / variance.to_f64();
-                }
-            }
-            _ => weights.fill(self.exposure_weight(exposure)),
-        }
-        for (weight, &value) in weights.iter_mut().zip(values) {
-            *weight = if value.to_f64().is_finite() { *weight } else { 0.0 };
-        }
-        if let Some(mask) = self.mask_row(exposure, row) {
-            for (weight, &masked) in weights.iter_mut().zip(&mask[cols]) {
-                *weight = if masked { 0.0 } else { *weight };
-            }
-        }
+        let variance = match self.variance {
+            Variance::Measurements(variance) => Some(&variance.row(exposure, row)[cols.clone()]),
+            _ => None,
+        };
+        let mask = self.mask_row(exposure, row).map(|mask| &mask[cols]);
+        let same = self.exposure_weight(exposure);
+        pulp::Arch::new().dispatch(Weigh { values, variance, mask, same, weights: &mut *weights });
         Stretch::Weighted(values, weights)
     }
 
