@@ -119,7 +119,7 @@ pub fn solve<'m, 'a, T: Real>(
     let limit = max_sweeps.unwrap_or(u64::MAX);
     let mut descent = Descent::new(model, workers);
     let mut history = History::default();
-    let mut next_check = limit.min(CHECK_EVERY);
+    let mut next_check = limit.min(CHECK_EVERY / 2);
     for sweep in 1..=limit {
         if sweep < next_check {
             history.objective.push(descent.sweep(control)?);

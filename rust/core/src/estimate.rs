@@ -136,11 +136,12 @@ impl<'m> Estimator<'m> {
         Ok(Estimate { sweep, error: by_rate.max(largest(&step)), step: largest_step })
     }
 
-    /// 1 − the factor by which the steps have shrunk per sweep since the last look.
+    /// 1 − the factor by which the steps have shrunk per sweep since the last look; at the first
+    /// look, where the slowest errors may still hide, what the longest wave loses.
     fn lost_per_sweep(&self, sweep: u64, rms: f64) -> f64 {
-        let lost = self
-            .last
-            .map_or(1.0, |last| 1.0 - (rms / last.rms).powf(1.0 / (sweep - last.sweep) as f64));
+        let lost = self.last.map_or(self.longest, |last| {
+            1.0 - (rms / last.rms).powf(1.0 / (sweep - last.sweep) as f64)
+        });
         lost.clamp(NOTHING, 1.0)
     }
 
