@@ -50,3 +50,35 @@ def positive_workers(workers: int | None) -> int | None:
             f"'workers' is {workers!r}, expected a whole number from 1 to {_MOST_WORKERS} or None"
         )
     return int(workers)
+
+
+def positive_count(name: str, value: int) -> int:
+    """A whole number above 0, checked."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
+    return int(value)
+
+
+def number(name: str, value: float) -> float:
+    """A number, checked."""
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{name}' is {value!r}, expected a number") from error
+
+
+def per_exposure(
+    name: str, values: ArrayLike | None, count: int, *, default: float
+) -> NDArray[np.float64]:
+    """One number for each exposure, `default` unless given."""
+    if values is None:
+        return np.full(count, float(default))
+    array = as_array(name, values, ndim=1).astype(np.float64)
+    check_count(name, len(array), count)
+    return array
+
+
+def check_count(name: str, got: int, count: int) -> None:
+    """Refuse an argument that has not one entry for each exposure."""
+    if got != count:
+        raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")

@@ -10,17 +10,25 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import as_array, as_floats, positive_workers
+from equipix._arrays import (
+    as_array,
+    as_floats,
+    check_count,
+    number,
+    per_exposure,
+    positive_count,
+    positive_workers,
+)
 from equipix.correction import Flagged, apply_gain
 from equipix.errors import (
     ConvergenceWarning,
     IdentifiabilityWarning,
     InputError,
-    ShiftRoundingWarning,
 )
 from equipix.io import save_pages
 from equipix.noise import smoothed_variances
 from equipix.results import FrameStatistics
+from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -32,12 +40,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 """Number of the file format; a file with a higher one is refused."""
-
-_UNNOTICED = 0.02
-"""Fraction of a pixel that a shift may be rounded by without a warning."""
-
-_BEYOND = 2**31
-"""More pixels than any sensor has along a side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,11 +330,11 @@ def calibrate(
     values, variances = _values_and_variances(frames, variance)
     count = len(values)
     positions = round_shifts(shifts)
-    _check_count("shifts", len(positions), count)
-    turns = _per_exposure("rotation", rotation, count, default=0)
+    check_count("shifts", len(positions), count)
+    turns = per_exposure("rotation", rotation, count, default=0)
     if not np.all(np.isin(turns, (0, 90, 180, 270))):
         raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
-    fluxes = _per_exposure("flux", flux, count, default=1)
+    fluxes = per_exposure("flux", flux, count, default=1)
     result = _native.calibrate_frames(
         values,
         positions,
@@ -340,8 +342,8 @@ def calibrate(
         flux=fluxes.tolist(),
         variance=variances,
         mask=None if mask is None else _boolean_mask(mask),
-        tolerance=_number("tolerance", tolerance),
-        max_sweeps=None if max_sweeps is None else _positive_count("max_sweeps", max_sweeps),
+        tolerance=number("tolerance", tolerance),
+        max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
         workers=positive_workers(workers),
         progress=progress,
     )
@@ -355,53 +357,6 @@ def calibrate(
     )
     _warn(calibration, tolerance)
     return calibration
-
-
-def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.int64]:
-    """Shifts rounded to whole pixels, with a warning where that changes them noticeably.
-
-    Parameters
-    ----------
-    shifts : array_like, shape (n, 2)
-        Shifts (row, col) in pixels.
-    std : array_like, shape (n, 2), optional
-        Their standard errors, in pixels; 0 unless given.
-
-    Returns
-    -------
-    ndarray, shape (n, 2), int64
-        The nearest whole shifts.
-
-    Raises
-    ------
-    InputError
-        If a shift is not a finite number.
-
-    Warns
-    -----
-    ShiftRoundingWarning
-        If a shift is more than 0.02 pixel and more than three standard errors from whole.
-    """
-    exact = as_array("shifts", shifts, ndim=2).astype(np.float64)
-    if exact.shape[1] != 2:
-        raise InputError(f"'shifts' has shape {exact.shape}, expected (n, 2): row and column")
-    if not np.isfinite(exact).all():
-        k = int(np.flatnonzero(~np.isfinite(exact).all(axis=1))[0])
-        raise InputError(f"'shifts' of exposure {k} is {exact[k].tolist()}, expected numbers")
-    # A shift beyond any sensor, which the solver refuses, must still fit an integer.
-    exact = np.clip(exact, -_BEYOND, _BEYOND)
-    whole = np.rint(exact)
-    known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
-    noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
-    if noticeable.any():
-        worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
-        warnings.warn(
-            f"shifts are rounded to whole pixels: that of exposure {worst[0]} is "
-            f"{np.round(exact[worst[0]], 3).tolist()}",
-            ShiftRoundingWarning,
-            stacklevel=3,
-        )
-    return whole.astype(np.int64)
 
 
 def _values_and_variances(
@@ -421,7 +376,7 @@ def _values_and_variances(
         return values, None
     variances = as_array("variance", variance, ndim=(1, 3))
     if variances.ndim == 1:
-        _check_count("variance", len(variances), len(values))
+        check_count("variance", len(variances), len(values))
         return values, variances.astype(np.float64)
     if variances.shape != values.shape:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
@@ -446,34 +401,6 @@ def _boolean_mask(mask: ArrayLike) -> NDArray[np.bool_]:
     if array.dtype != np.bool_:
         raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
     return array
-
-
-def _per_exposure(
-    name: str, values: ArrayLike | None, count: int, *, default: float
-) -> NDArray[np.float64]:
-    if values is None:
-        return np.full(count, float(default))
-    array = as_array(name, values, ndim=1).astype(np.float64)
-    _check_count(name, len(array), count)
-    return array
-
-
-def _check_count(name: str, got: int, count: int) -> None:
-    if got != count:
-        raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")
-
-
-def _number(name: str, value: float) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"'{name}' is {value!r}, expected a number") from error
-
-
-def _positive_count(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
-    return int(value)
 
 
 def _wrapped(

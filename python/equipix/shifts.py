@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,10 +10,16 @@ import numpy as np
 
 from equipix import _native
 from equipix._arrays import as_array
-from equipix.errors import InputError
+from equipix.errors import InputError, ShiftRoundingWarning
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
+
+_UNNOTICED = 0.02
+"""Fraction of a pixel that a shift may be rounded by without a warning."""
+
+_BEYOND = 2**31
+"""More pixels than any sensor has along a side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +168,53 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     if first == second:
         raise InputError(f"'second' is {second!r}, the same as 'first': the positions coincide")
     return np.array([(0, 0), (0, first), (0, second), (first, 0), (second, 0)], dtype=np.int64)
+
+
+def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.int64]:
+    """Shifts rounded to whole pixels, with a warning where that changes them noticeably.
+
+    Parameters
+    ----------
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col) in pixels.
+    std : array_like, shape (n, 2), optional
+        Their standard errors, in pixels; 0 unless given.
+
+    Returns
+    -------
+    ndarray, shape (n, 2), int64
+        The nearest whole shifts.
+
+    Raises
+    ------
+    InputError
+        If a shift is not a finite number.
+
+    Warns
+    -----
+    ShiftRoundingWarning
+        If a shift is more than 0.02 pixel and more than three standard errors from whole.
+    """
+    exact = as_array("shifts", shifts, ndim=2).astype(np.float64)
+    if exact.shape[1] != 2:
+        raise InputError(f"'shifts' has shape {exact.shape}, expected (n, 2): row and column")
+    if not np.isfinite(exact).all():
+        k = int(np.flatnonzero(~np.isfinite(exact).all(axis=1))[0])
+        raise InputError(f"'shifts' of exposure {k} is {exact[k].tolist()}, expected numbers")
+    # A shift beyond any sensor, which the solver refuses, must still fit an integer.
+    exact = np.clip(exact, -_BEYOND, _BEYOND)
+    whole = np.rint(exact)
+    known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
+    noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
+    if noticeable.any():
+        worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
+        warnings.warn(
+            f"shifts are rounded to whole pixels: that of exposure {worst[0]} is "
+            f"{np.round(exact[worst[0]], 3).tolist()}",
+            ShiftRoundingWarning,
+            stacklevel=3,
+        )
+    return whole.astype(np.int64)
 
 
 def _frames(name: str, values: ArrayLike) -> NDArray[Any]:
