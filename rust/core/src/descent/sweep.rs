@@ -1,0 +1,283 @@
+//! One sweep over all exposures: which lines of data meet in which cells and pixels.
+
+use std::ops::Range;
+
+use super::kernel::{Line, STRETCH, Scratch, Sums, improve, quotient};
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::{Real, Shape};
+use crate::geometry::{Placement, View};
+use crate::model::Model;
+use crate::parallel::Workers;
+
+/// Rows that a thread works on at a time.
+const BAND: usize = 8;
+/// Bytes of data that may be expected to stay in the last-level cache.
+const IN_CACHE: usize = 1 << 25;
+
+/// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
+pub struct Descent<'m, 'a, T> {
+    model: &'m Model<'a, T>,
+    workers: &'m Workers,
+    /// M, row by row; 1 where no measurement tells.
+    pub sensitivity: Vec<f64>,
+    /// L in each of the geometry's views; 0 where no measurement tells.
+    beams: Vec<Vec<f64>>,
+}
+
+impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
+    /// Starts from a sensor of equal pixels, M = 1.
+    #[must_use]
+    pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+        let cells = model.geometry.beam.len();
+        Self {
+            model,
+            workers,
+            sensitivity: vec![1.0; model.sensor().len()],
+            beams: vec![vec![0.0; cells]; model.geometry.views.len()],
+        }
+    }
+
+    /// One sweep: all L, then all M. Returns F after it.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled); the state is then no whole sweep's.
+    pub fn sweep(&mut self, control: &Control) -> Result<f64> {
+        let Shape { rows, cols } = self.model.sensor();
+        let mut bands = Vec::with_capacity(rows.div_ceil(BAND));
+        if self.beams.len() == 1 {
+            let places = self.model.geometry.exposures.iter();
+            let reach = places.map(|place| place.row).max().unwrap_or(0);
+            let mut done = 0;
+            for start in (0..rows).step_by(self.rows_in_cache()) {
+                let end = (start + self.rows_in_cache()).min(rows);
+                self.update_beam(done..end + reach, control);
+                done = end + reach;
+                bands.extend(self.update_sensitivity(start * cols..end * cols, control));
+            }
+        } else {
+            self.update_turned_beams(control);
+            bands.extend(self.update_sensitivity(0..rows * cols, control));
+        }
+        control.check()?;
+        Ok(bands.into_iter().sum())
+    }
+
+    /// Rows whose data are still in cache when M is updated, right after the cells of L that see
+    /// them. The cells of the rows that follow still see the old M, so nothing changes but the
+    /// number of times that the data come from memory: once a sweep, not twice.
+    fn rows_in_cache(&self) -> usize {
+        let Shape { cols, .. } = self.model.sensor();
+        let row = cols * self.model.count() * size_of::<T>();
+        (IN_CACHE / row).max(4 * BAND * self.workers.count()).next_multiple_of(BAND)
+    }
+
+    /// L on the beam grid, row by row; 0 where no measurement tells.
+    #[must_use]
+    pub fn beam(&self) -> Vec<f64> {
+        let geometry = &self.model.geometry;
+        let mut beam = vec![0.0; geometry.beam.len()];
+        self.workers.map_blocks(&mut beam, geometry.beam.cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell = self.beams[0][geometry.views[0].places.at(row, col)];
+            }
+        });
+        beam
+    }
+
+    /// The change of M since it was `before`, in units of the mean of M.
+    pub(super) fn step_since(&self, before: Vec<f64>) -> Vec<f64> {
+        let mean = self.sensitivity.iter().sum::<f64>() / self.sensitivity.len() as f64;
+        let mut step = before;
+        for (step, now) in step.iter_mut().zip(&self.sensitivity) {
+            *step = (now - *step) / mean;
+        }
+        step
+    }
+
+    /// Updates some rows of the beam, which has one view.
+    fn update_beam(&mut self, rows: Range<usize>, control: &Control) {
+        let cols = self.model.geometry.views[0].shape.cols;
+        let (model, sensitivity) = (self.model, &self.sensitivity[..]);
+        let first = rows.start;
+        let cells = &mut self.beams[0][rows.start * cols..rows.end * cols];
+        self.workers.map_blocks(cells, BAND * cols, |band, rows| {
+            let mut scratch = Scratch::new(model.count());
+            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
+                }
+                let row_of_view = first + band * BAND + index;
+                let seen = BeamRow { model, sensitivity, view: 0, row: row_of_view };
+                seen.for_each_stretch(&mut scratch, |lines, cells| {
+                    improve(lines, &mut row[cells]);
+                });
+            }
+        });
+    }
+
+    /// The update of L where exposures are turned against each other: the sums of each view are
+    /// brought together on the beam grid, and the new beam is turned into each view.
+    fn update_turned_beams(&mut self, control: &Control) {
+        let (views, beams) = (&self.model.geometry.views, &self.beams);
+        let sums: Vec<_> = (0..views.len()).map(|view| self.view_sums(view, control)).collect();
+        let Shape { rows, cols } = self.model.geometry.beam;
+        let mut beam = vec![0.0; rows * cols];
+        self.workers.map_blocks(&mut beam, cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell = beams[0][views[0].places.at(row, col)];
+                let [mut slope, mut weight] = [0.0; 2];
+                for (view, sums) in views.iter().zip(&sums) {
+                    let more = &sums[view.places.at(row, col)];
+                    slope += more[0];
+                    weight += more[1];
+                }
+                *cell += quotient(slope, weight);
+            }
+        });
+        for (view, turned) in views.iter().zip(&mut self.beams) {
+            turn(view, &beam, turned, self.workers);
+        }
+    }
+
+    /// Slope and weight of one view's exposures, for each of its cells.
+    fn view_sums(&self, view: usize, control: &Control) -> Vec<[f64; 2]> {
+        let (model, sensitivity, beam) = (self.model, &self.sensitivity[..], &self.beams[view]);
+        let shape = model.geometry.views[view].shape;
+        let mut result = vec![[0.0; 2]; shape.len()];
+        self.workers.map_blocks(&mut result, BAND * shape.cols, |band, rows| {
+            let mut scratch = Scratch::new(model.count());
+            for (index, sums) in rows.chunks_exact_mut(shape.cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
+                }
+                let row = band * BAND + index;
+                let sought = &beam[row * shape.cols..][..shape.cols];
+                let seen = BeamRow { model, sensitivity, view, row };
+                seen.for_each_stretch(&mut scratch, |lines, cells| {
+                    for (index, sum) in sums[cells.clone()].iter_mut().enumerate() {
+                        let found = Sums::<1>::over(lines, index, &[sought[cells.start + index]]);
+                        *sum = [found.slope[0], found.weight[0]];
+                    }
+                });
+            }
+        });
+        result
+    }
+
+    /// Updates M in a range of pixels, whole rows; returns the share of F of each band of them.
+    fn update_sensitivity(&mut self, pixels: Range<usize>, control: &Control) -> Vec<f64> {
+        let cols = self.model.sensor().cols;
+        let (model, beams) = (self.model, &self.beams[..]);
+        let first = pixels.start / cols;
+        let pixels = &mut self.sensitivity[pixels];
+        self.workers.map_blocks(pixels, BAND * cols, |band, rows| {
+            let mut scratch = Scratch::new(model.count());
+            let mut objective = 0.0;
+            for (index, pixels) in rows.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return objective;
+                }
+                let row = first + band * BAND + index;
+                for start in (0..cols).step_by(STRETCH) {
+                    let stretch = start..(start + STRETCH).min(cols);
+                    let lines = pixel_lines(model, beams, row, stretch.clone(), &mut scratch);
+                    objective += improve(&lines, &mut pixels[stretch]);
+                }
+            }
+            objective
+        })
+    }
+}
+
+/// Copies `beam` into the orientation of `view`.
+fn turn(view: &View, beam: &[f64], turned: &mut [f64], workers: &Workers) {
+    workers.map_blocks(turned, view.shape.cols, |row, cells| {
+        for (col, cell) in cells.iter_mut().enumerate() {
+            *cell = beam[view.cells.at(row, col)];
+        }
+    });
+}
+
+/// The exposures along a stretch of a row of pixels, with the beam that they see.
+fn pixel_lines<'s, T: Real>(
+    model: &Model<'s, T>,
+    beams: &'s [Vec<f64>],
+    row: usize,
+    cols: Range<usize>,
+    scratch: &'s mut Scratch,
+) -> Vec<Line<'s, T>> {
+    let exposures = model.geometry.exposures.iter().zip(&model.flux).enumerate();
+    exposures
+        .zip(&mut scratch.weights)
+        .map(|((exposure, (place, &flux)), weights)| {
+            let view_cols = model.geometry.views[place.view].shape.cols;
+            let first = (row + place.row) * view_cols + place.col + cols.start;
+            let known = &beams[place.view][first..][..cols.len()];
+            Line { measured: model.stretch(exposure, row, cols.clone(), weights), known, flux }
+        })
+        .collect()
+}
+
+/// One row of beam cells, in one view, and what the exposures there see of it.
+struct BeamRow<'r, 'a, T> {
+    model: &'r Model<'a, T>,
+    sensitivity: &'r [f64],
+    view: usize,
+    row: usize,
+}
+
+impl<T: Real> BeamRow<'_, '_, T> {
+    /// Calls `work(lines, cells)` for each stretch of cells that the same exposures see.
+    fn for_each_stretch(
+        &self,
+        scratch: &mut Scratch,
+        mut work: impl FnMut(&[Line<'_, T>], Range<usize>),
+    ) {
+        let edges = self.edges();
+        for pair in edges.windows(2) {
+            for start in (pair[0]..pair[1]).step_by(STRETCH) {
+                let cells = start..(start + STRETCH).min(pair[1]);
+                let lines = self.lines(cells.clone(), scratch);
+                work(&lines, cells);
+            }
+        }
+    }
+
+    /// Where windows of exposures begin and end along the row, rising.
+    fn edges(&self) -> Vec<usize> {
+        let cols = self.model.sensor().cols;
+        let ends = self.exposures().flat_map(|(_, place)| [place.col, place.col + cols]);
+        let mut edges: Vec<usize> = ends.collect();
+        edges.sort_unstable();
+        edges.dedup();
+        edges
+    }
+
+    /// The exposures whose windows reach this row.
+    fn exposures(&self) -> impl Iterator<Item = (usize, &Placement)> {
+        let rows = self.model.sensor().rows;
+        let places = self.model.geometry.exposures.iter().enumerate();
+        places.filter(move |(_, place)| {
+            place.view == self.view && (place.row..place.row + rows).contains(&self.row)
+        })
+    }
+
+    /// The exposures that see `cells`, with the sensitivities of the pixels that do.
+    fn lines<'s>(&'s self, cells: Range<usize>, scratch: &'s mut Scratch) -> Vec<Line<'s, T>> {
+        let cols = self.model.sensor().cols;
+        let seeing = self
+            .exposures()
+            .filter(|(_, place)| place.col <= cells.start && cells.end <= place.col + cols);
+        seeing
+            .zip(&mut scratch.weights)
+            .map(|((exposure, place), weights)| {
+                let row = self.row - place.row;
+                let pixels = cells.start - place.col..cells.end - place.col;
+                let known = &self.sensitivity[row * cols..][pixels.clone()];
+                let measured = self.model.stretch(exposure, row, pixels, weights);
+                Line { measured, known, flux: self.model.flux[exposure] }
+            })
+            .collect()
+    }
+}
