@@ -305,3 +305,13 @@ class TestFrameStatistics:
         scatter = np.std(simulate.relative_error(weighted.sensitivity, truth))
         difference = np.std(simulate.relative_error(cal.sensitivity, weighted.sensitivity))
         assert difference < 0.1 * scatter
+
+    def test_saturated_means_are_left_out_and_flagged(self):
+        frames, truth = measured((30, 40), noise=0)
+        raw = np.rint(frames[:, None] * 200).astype(np.uint8)
+        raw[2, :, 5, 6] = 255
+        averages = [equipix.average(each) for each in raw]
+        cal = equipix.calibrate(averages, CROSS, variance=np.ones(5))
+        assert np.argwhere(cal.flags == Flag.SATURATED).tolist() == [[5, 6]]
+        # The other four exposures determine the pixel, to the rounding of 200 DN.
+        assert cal.sensitivity[5, 6] == pytest.approx(truth[5, 6], abs=5 / 200)

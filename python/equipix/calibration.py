@@ -27,7 +27,7 @@ from equipix.errors import (
 )
 from equipix.io import save_pages
 from equipix.noise import smoothed_variances
-from equipix.results import FrameStatistics
+from equipix.results import Flag, FrameStatistics
 from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
@@ -253,7 +253,8 @@ def calibrate(
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
         `FrameStatistics` bring their variances along: a noise model fitted over all pixels, not
-        each pixel's own sample variance, gives the weights.
+        each pixel's own sample variance, gives the weights. A mean with saturated samples counts
+        as masked, and its pixel is flagged.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
         unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result without
@@ -327,7 +328,10 @@ def calibrate(
     started = datetime.now(UTC)
     if method != "coordinate-descent":
         raise InputError(f"'method' is {method!r}, expected 'coordinate-descent'")
-    values, variances = _values_and_variances(frames, variance)
+    statistics = _statistics(frames)
+    values = _values(cast("ArrayLike", frames), statistics)
+    if variance is None and statistics:
+        variance = smoothed_variances(statistics)
     count = len(values)
     positions = round_shifts(shifts)
     check_count("shifts", len(positions), count)
@@ -340,7 +344,7 @@ def calibrate(
         positions,
         rotation=turns.astype(int).tolist(),
         flux=fluxes.tolist(),
-        variance=variances,
+        variance=None if variance is None else _variances(variance, values),
         mask=None if mask is None else _boolean_mask(mask),
         tolerance=number("tolerance", tolerance),
         max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
@@ -355,32 +359,31 @@ def calibrate(
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+    for each in statistics:
+        calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
     _warn(calibration, tolerance)
     return calibration
 
 
-def _values_and_variances(
-    frames: ArrayLike | Sequence[FrameStatistics], variance: ArrayLike | None
-) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Frames as (n, rows, cols) and their variances in a dtype that fits."""
-    statistics = _statistics(frames)
+def _values(frames: ArrayLike, statistics: list[FrameStatistics]) -> NDArray[Any]:
+    """Frames as (n, rows, cols); NaN, which counts as masked, where averaged samples saturated."""
     if statistics:
-        values = as_floats("frames", np.stack([each.mean for each in statistics]), ndim=3)
-        if variance is None:
-            return values, smoothed_variances(statistics).astype(values.dtype, copy=False)
-    else:
-        values = as_floats("frames", cast("ArrayLike", frames), ndim=3)
+        frames = np.stack([np.where(f.saturated > 0, np.nan, f.mean) for f in statistics])
+    values = as_floats("frames", frames, ndim=3)
     if 0 in values.shape[1:]:
         raise InputError(f"'frames' has shape {values.shape}, expected at least one pixel")
-    if variance is None:
-        return values, None
+    return values
+
+
+def _variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
+    """Variances in the shape and dtype that the solver takes."""
     variances = as_array("variance", variance, ndim=(1, 3))
     if variances.ndim == 1:
         check_count("variance", len(variances), len(values))
-        return values, variances.astype(np.float64)
+        return variances.astype(np.float64)
     if variances.shape != values.shape:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
-    return values, variances.astype(values.dtype, copy=False)
+    return variances.astype(values.dtype, copy=False)
 
 
 def _statistics(frames: object) -> list[FrameStatistics]:
