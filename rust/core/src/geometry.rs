@@ -141,7 +141,8 @@ impl Geometry {
     ///
     /// # Errors
     /// [`Error::Shape`] if the two differ in number; [`Error::Value`] for fewer than two
-    /// exposures and for a shift as large as the sensor or larger.
+    /// exposures, for a shift as large as the sensor or larger, and for a sensor whose pixels and
+    /// beam cells cannot be numbered in 32 bits.
     pub fn new(sensor: Shape, shifts: &[[i64; 2]], rotations: &[Rotation]) -> Result<Self> {
         if shifts.len() < 2 {
             let problem = format!("holds {} exposure(s), at least two are needed", shifts.len());
@@ -166,6 +167,7 @@ impl Geometry {
             }
         }
         let beam = Shape::new((high[0] - low[0]) as usize, (high[1] - low[1]) as usize);
+        check_size(sensor, beam)?;
         let mut views: Vec<View> = Vec::new();
         let mut exposures = Vec::with_capacity(shifts.len());
         for (&[row, col], &rotation) in shifts.iter().zip(rotations) {
@@ -194,6 +196,20 @@ fn turned_corner(rotation: Rotation, beam: Shape, window: Shape, corner: [usize;
         Rotation::Half => [from_bottom, from_right],
         Rotation::ThreeQuarters => [col, from_bottom],
     }
+}
+
+/// Pixels and cells together are numbered in 32 bits.
+fn check_size(sensor: Shape, beam: Shape) -> Result<()> {
+    let count = |shape: Shape| shape.rows as u128 * shape.cols as u128;
+    if count(sensor) + count(beam) <= u128::from(u32::MAX) {
+        return Ok(());
+    }
+    let problem = format!(
+        "have {sensor} pixels and a beam grid of {beam} cells: more than {} together cannot be \
+         calibrated at once",
+        u32::MAX
+    );
+    Err(Error::value("frames", problem))
 }
 
 /// A shift as large as the window leaves nothing in common with the beam at shift 0.
@@ -250,6 +266,13 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_grid_beyond_32_bits_is_refused() {
+        let shifts = [[0, 0], [1, 0]];
+        let refused = Geometry::new(Shape::new(50_000, 50_000), &shifts, &[Rotation::None; 2]);
+        assert!(refused.unwrap_err().to_string().contains("more than 4294967295 together"));
     }
 
     #[test]
