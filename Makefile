@@ -1,30 +1,27 @@
 # Each target creates .venv and installs what it needs: a Rust toolchain and Python are enough.
 PYTHON ?= python3
 BIN := .venv/bin
-PROFILE ?= release
 SOURCES := $(shell find rust python -name '*.rs' -o -name '*.py') Cargo.toml Cargo.lock pyproject.toml
 
 .PHONY: demo test bench figures docs lint audit build clean
 
-demo: build
+demo: $(BIN)/.built-release
 	$(BIN)/equipix demo --force
 
-test: PROFILE = ci
-test: build
+test: $(BIN)/.built-ci
 	cargo test --locked
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-bench: build
+bench: $(BIN)/.built-release
 	$(BIN)/python benches/run.py
 
-figures: build
+figures: $(BIN)/.built-release
 	$(BIN)/python docs/figures.py
 
 docs:
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps -p equipix-core
 
-lint: PROFILE = ci
-lint: build docs
+lint: $(BIN)/.built-ci docs
 	cargo fmt --all --check
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 	$(BIN)/ruff format --check .
@@ -39,15 +36,14 @@ audit:
 	@if command -v pip-audit; then pip-audit -r requirements-dev.txt; \
 	else echo "no pip-audit: pipx install pip-audit"; fi
 
-build: $(BIN)/.built-$(PROFILE)
-
 $(BIN)/.installed: requirements-dev.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	touch $@
 
-$(BIN)/.built-$(PROFILE): $(BIN)/.installed $(SOURCES)
-	$(BIN)/maturin develop --locked --profile $(PROFILE) --extras plot,codecs
+# Only one build is installed at a time: that of the target asked for.
+$(BIN)/.built-%: $(BIN)/.installed $(SOURCES)
+	$(BIN)/maturin develop --locked --profile $* --extras plot,codecs
 	rm -f $(BIN)/.built-*
 	touch $@
 

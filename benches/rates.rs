@@ -1,6 +1,7 @@
 //! The rate of one sweep beside the machine's copy rate, measured in turn; prints a line of JSON
-//! for each size. A sweep reads its data twice, so it is held against a copy of the data: as many
-//! bytes, half of them read and half written, by as many threads.
+//! for each size. The yardstick is a copy of as many bytes, half of them read and half written, by as
+//! many threads. Two counts of a sweep's bytes: the data twice, as in two separate passes; and all
+//! that the fused sweep moves when nothing fits the cache: the data once, L and M read and written.
 
 #![allow(clippy::unwrap_used, reason = "a bench has nobody to report to")]
 
@@ -52,16 +53,18 @@ fn measure(shape: Shape, repetitions: usize) {
     }
     // The first of each touches its memory for the first time.
     let ratios = copies.iter().zip(&sweeps).skip(1).map(|(copy, sweep)| copy / sweep);
+    let ratio = median(ratios.collect());
     println!(
         "{{\"rows\": {}, \"cols\": {}, \"threads\": {}, \"sweep_s\": {:.3e}, \"copy_s\": {:.3e}, \
-         \"copy_gb_per_s\": {:.2}, \"share_of_copy_rate\": {:.4}}}",
+         \"copy_gb_per_s\": {:.2}, \"share_of_copy_rate\": {:.4}, \"share_in_all\": {:.4}}}",
         shape.rows,
         shape.cols,
         workers.count(),
         median(sweeps[1..].to_vec()),
         median(copies[1..].to_vec()),
         (8 * data.len()) as f64 / median(copies[1..].to_vec()) / 1e9,
-        median(ratios.collect()),
+        ratio,
+        ratio * (4 * data.len() + 32 * shape.len()) as f64 / (8 * data.len()) as f64,
     );
 }
 

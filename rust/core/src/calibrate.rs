@@ -41,24 +41,40 @@ pub fn calibrate<T: Real>(
 ) -> Result<Solution> {
     let components = Components::of(model, control)?;
     let (descent, history) = descent::solve(model, components.sizes.len(), stop, workers, control)?;
-    let beam = descent.beam();
+    let mut beam = descent.beam();
     let mut sensitivity = descent.sensitivity;
     let means = component_means(&sensitivity, &components);
-    for (value, &label) in sensitivity.iter_mut().zip(&components.pixels) {
-        *value = if label == 0 { *value / means[0] } else { f64::NAN };
-    }
-    let observed = |label: i32| usize::try_from(label).ok().map(|label| means[label]);
-    let beam = beam.iter().zip(&components.cells);
+    rescale(&mut sensitivity, &components.pixels, workers, |value, label| {
+        if label == 0 { value / means[0] } else { f64::NAN }
+    });
+    rescale(&mut beam, &components.cells, workers, |value, label| {
+        usize::try_from(label).map_or(f64::NAN, |label| value * means[label])
+    });
     let undetermined = flag::NO_FLAT_FIELD | flag::DO_NOT_USE;
     Ok(Solution {
         sensitivity,
-        beam: beam.map(|(l, &label)| observed(label).map_or(f64::NAN, |mean| l * mean)).collect(),
+        beam,
         flags: components.pixels.iter().map(|&l| if l == 0 { 0 } else { undetermined }).collect(),
         degrees_of_freedom: degrees_of_freedom(model.used(), &components),
-        converged: history.last_estimate() <= stop.tolerance,
+        converged: history.converged(stop.tolerance),
         components,
         history,
     })
+}
+
+/// Replaces each value by `scaled(value, label)`.
+fn rescale(
+    values: &mut [f64],
+    labels: &[i32],
+    workers: &Workers,
+    scaled: impl Fn(f64, i32) -> f64 + Send + Sync,
+) {
+    const PART: usize = 1 << 16;
+    workers.map_blocks(values, PART, |index, part| {
+        for (value, &label) in part.iter_mut().zip(&labels[index * PART..]) {
+            *value = scaled(*value, label);
+        }
+    });
 }
 
 /// The mean sensitivity of each component.

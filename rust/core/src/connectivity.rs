@@ -36,6 +36,15 @@ impl DisjointSets {
         node
     }
 
+    /// The smallest member of each set, by member.
+    fn into_roots(mut self, control: &Control) -> Result<Vec<u32>> {
+        // A parent is smaller than its child, so it is already a root when the child's turn comes.
+        in_parts(self.parents.len(), control, |node| {
+            self.parents[node] = self.parents[self.parents[node] as usize];
+        })?;
+        Ok(self.parents)
+    }
+
     /// Makes one set of the sets of `a` and `b`.
     pub fn union(&mut self, a: usize, b: usize) {
         let (a, b) = (self.find(a), self.find(b));
@@ -43,6 +52,15 @@ impl DisjointSets {
             self.parents[a.max(b)] = a.min(b) as u32;
         }
     }
+}
+
+/// Calls `visit` for 0, 1, … `count` − 1, and looks now and then whether to stop.
+fn in_parts(count: usize, control: &Control, mut visit: impl FnMut(usize)) -> Result<()> {
+    for start in (0..count).step_by(CHECK_EVERY) {
+        control.check()?;
+        (start..count.min(start + CHECK_EVERY)).for_each(&mut visit);
+    }
+    Ok(())
 }
 
 /// The label of what belongs to no component: it has no used measurement.
@@ -75,28 +93,26 @@ impl Components {
             used[pixel] = true;
             used[pixels + cell] = true;
         })?;
+        let roots = sets.into_roots(control)?;
         // Each component has a pixel, and pixels come before cells: so roots are pixels.
         let mut sizes = vec![0_usize; pixels];
-        for pixel in (0..pixels).filter(|&pixel| used[pixel]) {
-            sizes[sets.find(pixel)] += 1;
+        in_parts(pixels, control, |pixel| {
+            sizes[roots[pixel] as usize] += usize::from(used[pixel]);
+        })?;
+        let mut order = Vec::new();
+        in_parts(pixels, control, |pixel| order.extend((sizes[pixel] > 0).then_some(pixel)))?;
+        order.sort_by_key(|&root| (std::cmp::Reverse(sizes[root]), root));
+        let mut label_of = vec![NONE; pixels];
+        for (label, &root) in order.iter().enumerate() {
+            label_of[root] = label as i32;
         }
-        let mut roots: Vec<usize> = (0..pixels).filter(|&root| sizes[root] > 0).collect();
-        roots.sort_by_key(|&root| (std::cmp::Reverse(sizes[root]), root));
-        let mut labels = vec![NONE; pixels];
-        for (label, &root) in roots.iter().enumerate() {
-            labels[root] = label as i32;
-        }
-        let mut label = |node: usize| {
-            if node.is_multiple_of(CHECK_EVERY) {
-                control.check()?;
-            }
-            Ok(if used[node] { labels[sets.find(node)] } else { NONE })
-        };
-        Ok(Self {
-            pixels: (0..pixels).map(&mut label).collect::<Result<_>>()?,
-            cells: (pixels..used.len()).map(&mut label).collect::<Result<_>>()?,
-            sizes: roots.iter().map(|&root| sizes[root]).collect(),
-        })
+        let mut labels = Vec::with_capacity(used.len());
+        in_parts(used.len(), control, |node| {
+            labels.push(if used[node] { label_of[roots[node] as usize] } else { NONE });
+        })?;
+        let cells = labels.split_off(pixels);
+        let sizes = order.iter().map(|&root| sizes[root]).collect();
+        Ok(Self { pixels: labels, cells, sizes })
     }
 }
 

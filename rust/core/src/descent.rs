@@ -29,6 +29,10 @@ use crate::parallel::Workers;
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
+/// Before so many sweeps slow errors may hide under those that fade at once.
+const FEWEST_SWEEPS: u64 = 64;
+/// Sweeps that nobody waits for: what makes so many is no experiment that this method can solve.
+const MOST_SWEEPS: u64 = 1_000_000;
 /// A step that may be rounding alone, where some pixels are much brighter than others.
 const TINY_STEP: f64 = 1e-11;
 
@@ -37,7 +41,7 @@ const TINY_STEP: f64 = 1e-11;
 pub struct Stop {
     /// The largest relative error of M that is wanted.
     pub tolerance: f64,
-    /// The most sweeps to make; `None` means as many as it takes.
+    /// The most sweeps to make; `None` means as many as it takes, at most a million.
     pub max_sweeps: Option<u64>,
 }
 
@@ -70,6 +74,12 @@ impl History {
         let half = earlier.iter().find(|estimate| 2 * estimate.sweep >= last.sweep);
         let falling = half.is_none_or(|half| last.error < half.error);
         last.step < ROUNDING || (last.step < TINY_STEP && !falling)
+    }
+
+    /// Whether the estimate is within `tolerance`, and late enough to be believed.
+    #[must_use]
+    pub fn converged(&self, tolerance: f64) -> bool {
+        self.sweeps() >= FEWEST_SWEEPS && self.last_estimate() <= tolerance
     }
 
     /// How many sweeps it will be until `tolerance` is met, if errors go on to fade as they did
@@ -109,8 +119,8 @@ pub fn solve<'m, 'a, T: Real>(
     if max_sweeps == Some(0) {
         return Err(Error::value("max_sweeps", "is 0: at least one sweep is needed"));
     }
-    let mut estimator = Estimator::new(model, components, workers);
-    let limit = max_sweeps.unwrap_or(u64::MAX);
+    let mut estimator = Estimator::new(model, components, workers, control)?;
+    let limit = max_sweeps.unwrap_or(MOST_SWEEPS);
     let mut descent = Descent::new(model, workers);
     let mut history = History::default();
     let mut next_check = limit.min(CHECK_EVERY / 2);
@@ -123,7 +133,7 @@ pub fn solve<'m, 'a, T: Real>(
         history.objective.push(descent.sweep(control)?);
         let estimate = estimator.largest_error(descent.step_since(before), sweep, control)?;
         history.error_estimate.push(estimate);
-        if estimate.error <= tolerance || history.stalled() {
+        if history.converged(tolerance) || history.stalled() {
             break;
         }
         let total = history.forecast(tolerance, estimator.longest()).min(limit);

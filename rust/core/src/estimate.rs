@@ -13,9 +13,13 @@
 //! the change of F can tell that it is there. Dividing the step by the symbol, mode by mode of a
 //! cosine transform, brings it back: the estimate is max |DCT⁻¹(DCT(s)·n/λ)|.
 //!
-//! Where masks narrow the way between two parts of the sensor, errors fade more slowly than the
-//! symbol says. So the rate at which the steps really shrink gives a second figure, that of a
-//! geometric series, max |s| / (1 − rate), and the larger of the two is the estimate.
+//! The symbol takes all measurements as equal. Where the light is faint or masks leave little, the
+//! parts on either side are coupled more weakly and their difference fades more slowly: by no more
+//! than the contrast of the weights w·m², taken over blocks of pixels, in which a few bad pixels do
+//! not count. The figure is multiplied by that contrast, the mean over the least.
+//!
+//! The rate at which the steps really shrink gives another figure, that of a geometric series,
+//! max |s| / (1 − rate), and the larger of the two is the estimate.
 //!
 //! Exposures that are turned against each other do not share plane waves. The phases between them
 //! are then taken as the worst possible, which makes the estimate too large rather than too small.
@@ -29,6 +33,8 @@ use crate::model::Model;
 use crate::parallel::Workers;
 use crate::transform::CosineTransform;
 
+/// Pixels along a side of the blocks whose weights are compared.
+const BLOCK: usize = 16;
 /// A symbol or a rate this small cannot be told from 0.
 const NOTHING: f64 = 1e-8;
 /// What a step may be by rounding alone, M being close to 1.
@@ -52,6 +58,8 @@ pub struct Estimator<'m> {
     waves: Vec<Waves>,
     /// The symbol of the longest wave along either side of the sensor.
     longest: f64,
+    /// How much more slowly than by the symbol errors may fade, since measurements are not equal.
+    contrast: f64,
     /// No symbol counts as less than this.
     least: f64,
     last: Option<LastStep>,
@@ -82,14 +90,22 @@ struct Complex {
 
 impl<'m> Estimator<'m> {
     /// Prepares the symbol of an experiment whose measurements form so many `components`.
-    #[must_use]
-    pub fn new<T: Real>(model: &Model<'_, T>, components: usize, workers: &'m Workers) -> Self {
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+    pub fn new<T: Real>(
+        model: &Model<'_, T>,
+        components: usize,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Self> {
         let shape = model.sensor();
         let mut estimator = Self {
             workers,
             transform: CosineTransform::new(shape),
             waves: waves(model),
             longest: 1.0,
+            contrast: contrast(model, workers, control)?,
             least: NOTHING,
             last: None,
         };
@@ -105,7 +121,7 @@ impl<'m> Estimator<'m> {
             // one the symbol says nothing. Within a component errors fade as on the open sensor.
             estimator.least = estimator.longest;
         }
-        estimator
+        Ok(estimator)
     }
 
     /// The share of the longest wave that one sweep removes, as the symbol has it.
@@ -133,7 +149,11 @@ impl<'m> Estimator<'m> {
         self.last = Some(LastStep { sweep, rms });
         let amplification = |i, j| self.amplification(i, j);
         self.transform.filter(&mut step, amplification, self.workers, control)?;
-        Ok(Estimate { sweep, error: by_rate.max(largest(&step)), step: largest_step })
+        Ok(Estimate {
+            sweep,
+            error: by_rate.max(self.contrast * largest(&step)),
+            step: largest_step,
+        })
     }
 
     /// 1 − the factor by which the steps have shrunk per sweep since the last look; at the first
@@ -173,6 +193,33 @@ impl<'m> Estimator<'m> {
     }
 }
 
+/// The mean over the least weight Σ w y² of blocks of pixels, those apart that have none at all.
+fn contrast<T: Real>(model: &Model<'_, T>, workers: &Workers, control: &Control) -> Result<f64> {
+    let Shape { rows, cols } = model.sensor();
+    let by_row = workers.map(rows.div_ceil(BLOCK), |block| {
+        let mut sums = vec![0.0; cols.div_ceil(BLOCK)];
+        let mut scratch = vec![0.0; cols];
+        for row in block * BLOCK..rows.min((block + 1) * BLOCK) {
+            for exposure in 0..model.count() {
+                control.check()?;
+                let squares = model.weighted_squares(exposure, row, &mut scratch);
+                for (sum, squares) in sums.iter_mut().zip(squares.chunks(BLOCK)) {
+                    *sum += squares.iter().sum::<f64>();
+                }
+            }
+        }
+        let height = (rows - block * BLOCK).min(BLOCK);
+        for (index, sum) in sums.iter_mut().enumerate() {
+            *sum /= (height * (cols - index * BLOCK).min(BLOCK)) as f64;
+        }
+        Ok(sums)
+    });
+    let blocks = by_row.into_iter().collect::<Result<Vec<_>>>()?.concat();
+    let seen = blocks.iter().copied().filter(|&weight| weight > 0.0);
+    let least = seen.clone().fold(f64::INFINITY, f64::min);
+    Ok((seen.clone().sum::<f64>() / seen.count() as f64 / least).max(1.0))
+}
+
 fn waves<T: Real>(model: &Model<'_, T>) -> Vec<Waves> {
     let Shape { rows, cols } = model.sensor();
     let weights = model.exposure_weights();
@@ -195,6 +242,13 @@ fn phases(shift: usize, count: usize) -> Vec<Complex> {
     (0..count).map(|mode| Complex { re: phase(mode).cos(), im: phase(mode).sin() }).collect()
 }
 
+/// The largest size of some values; NaN if any is.
 fn largest(values: &[f64]) -> f64 {
-    values.iter().fold(0.0, |largest, value| value.abs().max(largest))
+    let larger = |largest: f64, value: f64| if value <= largest { largest } else { value };
+    values.iter().fold(
+        0.0,
+        |largest, value| {
+            if largest.is_nan() { largest } else { larger(largest, value.abs()) }
+        },
+    )
 }

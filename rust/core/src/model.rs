@@ -56,7 +56,13 @@ struct Tally {
     used: usize,
     positive: usize,
     weight: f64,
+    largest: f64,
 }
+
+/// Values whose squares and weights stay far from the ends of what a double holds.
+const VALUES: Range<f64> = 1e-50..1e50;
+/// Variances likewise.
+const VARIANCES: Range<f64> = 1e-100..1e100;
 
 /// A stretch of one row of one exposure, as the kernels take it.
 pub(crate) enum Stretch<'a, T> {
@@ -104,9 +110,9 @@ impl<'a, T: Real> Model<'a, T> {
     /// Checks the measurements of an experiment and views them.
     ///
     /// # Errors
-    /// [`Error::Shape`] if the arguments do not fit each other; [`Error::Value`] if a flux is not
-    /// a positive number, the variance of a used measurement not positive, no measurement of an
-    /// exposure is used, or the median of an exposure is not above 0; [`Error::Cancelled`] if
+    /// [`Error::Shape`] if the arguments do not fit each other; [`Error::Value`] if a flux, the
+    /// variance of a used measurement or the largest value of an exposure is not a positive number
+    /// far from the ends of what a double holds, no measurement of an exposure is used, or the median of an exposure is not above 0; [`Error::Cancelled`] if
     /// `control` asks to stop.
     pub fn new(
         frames: Stack<'a, T>,
@@ -209,6 +215,28 @@ impl<'a, T: Real> Model<'a, T> {
         Stretch::Weighted(values, weights)
     }
 
+    /// w y² of the measurements of one row of an exposure; 0 where not used.
+    pub(crate) fn weighted_squares<'s>(
+        &self,
+        exposure: usize,
+        row: usize,
+        scratch: &'s mut [f64],
+    ) -> &'s [f64]
+    where
+        'a: 's,
+    {
+        let cols = self.sensor().cols;
+        let values = self.frames.row(exposure, row);
+        match self.stretch(exposure, row, 0..cols, scratch) {
+            Stretch::Uniform(_, weight) => scratch.fill(weight),
+            Stretch::Weighted(..) => {}
+        }
+        for (weight, value) in scratch.iter_mut().zip(values) {
+            *weight *= if *weight > 0.0 { value.to_f64().powi(2) } else { 0.0 };
+        }
+        scratch
+    }
+
     /// The weight of an exposure's measurements where it is the same for all.
     fn exposure_weight(&self, exposure: usize) -> f64 {
         match self.variance {
@@ -257,11 +285,13 @@ impl<'a, T: Real> Model<'a, T> {
     }
 
     fn check_flux(&self) -> Result<()> {
-        match self.flux.iter().position(|&c| !(c.is_finite() && c > 0.0)) {
+        match self.flux.iter().position(|c| !VALUES.contains(c)) {
             None => Ok(()),
             Some(k) => {
                 let c = self.flux[k];
-                let problem = format!("of exposure {k} is {c}: expected a positive number");
+                let problem = format!(
+                    "of exposure {k} is {c}: expected a positive number from 1e-50 to 1e50"
+                );
                 Err(Error::value("flux", problem))
             }
         }
@@ -281,12 +311,13 @@ impl<'a, T: Real> Model<'a, T> {
                     if weight == 0.0 {
                         continue;
                     }
-                    if !(weight > 0.0 && weight.is_finite()) {
+                    if !VARIANCES.contains(&(1.0 / weight)) {
                         return Err(self.bad_variance(exposure, row, col, 1.0 / weight));
                     }
                     tally.used += 1;
                     tally.positive += usize::from(value.to_f64() > 0.0);
                     tally.weight += weight;
+                    tally.largest = tally.largest.max(value.to_f64().abs());
                 }
             }
             Ok(tally)
@@ -297,6 +328,7 @@ impl<'a, T: Real> Model<'a, T> {
                 used: sum.used + row.used,
                 positive: sum.positive + row.positive,
                 weight: sum.weight + row.weight,
+                largest: sum.largest.max(row.largest),
             })
         })
     }
@@ -306,8 +338,10 @@ impl<'a, T: Real> Model<'a, T> {
             Variance::Measurements(_) => format!(" at row {row}, column {col}"),
             _ => String::new(),
         };
-        let problem =
-            format!("of exposure {exposure}{place} is {variance}: expected a positive number");
+        let problem = format!(
+            "of exposure {exposure}{place} is {variance}: expected a positive number from 1e-100 \
+             to 1e100"
+        );
         Error::value("variance", problem)
     }
 
@@ -320,6 +354,14 @@ impl<'a, T: Real> Model<'a, T> {
             if tally.used == 0 {
                 let problem = format!("leaves nothing of exposure {exposure}: leave it out");
                 return Err(Error::value("mask", problem));
+            }
+            if tally.largest >= VALUES.end || (tally.largest < VALUES.start && tally.positive > 0) {
+                let problem = format!(
+                    "of exposure {exposure} have a largest value of {:e}: expected 1e-50 to 1e50, \
+                     choose another unit",
+                    tally.largest
+                );
+                return Err(Error::value("frames", problem));
             }
             if 2 * tally.positive <= tally.used {
                 let problem = format!(

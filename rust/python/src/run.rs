@@ -4,8 +4,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
-use equipix_core::Result;
 use equipix_core::control::Control;
+use equipix_core::{Error, Result};
 use pyo3::prelude::*;
 
 use crate::errors;
@@ -26,11 +26,15 @@ pub(crate) fn interruptible<R: Send>(
     let (sender, receiver) = channel();
     let receiver = std::sync::Mutex::new(receiver);
     std::thread::scope(|scope| {
-        scope.spawn(|| {
+        let started = std::thread::Builder::new().spawn_scoped(scope, || {
             let outcome = catch_unwind(AssertUnwindSafe(|| work(&control)));
             // The receiver waits until this arrives, so there is always somebody to send it to.
             let _ = sender.send(outcome);
         });
+        started.map_err(|error| {
+            let reason = error.to_string();
+            errors::exception(py, &Error::Workers { workers: 1, reason })
+        })?;
         let mut raised = None;
         loop {
             let wait = || receiver.lock().ok().map(|receiver| receiver.recv_timeout(POLL));

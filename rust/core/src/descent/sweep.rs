@@ -10,6 +10,8 @@ use crate::geometry::{Placement, View};
 use crate::model::Model;
 use crate::parallel::Workers;
 
+/// Pixels that a thread takes at a time where rows do not matter.
+const PART: usize = 1 << 16;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
 /// Bytes of data that may be expected to stay in the last-level cache.
@@ -87,11 +89,16 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
 
     /// The change of M since it was `before`, in units of the mean of M.
     pub(super) fn step_since(&self, before: Vec<f64>) -> Vec<f64> {
-        let mean = self.sensitivity.iter().sum::<f64>() / self.sensitivity.len() as f64;
+        let now = &self.sensitivity[..];
+        let blocks: Vec<&[f64]> = now.chunks(PART).collect();
+        let sums = self.workers.map(blocks.len(), |index| blocks[index].iter().sum::<f64>());
+        let mean = sums.into_iter().sum::<f64>() / now.len() as f64;
         let mut step = before;
-        for (step, now) in step.iter_mut().zip(&self.sensitivity) {
-            *step = (now - *step) / mean;
-        }
+        self.workers.map_blocks(&mut step, PART, |index, part| {
+            for (step, now) in part.iter_mut().zip(blocks[index]) {
+                *step = (now - *step) / mean;
+            }
+        });
         step
     }
 
