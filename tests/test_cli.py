@@ -227,6 +227,19 @@ def test_force_replaces(run, experiment, tmp_path):
     assert load_statistics(output).mean.shape == SHAPE
 
 
+def test_an_input_is_never_replaced(run, experiment, calibration, tmp_path):
+    raw = tmp_path / "p0.tif"
+    raw.write_bytes(content := (experiment.parent / "frames/p0.tif").read_bytes())
+    (tmp_path / "link").symlink_to(tmp_path)
+    for output in (raw, tmp_path, tmp_path / "link/p0.tif"):
+        refused(run("correct", calibration, raw, "-o", output, "--force"), "one of the inputs")
+    refused(run("average", raw, "-o", raw, "--force"), raw, "one of the inputs")
+    refused(run("correct", calibration, raw, "-o", calibration, "--force"), "one of the inputs")
+    frames = experiment.parent / "frames/p1.tif"
+    refused(run("calibrate", experiment, "-o", frames, "--force"), frames, "one of the inputs")
+    assert raw.read_bytes() == content
+
+
 def test_a_failed_job_leaves_nothing(run, experiment, calibration, tmp_path):
     truncated = tmp_path / "truncated.tif"
     truncated.write_bytes((experiment.parent / "frames/p0.tif").read_bytes()[:999])

@@ -22,7 +22,7 @@ from equipix.errors import EquipixError, EquipixWarning
 from equipix.experiment import Experiment
 from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
-from equipix.io import SUFFIXES
+from equipix.io import SUFFIXES, find_files, refuse_inputs
 from equipix.load import load
 from equipix.report import check_picture, draw_demo, save_figure
 from equipix.results import Flag
@@ -77,6 +77,7 @@ def calibrate(
     """Calibrate a sensor from the images of an experiment."""
     check_output(output, force=force, suffixes=SUFFIXES)
     loaded = Experiment.load(experiment)
+    refuse_inputs([output], [experiment, *loaded.files()])
     with progress_bars() as progress:
         calibration = loaded.run(
             method=method,
@@ -135,6 +136,7 @@ def average(
 ) -> None:
     """Mean and variance of every pixel over many frames."""
     check_output(output, force=force, suffixes=SUFFIXES)
+    refuse_inputs([output], find_files([*source, *(dark or [])]))
     with progress_bars() as progress:
         offset = None
         if dark:
@@ -170,6 +172,7 @@ def correct(
 ) -> None:
     """Divide frames by the sensitivity, their dark level subtracted."""
     check_output(output, force=force)
+    refuse_inputs([output], [calibration])
     with progress_bars() as progress:
         done = correct_files(
             load(calibration),

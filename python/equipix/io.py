@@ -242,6 +242,20 @@ def _reading(path: Path) -> Iterator[None]:
         raise FileError(f"{path}: is broken: {complaints.messages[0]}")
 
 
+def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Refuse to write over a file that the work reads.
+
+    Raises
+    ------
+    FileError
+        If an output is one of the inputs, by whatever name.
+    """
+    taken = {path.resolve() for path in inputs}
+    for path in outputs:
+        if path.resolve() in taken:
+            raise FileError(f"{path}: is one of the inputs: name another output")
+
+
 @contextmanager
 def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[Path]:
     """Give a file's place to a new version in one step, when all of it is written.
