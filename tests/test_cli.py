@@ -200,6 +200,7 @@ def test_usage_errors_have_status_2(run, experiment, tmp_path):
     assert run("calibrate")[0] == 2
     assert run("calibrate", experiment, "-o", tmp_path / "c.tif", "--workers", "0")[0] == 2
     assert run("calibrate", experiment, "-o", tmp_path / "c.tif", "--method", "magic")[0] == 2
+    assert run("simulate", "-o", tmp_path / "e", "--shape", "-3", "5")[0] == 2
     assert run("nothing")[0] == 2
 
 

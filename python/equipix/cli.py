@@ -46,7 +46,9 @@ Saturation = Annotated[
     float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
 ]
 Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
-Shape = Annotated[tuple[int, int], typer.Option(help="Rows and columns of the sensor.")]
+Shape = Annotated[
+    tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
+]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -230,7 +232,13 @@ def demo(
     ):
         folder = keep or Path(scratch) / "experiment"
         result = run_demo(
-            folder, shape=shape, frames=frames, workers=workers, progress=progress, rng=rng
+            folder,
+            shape=shape,
+            frames=frames,
+            workers=workers,
+            progress=progress,
+            rng=rng,
+            force=force,
         )
     save_figure(draw_demo(result), output, force=force)
     figures = {"picture": str(output), **result.figures()}
