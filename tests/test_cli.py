@@ -220,6 +220,16 @@ def test_an_impossible_output_is_refused_before_the_work(run, tmp_path, name):
     refused(run("calibrate", "x.toml", "-o", tmp_path / name), tmp_path / name)
 
 
+def test_a_folder_is_refused_where_a_file_is_wanted_and_a_file_where_a_folder(run, tmp_path):
+    folder, file = tmp_path / "folder.tif", tmp_path / "file"
+    folder.mkdir()
+    file.touch()
+    for command in (["calibrate", "x"], ["average", "x"], ["correct", "x", "y"]):
+        refused(run(*command, "-o", folder, "--force"), folder, "is a folder")
+    refused(run("correct", "x", "y", "-o", file, "--force"), file, "is a file")
+    refused(run("simulate", "-o", file, "--force"), file, "is a file")
+
+
 def test_force_replaces(run, experiment, tmp_path):
     output = tmp_path / "mean.tif"
     output.write_text("old")

@@ -12,6 +12,7 @@ import sys
 import textwrap
 import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -359,7 +360,7 @@ def test_globs_are_in_natural_order(tmp_path: Path) -> None:
     literal.touch()
     assert io.find_files(str(literal)) == [literal]
     assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
-    with pytest.raises(InputError, match="'source' holds 3, expected names"):
+    with pytest.raises(InputError, match="'source' holds 3, expected the name"):
         equipix.average([literal, 3])  # type: ignore[list-item]
     with pytest.raises(InputError, match="'source' names no file"):
         io.read_frames([])
@@ -408,6 +409,29 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
         io.save_pages(tmp_path / "none" / "out.tif", PAGES, {})
     with pytest.raises(InputError, match=r"expected the suffix \.tif or \.npz"):
         io.save_pages(tmp_path / "out.jpg", PAGES, {})
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("path", [3, None, b"out.tif", "out\0.tif"])
+def test_what_is_no_name_is_refused(path: object) -> None:
+    for call in (lambda: io.save_pages(path, PAGES, {}), lambda: io.load_pages(path)):  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="'path' holds .*, expected the name of a file"):
+            call()
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").mkdir()
+    for target in ("a.tif", f"{'n' * 300}.tif"):
+        with pytest.raises(FileError, match=r"\.tif: (is a folder|cannot be written)"):
+            io.save_pages(tmp_path / target, PAGES, {}, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+
+
+def test_the_longest_name_can_be_written_by_many_at_once(tmp_path: Path) -> None:
+    path = tmp_path / f"{'n' * 250}.tif"
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: io.save_pages(path, PAGES, {}, force=True), range(40)))
+    assert list(io.load_pages(path)[0]) == list(PAGES)
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration
-from equipix.correct_files import correct_files
+from equipix.correct_files import correct_files, is_folder
 from equipix.correction import Flagged
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError, EquipixWarning
@@ -173,7 +173,7 @@ def correct(
     as_json: Json = False,
 ) -> None:
     """Divide frames by the sensitivity, their dark level subtracted."""
-    check_output(output, force=force)
+    check_output(output, force=force, folder=is_folder(output))
     refuse_inputs([output], [calibration])
     with progress_bars() as progress:
         done = correct_files(
@@ -199,7 +199,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Write the images of an experiment with a virtual camera, and its truth."""
-    check_output(output, force=force)
+    check_output(output, force=force, folder=True)
     virtual = virtual_experiment(shape, frames=frames, bit_depth=bit_depth, rng=rng)
     with progress_bars() as progress:
         manifest = virtual.write(output, force=force, progress=progress)
@@ -225,7 +225,7 @@ def demo(
     check_picture(output)
     check_output(output, force=force)
     if keep is not None:
-        check_output(keep, force=force)
+        check_output(keep, force=force, folder=True)
     with (
         tempfile.TemporaryDirectory(prefix="equipix-") as scratch,
         progress_bars(announce=True) as progress,

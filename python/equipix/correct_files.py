@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from equipix.errors import EquipixError, FileError, InputError
 from equipix.frames import average
 from equipix.io import (
+    beside,
     find_files,
     frame_format,
     refuse_inputs,
@@ -135,7 +135,7 @@ def _dark_frame(dark: str) -> Literal["stored"] | NDArray[Any] | None:
 @contextmanager
 def _whole_folder(target: Path) -> Iterator[Path]:
     """Make a folder whose files move to the target when all are written."""
-    partial = target.with_name(f".{target.name}.{os.getpid()}")
+    partial = beside(target.resolve())
     try:
         partial.mkdir()
         yield partial

@@ -6,7 +6,6 @@ import hashlib
 import os
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -16,13 +15,14 @@ from equipix.calibration import calibrate
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
 from equipix.errors import FileError, InputError
 from equipix.frames import average
-from equipix.io import frame_format, read_frames
+from equipix.io import as_path, frame_format, read_frames
 from equipix.noise import NoiseModel, photon_transfer
 from equipix.shifts import measure_shift, round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from os import PathLike
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -85,7 +85,8 @@ class Experiment:
             If the file cannot be read, has an unknown key or a wrong value, or names a file that
             does not exist.
         """
-        experiment = cls(Path(path), read_manifest(Path(path)))
+        file = as_path("path", path)
+        experiment = cls(file, read_manifest(file))
         experiment.files()
         return experiment
 

@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import threading
+import uuid
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,7 +52,7 @@ def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> l
     InputError
         If there is no name, or something else than a name.
     """
-    names = [source] if isinstance(source, str | os.PathLike) else source
+    names = [source] if isinstance(source, str | bytes | os.PathLike) else source
     found = [path for name in names for path in _matches(name)]
     if not found:
         raise InputError("'source' names no file")
@@ -59,9 +60,7 @@ def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> l
 
 
 def _matches(name: str | PathLike[str]) -> list[Path]:
-    if not isinstance(name, str | os.PathLike):
-        raise InputError(f"'source' holds {name!r}, expected names of files only")
-    path = Path(name)
+    path = as_path("source", name)
     if path.is_dir():
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
     if path.exists():
@@ -73,6 +72,20 @@ def _matches(name: str | PathLike[str]) -> list[Path]:
     if not found:
         raise FileError(f"{path}: no file matches")
     return sorted(map(Path, found), key=_natural)
+
+
+def as_path(name: str, value: object) -> Path:
+    """Take an argument for the name of a file.
+
+    Raises
+    ------
+    InputError
+        If it is no name, or none that a file can have.
+    """
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or "\0" in text:
+        raise InputError(f"'{name}' holds {value!r}, expected the name of a file")
+    return Path(text)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -256,6 +269,11 @@ def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
             raise FileError(f"{path}: is one of the inputs: name another output")
 
 
+def beside(target: Path) -> Path:
+    """Give a hidden name in the folder of `target` that nothing else has, of the same suffix."""
+    return target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+
+
 @contextmanager
 def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[Path]:
     """Give a file's place to a new version in one step, when all of it is written.
@@ -276,12 +294,16 @@ def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[P
     ------
     FileError
         If the file exists and `force` is not set, or cannot be written.
+    InputError
+        If `path` is not the name of a file.
     """
-    target = Path(path)
-    if target.exists() and not force:
-        raise FileError(f"{target}: exists already; force=True (--force) replaces it")
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    target = as_path("path", path)
+    temporary = beside(target)
     try:
+        if target.is_dir():
+            raise FileError(f"{target}: is a folder, expected the name of a file")
+        if target.exists() and not force:
+            raise FileError(f"{target}: exists already; force=True (--force) replaces it")
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -321,7 +343,7 @@ def save_pages(
     InputError
         If the suffix is unknown or a page is not an array of numbers in two dimensions.
     """
-    write = _WRITERS.get(Path(path).suffix.lower())
+    write = _WRITERS.get(as_path("path", path).suffix.lower())
     if write is None:
         raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
     for name, array in pages.items():
@@ -357,7 +379,7 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     InputError
         If the suffix is unknown.
     """
-    path = Path(path)
+    path = as_path("path", path)
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise InputError(f"'path' is {str(path)!r}, expected the suffix .tif or .npz")
