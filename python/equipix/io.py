@@ -392,6 +392,58 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     return pages, metadata
 
 
+def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:
+    """Refuse the metadata of another kind of file than `kind`, or of a format above `newest`.
+
+    Raises
+    ------
+    FileError
+        If the metadata are not of such a file.
+    """
+    if not isinstance(content, dict) or content.get("kind") != kind:
+        raise FileError(f"{path}: holds something else than {kind} that equipix has saved")
+    number = content.get("format")
+    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+        raise FileError(f"{path}: is damaged: its format is {number!r}, expected a whole number")
+    if number > newest:
+        raise FileError(
+            f"{path}: has format {number}, this version of equipix reads up to {newest}: install"
+            " a newer one"
+        )
+
+
+def check_pages(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], wanted: Mapping[str, type]
+) -> None:
+    """Refuse pages that lack one of those wanted, or are not all maps of one sensor.
+
+    Parameters
+    ----------
+    path : path
+        The file they are from.
+    pages : mapping of str to ndarray
+        Arrays by name.
+    wanted : mapping of str to type
+        Dtype, or kind of dtype, of each page that must be there.
+
+    Raises
+    ------
+    FileError
+        If a page is missing, or has another dtype, rank or shape.
+    """
+    shape = None
+    for name, dtype in wanted.items():
+        if name not in pages:
+            raise FileError(f"{path}: is damaged: lacks the page '{name}'")
+        page = pages[name]
+        shape = shape or page.shape
+        if page.ndim != 2 or page.shape != shape or not np.issubdtype(page.dtype, dtype):
+            raise FileError(
+                f"{path}: is damaged: page '{name}' is {page.dtype} of shape {page.shape},"
+                f" expected {dtype.__name__} in two dimensions, as large as '{next(iter(wanted))}'"
+            )
+
+
 def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, nbytes: int) -> None:
     """Write frames as the pages of a TIFF file, holding one at a time.
 
