@@ -140,10 +140,15 @@ def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_p
 
 def test_correct_takes_another_dark(run, experiment, calibration, tmp_path):
     frames, dark = experiment.parent / "frames/p0.tif", experiment.parent / "dark/dark.tif"
-    for choice in ("none", dark):
-        output = tmp_path / f"{choice is dark}.tif"
+    mean = tmp_path / "mean.tif"
+    assert run("average", dark, "-o", mean)[0] == 0
+    corrected = []
+    for choice in ("none", dark, mean):
+        output = tmp_path / f"{len(corrected)}.tif"
         assert run("correct", calibration, frames, "-o", output, "--dark", choice)[0] == 0
-    plain, dark_subtracted = (read_frames(tmp_path / f"{given}.tif") for given in (False, True))
+        corrected.append(read_frames(output))
+    plain, dark_subtracted, mean_subtracted = corrected
+    np.testing.assert_array_equal(mean_subtracted, dark_subtracted)
     assert np.nanmean(plain - dark_subtracted) == pytest.approx(60, abs=10)
 
 

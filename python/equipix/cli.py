@@ -166,7 +166,7 @@ def correct(
         Path, typer.Option("--output", "-o", help="A .tif of all frames, or a folder of files.")
     ],
     dark: Annotated[
-        str, typer.Option(help="'stored' in the calibration, 'none', or a file of dark frames.")
+        str, typer.Option(help="'stored', 'none', or a file: dark frames or their average.")
     ] = "stored",
     flagged: Annotated[Flagged, typer.Option(help="What flagged pixels become.")] = "nan",
     force: Force = False,

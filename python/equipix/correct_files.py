@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix.errors import EquipixError, FileError, InputError
-from equipix.frames import average
+from equipix.frames import average, load_statistics
 from equipix.io import (
     beside,
     find_files,
@@ -54,7 +54,7 @@ def correct_files(
         A name that ends in .tif: one file of all frames. Another: a folder to make, with a TIFF
         for each input file.
     dark : str
-        "stored", "none", or a file or glob of dark frames.
+        "stored", "none", a file or glob of dark frames, or one of their saved statistics.
     flagged : {"nan", "keep", "replace"}
         What becomes of flagged pixels.
     force : bool
@@ -129,7 +129,13 @@ def _count(file: Path, correction: Correction) -> int:
 def _dark_frame(dark: str) -> Literal["stored"] | NDArray[Any] | None:
     if dark == "stored":
         return "stored"
-    return None if dark == "none" else average(dark).mean.astype(np.float32)
+    if dark == "none":
+        return None
+    try:
+        mean = load_statistics(dark).mean
+    except (FileError, InputError):  # not averaged yet
+        mean = average(dark).mean
+    return mean.astype(np.float32)
 
 
 @contextmanager
