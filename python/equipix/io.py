@@ -32,13 +32,17 @@ _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
 _TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that still leave room for the directories
 
 
-def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> list[Path]:
+def find_files(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, folder: Path = Path()
+) -> list[Path]:
     """Files that a path, a glob or a list of these names; a glob's in natural order.
 
     Parameters
     ----------
     source : path, or iterable of paths
         A name with ``*``, ``?`` or ``[`` is a glob, unless a file has just that name.
+    folder : Path, optional
+        Where relative names start.
 
     Returns
     -------
@@ -53,25 +57,26 @@ def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> l
         If there is no name, or something else than a name.
     """
     names = [source] if isinstance(source, str | bytes | os.PathLike) else source
-    found = [path for name in names for path in _matches(name)]
+    found = [path for name in names for path in _matches(name, folder)]
     if not found:
         raise InputError("'source' names no file")
     return found
 
 
-def _matches(name: str | PathLike[str]) -> list[Path]:
-    path = as_path("source", name)
+def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
+    pattern = str(as_path("source", name))
+    path = folder / pattern
     if path.is_dir():
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
     if path.exists():
         return [path]
-    if not glob.has_magic(str(path)):
+    if not glob.has_magic(pattern):
         raise FileError(f"{path}: does not exist")
     # Unlike Path.glob, this leaves out hidden files, as a shell does.
-    found = glob.glob(str(path), recursive=True)  # noqa: PTH207
+    found = glob.glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
     if not found:
         raise FileError(f"{path}: no file matches")
-    return sorted(map(Path, found), key=_natural)
+    return sorted((folder / match for match in found), key=_natural)
 
 
 def as_path(name: str, value: object) -> Path:
