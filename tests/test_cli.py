@@ -14,6 +14,7 @@ import time
 import numpy as np
 import pytest
 
+import equipix
 from equipix import average, cli, load, simulate
 from equipix.frames import load_statistics
 from equipix.io import read_frames
@@ -198,6 +199,16 @@ def with_dark(paths):
 
 
 # Failures
+
+
+def test_version(run):
+    assert run("--version") == (0, f"{equipix.__version__}\n", "")
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
+def test_a_tolerance_that_is_none_is_refused(run, experiment, tmp_path, value):
+    output = tmp_path / "cal.tif"
+    refused(run("calibrate", experiment, "-o", output, "--tolerance", value), "'tolerance' is")
 
 
 def test_usage_errors_have_status_2(run, experiment, tmp_path):

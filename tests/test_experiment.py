@@ -276,6 +276,17 @@ def test_bad_images_are_named(edited, tmp_path, frames, message):
         Experiment.load(path).run()
 
 
+@pytest.mark.parametrize(
+    "option",
+    [{"tolerance": -1}, {"tolerance": "x"}, {"max_sweeps": 0}, {"max_sweeps": 2.5}, {"workers": 0}],
+)
+def test_bad_options_are_refused_before_the_work(manifest, option):
+    stages = []
+    with pytest.raises(errors.InputError, match=f"'{next(iter(option))}' is"):
+        Experiment.load(manifest).run(**option, progress=lambda *stage: stages.append(stage))
+    assert stages == []
+
+
 def test_a_missing_spot_names_the_move(edited):
     path = edited('"aperture/p2-after.tif"', '"dark/dark.tif"')
     with pytest.raises(errors.SpotError, match=r"move to exposure 'p2'.*after"):

@@ -13,6 +13,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from equipix._native import __version__
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration
 from equipix.correct_files import correct_files, is_folder
@@ -61,6 +62,23 @@ def main(arguments: list[str] | None = None) -> None:
         except (EquipixError, OSError, MemoryError) as error:
             say("error", error or type(error).__name__)
             raise SystemExit(1) from None
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)  # noqa: T201
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None: ...
 
 
 @app.command(epilog="Example: equipix calibrate experiment.toml -o cal.tif")
