@@ -51,6 +51,14 @@ def test_picture_shows_all(result):
     assert len(titles) == 9
     shown = figure.axes[0].images[0].get_array()
     np.testing.assert_array_equal(shown, result.truth)
+    block_rms = 100 * result.figures()["block_rms"]
+    assert f"rms {block_rms:.1g}" in figure.axes[3].get_title()
+    for axes in figure.axes[6:8]:
+        assert axes.get_xlabel() == "error, %"
+        # Every error has a place in its histogram: the area is 1.
+        for steps in axes.patches:
+            values, edges, _ = steps.get_data()
+            assert np.sum(values * np.diff(edges)) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("shape", [(48, 64), (64, 80), SHAPE, (240, 320)])
