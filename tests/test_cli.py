@@ -14,6 +14,7 @@ import time
 import numpy as np
 import pytest
 
+import equipix
 from equipix import average, cli, load, simulate
 from equipix.frames import load_statistics
 from equipix.io import read_frames
@@ -140,10 +141,15 @@ def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_p
 
 def test_correct_takes_another_dark(run, experiment, calibration, tmp_path):
     frames, dark = experiment.parent / "frames/p0.tif", experiment.parent / "dark/dark.tif"
-    for choice in ("none", dark):
-        output = tmp_path / f"{choice is dark}.tif"
+    mean = tmp_path / "mean.tif"
+    assert run("average", dark, "-o", mean)[0] == 0
+    corrected = []
+    for choice in ("none", dark, mean):
+        output = tmp_path / f"{len(corrected)}.tif"
         assert run("correct", calibration, frames, "-o", output, "--dark", choice)[0] == 0
-    plain, dark_subtracted = (read_frames(tmp_path / f"{given}.tif") for given in (False, True))
+        corrected.append(read_frames(output))
+    plain, dark_subtracted, mean_subtracted = corrected
+    np.testing.assert_array_equal(mean_subtracted, dark_subtracted)
     assert np.nanmean(plain - dark_subtracted) == pytest.approx(60, abs=10)
 
 
@@ -195,11 +201,22 @@ def with_dark(paths):
 # Failures
 
 
+def test_version(run):
+    assert run("--version") == (0, f"{equipix.__version__}\n", "")
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
+def test_a_tolerance_that_is_none_is_refused(run, experiment, tmp_path, value):
+    output = tmp_path / "cal.tif"
+    refused(run("calibrate", experiment, "-o", output, "--tolerance", value), "'tolerance' is")
+
+
 def test_usage_errors_have_status_2(run, experiment, tmp_path):
     assert run()[0] == 2
     assert run("calibrate")[0] == 2
     assert run("calibrate", experiment, "-o", tmp_path / "c.tif", "--workers", "0")[0] == 2
     assert run("calibrate", experiment, "-o", tmp_path / "c.tif", "--method", "magic")[0] == 2
+    assert run("simulate", "-o", tmp_path / "e", "--shape", "-3", "5")[0] == 2
     assert run("nothing")[0] == 2
 
 
@@ -219,12 +236,35 @@ def test_an_impossible_output_is_refused_before_the_work(run, tmp_path, name):
     refused(run("calibrate", "x.toml", "-o", tmp_path / name), tmp_path / name)
 
 
+def test_a_folder_is_refused_where_a_file_is_wanted_and_a_file_where_a_folder(run, tmp_path):
+    folder, file = tmp_path / "folder.tif", tmp_path / "file"
+    folder.mkdir()
+    file.touch()
+    for command in (["calibrate", "x"], ["average", "x"], ["correct", "x", "y"]):
+        refused(run(*command, "-o", folder, "--force"), folder, "is a folder")
+    refused(run("correct", "x", "y", "-o", file, "--force"), file, "is a file")
+    refused(run("simulate", "-o", file, "--force"), file, "is a file")
+
+
 def test_force_replaces(run, experiment, tmp_path):
     output = tmp_path / "mean.tif"
     output.write_text("old")
     frames = experiment.parent / "frames/p0.tif"
     assert run("average", frames, "-o", output, "--force")[0] == 0
     assert load_statistics(output).mean.shape == SHAPE
+
+
+def test_an_input_is_never_replaced(run, experiment, calibration, tmp_path):
+    raw = tmp_path / "p0.tif"
+    raw.write_bytes(content := (experiment.parent / "frames/p0.tif").read_bytes())
+    (tmp_path / "link").symlink_to(tmp_path)
+    for output in (raw, tmp_path, tmp_path / "link/p0.tif"):
+        refused(run("correct", calibration, raw, "-o", output, "--force"), "one of the inputs")
+    refused(run("average", raw, "-o", raw, "--force"), raw, "one of the inputs")
+    refused(run("correct", calibration, raw, "-o", calibration, "--force"), "one of the inputs")
+    frames = experiment.parent / "frames/p1.tif"
+    refused(run("calibrate", experiment, "-o", frames, "--force"), frames, "one of the inputs")
+    assert raw.read_bytes() == content
 
 
 def test_a_failed_job_leaves_nothing(run, experiment, calibration, tmp_path):

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from equipix import cli, demo, errors, report
+from equipix import cli, demo, errors, measure_shift, report
 
 pytest.importorskip("matplotlib")
 
@@ -16,13 +16,6 @@ pytest.importorskip("matplotlib")
 pytestmark = pytest.mark.filterwarnings("ignore::equipix.errors.ShiftRoundingWarning")
 
 SHAPE = (160, 208)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _shorter_arms():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "ARMS", (11, 19))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +51,27 @@ def test_picture_shows_all(result):
     assert len(titles) == 9
     shown = figure.axes[0].images[0].get_array()
     np.testing.assert_array_equal(shown, result.truth)
+    block_rms = 100 * result.figures()["block_rms"]
+    assert f"rms {block_rms:.1g}" in figure.axes[3].get_title()
+    for axes in figure.axes[6:8]:
+        assert axes.get_xlabel() == "error, %"
+        # Every error has a place in its histogram: the area is 1.
+        for steps in axes.patches:
+            values, edges, _ = steps.get_data()
+            assert np.sum(values * np.diff(edges)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (64, 80), SHAPE, (240, 320)])
+@pytest.mark.parametrize("seed", [1, 6, 11])
+def test_the_hole_is_seen_whole_and_on_good_pixels(shape, seed):
+    virtual = demo.virtual_experiment(shape, frames=2, rng=seed)
+    for k in range(1, len(virtual.positions)):
+        images = (virtual.aperture_before(k), virtual.aperture_after(k))
+        before, after = (np.stack(list(image)) for image in images)
+        measured = measure_shift(before, after, saturation=4095)
+        moved = virtual.positions[k] - virtual.positions[k - 1]
+        # Unequal pixels move a centroid by 0.008: ten of it, for the two images.
+        np.testing.assert_allclose(measured.shift, moved, atol=0.08 * np.sqrt(2))
 
 
 def test_command_leaves_a_picture_only(tmp_path, capsys, monkeypatch):
@@ -81,6 +95,17 @@ def test_command_fails_when_the_errors_are_too_large(tmp_path, capsys, monkeypat
     assert "noise predicts" in captured.out
     assert captured.err.endswith("larger than the noise explains\n")
     assert (tmp_path / "kept/experiment.toml").is_file()
+
+
+def test_command_replaces_what_it_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["demo", "--shape", "64", "80", "--frames", "4", "--keep", "kept", "--force"]
+    truths = []
+    for seed in ("1", "2"):
+        with pytest.raises(SystemExit):
+            cli.main([*command, "--rng", seed])
+        truths.append((tmp_path / "kept/truth.npz").read_bytes())
+    assert truths[0] != truths[1]
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch):

@@ -38,7 +38,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec("\n".join(blocks("python")), names)
-    cal, truth = equipix.load("cal.tif"), names["truth"]
+    cal, truth = equipix.load("first.tif"), names["truth"]
     error = simulate.relative_error(cal.sensitivity, truth)
     # The largest of 19 200 normal values of this rms stays below 6 of them.
     assert np.abs(error).max() < 6 * names["camera"].noise_prediction(rng=1)[0]

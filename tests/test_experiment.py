@@ -190,27 +190,27 @@ def test_real_input(data_dir):
     [
         ("[sensor]", "[sensro]", r"unknown key 'sensro'"),
         ("bit_depth", "bits", r"unknown key 'bits' in \[sensor\]"),
-        ('name = "p1"', 'name = "p1"\nshift_std = 1', r"'shift_std' in exposure 2 \('p1'\)"),
+        ('name = "p1"', 'name = "p1"\nshift_std = 1', r"'shift_std' in exposure 1 \('p1'\)"),
         ('name = "p1"', 'name = "p1"\nflux_std = 1', r"unknown key 'flux_std'"),
         ('name = "p1"', 'name = "p1"\ntime = 1', r"unknown key 'time'"),
-        ('name = "p2"', "", r"key 'name' is missing in exposure 3"),
+        ('name = "p2"', "", r"key 'name' is missing in exposure 2"),
         ("bit_depth = 12", "bit_depth = 17", r"holds 17, expected a whole number from 1 to 16"),
         ("bit_depth = 12", "saturation = -1", r"'saturation' in \[sensor\] holds -1"),
         ("bit_depth = 12", "gain_dn_per_e = 'x'", r"'gain_dn_per_e' in \[sensor\] holds 'x'"),
         ('name = "p1"', 'name = "p1"\nrotation = 45', r"holds 45, expected 0, 90, 180 or 270"),
-        ('name = "p1"', 'name = "p1"\nflux = 0', r"'flux' in exposure 2 \('p1'\) holds 0"),
+        ('name = "p1"', 'name = "p1"\nflux = 0', r"'flux' in exposure 1 \('p1'\) holds 0"),
         ('name = "p1"', 'name = "p1"\nflux = 1', r"'flux' is missing in exposure 'p0'"),
         ('name = "p1"', 'name = "p0"', r"two exposures have the name 'p0'"),
-        ('name = "p1"', 'name = "p1"\nshift = [1, 2]', r"not both in exposure 2 \('p1'\)"),
+        ('name = "p1"', 'name = "p1"\nshift = [1, 2]', r"not both in exposure 1 \('p1'\)"),
         ('name = "p0"', 'name = "p0"\nshift = [1]', r"\[row, col\] in pixels"),
         ('name = "p0"', 'name = "p0"\nshift = [1, nan]', r"holds nan, expected \[row, col\]"),
         ('aperture_after = "aperture/p1-after.tif"', "", r"both 'aperture_before' and"),
         ("# calibration", "format = 2\n# calibration", r"'format' holds 2, expected 1"),
         ("[dark]", "[dark", r"is not valid TOML"),
         ('frames = "dark/dark.tif"', "", r"key 'frames' is missing in \[dark\]"),
-        ('"frames/p1.tif"', "[]", r"'frames' in exposure 2 \('p1'\) holds \[\]"),
-        ('"frames/p1.tif"', '"frames/none.tif"', r"no file '.*frames/none\.tif'"),
-        ('"frames/p1.tif"', '"frames/none*.tif"', r"no file '.*frames/none\*\.tif'"),
+        ('"frames/p1.tif"', "[]", r"'frames' in exposure 1 \('p1'\) holds \[\]"),
+        ('"frames/p1.tif"', '"frames/none.tif"', r"frames/none\.tif: does not exist"),
+        ('"frames/p1.tif"', '"frames/none*.tif"', r"frames/none\*\.tif: no file matches"),
     ],
 )
 def test_a_wrong_manifest_is_refused_by_name(edited, old, new, message):
@@ -220,6 +220,17 @@ def test_a_wrong_manifest_is_refused_by_name(edited, old, new, message):
     assert str(path) in str(caught.value)
     assert "pydantic" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_glob_is_in_natural_order_and_in_its_own_folder(tmp_path):
+    from equipix._manifest import find_files
+
+    folder = tmp_path / "run[1]"
+    folder.mkdir()
+    for name in ("f10.tif", "f9.tif"):
+        (folder / name).touch()
+    found = find_files(folder / "experiment.toml", "f*.tif")
+    assert [path.name for path in found] == ["f9.tif", "f10.tif"]
 
 
 def test_one_exposure_is_not_enough(manifest, tmp_path):
@@ -263,6 +274,17 @@ def test_bad_images_are_named(edited, tmp_path, frames, message):
         write_tiff(tmp_path / "bad.tif", frames)
     with pytest.raises(errors.FileError, match=message):
         Experiment.load(path).run()
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"tolerance": -1}, {"tolerance": "x"}, {"max_sweeps": 0}, {"max_sweeps": 2.5}, {"workers": 0}],
+)
+def test_bad_options_are_refused_before_the_work(manifest, option):
+    stages = []
+    with pytest.raises(errors.InputError, match=f"'{next(iter(option))}' is"):
+        Experiment.load(manifest).run(**option, progress=lambda *stage: stages.append(stage))
+    assert stages == []
 
 
 def test_a_missing_spot_names_the_move(edited):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io as stdio
 import json
 import os
@@ -12,6 +13,7 @@ import sys
 import textwrap
 import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ import tifffile
 from PIL import Image
 
 import equipix
-from equipix import FrameStatistics, io
+from equipix import FrameStatistics, io, simulate
 from equipix.errors import FileError, InputError
 from equipix.frames import load_statistics, save_statistics
 
@@ -359,7 +361,7 @@ def test_globs_are_in_natural_order(tmp_path: Path) -> None:
     literal.touch()
     assert io.find_files(str(literal)) == [literal]
     assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
-    with pytest.raises(InputError, match="'source' holds 3, expected names"):
+    with pytest.raises(InputError, match="'source' holds 3, expected the name"):
         equipix.average([literal, 3])  # type: ignore[list-item]
     with pytest.raises(InputError, match="'source' names no file"):
         io.read_frames([])
@@ -411,6 +413,29 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("path", [3, None, b"out.tif", "out\0.tif"])
+def test_what_is_no_name_is_refused(path: object) -> None:
+    for call in (lambda: io.save_pages(path, PAGES, {}), lambda: io.load_pages(path)):  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="'path' holds .*, expected the name of a file"):
+            call()
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").mkdir()
+    for target in ("a.tif", f"{'n' * 300}.tif"):
+        with pytest.raises(FileError, match=r"\.tif: (is a folder|cannot be written)"):
+            io.save_pages(tmp_path / target, PAGES, {}, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+
+
+def test_the_longest_name_can_be_written_by_many_at_once(tmp_path: Path) -> None:
+    path = tmp_path / f"{'n' * 250}.tif"
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: io.save_pages(path, PAGES, {}, force=True), range(40)))
+    assert list(io.load_pages(path)[0]) == list(PAGES)
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"dark{suffix}"
@@ -422,12 +447,57 @@ def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    pages = vars(equipix.average(WIDE))
+    good = {"kind": "frame statistics", "format": 1}
+    for changed, metadata, message in (
+        ({}, good | {"format": "2"}, "format is '2'"),
+        ({}, good | {"format": None}, "format is None"),
+        ({"mean": pages["mean"].astype(np.int64)}, good, "'mean' is int64"),
+        ({"count": pages["count"][1:]}, good, r"'count' is uint32 of shape \(22, 37\)"),
+    ):
+        io.save_pages(path, pages | changed, metadata, force=True)
+        with pytest.raises(FileError, match=f"is damaged: .*{message}"):
+            load_statistics(path)
+    del pages["saturated"]
+    io.save_pages(path, pages, good, force=True)
+    with pytest.raises(FileError, match="is damaged: lacks the page 'saturated'"):
+        load_statistics(path)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cal{suffix}"
+    frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), [(0, 0), (0, 1)])
+    cal = equipix.calibrate(np.concatenate([frames, frames]), [(0, 0), (0, 1), (1, 0), (0, 0)])
+    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32)).save(path)
+    pages, content = io.load_pages(path)
+    for name, page in (
+        ("sensitivity", pages["sensitivity"].astype(np.int32)),
+        ("flags", pages["flags"].astype(np.int32)),
+        ("flags", pages["flags"][1:]),
+        ("component_labels", pages["component_labels"][:, 1:]),
+        ("dark", pages["dark"][1:]),
+    ):
+        io.save_pages(path, pages | {name: page}, content, force=True)
+        with pytest.raises(FileError, match=f"is damaged: page '{name}' is"):
+            equipix.load(path)
+    for number in ("2", None, True):
+        io.save_pages(path, pages, content | {"format": number}, force=True)
+        with pytest.raises(FileError, match="is damaged: its format is"):
+            equipix.load(path)
+    io.save_pages(path, pages, content, force=True)
+    assert equipix.load(path).dark is not None
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with pytest.raises(FileError, match=f"a{suffix}"):
         load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "something"})
-    with pytest.raises(FileError, match="something else than averaged frames"):
+    with pytest.raises(FileError, match="something else than frame statistics"):
         load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
     with pytest.raises(FileError, match=r"has format 99.*install a newer one"):

@@ -383,6 +383,29 @@ class TestWrite:
             small_experiment().write(tmp_path, force=True)
         assert (tmp_path / "thesis.txt").exists()
 
+    @pytest.mark.parametrize("name", ["thesis.txt", "frames/thesis.txt", "dark/2024/dark.tif"])
+    def test_force_removes_only_what_it_wrote(self, tmp_path, name):
+        virtual = small_experiment()
+        virtual.write(tmp_path / "out")
+        precious = tmp_path / "out" / name
+        precious.parent.mkdir(exist_ok=True)
+        precious.write_text("years of work")
+        with pytest.raises(FileError, match="nothing but an experiment"):
+            virtual.write(tmp_path / "out", force=True)
+        assert precious.read_text() == "years of work"
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    def test_a_failure_keeps_what_was_there(self, tmp_path):
+        def give_up(*_):
+            raise KeyboardInterrupt
+
+        manifest = small_experiment().write(tmp_path / "out")
+        with pytest.raises(KeyboardInterrupt):
+            small_experiment().write(tmp_path / "out", force=True, progress=give_up)
+        assert manifest.is_file()
+        small_experiment().write(tmp_path / "out", force=True)
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
     def test_a_failure_leaves_nothing_behind(self, tmp_path):
         def give_up(done, *_):
             if done == 7:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from equipix.errors import FileError
+from equipix import io
+from equipix.errors import EquipixError, FileError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -96,9 +96,9 @@ class Manifest(_Table):
         first, *others = self.exposure
         if first.aperture_before is not None:
             raise _problem(
-                f"exposure 1 ('{first.name}') has aperture images, but no move before it"
+                f"exposure 0 ('{first.name}') has aperture images, but no move before it"
             )
-        for number, exposure in enumerate(others, start=2):
+        for number, exposure in enumerate(others, start=1):
             if exposure.aperture_before is None and exposure.shift is None:
                 raise _problem(
                     f"exposure {number} ('{exposure.name}') needs 'aperture_before' and "
@@ -132,17 +132,10 @@ def read_manifest(path: Path) -> Manifest:
 
 def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
     """Find the files that an entry of `manifest` (a file, a glob or a list) stands for."""
-    folder = manifest.parent
-    found: list[Path] = []
-    for pattern in [entry] if isinstance(entry, str) else entry:
-        if (folder / pattern).is_file():
-            found.append(folder / pattern)
-            continue
-        matches = sorted(glob.glob(pattern, root_dir=folder))  # noqa: PTH207 (may be absolute)
-        if not matches:
-            raise FileError(f"{manifest}: no file '{pattern}' in {folder}")
-        found += [folder / match for match in matches]
-    return found
+    try:
+        return io.find_files(entry, folder=manifest.parent)
+    except EquipixError as error:
+        raise FileError(f"{manifest}: {error}") from error
 
 
 def _problem(text: str) -> PydanticCustomError:
@@ -154,7 +147,7 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     location = detail["loc"]
     match location:
         case ["exposure", int(index), *_]:
-            place = f" in exposure {index + 1}{_name(content['exposure'][index])}"
+            place = f" in exposure {index}{_name(content['exposure'][index])}"
         case [table, _, *_]:
             place = f" in [{table}]"
         case _:

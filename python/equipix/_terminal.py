@@ -76,18 +76,24 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
         print(f"{name.replace('_', ' '):<{width}}  {_words(value)}")  # noqa: T201
 
 
-def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = ()) -> None:
+def check_output(
+    path: Path, *, force: bool, folder: bool = False, suffixes: tuple[str, ...] = ()
+) -> None:
     """Refuse an output that cannot be written, before the work starts.
 
     Raises
     ------
     FileError
-        If `path` exists and `force` is not given, or its folder does not exist or is closed.
+        If `path` exists and `force` is not given, is a file where a `folder` is wanted or the
+        other way about, or its folder does not exist or is closed.
     InputError
         If `path` ends in none of `suffixes`.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(f"'{path}' ends in none of {', '.join(suffixes)}, which name the format")
+    if path.exists() and path.is_dir() != folder:
+        kind, wanted = ("file", "folder") if folder else ("folder", "file")
+        raise FileError(f"'{path}' is a {kind}, expected the name of a {wanted}")
     if path.exists() and not force:
         raise FileError(f"'{path}' exists: name another output, or replace it with --force")
     if not path.parent.is_dir():

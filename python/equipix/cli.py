@@ -13,16 +13,17 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from equipix._native import __version__
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration
-from equipix.correct_files import correct_files
+from equipix.correct_files import correct_files, is_folder
 from equipix.correction import Flagged
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError, EquipixWarning
 from equipix.experiment import Experiment
 from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
-from equipix.io import SUFFIXES
+from equipix.io import SUFFIXES, find_files, refuse_inputs
 from equipix.load import load
 from equipix.report import check_picture, draw_demo, save_figure
 from equipix.results import Flag
@@ -46,7 +47,9 @@ Saturation = Annotated[
     float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
 ]
 Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
-Shape = Annotated[tuple[int, int], typer.Option(help="Rows and columns of the sensor.")]
+Shape = Annotated[
+    tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
+]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -59,6 +62,23 @@ def main(arguments: list[str] | None = None) -> None:
         except (EquipixError, OSError, MemoryError) as error:
             say("error", error or type(error).__name__)
             raise SystemExit(1) from None
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)  # noqa: T201
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None: ...
 
 
 @app.command(epilog="Example: equipix calibrate experiment.toml -o cal.tif")
@@ -77,6 +97,7 @@ def calibrate(
     """Calibrate a sensor from the images of an experiment."""
     check_output(output, force=force, suffixes=SUFFIXES)
     loaded = Experiment.load(experiment)
+    refuse_inputs([output], [experiment, *loaded.files()])
     with progress_bars() as progress:
         calibration = loaded.run(
             method=method,
@@ -135,6 +156,7 @@ def average(
 ) -> None:
     """Mean and variance of every pixel over many frames."""
     check_output(output, force=force, suffixes=SUFFIXES)
+    refuse_inputs([output], find_files([*source, *(dark or [])]))
     with progress_bars() as progress:
         offset = None
         if dark:
@@ -162,14 +184,15 @@ def correct(
         Path, typer.Option("--output", "-o", help="A .tif of all frames, or a folder of files.")
     ],
     dark: Annotated[
-        str, typer.Option(help="'stored' in the calibration, 'none', or a file of dark frames.")
+        str, typer.Option(help="'stored', 'none', or a file: dark frames or their average.")
     ] = "stored",
     flagged: Annotated[Flagged, typer.Option(help="What flagged pixels become.")] = "nan",
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Divide frames by the sensitivity, their dark level subtracted."""
-    check_output(output, force=force)
+    check_output(output, force=force, folder=is_folder(output))
+    refuse_inputs([output], [calibration])
     with progress_bars() as progress:
         done = correct_files(
             load(calibration),
@@ -194,7 +217,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Write the images of an experiment with a virtual camera, and its truth."""
-    check_output(output, force=force)
+    check_output(output, force=force, folder=True)
     virtual = virtual_experiment(shape, frames=frames, bit_depth=bit_depth, rng=rng)
     with progress_bars() as progress:
         manifest = virtual.write(output, force=force, progress=progress)
@@ -220,14 +243,20 @@ def demo(
     check_picture(output)
     check_output(output, force=force)
     if keep is not None:
-        check_output(keep, force=force)
+        check_output(keep, force=force, folder=True)
     with (
         tempfile.TemporaryDirectory(prefix="equipix-") as scratch,
         progress_bars(announce=True) as progress,
     ):
         folder = keep or Path(scratch) / "experiment"
         result = run_demo(
-            folder, shape=shape, frames=frames, workers=workers, progress=progress, rng=rng
+            folder,
+            shape=shape,
+            frames=frames,
+            workers=workers,
+            progress=progress,
+            rng=rng,
+            force=force,
         )
     save_figure(draw_demo(result), output, force=force)
     figures = {"picture": str(output), **result.figures()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +10,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix.errors import EquipixError, FileError, InputError
-from equipix.frames import average
-from equipix.io import find_files, frame_format, stream_frames, write_frames, write_whole
+from equipix.frames import average, load_statistics
+from equipix.io import (
+    beside,
+    find_files,
+    frame_format,
+    refuse_inputs,
+    stream_frames,
+    write_frames,
+    write_whole,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -47,7 +54,7 @@ def correct_files(
         A name that ends in .tif: one file of all frames. Another: a folder to make, with a TIFF
         for each input file.
     dark : str
-        "stored", "none", or a file or glob of dark frames.
+        "stored", "none", a file or glob of dark frames, or one of their saved statistics.
     flagged : {"nan", "keep", "replace"}
         What becomes of flagged pixels.
     force : bool
@@ -63,11 +70,14 @@ def correct_files(
     Raises
     ------
     FileError
-        If a file cannot be read or written, or two outputs would have the same name.
+        If a file cannot be read or written, two outputs would have the same name, or one would
+        replace an input.
     InputError
         If the frames have another shape than the correction.
     """
     files = find_files(source)
+    outputs = _outputs(output, files)
+    refuse_inputs(outputs, files)
     counts = {file: _count(file, correction) for file in files}
     level = _dark_frame(dark)
     total, done = sum(counts.values()), 0
@@ -81,17 +91,29 @@ def correct_files(
                 progress(done, total, "correcting")
 
     frame_bytes = 4 * correction.shape[0] * correction.shape[1]
-    if output.suffix.lower() in (".tif", ".tiff"):
+    if not is_folder(output):
         with write_whole(output, force=force) as temporary:
             write_frames(temporary, corrected(files), nbytes=total * frame_bytes)
         return total
+    with _whole_folder(output) as folder:
+        for file, path in zip(files, outputs, strict=True):
+            write_frames(folder / path.name, corrected([file]), nbytes=counts[file] * frame_bytes)
+    return total
+
+
+def is_folder(output: Path) -> bool:
+    """Whether the name of an output stands for a folder of files."""
+    return output.suffix.lower() not in (".tif", ".tiff")
+
+
+def _outputs(output: Path, files: list[Path]) -> list[Path]:
+    """Name what will be written."""
+    if not is_folder(output):
+        return [output]
     names = [f"{file.stem}.tif" for file in files]
     if repeated := [name for name in names if names.count(name) > 1]:
         raise FileError(f"{output}: two inputs would become '{repeated[0]}': correct them apart")
-    with _whole_folder(output) as folder:
-        for file, name in zip(files, names, strict=True):
-            write_frames(folder / name, corrected([file]), nbytes=counts[file] * frame_bytes)
-    return total
+    return [output / name for name in names]
 
 
 def _count(file: Path, correction: Correction) -> int:
@@ -107,13 +129,19 @@ def _count(file: Path, correction: Correction) -> int:
 def _dark_frame(dark: str) -> Literal["stored"] | NDArray[Any] | None:
     if dark == "stored":
         return "stored"
-    return None if dark == "none" else average(dark).mean.astype(np.float32)
+    if dark == "none":
+        return None
+    try:
+        mean = load_statistics(dark).mean
+    except (FileError, InputError):  # not averaged yet
+        mean = average(dark).mean
+    return mean.astype(np.float32)
 
 
 @contextmanager
 def _whole_folder(target: Path) -> Iterator[Path]:
     """Make a folder whose files move to the target when all are written."""
-    partial = target.with_name(f".{target.name}.{os.getpid()}")
+    partial = beside(target.resolve())
     try:
         partial.mkdir()
         yield partial

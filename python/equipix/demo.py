@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,11 +26,15 @@ if TYPE_CHECKING:
 RMS_LIMIT, BLOCK_RMS_LIMIT = 1.1, 1.5
 """How far the errors may exceed what the noise predicts."""
 
-ARMS = (23, 41)
-"""Shifts in pixels: the sweeps needed fall with their square, to some 2800 at 782×582."""
+ARMS = {200: (23, 41), 96: (11, 19), 0: (5, 7)}
+"""Shifts in pixels by the least size of a sensor: the sweeps needed fall with the square of shifts,
+to some 2800 at 782×582, but the image of the hole must stay on the sensor."""
 
 EXPOSURE_E = 14_000.0
 """Electrons in a frame, of an ADC range of 20 000."""
+
+UNDER_HOLE = 1e-4
+"""Share of the light that still counts as the image of the hole."""
 
 SOURCE_UNEVENNESS = 0.01
 """By how much the source of the flat field is brighter in one corner than in the opposite one."""
@@ -99,7 +103,8 @@ def virtual_experiment(
     """Prepare the demo's experiment: the hard case of plain coordinate descent.
 
     The sensor carries white spread of 5 % and a cosine of 5 % over its whole size; the beam is
-    Gaussian, the positions make the cross (23, 41).
+    Gaussian, the positions make a cross, (23, 41) from 200 pixels on. The hole's image falls on
+    good pixels, as one would choose its place.
 
     Parameters
     ----------
@@ -118,15 +123,27 @@ def virtual_experiment(
         The experiment, in memory.
     """
     generator = np.random.default_rng(rng)
-    return simulate.experiment(
+    arms = next(arms for size, arms in ARMS.items() if min(shape) >= size)
+    virtual = simulate.experiment(
         simulate.cosine_sensitivity(shape, rng=generator),
         simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782)),
-        cross_pattern(*ARMS),
+        cross_pattern(*arms),
         frames=frames,
         exposure_e=EXPOSURE_E,
         bit_depth=bit_depth,
         rng=generator,
     )
+    camera = virtual.camera
+    dead, hot = (bad[~_under_hole(virtual, bad)] for bad in (camera.dead, camera.hot))
+    return replace(virtual, camera=replace(camera, dead=dead, hot=hot))
+
+
+def _under_hole(virtual: VirtualExperiment, pixels: NDArray[Any]) -> NDArray[Any]:
+    """Whether the image of the hole falls on these pixels in any exposure."""
+    rows, cols = np.divmod(pixels, virtual.camera.shape[1])
+    light = [virtual.hole(rows + row, cols + col) for row, col in virtual.positions]
+    under: NDArray[Any] = np.max(light, axis=0) > UNDER_HOLE * EXPOSURE_E
+    return under
 
 
 def run_demo(

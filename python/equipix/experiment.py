@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
+from equipix._arrays import number, positive_count, positive_workers
 from equipix._manifest import find_files, read_manifest
 from equipix.calibration import calibrate
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
 from equipix.errors import FileError, InputError
 from equipix.frames import average
-from equipix.io import frame_format, read_frames
+from equipix.io import as_path, frame_format, read_frames
 from equipix.noise import NoiseModel, photon_transfer
 from equipix.shifts import measure_shift, round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from os import PathLike
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -85,7 +87,8 @@ class Experiment:
             If the file cannot be read, has an unknown key or a wrong value, or names a file that
             does not exist.
         """
-        experiment = cls(Path(path), read_manifest(Path(path)))
+        file = as_path("path", path)
+        experiment = cls(file, read_manifest(file))
         experiment.files()
         return experiment
 
@@ -192,6 +195,7 @@ class Experiment:
             If an option is out of range, or the exposures do not make a calibration.
         """
         started = datetime.now(UTC)
+        _check_options(tolerance, max_sweeps, workers)
         self.check_formats()
         shifts, std = self.measure_shifts()
         whole_shifts = round_shifts(shifts, std)
@@ -326,6 +330,15 @@ class _Measured:
     saturated: NDArray[Any]
     frames: list[int]
     transfer: list[NDArray[Any]]
+
+
+def _check_options(tolerance: float, max_sweeps: int | None, workers: int | None) -> None:
+    """Refuse before the work starts what the solver would refuse after the averaging."""
+    if not 0 < number("tolerance", tolerance) < math.inf:
+        raise InputError(f"'tolerance' is {tolerance!r}, expected a positive number")
+    if max_sweeps is not None:
+        positive_count("max_sweeps", max_sweeps)
+    positive_workers(workers)
 
 
 def _transfer(signal: NDArray[Any], frames: FrameStatistics) -> NDArray[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from equipix import _native, io
 from equipix._arrays import as_array, as_floats, positive_workers
-from equipix.errors import FileError, InputError, UnsupportedFileError
+from equipix.errors import InputError, UnsupportedFileError
 from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
@@ -24,6 +24,13 @@ _BATCH = 16  # frames handed over at once
 _BATCH_BYTES = 2**26
 _FORMAT = 1  # of saved statistics; files with a larger number are refused
 _KIND = "frame statistics"
+_PAGES = {
+    "mean": np.float64,
+    "variance": np.float64,
+    "variance_of_mean": np.float64,
+    "count": np.uint32,
+    "saturated": np.uint32,
+}
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
@@ -145,17 +152,9 @@ def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
         If the file is not readable or holds something else.
     """
     pages, metadata = io.load_pages(path)
-    if not isinstance(metadata, dict) or metadata.get("kind") != _KIND:
-        raise FileError(f"{path}: holds something else than averaged frames")
-    if metadata["format"] > _FORMAT:
-        raise FileError(
-            f"{path}: has format {metadata['format']}, this version of equipix reads up to"
-            f" {_FORMAT}: install a newer one"
-        )
-    try:
-        return FrameStatistics(**pages)
-    except TypeError as error:
-        raise FileError(f"{path}: lacks a page of averaged frames: {error}") from error
+    io.check_format(path, metadata, _KIND, _FORMAT)
+    io.check_pages(path, pages, _PAGES)
+    return FrameStatistics(**{name: pages[name] for name in _PAGES})
 
 
 def _level(saturation: float | None) -> float | None:

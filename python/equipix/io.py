@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import threading
+import uuid
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,13 +32,17 @@ _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
 _TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that still leave room for the directories
 
 
-def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> list[Path]:
+def find_files(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, folder: Path = Path()
+) -> list[Path]:
     """Files that a path, a glob or a list of these names; a glob's in natural order.
 
     Parameters
     ----------
     source : path, or iterable of paths
         A name with ``*``, ``?`` or ``[`` is a glob, unless a file has just that name.
+    folder : Path, optional
+        Where relative names start.
 
     Returns
     -------
@@ -51,28 +56,41 @@ def find_files(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> l
     InputError
         If there is no name, or something else than a name.
     """
-    names = [source] if isinstance(source, str | os.PathLike) else source
-    found = [path for name in names for path in _matches(name)]
+    names = [source] if isinstance(source, str | bytes | os.PathLike) else source
+    found = [path for name in names for path in _matches(name, folder)]
     if not found:
         raise InputError("'source' names no file")
     return found
 
 
-def _matches(name: str | PathLike[str]) -> list[Path]:
-    if not isinstance(name, str | os.PathLike):
-        raise InputError(f"'source' holds {name!r}, expected names of files only")
-    path = Path(name)
+def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
+    pattern = str(as_path("source", name))
+    path = folder / pattern
     if path.is_dir():
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
     if path.exists():
         return [path]
-    if not glob.has_magic(str(path)):
+    if not glob.has_magic(pattern):
         raise FileError(f"{path}: does not exist")
     # Unlike Path.glob, this leaves out hidden files, as a shell does.
-    found = glob.glob(str(path), recursive=True)  # noqa: PTH207
+    found = glob.glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
     if not found:
         raise FileError(f"{path}: no file matches")
-    return sorted(map(Path, found), key=_natural)
+    return sorted((folder / match for match in found), key=_natural)
+
+
+def as_path(name: str, value: object) -> Path:
+    """Take an argument for the name of a file.
+
+    Raises
+    ------
+    InputError
+        If it is no name, or none that a file can have.
+    """
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or "\0" in text:
+        raise InputError(f"'{name}' holds {value!r}, expected the name of a file")
+    return Path(text)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -242,6 +260,25 @@ def _reading(path: Path) -> Iterator[None]:
         raise FileError(f"{path}: is broken: {complaints.messages[0]}")
 
 
+def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Refuse to write over a file that the work reads.
+
+    Raises
+    ------
+    FileError
+        If an output is one of the inputs, by whatever name.
+    """
+    taken = {path.resolve() for path in inputs}
+    for path in outputs:
+        if path.resolve() in taken:
+            raise FileError(f"{path}: is one of the inputs: name another output")
+
+
+def beside(target: Path) -> Path:
+    """Give a hidden name in the folder of `target` that nothing else has, of the same suffix."""
+    return target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+
+
 @contextmanager
 def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[Path]:
     """Give a file's place to a new version in one step, when all of it is written.
@@ -262,12 +299,16 @@ def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[P
     ------
     FileError
         If the file exists and `force` is not set, or cannot be written.
+    InputError
+        If `path` is not the name of a file.
     """
-    target = Path(path)
-    if target.exists() and not force:
-        raise FileError(f"{target}: exists already; force=True (--force) replaces it")
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    target = as_path("path", path)
+    temporary = beside(target)
     try:
+        if target.is_dir():
+            raise FileError(f"{target}: is a folder, expected the name of a file")
+        if target.exists() and not force:
+            raise FileError(f"{target}: exists already; force=True (--force) replaces it")
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -307,7 +348,7 @@ def save_pages(
     InputError
         If the suffix is unknown or a page is not an array of numbers in two dimensions.
     """
-    write = _WRITERS.get(Path(path).suffix.lower())
+    write = _WRITERS.get(as_path("path", path).suffix.lower())
     if write is None:
         raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
     for name, array in pages.items():
@@ -343,7 +384,7 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     InputError
         If the suffix is unknown.
     """
-    path = Path(path)
+    path = as_path("path", path)
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise InputError(f"'path' is {str(path)!r}, expected the suffix .tif or .npz")
@@ -354,6 +395,58 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     except ValueError as error:
         raise FileError(f"{path}: was not written by equipix: it lacks its metadata") from error
     return pages, metadata
+
+
+def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:
+    """Refuse the metadata of another kind of file than `kind`, or of a format above `newest`.
+
+    Raises
+    ------
+    FileError
+        If the metadata are not of such a file.
+    """
+    if not isinstance(content, dict) or content.get("kind") != kind:
+        raise FileError(f"{path}: holds something else than {kind} that equipix has saved")
+    number = content.get("format")
+    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+        raise FileError(f"{path}: is damaged: its format is {number!r}, expected a whole number")
+    if number > newest:
+        raise FileError(
+            f"{path}: has format {number}, this version of equipix reads up to {newest}: install"
+            " a newer one"
+        )
+
+
+def check_pages(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], wanted: Mapping[str, type]
+) -> None:
+    """Refuse pages that lack one of those wanted, or are not all maps of one sensor.
+
+    Parameters
+    ----------
+    path : path
+        The file they are from.
+    pages : mapping of str to ndarray
+        Arrays by name.
+    wanted : mapping of str to type
+        Dtype, or kind of dtype, of each page that must be there.
+
+    Raises
+    ------
+    FileError
+        If a page is missing, or has another dtype, rank or shape.
+    """
+    shape = None
+    for name, dtype in wanted.items():
+        if name not in pages:
+            raise FileError(f"{path}: is damaged: lacks the page '{name}'")
+        page = pages[name]
+        shape = shape or page.shape
+        if page.ndim != 2 or page.shape != shape or not np.issubdtype(page.dtype, dtype):
+            raise FileError(
+                f"{path}: is damaged: page '{name}' is {page.dtype} of shape {page.shape},"
+                f" expected {dtype.__name__} in two dimensions, as large as '{next(iter(wanted))}'"
+            )
 
 
 def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, nbytes: int) -> None:

@@ -8,12 +8,14 @@ import numpy as np
 
 from equipix.calibration import FORMAT, Calibration, History
 from equipix.errors import FileError
-from equipix.io import load_pages
+from equipix.io import check_format, check_pages, load_pages
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from numpy.typing import NDArray
+
+_MAPS = {"sensitivity": np.floating, "flags": np.uint32, "component_labels": np.integer}
 
 
 def load(path: str | PathLike[str]) -> Calibration:
@@ -35,13 +37,9 @@ def load(path: str | PathLike[str]) -> Calibration:
         If the file cannot be read, holds something else, or was written in a newer format.
     """
     pages, content = load_pages(path)
-    if not isinstance(content, dict) or content.get("kind") != "calibration":
-        raise FileError(f"{path}: not a calibration that equipix has saved")
-    if content.get("format", 0) > FORMAT:
-        raise FileError(
-            f"{path}: written in format {content['format']}, this version of equipix reads up to "
-            f"{FORMAT}: install a newer one"
-        )
+    check_format(path, content, "calibration", FORMAT)
+    check_pages(path, pages, _MAPS | {"dark": np.floating} if "dark" in pages else _MAPS)
+    check_pages(path, pages, {"beam": np.floating})
     try:
         return _calibration(pages, content)
     except (KeyError, TypeError, ValueError) as error:

@@ -97,7 +97,7 @@ def draw_demo(demo: Demo) -> Figure:
     limit = float(np.nanmax(np.abs(errors[1])))
     _map(
         rows[1, 0],
-        "Error of shift calibration, %\n(16×16 means)",
+        f"Error of shift calibration, %\n(16×16 means, rms {_rms(errors[0]):.1g})",
         errors[0],
         (-limit, limit),
         "RdBu_r",
@@ -105,7 +105,7 @@ def draw_demo(demo: Demo) -> Figure:
     )
     _map(
         rows[1, 1],
-        "Error of flat field, %\n(16×16 means)",
+        f"Error of flat field, %\n(16×16 means, rms {_rms(errors[1]):.1g})",
         errors[1],
         (-limit, limit),
         "RdBu_r",
@@ -114,10 +114,14 @@ def draw_demo(demo: Demo) -> Figure:
     _profiles(rows[1, 2], *errors)
     predicted, predicted_blocks = (100 * value for value in demo.predicted)
     pixels = [100 * error for error in (demo.error, demo.flat_field_error)]
-    _distributions(rows[2, 0], "Errors of pixels, %", pixels, predicted)
-    _distributions(rows[2, 1], "Errors of 16×16 means, %", errors, predicted_blocks)
+    _distributions(rows[2, 0], "Errors of pixels", pixels, predicted)
+    _distributions(rows[2, 1], "Errors of 16×16 means", errors, predicted_blocks)
     _history(rows[2, 2], demo.calibration)
     return figure
+
+
+def _rms(values: NDArray[Any]) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def _map(
@@ -148,16 +152,21 @@ def _profiles(axes: Axes, calibration: NDArray[Any], flat_field: NDArray[Any]) -
 
 def _distributions(axes: Axes, title: str, errors: list[NDArray[Any]], predicted: float) -> None:
     """Draw histograms of errors of calibration and flat field, and what the noise predicts."""
-    edges = predicted * np.linspace(-6, 6, 61)
     for values, color, label in zip(
         errors, (_CALIBRATION, _FLAT_FIELD), ("shift calibration", "flat field"), strict=True
     ):
+        edges = np.nanmax(np.abs(values)) * np.linspace(-1, 1, 62)
         density = np.histogram(values, edges)[0] / np.isfinite(values).sum() / np.diff(edges)
         axes.stairs(density, edges, color=color, label=label)
-    normal = np.exp(-0.5 * (edges / predicted) ** 2) / (predicted * np.sqrt(2 * np.pi))
-    axes.plot(edges, normal, color=_PREDICTION, linestyle=":", label="noise predicts")
+    sigmas = np.linspace(-6, 6, 121)
+    normal = np.exp(-0.5 * sigmas**2) / (predicted * np.sqrt(2 * np.pi))
+    axes.plot(predicted * sigmas, normal, color=_PREDICTION, linestyle=":", label="noise predicts")
     axes.set(
-        title=title, ylabel="density", yscale="log", ylim=(normal.max() / 1e4, 30 * normal.max())
+        title=title,
+        xlabel="error, %",
+        ylabel="density",
+        yscale="log",
+        ylim=(normal.max() / 1e4, 30 * normal.max()),
     )
     axes.legend(loc="upper right", fontsize="small")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from equipix.errors import FileError
-from equipix.io import write_frames
+from equipix.io import beside, write_frames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -92,23 +91,44 @@ def _new_folder(target: Path, force: bool) -> Iterator[Path]:
     if target.exists() and not _may_replace(target, force):
         raise FileError(
             f"'{target}' exists and is not empty: name another folder, or force the replacement "
-            "of an experiment"
+            "of a folder that holds nothing but an experiment written before"
         )
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    partial, old = beside(target.resolve()), beside(target.resolve())
     try:
         partial.mkdir(parents=True)
         yield partial
-        if target.exists():
-            shutil.rmtree(target)
-        partial.rename(target)
+        _replace(target.resolve(), partial, old)
     except OSError as error:
         raise FileError(f"cannot write '{target}': {error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def _replace(target: Path, new: Path, old: Path) -> None:
+    """Put a folder in the place of another, which goes away last of all."""
+    if not target.exists():
+        new.rename(target)
+        return
+    target.rename(old)
+    try:
+        new.rename(target)
+    except OSError:
+        old.rename(target)
+        raise
+    shutil.rmtree(old)
+
+
 def _may_replace(target: Path, force: bool) -> bool:
     """Whether the target is an empty folder, or an experiment that may go."""
     if not target.is_dir():
         return False
-    return not any(target.iterdir()) or (force and (target / "experiment.toml").is_file())
+    return not any(target.iterdir()) or (force and all(map(_is_ours, target.iterdir())))
+
+
+def _is_ours(entry: Path) -> bool:
+    """Whether an entry of an experiment's folder is one that `write_experiment` makes."""
+    if entry.is_symlink():
+        return False
+    if entry.name in ("frames", "dark", "aperture") and entry.is_dir():
+        return all(file.suffix == ".tif" and file.is_file() for file in entry.iterdir())
+    return entry.name in ("experiment.toml", "truth.npz") and entry.is_file()
