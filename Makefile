@@ -48,4 +48,4 @@ $(BIN)/.built-%: $(BIN)/.installed $(SOURCES)
 	touch $@
 
 clean:
-	rm -rf .venv target demo
+	rm -rf .venv target
