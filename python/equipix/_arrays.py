@@ -19,6 +19,11 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
 
     A copy is made only where the caller's array is not already so.
     """
+    if _is_masked(values):
+        raise InputError(
+            f"'{name}' is a masked array, whose mask would be lost: pass it as mask=, or fill "
+            "the masked values with NaN"
+        )
     try:
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
@@ -32,6 +37,12 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
             f"'{name}' has shape {array.shape}, expected {wanted} dimensions, not {array.ndim}"
         )
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+
+
+def _is_masked(values: object) -> bool:
+    """Whether an array, or one of a list of arrays, has masked values as numpy.ma marks them."""
+    arrays = values if isinstance(values, list | tuple) else (values,)
+    return any(np.ma.is_masked(array) for array in arrays)
 
 
 def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:
