@@ -46,6 +46,8 @@ def with_value(array, place, value):
         ({"frames": np.full((5, 8, 9), np.nan)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
+        ({"mask": np.zeros((9, 8), bool)}, r"'mask' has shape \(9, 8\), expected \(8, 9\) or"),
+        ({"mask": np.zeros((8, 9, 5), bool)}, r"'mask' has shape \(8, 9, 5\)"),
         ({"mask": np.ones((8, 9))}, "'mask' has dtype float64, expected bool"),
         ({"mask": np.arange(5)[:, None, None] == np.full((5, 8, 9), 3)}, "nothing of exposure 3"),
         ({"frames": with_value(frames(), 1, -0.1)}, "'frames' of exposure 1 have a median"),

@@ -345,7 +345,7 @@ def calibrate(
         rotation=turns.astype(int).tolist(),
         flux=fluxes.tolist(),
         variance=None if variance is None else _variances(variance, values),
-        mask=None if mask is None else _boolean_mask(mask),
+        mask=None if mask is None else _boolean_mask(mask, values.shape),
         tolerance=number("tolerance", tolerance),
         max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
         workers=positive_workers(workers),
@@ -399,10 +399,12 @@ def _statistics(frames: object) -> list[FrameStatistics]:
     return statistics
 
 
-def _boolean_mask(mask: ArrayLike) -> NDArray[np.bool_]:
+def _boolean_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     array = as_array("mask", mask, ndim=(2, 3))
     if array.dtype != np.bool_:
         raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
+    if array.shape not in (shape[1:], shape):
+        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
     return array
 
 
