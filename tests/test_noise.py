@@ -7,6 +7,7 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
+from equipix.defects import dead_pixels, hot_pixels
 from equipix.noise import NoiseModel
 
 CROSS = equipix.cross_pattern(5, 7)
@@ -51,3 +52,27 @@ def test_frames_that_are_all_equal_have_no_model(raw):
     same = [equipix.average(np.stack([each[0]] * 2)) for each in raw]
     with pytest.raises(errors.InputError, match="all equal"):
         equipix.calibrate(same, CROSS)
+
+
+def test_exposures_that_saturate_everywhere_are_named(raw):
+    averages = [
+        equipix.average(each, saturation=0 if k == 3 else None) for k, each in enumerate(raw)
+    ]
+    with pytest.raises(errors.InputError, match="every pixel of exposure 3 saturates"):
+        equipix.calibrate(averages, CROSS)
+
+
+def test_a_pixel_without_samples_hides_no_defect():
+    dark = np.random.default_rng(1).normal(100, 2, (10, 40, 40))
+    dark[:, 3, 4] += 500
+    dark[:, 5, 6] = np.nan
+    hot = hot_pixels(equipix.average(dark), NoiseModel(2.0, 0.3))
+    assert np.argwhere(hot).tolist() == [[3, 4]]
+
+    signals = np.full((3, 40, 40), 100.0)
+    signals[:, 7, 8] = 1
+    signals[0, 7, 8] = np.nan
+    signals[1, 9, 9] = np.nan
+    signals[:, 20, 20] = np.nan
+    signals[0, :16, :16] = np.nan
+    assert np.argwhere(dead_pixels(signals, None)).tolist() == [[7, 8], [20, 20]]

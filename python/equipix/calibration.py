@@ -396,6 +396,12 @@ def _statistics(frames: object) -> list[FrameStatistics]:
     shapes = [each.mean.shape for each in statistics]
     if len(set(shapes)) > 1:
         raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
+    for k, each in enumerate(statistics):
+        if each.saturated.all():
+            raise InputError(
+                f"'frames': every pixel of exposure {k} saturates: expose less, or correct the "
+                "'saturation' that they were averaged with"
+            )
     return statistics
 
 
