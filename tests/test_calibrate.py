@@ -275,7 +275,7 @@ class TestComponents:
         assert np.nanmax(np.abs(error)) < 1e-9
         assert np.isnan(cal.beam).any()
 
-    def test_dead_and_negative_pixels_are_solved_too(self):
+    def test_dead_and_negative_pixels_are_solved_and_flagged(self):
         frames, truth = measured((30, 40))
         frames[:, 4, 4] = 0
         frames[:, 9, 9] = -0.01
@@ -283,6 +283,9 @@ class TestComponents:
         assert cal.converged
         assert cal.sensitivity[4, 4] == 0
         assert cal.sensitivity[9, 9] < 0
+        assert np.argwhere(cal.flags).tolist() == [[4, 4], [9, 9]]
+        assert (cal.flags[[4, 9], [4, 9]] == Flag.DEAD | Flag.DO_NOT_USE).all()
+        assert np.isposinf(cal.correct(np.ones((30, 40)), dark=None, flagged="keep")[4, 4])
         others = np.delete((cal.sensitivity / truth).ravel(), [4 * 40 + 4, 9 * 40 + 9])
         assert np.abs(others / others.mean() - 1).max() < 5e-3
 

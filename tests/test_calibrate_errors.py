@@ -97,6 +97,12 @@ class TestCorrect:
         assert corrected.dtype == np.float32
         np.testing.assert_allclose(corrected[1], 5 / calibration.sensitivity, rtol=3e-7)
 
+    def test_averaged_dark_frames(self, calibration):
+        raw, dark = frames((8, 9)), equipix.average(frames((3, 8, 9)))
+        np.testing.assert_array_equal(
+            calibration.correct(raw, dark=dark), calibration.correct(raw, dark=dark.mean)
+        )
+
     def test_into_an_array(self, calibration):
         raw, out = frames((8, 9)), np.empty((8, 9))
         assert calibration.correct(raw, dark=None, out=out) is out
@@ -124,6 +130,8 @@ class TestCorrect:
             ({"flagged": "drop"}, "'flagged' is 'drop'"),
             ({"out": np.empty((9, 8))}, "'out' is float64"),
             ({"out": np.empty((8, 9), int)}, "'out' is int64"),
+            ({"out": np.empty((8, 9), np.float16)}, "'out' is float16.* expected .*float32"),
+            ({"out": np.empty((8, 9), np.longdouble)}, "'out' is .* expected .*float32"),
         ],
     )
     def test_names_what_is_wrong(self, calibration, options, message):

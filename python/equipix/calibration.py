@@ -75,7 +75,8 @@ class Calibration:
     beam_origin : tuple of int
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel.
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0 is
+        ``DEAD | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     flux : ndarray, shape (n,), float64
@@ -139,7 +140,7 @@ class Calibration:
         self,
         frames: ArrayLike,
         *,
-        dark: Literal["stored"] | ArrayLike | None = "stored",
+        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
         flagged: Flagged = "nan",
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
@@ -149,9 +150,9 @@ class Calibration:
         ----------
         frames : array_like, shape (rows, cols) or (n, rows, cols)
             Raw frames, in DN.
-        dark : "stored", array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the one that is part of the calibration, another,
-            or none where it is already subtracted.
+        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+            The dark frame to subtract, in DN: the one that is part of the calibration, another
+            (of averaged frames the mean), or none where it is already subtracted.
         flagged : {"nan", "keep", "replace"}
             What becomes of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
@@ -359,6 +360,7 @@ def calibrate(
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+    calibration.flags[calibration.sensitivity <= 0] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
     _warn(calibration, tolerance)
