@@ -55,6 +55,9 @@ def with_value(array, place, value):
         ({"variance": np.ones(4)}, "'variance' has 4 entries"),
         ({"variance": np.ones((5, 8, 8))}, "'variance' has shape"),
         ({"variance": with_value(np.ones(5), 2, 0)}, "'variance' of exposure 2 is 0"),
+        ({"variance": with_value(np.ones(5), 2, -1)}, "'variance' of exposure 2 is -1"),
+        ({"variance": with_value(np.ones(5), 2, np.nan)}, "'variance' of exposure 2 is NaN"),
+        ({"variance": with_value(np.ones(5), 2, np.inf)}, "'variance' of exposure 2 is inf"),
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), -1)}, "row 2, column 3 is -1"),
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), np.nan)}, "row 2, column 3 is NaN"),
         ({"flux": [1, 1, 1, 1]}, "'flux' has 4 entries"),
@@ -65,6 +68,11 @@ def with_value(array, place, value):
         ({"tolerance": 0}, "'tolerance' is 0"),
         ({"tolerance": np.nan}, "'tolerance' is NaN"),
         ({"tolerance": "small"}, "'tolerance' is 'small'"),
+        ({"tolerance": "1e-3"}, "'tolerance' is '1e-3'"),
+        ({"tolerance": True}, "'tolerance' is True"),
+        ({"tolerance": 10**400}, "'tolerance' is 1000"),
+        ({"progress": 3}, "'progress' is 3, expected a function"),
+        ({"frames": frames() > 1}, "'frames' has dtype bool"),
         ({"max_sweeps": 0}, "'max_sweeps' is 0"),
         ({"max_sweeps": 2.5}, r"'max_sweeps' is 2\.5"),
         ({"workers": 0}, "'workers' is 0"),
@@ -75,6 +83,23 @@ def with_value(array, place, value):
 def test_calibrate_names_what_is_wrong(options, message):
     with pytest.raises(InputError, match=message):
         equipix.calibrate(**changed(**options))
+
+
+def test_any_number_of_sweeps_may_be_allowed():
+    assert equipix.calibrate(frames(), CROSS, tolerance=1e-3, max_sweeps=2**64).converged
+
+
+def test_a_masked_measurement_needs_no_variance():
+    values, variance = frames(), np.ones((5, 8, 9))
+    values[1, 2, 3] = np.nan
+    variance[1, 2, 3] = np.nan
+    assert equipix.calibrate(values, CROSS, variance=variance, tolerance=1e-3).converged
+
+
+@pytest.mark.parametrize("arm", [10**30, -(10**30), 0, 2.5, True])
+def test_cross_pattern_names_a_wrong_arm(arm):
+    with pytest.raises(InputError, match="'first' is"):
+        equipix.cross_pattern(arm, 5)
 
 
 def test_an_exception_in_the_progress_callback_stops_the_work_and_is_raised():

@@ -14,6 +14,7 @@ from equipix._arrays import (
     as_array,
     as_floats,
     check_count,
+    check_progress,
     number,
     per_exposure,
     positive_count,
@@ -329,6 +330,7 @@ def calibrate(
     started = datetime.now(UTC)
     if method != "coordinate-descent":
         raise InputError(f"'method' is {method!r}, expected 'coordinate-descent'")
+    check_progress(progress)
     statistics = _statistics(frames)
     values = _values(cast("ArrayLike", frames), statistics)
     if variance is None and statistics:
@@ -382,10 +384,14 @@ def _variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
     variances = as_array("variance", variance, ndim=(1, 3))
     if variances.ndim == 1:
         check_count("variance", len(variances), len(values))
+        if np.isinf(variances).any():
+            k = int(np.argmax(np.isinf(variances)))
+            raise InputError(f"'variance' of exposure {k} is infinite, expected a positive number")
         return variances.astype(np.float64)
     if variances.shape != values.shape:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
-    return variances.astype(values.dtype, copy=False)
+    with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
+        return variances.astype(values.dtype, copy=False)
 
 
 def _statistics(frames: object) -> list[FrameStatistics]:
