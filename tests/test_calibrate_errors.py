@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix.errors import FileError, InputError
+from equipix.errors import ConvergenceWarning, FileError, InputError, ShiftRoundingWarning
 
 CROSS = equipix.cross_pattern(2, 3)
 
@@ -83,6 +83,18 @@ def with_value(array, place, value):
 def test_calibrate_names_what_is_wrong(options, message):
     with pytest.raises(InputError, match=message):
         equipix.calibrate(**changed(**options))
+
+
+def test_an_unmet_tolerance_says_what_would_meet_it():
+    with pytest.warns(ConvergenceWarning, match="allow more sweeps"):
+        equipix.calibrate(frames(), CROSS, max_sweeps=2)
+    with pytest.warns(ConvergenceWarning, match="rounding is the limit, ask for a larger"):
+        equipix.calibrate(frames(), CROSS, tolerance=1e-300)
+
+
+def test_a_rounded_shift_is_named_with_what_to_do():
+    with pytest.warns(ShiftRoundingWarning, match=r"exposure 2 \(from 0\) is .*0\.3.* move the"):
+        equipix.calibrate(frames(), with_value(CROSS, (2, 0), 0.3), tolerance=1e-3)
 
 
 def test_any_number_of_sweeps_may_be_allowed():

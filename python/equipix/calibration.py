@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 FORMAT = 1
 """Number of the file format; a file with a higher one is refused."""
 
+_MOST_SWEEPS = 1_000_000
+"""Where the compiled part stops unless told otherwise."""
+
 
 @dataclass(frozen=True, eq=False)
 class History:
@@ -276,8 +279,8 @@ def calibrate(
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Most passes over the data; unless given, as many as it takes, as long as the error
-        estimate falls.
+        Most passes over the data; unless given, as many as it takes, at most a million. It
+        also ends where rounding keeps the error estimate from falling.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.
@@ -365,7 +368,7 @@ def calibrate(
     calibration.flags[calibration.sensitivity <= 0] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
-    _warn(calibration, tolerance)
+    _warn(calibration, tolerance, _MOST_SWEEPS if max_sweeps is None else max_sweeps)
     return calibration
 
 
@@ -449,7 +452,7 @@ def _wrapped(
     )
 
 
-def _warn(calibration: Calibration, tolerance: float) -> None:
+def _warn(calibration: Calibration, tolerance: float, max_sweeps: int) -> None:
     if calibration.components > 1:
         left = int(np.count_nonzero(calibration.component_labels > 0))
         warnings.warn(
@@ -459,10 +462,11 @@ def _warn(calibration: Calibration, tolerance: float) -> None:
             stacklevel=3,
         )
     if not calibration.converged:
+        used_up = calibration.sweeps >= max_sweeps
+        remedy = "allow more sweeps" if used_up else "rounding is the limit, ask for a larger one"
         warnings.warn(
             f"stopped after {calibration.sweeps} sweeps with an estimated error of "
-            f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: "
-            "allow more sweeps",
+            f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: {remedy}",
             ConvergenceWarning,
             stacklevel=3,
         )

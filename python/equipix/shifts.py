@@ -211,8 +211,9 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
     if noticeable.any():
         worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
         warnings.warn(
-            f"shifts are rounded to whole pixels: that of exposure {worst[0]} is "
-            f"{np.round(exact[worst[0]], 3).tolist()}",
+            f"shifts are rounded to whole pixels: that of exposure {worst[0]} (from 0) is "
+            f"{np.round(exact[worst[0]], 3).tolist()}; a smooth beam forgives it, for a "
+            "structured one move the sensor by whole pixels",
             ShiftRoundingWarning,
             stacklevel=3,
         )
