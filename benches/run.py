@@ -31,8 +31,7 @@ def main(*, smoke: bool) -> None:
     rates = sweep_rates(smoke=smoke)
     rows = [rate_row(rate) for rate in rates]
     rows.append(numpy_row(rates[0], repetitions=1 if smoke else 7))
-    if not smoke:
-        rows += averaging.rows()
+    rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     table = markdown(rows, rates[0]["threads"])
     print(table)
     if not smoke:

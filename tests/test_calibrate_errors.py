@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix.errors import FileError, InputError
+from equipix.errors import ConvergenceWarning, FileError, InputError, ShiftRoundingWarning
 
 CROSS = equipix.cross_pattern(2, 3)
 
@@ -33,6 +33,8 @@ def with_value(array, place, value):
         ({"frames": "frame.tif"}, "'frames' has dtype"),
         ({"frames": frames().astype(complex)}, "'frames' has dtype complex128"),
         ({"frames": [frames()[0], frames()[0, :3]]}, "'frames' is not an array"),
+        ({"frames": np.ma.masked_greater(frames(), 1)}, "'frames' is a masked array.* mask="),
+        ({"frames": list(np.ma.masked_greater(frames(), 1))}, "'frames' is a masked array"),
         ({"frames": frames((1, 8, 9)), "shifts": [(0, 0)]}, "at least two"),
         ({"frames": frames((4, 8, 9))}, "'shifts' has 5 entries, expected 4"),
         ({"shifts": CROSS[:, :1]}, r"'shifts' has shape \(5, 1\), expected \(n, 2\)"),
@@ -44,6 +46,8 @@ def with_value(array, place, value):
         ({"frames": np.full((5, 8, 9), np.nan)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
+        ({"mask": np.zeros((9, 8), bool)}, r"'mask' has shape \(9, 8\), expected \(8, 9\) or"),
+        ({"mask": np.zeros((8, 9, 5), bool)}, r"'mask' has shape \(8, 9, 5\)"),
         ({"mask": np.ones((8, 9))}, "'mask' has dtype float64, expected bool"),
         ({"mask": np.arange(5)[:, None, None] == np.full((5, 8, 9), 3)}, "nothing of exposure 3"),
         ({"frames": with_value(frames(), 1, -0.1)}, "'frames' of exposure 1 have a median"),
@@ -51,6 +55,9 @@ def with_value(array, place, value):
         ({"variance": np.ones(4)}, "'variance' has 4 entries"),
         ({"variance": np.ones((5, 8, 8))}, "'variance' has shape"),
         ({"variance": with_value(np.ones(5), 2, 0)}, "'variance' of exposure 2 is 0"),
+        ({"variance": with_value(np.ones(5), 2, -1)}, "'variance' of exposure 2 is -1"),
+        ({"variance": with_value(np.ones(5), 2, np.nan)}, "'variance' of exposure 2 is NaN"),
+        ({"variance": with_value(np.ones(5), 2, np.inf)}, "'variance' of exposure 2 is inf"),
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), -1)}, "row 2, column 3 is -1"),
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), np.nan)}, "row 2, column 3 is NaN"),
         ({"flux": [1, 1, 1, 1]}, "'flux' has 4 entries"),
@@ -61,6 +68,11 @@ def with_value(array, place, value):
         ({"tolerance": 0}, "'tolerance' is 0"),
         ({"tolerance": np.nan}, "'tolerance' is NaN"),
         ({"tolerance": "small"}, "'tolerance' is 'small'"),
+        ({"tolerance": "1e-3"}, "'tolerance' is '1e-3'"),
+        ({"tolerance": True}, "'tolerance' is True"),
+        ({"tolerance": 10**400}, "'tolerance' is 1000"),
+        ({"progress": 3}, "'progress' is 3, expected a function"),
+        ({"frames": frames() > 1}, "'frames' has dtype bool"),
         ({"max_sweeps": 0}, "'max_sweeps' is 0"),
         ({"max_sweeps": 2.5}, r"'max_sweeps' is 2\.5"),
         ({"workers": 0}, "'workers' is 0"),
@@ -71,6 +83,35 @@ def with_value(array, place, value):
 def test_calibrate_names_what_is_wrong(options, message):
     with pytest.raises(InputError, match=message):
         equipix.calibrate(**changed(**options))
+
+
+def test_an_unmet_tolerance_says_what_would_meet_it():
+    with pytest.warns(ConvergenceWarning, match="allow more sweeps"):
+        equipix.calibrate(frames(), CROSS, max_sweeps=2)
+    with pytest.warns(ConvergenceWarning, match="rounding is the limit, ask for a larger"):
+        equipix.calibrate(frames(), CROSS, tolerance=1e-300)
+
+
+def test_a_rounded_shift_is_named_with_what_to_do():
+    with pytest.warns(ShiftRoundingWarning, match=r"exposure 2 \(from 0\) is .*0\.3.* move the"):
+        equipix.calibrate(frames(), with_value(CROSS, (2, 0), 0.3), tolerance=1e-3)
+
+
+def test_any_number_of_sweeps_may_be_allowed():
+    assert equipix.calibrate(frames(), CROSS, tolerance=1e-3, max_sweeps=2**64).converged
+
+
+def test_a_masked_measurement_needs_no_variance():
+    values, variance = frames(), np.ones((5, 8, 9))
+    values[1, 2, 3] = np.nan
+    variance[1, 2, 3] = np.nan
+    assert equipix.calibrate(values, CROSS, variance=variance, tolerance=1e-3).converged
+
+
+@pytest.mark.parametrize("arm", [10**30, -(10**30), 0, 2.5, True])
+def test_cross_pattern_names_a_wrong_arm(arm):
+    with pytest.raises(InputError, match="'first' is"):
+        equipix.cross_pattern(arm, 5)
 
 
 def test_an_exception_in_the_progress_callback_stops_the_work_and_is_raised():
@@ -92,6 +133,12 @@ class TestCorrect:
         corrected = calibration.correct(raw, dark=np.full((8, 9), 2))
         assert corrected.dtype == np.float32
         np.testing.assert_allclose(corrected[1], 5 / calibration.sensitivity, rtol=3e-7)
+
+    def test_averaged_dark_frames(self, calibration):
+        raw, dark = frames((8, 9)), equipix.average(frames((3, 8, 9)))
+        np.testing.assert_array_equal(
+            calibration.correct(raw, dark=dark), calibration.correct(raw, dark=dark.mean)
+        )
 
     def test_into_an_array(self, calibration):
         raw, out = frames((8, 9)), np.empty((8, 9))
@@ -120,6 +167,8 @@ class TestCorrect:
             ({"flagged": "drop"}, "'flagged' is 'drop'"),
             ({"out": np.empty((9, 8))}, "'out' is float64"),
             ({"out": np.empty((8, 9), int)}, "'out' is int64"),
+            ({"out": np.empty((8, 9), np.float16)}, "'out' is float16.* expected .*float32"),
+            ({"out": np.empty((8, 9), np.longdouble)}, "'out' is .* expected .*float32"),
         ],
     )
     def test_names_what_is_wrong(self, calibration, options, message):

@@ -80,7 +80,7 @@ def test_noise_of_the_camera_is_recovered(calibration, virtual):
     # The variance of one pixel of 12 frames scatters by sqrt(2/11) = 0.43; over 5120 pixels that
     # is 0.6 % of the dark variance, and over 5 exposures 0.27 % of the photon noise: 5 of these.
     assert noise["gain"] == pytest.approx(camera.gain_dn_per_e, rel=0.014)
-    read_noise = camera.gain_dn_per_e * camera.read_noise_e
+    read_noise = np.hypot(camera.gain_dn_per_e * camera.read_noise_e, np.sqrt(1 / 12))
     assert noise["read_noise"] == pytest.approx(read_noise, rel=0.015)
     # So the model explains the residuals: 3 * 5112 - ... degrees of freedom, 5 deviations.
     assert calibration.reduced_chi2 == pytest.approx(1, abs=0.05)
@@ -329,7 +329,7 @@ def test_fit_recovers_the_model(frames):
     # has that of two levels, the read noise half of that of its square. Five of each.
     error = np.sqrt(2 / (frames - 1) / 40_000)
     assert model.gain == pytest.approx(0.3, rel=5 * error)
-    assert model.read_noise == pytest.approx(2.0, rel=5 * error)
+    assert model.read_noise == pytest.approx(np.sqrt(4 + 1 / 12), rel=5 * error)
     known = NoiseModel.fit(points[:1], gain=0.3)
     assert known.gain == 0.3
 

@@ -91,15 +91,27 @@ def test_ten_times_the_noise_gives_ten_times_the_error(draw):
         assert abs(error).max() < 1e-2
 
 
+@pytest.mark.parametrize(("shape", "factor"), [((582, 782), 1.21), ((240, 320), 1.23)])
+def test_noise_of_the_exposures_fades_with_their_number(shape, factor):
+    """The rms error is factor · noise/√n, with noise relative to the mean signal."""
+    truth = simulate.paper_sensitivity(shape, rng=1)
+    beam, shifts = simulate.gaussian_beam(shape, width=1000), equipix.cross_pattern(*ARMS)
+    noise = 1e-3 * simulate.exposures(truth, beam, shifts).mean()
+    predicted, _ = simulate.noise_prediction(truth, beam, shifts, noise**2, draws=2, rng=2)
+    # Half a unit of the last digit, and as much for the large scales, whose few modes scatter.
+    assert predicted * np.sqrt(len(shifts)) / 1e-3 == pytest.approx(factor, abs=0.01)
+
+
+@pytest.mark.parametrize("largest", [1e-3, 1e-2])
 @pytest.mark.parametrize("arms", list(combinations((5, 7, 11, 19, 23), 2)))
-def test_any_pair_of_arms_does(arms):
+def test_any_pair_of_arms_does(arms, largest):
     truth = simulate.paper_sensitivity(SHAPE, rng=1)
     beam, shifts = simulate.gaussian_beam(SHAPE), equipix.cross_pattern(*arms)
-    predicted, _ = simulate.noise_prediction(truth, beam, shifts, 1e-6 / 3, rng=2)
-    assert predicted == pytest.approx(3.21e-4, abs=0.05e-4)
-    error = error_of_calibration(1, arms=arms)
-    assert rms(error) == pytest.approx(predicted, abs=0.05e-4)
-    assert (abs(error) < 1e-3).mean() > 0.997
+    predicted, _ = simulate.noise_prediction(truth, beam, shifts, largest**2 / 3, rng=2)
+    assert predicted == pytest.approx(0.321 * largest, abs=0.005 * largest)
+    error = error_of_calibration(1, arms=arms, largest=largest)
+    assert rms(error) == pytest.approx(predicted, abs=0.005 * largest)
+    assert (abs(error) < largest).mean() > 0.997
 
 
 @pytest.mark.parametrize("form", [simulate.striped_beam, simulate.tilted_beam])

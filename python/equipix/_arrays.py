@@ -19,6 +19,11 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
 
     A copy is made only where the caller's array is not already so.
     """
+    if _is_masked(values):
+        raise InputError(
+            f"'{name}' is a masked array, whose mask would be lost: pass it as mask=, or fill "
+            "the masked values with NaN"
+        )
     try:
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
@@ -34,9 +39,17 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
 
 
+def _is_masked(values: object) -> bool:
+    """Whether an array, or one of a list of arrays, has masked values as numpy.ma marks them."""
+    arrays = values if isinstance(values, list | tuple) else (values,)
+    return any(np.ma.is_masked(array) for array in arrays)
+
+
 def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:
     """Like `as_array`, with float32 kept and every other dtype made float64."""
     array = as_array(name, values, ndim=ndim)
+    if array.dtype == np.bool_:
+        raise InputError(f"'{name}' has dtype bool, expected numbers")
     return array if array.dtype == np.float32 else array.astype(np.float64, copy=False)
 
 
@@ -53,18 +66,28 @@ def positive_workers(workers: int | None) -> int | None:
 
 
 def positive_count(name: str, value: int) -> int:
-    """A whole number above 0, checked."""
+    """A whole number above 0, checked; one beyond 64 bits becomes the largest within."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
-    return int(value)
+    return min(int(value), 2**63 - 1)
 
 
 def number(name: str, value: float) -> float:
     """A number, checked."""
+    if isinstance(value, bool | np.bool_ | str | bytes):
+        raise InputError(f"'{name}' is {value!r}, expected a number")
     try:
         return float(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
+
+
+def check_progress(progress: object) -> None:
+    """Refuse a progress callback that cannot be called."""
+    if progress is not None and not callable(progress):
+        raise InputError(
+            f"'progress' is {progress!r}, expected a function of (done, total, stage) or None"
+        )
 
 
 def per_exposure(

@@ -14,6 +14,7 @@ from equipix._arrays import (
     as_array,
     as_floats,
     check_count,
+    check_progress,
     number,
     per_exposure,
     positive_count,
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 """Number of the file format; a file with a higher one is refused."""
+
+_MOST_SWEEPS = 1_000_000
+"""Where the compiled part stops unless told otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +79,8 @@ class Calibration:
     beam_origin : tuple of int
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel.
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0 is
+        ``DEAD | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     flux : ndarray, shape (n,), float64
@@ -139,7 +144,7 @@ class Calibration:
         self,
         frames: ArrayLike,
         *,
-        dark: Literal["stored"] | ArrayLike | None = "stored",
+        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
         flagged: Flagged = "nan",
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
@@ -149,9 +154,9 @@ class Calibration:
         ----------
         frames : array_like, shape (rows, cols) or (n, rows, cols)
             Raw frames, in DN.
-        dark : "stored", array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the one that is part of the calibration, another,
-            or none where it is already subtracted.
+        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+            The dark frame to subtract, in DN: the one that is part of the calibration, another
+            (of averaged frames the mean), or none where it is already subtracted.
         flagged : {"nan", "keep", "replace"}
             What becomes of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
@@ -274,8 +279,8 @@ def calibrate(
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Most passes over the data; unless given, as many as it takes, as long as the error
-        estimate falls.
+        Most passes over the data; unless given, as many as it takes, at most a million. It
+        also ends where rounding keeps the error estimate from falling.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.
@@ -328,6 +333,7 @@ def calibrate(
     started = datetime.now(UTC)
     if method != "coordinate-descent":
         raise InputError(f"'method' is {method!r}, expected 'coordinate-descent'")
+    check_progress(progress)
     statistics = _statistics(frames)
     values = _values(cast("ArrayLike", frames), statistics)
     if variance is None and statistics:
@@ -345,7 +351,7 @@ def calibrate(
         rotation=turns.astype(int).tolist(),
         flux=fluxes.tolist(),
         variance=None if variance is None else _variances(variance, values),
-        mask=None if mask is None else _boolean_mask(mask),
+        mask=None if mask is None else _boolean_mask(mask, values.shape),
         tolerance=number("tolerance", tolerance),
         max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
         workers=positive_workers(workers),
@@ -359,9 +365,10 @@ def calibrate(
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+    calibration.flags[calibration.sensitivity <= 0] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
-    _warn(calibration, tolerance)
+    _warn(calibration, tolerance, _MOST_SWEEPS if max_sweeps is None else max_sweeps)
     return calibration
 
 
@@ -380,10 +387,14 @@ def _variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
     variances = as_array("variance", variance, ndim=(1, 3))
     if variances.ndim == 1:
         check_count("variance", len(variances), len(values))
+        if np.isinf(variances).any():
+            k = int(np.argmax(np.isinf(variances)))
+            raise InputError(f"'variance' of exposure {k} is infinite, expected a positive number")
         return variances.astype(np.float64)
     if variances.shape != values.shape:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
-    return variances.astype(values.dtype, copy=False)
+    with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
+        return variances.astype(values.dtype, copy=False)
 
 
 def _statistics(frames: object) -> list[FrameStatistics]:
@@ -396,13 +407,21 @@ def _statistics(frames: object) -> list[FrameStatistics]:
     shapes = [each.mean.shape for each in statistics]
     if len(set(shapes)) > 1:
         raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
+    for k, each in enumerate(statistics):
+        if each.saturated.all():
+            raise InputError(
+                f"'frames': every pixel of exposure {k} saturates: expose less, or correct the "
+                "'saturation' that they were averaged with"
+            )
     return statistics
 
 
-def _boolean_mask(mask: ArrayLike) -> NDArray[np.bool_]:
+def _boolean_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     array = as_array("mask", mask, ndim=(2, 3))
     if array.dtype != np.bool_:
         raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
+    if array.shape not in (shape[1:], shape):
+        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
     return array
 
 
@@ -433,7 +452,7 @@ def _wrapped(
     )
 
 
-def _warn(calibration: Calibration, tolerance: float) -> None:
+def _warn(calibration: Calibration, tolerance: float, max_sweeps: int) -> None:
     if calibration.components > 1:
         left = int(np.count_nonzero(calibration.component_labels > 0))
         warnings.warn(
@@ -443,10 +462,11 @@ def _warn(calibration: Calibration, tolerance: float) -> None:
             stacklevel=3,
         )
     if not calibration.converged:
+        used_up = calibration.sweeps >= max_sweeps
+        remedy = "allow more sweeps" if used_up else "rounding is the limit, ask for a larger one"
         warnings.warn(
             f"stopped after {calibration.sweeps} sweeps with an estimated error of "
-            f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: "
-            "allow more sweeps",
+            f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: {remedy}",
             ConvergenceWarning,
             stacklevel=3,
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from equipix._arrays import as_array
 from equipix.errors import InputError
-from equipix.results import Flag
+from equipix.results import Flag, FrameStatistics
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ def apply_gain(
     frames: ArrayLike,
     *,
     gain: NDArray[Any],
-    dark: ArrayLike | None,
+    dark: FrameStatistics | ArrayLike | None,
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
@@ -35,6 +35,8 @@ def apply_gain(
     if flagged not in get_args(Flagged):
         raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
     dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
+    if isinstance(dark, FrameStatistics):
+        dark = dark.mean
     offset = np.zeros((), dtype) if dark is None else as_array("dark", dark, ndim=2)
     if dark is not None and offset.shape != gain.shape:
         raise InputError(f"'dark' has shape {offset.shape}, the sensor {gain.shape}")
@@ -42,7 +44,8 @@ def apply_gain(
     bad = (flags & Flag.DO_NOT_USE) != 0
     for source, target in zip(_each(raw), _each(result), strict=True):
         np.subtract(source, offset, out=target, dtype=target.dtype, casting="same_kind")
-        np.divide(target, gain, out=target, casting="same_kind")
+        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
+            np.divide(target, gain, out=target, casting="same_kind")
         if flagged == "nan":
             target[bad] = np.nan
         elif flagged == "replace":
@@ -83,8 +86,10 @@ def _each(stack: NDArray[Any]) -> NDArray[Any]:
 
 
 def _checked_out(out: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    fits = isinstance(out, np.ndarray) and out.shape == shape and out.dtype.kind == "f"
-    if not fits or not out.flags.writeable:
+    fits = isinstance(out, np.ndarray) and out.shape == shape and out.flags.writeable
+    if not fits or out.dtype not in (np.float32, np.float64):
         got = f"{getattr(out, 'dtype', type(out).__name__)} {np.shape(out)}"
-        raise InputError(f"'out' is {got}, expected a writeable float array of shape {shape}")
+        raise InputError(
+            f"'out' is {got}, expected a writeable float32 or float64 array of shape {shape}"
+        )
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,13 +41,14 @@ def dead_pixels(signals: NDArray[Any], variances: NDArray[Any] | None) -> NDArra
     Returns
     -------
     ndarray of bool, shape (rows, cols)
-        True where this holds in every exposure; the neighbours' response is the median of a
-        block of 16×16 pixels.
+        True where this holds in every exposure with a measurement, and where none has one; the
+        neighbours' response is the median of a block of 16×16 pixels.
     """
     dead = np.ones(signals.shape[1:], dtype=bool)
     for k, signal in enumerate(signals):
         margin = 0.0 if variances is None else SIGMAS * np.sqrt(variances[k])
-        dead &= signal + margin < DEAD_RESPONSE * _block_medians(signal)
+        # A comparison with NaN is false: no measurement does not make a pixel alive.
+        dead &= ~(signal + margin >= DEAD_RESPONSE * _block_medians(signal))
     return dead
 
 
@@ -67,8 +69,8 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
         1.4826 times the median absolute deviation, and at least one DN), or the variance beyond
         what chance explains.
     """
-    excess = dark.mean - np.median(dark.mean)
-    spread = max(1.0, 1.4826 * float(np.median(np.abs(excess))))
+    excess = dark.mean - np.nanmedian(dark.mean)
+    spread = max(1.0, 1.4826 * float(np.nanmedian(np.abs(excess))))
     hot: NDArray[Any] = excess > HOT_SIGMAS * spread
     frames = int(dark.count.max())
     if noise is not None and frames > 1:
@@ -93,5 +95,7 @@ def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
     rows, cols = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
     blocks = padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK)
-    medians: NDArray[Any] = np.median(blocks, axis=(1, 3))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
+        medians: NDArray[Any] = np.nanmedian(blocks, axis=(1, 3))
     return medians.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:rows, :cols]

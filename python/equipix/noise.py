@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
     from equipix.results import FrameStatistics
 
-QUANTISATION = 1 / 12
-"""Variance of rounding to whole DN, in DN²."""
-
 _BINS = 64
+
+_FLOOR = 1e-6
+"""Least variance of a model, as a fraction of the largest that it was fitted to."""
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,17 @@ class NoiseModel:
     Attributes
     ----------
     read_noise : float
-        Standard deviation of a frame without light, quantisation apart, in DN.
+        Standard deviation of a frame without light, quantisation included, in DN.
     gain : float
         Slope of the photon noise, in DN per electron.
 
     Notes
     -----
-    At mean signal μ (in DN, dark subtracted) the variance is ``read_noise² + 1/12 + gain · μ``:
-    read noise, quantisation and photon noise. Two parameters fitted over all pixels weight a
-    pixel better than its own sample variance, whose scatter would enter the weights.
+    At mean signal μ (in DN, dark subtracted) the variance is ``read_noise² + gain · μ``: noise
+    without light and photon noise. Rounding to whole DN adds its 1/12 DN² to the former; since no
+    other number has a unit, frames in any unit give the same weights. Two parameters fitted over
+    all pixels weight a pixel better than its own sample variance, whose scatter would enter the
+    weights.
     """
 
     read_noise: float
@@ -45,7 +47,7 @@ class NoiseModel:
 
     def variance(self, signal: ArrayLike) -> NDArray[Any]:
         """Variance of one frame, in DN², at the mean `signal`, in DN."""
-        return self.read_noise**2 + QUANTISATION + self.gain * np.maximum(signal, 0)
+        return self.read_noise**2 + self.gain * np.maximum(signal, 0)
 
     @classmethod
     def fit(cls, points: NDArray[Any], *, gain: float | None = None) -> Self:
@@ -63,17 +65,27 @@ class NoiseModel:
         -------
         NoiseModel
             Weighted least squares; a variance s² of f degrees of freedom has variance 2s⁴/f.
-            Neither parameter is below 0.
+            The gain is not below 0, the variance without light not below a millionth of the
+            largest variance.
+
+        Raises
+        ------
+        InputError
+            If no variance is above 0.
         """
         signal, variance, degrees = points.T
-        excess = variance - QUANTISATION
-        weight = degrees / np.maximum(variance, QUANTISATION) ** 2
+        floor = _FLOOR * variance.max()
+        if not floor > 0:
+            raise InputError(
+                "repeated frames are all equal, which shows no scatter: give a single one of them"
+            )
+        weight = degrees / np.maximum(variance, floor) ** 2
         if gain is None:
             x = signal - np.average(signal, weights=weight)
             spread = np.sum(weight * x**2)
-            gain = max(0.0, float(np.sum(weight * x * excess) / spread)) if spread > 0 else 0.0
-        read_variance = np.average(excess - gain * signal, weights=weight)
-        return cls(read_noise=float(np.sqrt(max(0.0, read_variance))), gain=gain)
+            gain = max(0.0, float(np.sum(weight * x * variance) / spread)) if spread > 0 else 0.0
+        read_variance = max(floor, np.average(variance - gain * signal, weights=weight))
+        return cls(read_noise=float(np.sqrt(read_variance)), gain=gain)
 
 
 def photon_transfer(

@@ -71,7 +71,7 @@ class Correction(Protocol):
         self,
         frames: ArrayLike,
         *,
-        dark: Literal["stored"] | ArrayLike | None = "stored",
+        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
         flagged: Literal["nan", "keep", "replace"] = "nan",
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:

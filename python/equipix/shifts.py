@@ -154,7 +154,7 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        A length is not a whole number, or positions coincide.
+        A length is not a whole number or beyond any sensor, or positions coincide.
 
     Examples
     --------
@@ -165,6 +165,8 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     for name, length in (("first", first), ("second", second)):
         if isinstance(length, bool) or not isinstance(length, int | np.integer) or length == 0:
             raise InputError(f"'{name}' is {length!r}, expected a whole number of pixels, not 0")
+        if abs(length) > _BEYOND:
+            raise InputError(f"'{name}' is {length!r}, more pixels than any sensor has")
     if first == second:
         raise InputError(f"'second' is {second!r}, the same as 'first': the positions coincide")
     return np.array([(0, 0), (0, first), (0, second), (first, 0), (second, 0)], dtype=np.int64)
@@ -209,8 +211,9 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
     if noticeable.any():
         worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
         warnings.warn(
-            f"shifts are rounded to whole pixels: that of exposure {worst[0]} is "
-            f"{np.round(exact[worst[0]], 3).tolist()}",
+            f"shifts are rounded to whole pixels: that of exposure {worst[0]} (from 0) is "
+            f"{np.round(exact[worst[0]], 3).tolist()}; a smooth beam forgives it, for a "
+            "structured one move the sensor by whole pixels",
             ShiftRoundingWarning,
             stacklevel=3,
         )

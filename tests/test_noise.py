@@ -1,0 +1,78 @@
+"""The noise model that weights averaged frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import errors, simulate
+from equipix.defects import dead_pixels, hot_pixels
+from equipix.noise import NoiseModel
+
+CROSS = equipix.cross_pattern(5, 7)
+EPS = np.finfo(np.float64).eps
+
+
+@pytest.fixture(scope="module")
+def raw():
+    """Sixteen noisy frames of each exposure."""
+    rng = np.random.default_rng(3)
+    truth = simulate.paper_sensitivity((40, 50), rng=rng)
+    beam = simulate.gaussian_beam(truth.shape, width=60, amplitude=2000)
+    means = simulate.exposures(truth, beam, CROSS)[:, None]
+    return means + np.sqrt(4 + 0.3 * means) * rng.standard_normal((5, 16, *truth.shape))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_unit_of_the_frames_plays_no_part(raw, unit):
+    options = {"max_sweeps": 30, "tolerance": 1e-9}
+    with pytest.warns(errors.ConvergenceWarning):
+        plain = equipix.calibrate([equipix.average(each) for each in raw], CROSS, **options)
+    with pytest.warns(errors.ConvergenceWarning):
+        scaled = equipix.calibrate([equipix.average(unit * each) for each in raw], CROSS, **options)
+    # A frame is rounded when it is scaled, which a difference of nearly equal frames shows
+    # enlarged by signal over noise, 2000/25, in each of 16 samples: weights move by less than
+    # 1e3 roundings and M by no more than they do.
+    np.testing.assert_allclose(scaled.sensitivity, plain.sensitivity, rtol=1e3 * EPS)
+    assert scaled.reduced_chi2 == pytest.approx(plain.reduced_chi2, rel=1e3 * EPS)
+    # Five standard deviations of chi2 over its degrees of freedom.
+    freedom = 4 * 40 * 50 - 47 * 57
+    assert plain.reduced_chi2 == pytest.approx(1, abs=5 * np.sqrt(2 / freedom))
+
+
+def test_the_model_has_a_floor_relative_to_its_largest_variance():
+    points = np.array([(0.0, 0.0, 100.0), (1000.0, 300.0, 100.0)])
+    model = NoiseModel.fit(points)
+    assert model.variance(0.0) == pytest.approx(300e-6)
+    assert model.variance(1000.0) == pytest.approx(300, rel=1e-5)
+
+
+def test_frames_that_are_all_equal_have_no_model(raw):
+    same = [equipix.average(np.stack([each[0]] * 2)) for each in raw]
+    with pytest.raises(errors.InputError, match="all equal"):
+        equipix.calibrate(same, CROSS)
+
+
+def test_exposures_that_saturate_everywhere_are_named(raw):
+    averages = [
+        equipix.average(each, saturation=0 if k == 3 else None) for k, each in enumerate(raw)
+    ]
+    with pytest.raises(errors.InputError, match="every pixel of exposure 3 saturates"):
+        equipix.calibrate(averages, CROSS)
+
+
+def test_a_pixel_without_samples_hides_no_defect():
+    dark = np.random.default_rng(1).normal(100, 2, (10, 40, 40))
+    dark[:, 3, 4] += 500
+    dark[:, 5, 6] = np.nan
+    hot = hot_pixels(equipix.average(dark), NoiseModel(2.0, 0.3))
+    assert np.argwhere(hot).tolist() == [[3, 4]]
+
+    signals = np.full((3, 40, 40), 100.0)
+    signals[:, 7, 8] = 1
+    signals[0, 7, 8] = np.nan
+    signals[1, 9, 9] = np.nan
+    signals[:, 20, 20] = np.nan
+    signals[0, :16, :16] = np.nan
+    assert np.argwhere(dead_pixels(signals, None)).tolist() == [[7, 8], [20, 20]]
