@@ -309,6 +309,7 @@ impl<'a, T: Real> Model<'a, T> {
             {
                 for (col, (&value, &weight)) in values.iter().zip(weights).enumerate() {
                     if weight == 0.0 {
+                        self.check_left_out(exposure, row, col, value)?;
                         continue;
                     }
                     if !VARIANCES.contains(&(1.0 / weight)) {
@@ -331,6 +332,18 @@ impl<'a, T: Real> Model<'a, T> {
                 largest: sum.largest.max(row.largest),
             })
         })
+    }
+
+    /// A weight of 0 comes from the mask or from a value that is no number, not from the variance.
+    fn check_left_out(&self, exposure: usize, row: usize, col: usize, value: T) -> Result<()> {
+        let masked = self.mask_row(exposure, row).is_some_and(|mask| mask[col]);
+        match self.variance {
+            Variance::Measurements(variance) if !masked && value.to_f64().is_finite() => {
+                let variance = variance.row(exposure, row)[col].to_f64();
+                Err(self.bad_variance(exposure, row, col, variance))
+            }
+            _ => Ok(()),
+        }
     }
 
     fn bad_variance(&self, exposure: usize, row: usize, col: usize, variance: f64) -> Error {
