@@ -55,9 +55,8 @@ def rate_row(rate: dict[str, float]) -> Row:
         wanted,
         f"{rate['share_of_copy_rate']:.0%}",
         f"sweep {rate['sweep_s'] * 1e3:.2f} ms, copy of the data {rate['copy_s'] * 1e3:.2f} ms "
-        f"({rate['copy_gb_per_s']:.1f} GB/s read and written); counting the data twice. Of all bytes "
-        f"that it moves where nothing fits the cache (data once, L and M read and written): "
-        f"{rate['share_in_all']:.0%}",
+        f"({rate['copy_gb_per_s']:.1f} GB/s read and written), counting the data twice; "
+        f"{rate['share_in_all']:.0%} counting the data once and L and M read and written",
     )
 
 
