@@ -10,7 +10,8 @@ demo: $(BIN)/.built-release
 
 test: $(BIN)/.built-ci
 	cargo test --locked
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m timing
+	$(BIN)/python -m pytest -m "not timing" -n 2 --dist worksteal
 
 bench: $(BIN)/.built-release
 	$(BIN)/python benches/run.py

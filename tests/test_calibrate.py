@@ -189,7 +189,6 @@ class TestLaws:
 
 
 class TestErrorEstimate:
-    @pytest.mark.slow
     @pytest.mark.parametrize("sweeps", [100, 1000, 5000])
     def test_it_sees_the_large_scales_of_the_hard_case(self, sweeps):
         frames, truth = hard_case((582, 782))
@@ -198,7 +197,6 @@ class TestErrorEstimate:
         assert 1 / 3 <= cal.error_estimate / true <= 10
         assert not cal.converged
 
-    @pytest.mark.slow
     def test_the_hard_case_converges(self):
         frames, truth = hard_case((582, 782))
         cal = equipix.calibrate(frames, equipix.cross_pattern(11, 19), tolerance=1e-4)

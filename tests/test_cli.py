@@ -320,6 +320,7 @@ def read(descriptor):
         return b""
 
 
+@pytest.mark.timing
 def test_ctrl_c_stops_the_solver_at_once(tmp_path_factory, tmp_path):
     # Short arms on a sensor of some size: to rounding takes many seconds.
     shape = (320, 400)

@@ -318,6 +318,7 @@ def endless_tiff(path: Path, count: int) -> None:
     path.write_bytes((header + strip).ljust(start, b"\0") + directories)
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("kind", ["pages", "files", "array"])
 def test_ctrl_c_stops_within_half_a_second(tmp_path: Path, kind: str) -> None:
     endless_tiff(tmp_path / "long.tif", 10_000 if kind == "pages" else 1)
