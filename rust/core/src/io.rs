@@ -27,7 +27,8 @@ const BATCH: usize = 16;
 /// Bytes of one batch, unless every worker's one frame takes more.
 const BATCH_BYTES: usize = 1 << 26;
 
-/// No lossless coding in use here packs tighter: a header that claims more is forged or broken.
+/// No lossless coding in use here packs tighter: a header that claims more is forged or broken, and
+/// memory for it must not even be asked for.
 const MAX_COMPRESSION: usize = 4096;
 
 /// The frames of one file.
@@ -200,7 +201,8 @@ impl<'a> Page<'a> {
         if length == 0 {
             return Err(Problem::bad("is empty"));
         }
-        let picture: Box<dyn Picture> = match kind(self.path)? {
+        let kind = kind(self.path)?;
+        let picture: Box<dyn Picture> = match kind {
             Kind::Tiff => Box::new(tiff::Picture::new(source)?),
             Kind::Png => Box::new(bitmap::Png::new(source)?),
             Kind::Pgm => Box::new(bitmap::Pgm::new(source)?),
@@ -210,7 +212,8 @@ impl<'a> Page<'a> {
         if format.shape.is_empty() {
             return Err(Problem::bad("has no pixels"));
         }
-        if format.bytes() / MAX_COMPRESSION > length {
+        let packing = if matches!(kind, Kind::Pgm | Kind::Bmp) { 1 } else { MAX_COMPRESSION };
+        if format.bytes() / packing > length {
             return Err(Problem::bad(format!("claims {format} in a file of {length} bytes")));
         }
         Ok(picture)
