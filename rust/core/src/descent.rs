@@ -130,6 +130,7 @@ pub fn solve<'m, 'a, T: Real>(
             continue;
         }
         let before = descent.sensitivity.clone();
+        control.check()?;
         history.objective.push(descent.sweep(control)?);
         let estimate = estimator.largest_error(descent.step_since(before), sweep, control)?;
         history.error_estimate.push(estimate);

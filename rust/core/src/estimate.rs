@@ -33,6 +33,8 @@ use crate::model::Model;
 use crate::parallel::Workers;
 use crate::transform::CosineTransform;
 
+/// Values that a thread takes at a time.
+const PART: usize = 1 << 16;
 /// Pixels along a side of the blocks whose weights are compared.
 const BLOCK: usize = 16;
 /// A symbol or a rate this small cannot be told from 0.
@@ -142,8 +144,8 @@ impl<'m> Estimator<'m> {
         sweep: u64,
         control: &Control,
     ) -> Result<Estimate> {
-        let largest_step = largest(&step);
-        let rms = (step.iter().map(|s| s * s).sum::<f64>() / step.len() as f64).sqrt();
+        let (largest_step, rms) = self.sizes(&step);
+        control.check()?;
         // Steps that are nothing but rounding do not shrink, and are no series.
         let by_rate = (largest_step - ROUNDING).max(0.0) / self.lost_per_sweep(sweep, rms);
         self.last = Some(LastStep { sweep, rms });
@@ -151,9 +153,19 @@ impl<'m> Estimator<'m> {
         self.transform.filter(&mut step, amplification, self.workers, control)?;
         Ok(Estimate {
             sweep,
-            error: by_rate.max(self.contrast * largest(&step)),
+            error: by_rate.max(self.contrast * self.sizes(&step).0),
             step: largest_step,
         })
+    }
+
+    /// The largest size of some values, and their root mean square.
+    fn sizes(&self, values: &[f64]) -> (f64, f64) {
+        let parts: Vec<&[f64]> = values.chunks(PART).collect();
+        let of_parts = self.workers.map(parts.len(), |index| {
+            (largest(parts[index]), parts[index].iter().map(|value| value * value).sum::<f64>())
+        });
+        let (tops, squares): (Vec<_>, Vec<_>) = of_parts.into_iter().unzip();
+        (largest(&tops), (squares.iter().sum::<f64>() / values.len() as f64).sqrt())
     }
 
     /// 1 − the factor by which the steps have shrunk per sweep since the last look; at the first

@@ -39,17 +39,20 @@ impl CosineTransform {
             each_line(image, transform, direction, workers, control)
         };
         each_line(image, &*self.along_rows, Direction::Forward)?;
-        let mut modes = transposed(image, self.shape, workers);
+        let mut modes = transposed(image, self.shape, workers, control);
         each_line(&mut modes, &*self.along_cols, Direction::Forward)?;
         // Forward and back multiply by a quarter of the number of pixels.
         let scale = 4.0 / (rows * cols) as f64;
         workers.map_blocks(&mut modes, rows, |j, line| {
+            if control.is_cancelled() {
+                return;
+            }
             for (i, mode) in line.iter_mut().enumerate() {
                 *mode *= scale * factor(i, j);
             }
         });
         each_line(&mut modes, &*self.along_cols, Direction::Back)?;
-        *image = transposed(&modes, self.shape.transposed(), workers);
+        *image = transposed(&modes, self.shape.transposed(), workers, control);
         each_line(image, &*self.along_rows, Direction::Back)
     }
 }
@@ -84,11 +87,15 @@ fn each_line(
     control.check()
 }
 
-/// The transposed image, in square tiles so that both sides stay in cache.
-fn transposed(image: &[f64], shape: Shape, workers: &Workers) -> Vec<f64> {
+/// The transposed image, in square tiles so that both sides stay in cache; nothing of use if
+/// `control` asks to stop.
+fn transposed(image: &[f64], shape: Shape, workers: &Workers, control: &Control) -> Vec<f64> {
     const TILE: usize = 32;
     let mut result = vec![0.0; image.len()];
     workers.map_blocks(&mut result, TILE * shape.rows, |block, lines| {
+        if control.is_cancelled() {
+            return;
+        }
         let first = block * TILE;
         for top in (0..shape.rows).step_by(TILE) {
             for (col, line) in lines.chunks_exact_mut(shape.rows).enumerate() {
