@@ -2,11 +2,22 @@
 
 use crate::connectivity::{Components, NONE};
 use crate::control::Control;
-use crate::descent::{self, History, Stop};
+use crate::descent;
 use crate::error::Result;
+use crate::estimate::{History, Stop};
 use crate::frames::{Real, flag};
 use crate::model::Model;
+use crate::multiscale;
 use crate::parallel::Workers;
+
+/// How to minimise F.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Method {
+    /// Gauss-Newton on all scales at once: see [`multiscale`](crate::multiscale).
+    Multiscale,
+    /// The method of the paper: see [`descent`](crate::descent).
+    CoordinateDescent,
+}
 
 /// A calibrated sensor.
 #[derive(Clone, Debug)]
@@ -23,27 +34,30 @@ pub struct Solution {
     pub history: History,
     /// Measurements used less unknowns determined.
     pub degrees_of_freedom: i64,
-    /// Whether the estimated largest relative error of M is within the tolerance.
-    pub converged: bool,
 }
 
-/// Minimises F by coordinate descent.
+/// Minimises F.
 ///
-/// M is given in the gauge mean(M) = 1 over the pixels of a component, each component for itself.
+/// M is given in the gauge mean(M) = 1 over the pixels of a component, each component for itself;
+/// pixels that their measurements leave almost no weight are flagged and not in the mean.
 ///
 /// # Errors
-/// As [`descent::solve`].
+/// As [`multiscale::solve`] and [`descent::solve`].
 pub fn calibrate<T: Real>(
     model: &Model<'_, T>,
+    method: Method,
     stop: Stop,
     workers: &Workers,
     control: &Control,
 ) -> Result<Solution> {
     let components = Components::of(model, control)?;
-    let (descent, history) = descent::solve(model, components.sizes.len(), stop, workers, control)?;
+    let (descent, history, left_out) = match method {
+        Method::Multiscale => multiscale::solve(model, stop, workers, control)?,
+        Method::CoordinateDescent => descent::solve(model, stop, workers, control)?,
+    };
     let mut beam = descent.beam();
     let mut sensitivity = descent.sensitivity;
-    let means = component_means(&sensitivity, &components);
+    let means = component_means(&sensitivity, &components, &left_out);
     rescale(&mut sensitivity, &components.pixels, workers, |value, label| {
         if label == 0 { value / means[0] } else { f64::NAN }
     });
@@ -51,12 +65,16 @@ pub fn calibrate<T: Real>(
         usize::try_from(label).map_or(f64::NAN, |label| value * means[label])
     });
     let undetermined = flag::NO_FLAT_FIELD | flag::DO_NOT_USE;
+    let mut flags: Vec<u32> =
+        components.pixels.iter().map(|&l| if l == 0 { 0 } else { undetermined }).collect();
+    for &pixel in &left_out {
+        flags[pixel] |= flag::UNRELIABLE_FLAT | flag::DO_NOT_USE;
+    }
     Ok(Solution {
         sensitivity,
         beam,
-        flags: components.pixels.iter().map(|&l| if l == 0 { 0 } else { undetermined }).collect(),
+        flags,
         degrees_of_freedom: degrees_of_freedom(model.used(), &components),
-        converged: history.converged(stop.tolerance),
         components,
         history,
     })
@@ -77,15 +95,23 @@ fn rescale(
     });
 }
 
-/// The mean sensitivity of each component.
-fn component_means(sensitivity: &[f64], components: &Components) -> Vec<f64> {
-    let mut sums = vec![0.0; components.sizes.len()];
-    for (value, &label) in sensitivity.iter().zip(&components.pixels) {
+/// The mean sensitivity of each component, without the pixels `left_out` unless nothing else is
+/// there.
+fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usize]) -> Vec<f64> {
+    let mut sums = vec![(0.0, 0_usize); components.sizes.len()];
+    for (&value, &label) in sensitivity.iter().zip(&components.pixels) {
         if let Ok(label) = usize::try_from(label) {
-            sums[label] += value;
+            sums[label] = (sums[label].0 + value, sums[label].1 + 1);
         }
     }
-    sums.iter().zip(&components.sizes).map(|(sum, &size)| sum / size as f64).collect()
+    let whole = sums.clone();
+    for &pixel in left_out {
+        if let Ok(label) = usize::try_from(components.pixels[pixel]) {
+            sums[label] = (sums[label].0 - sensitivity[pixel], sums[label].1 - 1);
+        }
+    }
+    let mean = |(sum, count): (f64, usize)| sum / count as f64;
+    sums.into_iter().zip(whole).map(|(s, all)| mean(if s.1 > 0 { s } else { all })).collect()
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge.

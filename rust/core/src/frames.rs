@@ -140,4 +140,6 @@ pub mod flag {
     pub const HOT: u32 = 1 << 11;
     /// The sensitivity could not be determined.
     pub const NO_FLAT_FIELD: u32 = 1 << 18;
+    /// The sensitivity is known so badly that it is no use.
+    pub const UNRELIABLE_FLAT: u32 = 1 << 25;
 }

@@ -50,6 +50,37 @@ impl Rotation {
         }
     }
 
+    /// Whether rows become columns.
+    pub(crate) const fn swaps_axes(self) -> bool {
+        matches!(self, Self::Quarter | Self::ThreeQuarters)
+    }
+
+    /// Where a point of a grid of `shape` comes to lie after this rotation.
+    pub(crate) fn turned_point(self, [row, col]: [f64; 2], shape: Shape) -> [f64; 2] {
+        let (from_bottom, from_right) = (shape.rows as f64 - 1.0 - row, shape.cols as f64 - 1.0 - col);
+        match self {
+            Self::None => [row, col],
+            Self::Quarter => [from_right, row],
+            Self::Half => [from_bottom, from_right],
+            Self::ThreeQuarters => [col, from_bottom],
+        }
+    }
+
+    /// Lines that cut a grid between its rows and between its columns, from 0 to its size, after
+    /// this rotation.
+    pub(crate) fn turned_edges(self, rows: &[usize], cols: &[usize]) -> [Vec<usize>; 2] {
+        let back = |edges: &[usize]| {
+            let end = edges.last().copied().unwrap_or(0);
+            edges.iter().rev().map(|edge| end - edge).collect()
+        };
+        match self {
+            Self::None => [rows.to_vec(), cols.to_vec()],
+            Self::Quarter => [back(cols), rows.to_vec()],
+            Self::Half => [back(rows), back(cols)],
+            Self::ThreeQuarters => [cols.to_vec(), back(rows)],
+        }
+    }
+
     /// The rotation that undoes this one.
     const fn inverse(self) -> Self {
         match self {
@@ -70,7 +101,7 @@ pub struct Walk {
 
 impl Walk {
     /// Positions in a grid of `shape`, in the order of `numpy.rot90(grid, rotation/90)`.
-    fn new(rotation: Rotation, shape: Shape) -> Self {
+    pub(crate) fn new(rotation: Rotation, shape: Shape) -> Self {
         let (rows, cols) = (shape.rows.cast_signed(), shape.cols.cast_signed());
         let (base, row_step, col_step) = match rotation {
             Rotation::None => (0, cols, 1),

@@ -24,13 +24,17 @@
 //!
 //! ```text
 //! calibrate       from measurements to a Solution: method, gauge, flags
-//! descent         coordinate descent, the method of the paper; when to stop
-//! estimate        how far M still is from the minimum, large scales included
+//! multiscale      the fast solver: Gauss-Newton steps on all scales at once
+//! descent         coordinate descent, the method of the paper
+//! estimate        how far M still is from the minimum, large scales included; when to stop
+//! conjugate       conjugate gradients, and the Ritz values that they yield
+//! precondition    the two levels: the diagonal, and hats on a coarse grid
+//! reduced         the linear problem of one step, with the beam eliminated
 //! connectivity    what the measurements can compare; connected pixels
 //! model           measurements, weights, masks; the checks of their values
 //! geometry        shifts, rotations, the padded grid of the beam
+//! linalg          sparse Cholesky factors
 //! parallel        threads; the same bytes for any number of them
-//! transform       cosine transforms of images
 //! control         cancellation and progress
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
@@ -51,9 +55,9 @@
 //! # Example
 //!
 //! ```
-//! use equipix_core::calibrate::calibrate;
+//! use equipix_core::calibrate::{Method, calibrate};
 //! use equipix_core::control::Control;
-//! use equipix_core::descent::Stop;
+//! use equipix_core::estimate::{Ended, Stop};
 //! use equipix_core::frames::{Shape, Stack};
 //! use equipix_core::geometry::{Geometry, Rotation};
 //! use equipix_core::model::{Mask, Model, Variance};
@@ -81,9 +85,9 @@
 //!     &control,
 //! )?;
 //! let stop = Stop { tolerance: 1e-9, max_sweeps: None };
-//! let solution = calibrate(&model, stop, &workers, &control)?;
+//! let solution = calibrate(&model, Method::Multiscale, stop, &workers, &control)?;
 //!
-//! assert!(solution.converged);
+//! assert_eq!(solution.history.ended, Ended::Converged);
 //! let mean = pixels().map(|(r, c)| sensitivity(r, c)).sum::<f64>() / sensor.len() as f64;
 //! for (found, (r, c)) in solution.sensitivity.iter().zip(pixels()) {
 //!     assert!((found * mean / sensitivity(r, c) - 1.0).abs() < 1e-8);
@@ -104,6 +108,7 @@
 
 pub mod calibrate;
 pub mod centroid;
+mod conjugate;
 pub mod connectivity;
 pub mod control;
 pub mod descent;
@@ -114,8 +119,11 @@ pub mod geometry;
 #[cfg(feature = "io")]
 pub mod io;
 pub mod model;
+pub mod multiscale;
 pub mod parallel;
+mod precondition;
+mod reduced;
 pub mod statistics;
-mod transform;
+mod linalg;
 
 pub use error::{Error, Result};

@@ -152,6 +152,11 @@ impl<'a, T: Real> Model<'a, T> {
         self.tallies.iter().map(|tally| tally.used).sum()
     }
 
+    /// The light of the brightest measurement: the largest y/c.
+    pub(crate) fn brightest(&self) -> f64 {
+        self.tallies.iter().zip(&self.flux).map(|(tally, c)| tally.largest / c).fold(0.0, f64::max)
+    }
+
     /// The weight that each exposure has in all: Σ_p w c².
     #[must_use]
     pub fn exposure_weights(&self) -> Vec<f64> {
@@ -213,28 +218,6 @@ impl<'a, T: Real> Model<'a, T> {
         let same = self.exposure_weight(exposure);
         pulp::Arch::new().dispatch(Weigh { values, variance, mask, same, weights: &mut *weights });
         Stretch::Weighted(values, weights)
-    }
-
-    /// w y² of the measurements of one row of an exposure; 0 where not used.
-    pub(crate) fn weighted_squares<'s>(
-        &self,
-        exposure: usize,
-        row: usize,
-        scratch: &'s mut [f64],
-    ) -> &'s [f64]
-    where
-        'a: 's,
-    {
-        let cols = self.sensor().cols;
-        let values = self.frames.row(exposure, row);
-        match self.stretch(exposure, row, 0..cols, scratch) {
-            Stretch::Uniform(_, weight) => scratch.fill(weight),
-            Stretch::Weighted(..) => {}
-        }
-        for (weight, value) in scratch.iter_mut().zip(values) {
-            *weight *= if *weight > 0.0 { value.to_f64().powi(2) } else { 0.0 };
-        }
-        scratch
     }
 
     /// The weight of an exposure's measurements where it is the same for all.

@@ -79,4 +79,24 @@ impl Workers {
                 .collect()
         })
     }
+
+    /// Like [`map_blocks`](Self::map_blocks) over two slices at once.
+    pub fn map_pairs<A, B, R>(
+        &self,
+        first: &mut [A],
+        second: &mut [B],
+        size: usize,
+        work: impl Fn(usize, &mut [A], &mut [B]) -> R + Sync + Send,
+    ) -> Vec<R>
+    where
+        A: Send,
+        B: Send,
+        R: Send,
+    {
+        let size = size.max(1);
+        self.pool.install(|| {
+            let pairs = first.par_chunks_mut(size).zip(second.par_chunks_mut(size));
+            pairs.enumerate().map(|(index, (first, second))| work(index, first, second)).collect()
+        })
+    }
 }

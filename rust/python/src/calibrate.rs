@@ -10,10 +10,10 @@
 
 use std::num::NonZeroUsize;
 
-use equipix_core::calibrate::{Solution, calibrate};
+use equipix_core::calibrate::{Method, Solution, calibrate};
 use equipix_core::control::Control;
-use equipix_core::descent::Stop;
 use equipix_core::error::{Error, Result};
+use equipix_core::estimate::{Ended, History, Look, Stop};
 use equipix_core::frames::{Real, Shape, Stack};
 use equipix_core::geometry::{Geometry, Rotation};
 use equipix_core::model::{Mask, Model, Variance};
@@ -24,7 +24,7 @@ use numpy::{
 };
 use pyo3::prelude::*;
 
-use crate::run;
+use crate::{errors, run};
 
 /// Mean frames of either precision.
 #[derive(FromPyObject)]
@@ -57,10 +57,11 @@ pub(crate) struct PySolution {
     flags: Py<PyArray2<u32>>,
     component_labels: Py<PyArray2<i32>>,
     components: usize,
+    sweeps: Py<PyArray1<u64>>,
     objective: Py<PyArray1<f64>>,
-    estimates: Vec<(u64, f64)>,
+    error_estimate: Py<PyArray1<f64>>,
+    ended: &'static str,
     degrees_of_freedom: i64,
-    converged: bool,
 }
 
 /// Everything but the frames and their variances, which have a type of their own.
@@ -69,14 +70,15 @@ struct Setting<'a> {
     rotation: Vec<i64>,
     flux: Vec<f64>,
     mask: Mask<'a>,
+    method: Method,
     stop: Stop,
     workers: Option<NonZeroUsize>,
 }
 
 /// Solves for sensitivity and beam.
 #[pyfunction]
-#[pyo3(signature = (frames, shifts, *, rotation, flux, variance, mask, tolerance, max_sweeps,
-                    workers, progress))]
+#[pyo3(signature = (frames, shifts, *, rotation, flux, variance, mask, method, tolerance,
+                    max_sweeps, workers, progress))]
 #[expect(clippy::too_many_arguments, reason = "the keywords of equipix.calibrate")]
 pub(crate) fn calibrate_frames(
     py: Python<'_>,
@@ -86,6 +88,7 @@ pub(crate) fn calibrate_frames(
     flux: Vec<f64>,
     variance: Option<PyVariance<'_>>,
     mask: Option<PyMask<'_>>,
+    method: &str,
     tolerance: f64,
     max_sweeps: Option<u64>,
     workers: Option<NonZeroUsize>,
@@ -94,7 +97,8 @@ pub(crate) fn calibrate_frames(
     let shifts = shifts.as_slice()?.chunks_exact(2).map(|d| [d[0], d[1]]).collect();
     let stop = Stop { tolerance, max_sweeps };
     let mask = mask.as_ref().map_or(Ok(Mask::None), view_mask)?;
-    let setting = Setting { shifts, rotation, flux, mask, stop, workers };
+    let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
+    let setting = Setting { shifts, rotation, flux, mask, method, stop, workers };
     let progress = progress.as_ref();
     let outcome = match (&frames, &variance) {
         (Frames::Single(frames), Some(PyVariance::Single(variance))) => {
@@ -132,8 +136,19 @@ fn solve<T: Real>(
     let geometry = Geometry::new(frames.shape(), &setting.shifts, &rotations)?;
     let model =
         Model::new(frames, geometry, &setting.flux, variance, setting.mask, &workers, control)?;
-    let solution = calibrate(&model, setting.stop, &workers, control)?;
+    let solution = calibrate(&model, setting.method, setting.stop, &workers, control)?;
     Ok((solution, model.geometry))
+}
+
+fn method_named(name: &str) -> Result<Method> {
+    match name {
+        "multiscale" => Ok(Method::Multiscale),
+        "coordinate-descent" => Ok(Method::CoordinateDescent),
+        other => Err(Error::Value {
+            argument: "method",
+            problem: format!("is '{other}': expected 'multiscale' or 'coordinate-descent'"),
+        }),
+    }
 }
 
 fn rotation(degrees: i64) -> Result<Rotation> {
@@ -150,7 +165,7 @@ fn stack<'a, T: Element + Real>(
     let shape = array.shape();
     let sizes = Shape::new(shape[1], shape[2]);
     let stack = Stack::new(argument, array.as_slice()?, shape[0], sizes);
-    stack.map_err(|error| crate::errors::exception(array.py(), &error))
+    stack.map_err(|error| errors::exception(array.py(), &error))
 }
 
 fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance<'a, T>> {
@@ -169,7 +184,10 @@ fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
 }
 
 fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PySolution> {
-    let history = solution.history;
+    let History { looks, ended } = solution.history;
+    let column = |value: fn(&Look) -> f64| {
+        looks.iter().map(value).collect::<Vec<_>>().into_pyarray(py).unbind()
+    };
     Ok(PySolution {
         sensitivity: image(py, solution.sensitivity, geometry.sensor)?,
         beam: image(py, solution.beam, geometry.beam)?,
@@ -177,10 +195,15 @@ fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PyS
         flags: image(py, solution.flags, geometry.sensor)?,
         component_labels: image(py, solution.components.pixels, geometry.sensor)?,
         components: solution.components.sizes.len(),
-        objective: history.objective.into_pyarray(py).unbind(),
-        estimates: history.error_estimate.iter().map(|e| (e.sweep, e.error)).collect(),
+        sweeps: looks.iter().map(|look| look.sweep).collect::<Vec<_>>().into_pyarray(py).unbind(),
+        objective: column(|look| look.objective),
+        error_estimate: column(|look| look.error),
+        ended: match ended {
+            Ended::Converged => "converged",
+            Ended::SweepsUsed => "sweeps used",
+            Ended::Stalled => "stalled",
+        },
         degrees_of_freedom: solution.degrees_of_freedom,
-        converged: solution.converged,
     })
 }
 

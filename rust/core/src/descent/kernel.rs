@@ -64,19 +64,64 @@ impl<T: Real> pulp::NullaryFnOnce for Improve<'_, '_, T> {
     }
 }
 
+/// Writes half the slope of −F and half its curvature along each of `sought`; returns F there.
+pub(super) fn measure<T: Real>(
+    lines: &[Line<'_, T>],
+    sought: &[f64],
+    slopes: &mut [f64],
+    weights: &mut [f64],
+) -> f64 {
+    pulp::Arch::new().dispatch(Measure { lines, sought, slopes, weights })
+}
+
+/// [`measure`] in a form that the compiler inlines into code for the CPU at hand.
+struct Measure<'l, 's, T> {
+    lines: &'l [Line<'s, T>],
+    sought: &'l [f64],
+    slopes: &'l mut [f64],
+    weights: &'l mut [f64],
+}
+
+impl<T: Real> pulp::NullaryFnOnce for Measure<'_, '_, T> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn call(self) -> f64 {
+        let (chunks, rest) = self.sought.as_chunks::<LANES>();
+        let whole = chunks.len() * LANES;
+        let mut objective = [0.0; LANES];
+        for (index, chunk) in chunks.iter().enumerate() {
+            let sums = Sums::over(self.lines, index * LANES, chunk);
+            self.slopes[index * LANES..][..LANES].copy_from_slice(&sums.slope);
+            self.weights[index * LANES..][..LANES].copy_from_slice(&sums.weight);
+            for (sum, part) in objective.iter_mut().zip(sums.objective) {
+                *sum += part;
+            }
+        }
+        let mut total: f64 = objective.iter().sum();
+        for (index, one) in (whole..).zip(rest) {
+            let sums = Sums::over(self.lines, index, &[*one]);
+            self.slopes[index] = sums.slope[0];
+            self.weights[index] = sums.weight[0];
+            total += sums.objective[0];
+        }
+        total
+    }
+}
+
 /// What the measurements say of `N` neighbouring values of L or M, the other one held fixed.
-pub(super) struct Sums<const N: usize> {
+struct Sums<const N: usize> {
     /// Σ w a r: half the slope of −F, with a = c·(the factor held fixed) and the residual r.
-    pub(super) slope: [f64; N],
+    slope: [f64; N],
     /// Σ w a²: half the curvature of F.
-    pub(super) weight: [f64; N],
+    weight: [f64; N],
     /// Σ w r²: the share of F.
     objective: [f64; N],
 }
 
 impl<const N: usize> Sums<N> {
     #[inline(always)]
-    pub(super) fn over<T: Real>(lines: &[Line<'_, T>], first: usize, sought: &[f64; N]) -> Self {
+    fn over<T: Real>(lines: &[Line<'_, T>], first: usize, sought: &[f64; N]) -> Self {
         let mut sums = Self { slope: [0.0; N], weight: [0.0; N], objective: [0.0; N] };
         for line in lines {
             let known = &line.known[first..first + N];

@@ -2,13 +2,14 @@
 
 use std::ops::Range;
 
-use super::kernel::{Line, STRETCH, Scratch, Sums, improve, quotient};
+use super::kernel::{Line, STRETCH, Scratch, improve, measure, quotient};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Placement, View};
 use crate::model::Model;
 use crate::parallel::Workers;
+use crate::reduced::Padding;
 
 /// Pixels that a thread takes at a time where rows do not matter.
 const PART: usize = 1 << 16;
@@ -45,7 +46,32 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled); the state is then no whole sweep's.
     pub fn sweep(&mut self, control: &Control) -> Result<f64> {
-        let Shape { rows, cols } = self.model.sensor();
+        self.with_best_beam(control, |descent, rows| descent.update_sensitivity(rows, control))
+    }
+
+    /// Updates all L; returns half the slope of −F along each pixel's M, times `scale`, and F.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn slopes(&mut self, scale: f64, control: &Control) -> Result<(Vec<f32>, f64)> {
+        let padding = Padding::of(&self.model.geometry);
+        let mut slopes = padding.zeros(self.model.sensor().rows);
+        let body = padding.body_mut(&mut slopes);
+        let objective = self.with_best_beam(control, |descent, rows| {
+            let body = &mut body[rows.start * padding.width..rows.end * padding.width];
+            descent.measure_slopes(rows, scale, &padding, body, control)
+        })?;
+        Ok((slopes, objective))
+    }
+
+    /// Updates all L, and calls `work` for ranges of pixel rows, in order, once the cells that they
+    /// see are up to date; returns the sum of what it returns.
+    fn with_best_beam(
+        &mut self,
+        control: &Control,
+        mut work: impl FnMut(&mut Self, Range<usize>) -> Vec<f64>,
+    ) -> Result<f64> {
+        let rows = self.model.sensor().rows;
         let mut bands = Vec::with_capacity(rows.div_ceil(BAND));
         if self.beams.len() == 1 {
             let places = self.model.geometry.exposures.iter();
@@ -55,11 +81,11 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                 let end = (start + self.rows_in_cache()).min(rows);
                 self.update_beam(done..end + reach, control);
                 done = end + reach;
-                bands.extend(self.update_sensitivity(start * cols..end * cols, control));
+                bands.extend(work(self, start..end));
             }
         } else {
             self.update_turned_beams(control);
-            bands.extend(self.update_sensitivity(0..rows * cols, control));
+            bands.extend(work(self, 0..rows));
         }
         control.check()?;
         Ok(bands.into_iter().sum())
@@ -87,19 +113,11 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         beam
     }
 
-    /// The change of M since it was `before`, in units of the mean of M.
-    pub(super) fn step_since(&self, before: Vec<f64>) -> Vec<f64> {
-        let now = &self.sensitivity[..];
-        let blocks: Vec<&[f64]> = now.chunks(PART).collect();
+    /// The mean of M.
+    pub(crate) fn mean_sensitivity(&self) -> f64 {
+        let blocks: Vec<&[f64]> = self.sensitivity.chunks(PART).collect();
         let sums = self.workers.map(blocks.len(), |index| blocks[index].iter().sum::<f64>());
-        let mean = sums.into_iter().sum::<f64>() / now.len() as f64;
-        let mut step = before;
-        self.workers.map_blocks(&mut step, PART, |index, part| {
-            for (step, now) in part.iter_mut().zip(blocks[index]) {
-                *step = (now - *step) / mean;
-            }
-        });
-        step
+        sums.into_iter().sum::<f64>() / self.sensitivity.len() as f64
     }
 
     /// Updates some rows of the beam, which has one view.
@@ -135,9 +153,9 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                 *cell = beams[0][views[0].places.at(row, col)];
                 let [mut slope, mut weight] = [0.0; 2];
                 for (view, sums) in views.iter().zip(&sums) {
-                    let more = &sums[view.places.at(row, col)];
-                    slope += more[0];
-                    weight += more[1];
+                    let place = view.places.at(row, col);
+                    slope += sums[0][place];
+                    weight += sums[1][place];
                 }
                 *cell += quotient(slope, weight);
             }
@@ -148,13 +166,17 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     }
 
     /// Slope and weight of one view's exposures, for each of its cells.
-    fn view_sums(&self, view: usize, control: &Control) -> Vec<[f64; 2]> {
+    fn view_sums(&self, view: usize, control: &Control) -> [Vec<f64>; 2] {
         let (model, sensitivity, beam) = (self.model, &self.sensitivity[..], &self.beams[view]);
         let shape = model.geometry.views[view].shape;
-        let mut result = vec![[0.0; 2]; shape.len()];
-        self.workers.map_blocks(&mut result, BAND * shape.cols, |band, rows| {
+        let mut slopes = vec![0.0; shape.len()];
+        let mut weights = vec![0.0; shape.len()];
+        let size = BAND * shape.cols;
+        self.workers.map_pairs(&mut slopes, &mut weights, size, |band, slopes, weights| {
             let mut scratch = Scratch::new(model.count());
-            for (index, sums) in rows.chunks_exact_mut(shape.cols).enumerate() {
+            let rows = slopes.chunks_exact_mut(shape.cols);
+            let rows = rows.zip(weights.chunks_exact_mut(shape.cols)).enumerate();
+            for (index, (slopes, weights)) in rows {
                 if control.is_cancelled() {
                     return;
                 }
@@ -162,30 +184,27 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                 let sought = &beam[row * shape.cols..][..shape.cols];
                 let seen = BeamRow { model, sensitivity, view, row };
                 seen.for_each_stretch(&mut scratch, |lines, cells| {
-                    for (index, sum) in sums[cells.clone()].iter_mut().enumerate() {
-                        let found = Sums::<1>::over(lines, index, &[sought[cells.start + index]]);
-                        *sum = [found.slope[0], found.weight[0]];
-                    }
+                    let (slopes, weights) = (&mut slopes[cells.clone()], &mut weights[cells.clone()]);
+                    measure(lines, &sought[cells], slopes, weights);
                 });
             }
         });
-        result
+        [slopes, weights]
     }
 
-    /// Updates M in a range of pixels, whole rows; returns the share of F of each band of them.
-    fn update_sensitivity(&mut self, pixels: Range<usize>, control: &Control) -> Vec<f64> {
+    /// Updates M in a range of rows; returns the share of F of each band of them.
+    fn update_sensitivity(&mut self, rows: Range<usize>, control: &Control) -> Vec<f64> {
         let cols = self.model.sensor().cols;
         let (model, beams) = (self.model, &self.beams[..]);
-        let first = pixels.start / cols;
-        let pixels = &mut self.sensitivity[pixels];
-        self.workers.map_blocks(pixels, BAND * cols, |band, rows| {
+        let pixels = &mut self.sensitivity[rows.start * cols..rows.end * cols];
+        self.workers.map_blocks(pixels, BAND * cols, |band, pixels| {
             let mut scratch = Scratch::new(model.count());
             let mut objective = 0.0;
-            for (index, pixels) in rows.chunks_exact_mut(cols).enumerate() {
+            for (index, pixels) in pixels.chunks_exact_mut(cols).enumerate() {
                 if control.is_cancelled() {
                     return objective;
                 }
-                let row = first + band * BAND + index;
+                let row = rows.start + band * BAND + index;
                 for start in (0..cols).step_by(STRETCH) {
                     let stretch = start..(start + STRETCH).min(cols);
                     let lines = pixel_lines(model, beams, row, stretch.clone(), &mut scratch);
@@ -194,6 +213,56 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
             }
             objective
         })
+    }
+
+    /// Slopes along M in a range of rows, times `scale`; returns the share of F of each band.
+    fn measure_slopes(
+        &self,
+        rows: Range<usize>,
+        scale: f64,
+        padding: &Padding,
+        slopes: &mut [f32],
+        control: &Control,
+    ) -> Vec<f64> {
+        let cols = self.model.sensor().cols;
+        self.workers.map_blocks(slopes, BAND * padding.width, |band, slopes| {
+            let mut scratch = Scratch::new(self.model.count());
+            let [mut found, mut weights] = [[0.0; STRETCH]; 2];
+            let mut objective = 0.0;
+            for (index, slopes) in slopes.chunks_exact_mut(padding.width).enumerate() {
+                if control.is_cancelled() {
+                    return objective;
+                }
+                let row = rows.start + band * BAND + index;
+                for start in (0..cols).step_by(STRETCH) {
+                    let stretch = start..(start + STRETCH).min(cols);
+                    let sought = &self.sensitivity[row * cols..][stretch.clone()];
+                    let lines =
+                        pixel_lines(self.model, &self.beams, row, stretch.clone(), &mut scratch);
+                    objective += measure(&lines, sought, &mut found, &mut weights);
+                    for (slope, found) in slopes[stretch].iter_mut().zip(&found) {
+                        *slope = (found * scale) as f32;
+                    }
+                }
+            }
+            objective
+        })
+    }
+
+    /// M ← M + share·x, for an `x` that lies as [`slopes`](Self::slopes) does.
+    pub(crate) fn advance(&mut self, x: &[f32], share: f64) {
+        let cols = self.model.sensor().cols;
+        let padding = Padding::of(&self.model.geometry);
+        self.workers.map_blocks(&mut self.sensitivity, cols, |row, pixels| {
+            for (m, &x) in pixels.iter_mut().zip(padding.row(x, row)) {
+                *m += share * f64::from(x);
+            }
+        });
+    }
+
+    /// L in each of the geometry's views; 0 where no measurement tells.
+    pub(crate) fn beams(&self) -> &[Vec<f64>] {
+        &self.beams
     }
 }
 

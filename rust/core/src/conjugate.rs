@@ -1,0 +1,147 @@
+//! Preconditioned conjugate gradients for the linear problem S x = b.
+//!
+//! After Hestenes and Stiefel (1952). Their coefficients also make up the tridiagonal matrix of
+//! Lanczos, whose eigenvalues, the Ritz values, approach those of P⁻¹S from within; the smallest is
+//! what turns a residual into an estimate of the error (see [`estimate`](crate::estimate)).
+
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::precondition::TwoLevel;
+use crate::reduced::Reduced;
+
+/// No eigenvalue that matters is smaller than 1/this: single precision could not tell it from 0.
+const LONGEST_STEP: f64 = 1e6;
+
+/// A solution in the making.
+pub(crate) struct Search<'s, 'm, 'a, T> {
+    reduced: &'s mut Reduced<'m, 'a, T>,
+    two_level: &'s mut TwoLevel<'m>,
+    /// b − S x.
+    residual: Vec<f32>,
+    pub(crate) x: Vec<f32>,
+    direction: Vec<f32>,
+    product: Vec<f32>,
+    /// r · P⁻¹ r.
+    square: f64,
+    /// The largest size of P⁻¹ r.
+    pub(crate) largest: f64,
+    pub(crate) ritz: Ritz,
+}
+
+impl<'s, 'm, 'a, T: Real> Search<'s, 'm, 'a, T> {
+    /// Starts from x = 0, where the residual is b.
+    pub(crate) fn new(
+        reduced: &'s mut Reduced<'m, 'a, T>,
+        two_level: &'s mut TwoLevel<'m>,
+        residual: Vec<f32>,
+    ) -> Self {
+        let [x, direction, product] = [(); 3].map(|()| vec![0.0; residual.len()]);
+        let ritz = Ritz::default();
+        let (square, largest) = (0.0, 0.0);
+        let mut search =
+            Self { reduced, two_level, residual, x, direction, product, square, largest, ritz };
+        search.square = search.descend(0.0);
+        search.largest = search.turn(0.0, 0.0);
+        search
+    }
+
+    /// One iteration: a step along the direction, and a new direction. `false` if there was none to
+    /// go: the residual is 0, or nothing but rounding along which S does not change.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn iterate(&mut self, control: &Control) -> Result<bool> {
+        let curvature = self.reduced.multiply(&self.direction, &mut self.product, control)?;
+        let step = self.square / curvature;
+        if !(step > 0.0 && step < LONGEST_STEP) {
+            return Ok(false);
+        }
+        let square = self.descend(step);
+        let keep = square / self.square;
+        self.square = square;
+        self.largest = self.turn(step, keep);
+        self.ritz.push(step, keep);
+        Ok(square > 0.0)
+    }
+
+    /// The largest size of the step found so far.
+    pub(crate) fn found(&self) -> f64 {
+        self.two_level.largest(&self.x)
+    }
+
+    /// The root mean square of P⁻¹ b as the first look has it, weighted by D.
+    pub(crate) fn size(&self) -> f64 {
+        (self.square.max(0.0) / self.reduced.trace).sqrt()
+    }
+
+    fn descend(&mut self, step: f64) -> f64 {
+        self.two_level.descend(self.reduced, &mut self.residual, step, &self.product)
+    }
+
+    fn turn(&mut self, step: f64, keep: f64) -> f64 {
+        let vectors = [&mut self.x[..], &mut self.direction[..]];
+        self.two_level.turn(self.reduced, &self.residual, vectors, [step, keep])
+    }
+}
+
+/// The tridiagonal matrix of Lanczos, from the coefficients of conjugate gradients: with steps a
+/// and kept shares b its diagonal is 1/a_j + b_(j−1)/a_(j−1), beside it stands √b_j/a_j.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Ritz {
+    diagonal: Vec<f64>,
+    /// Squares of the elements beside the diagonal, the first one before the first row.
+    beside: Vec<f64>,
+    /// b/a and √b/a, squared, of the last iteration.
+    carried: [f64; 2],
+}
+
+impl Ritz {
+    fn push(&mut self, step: f64, keep: f64) {
+        self.diagonal.push(1.0 / step + self.carried[0]);
+        self.beside.push(self.carried[1]);
+        self.carried = [keep / step, keep / (step * step)];
+    }
+
+    /// The smallest eigenvalue, to three digits, by bisection on Sturm's count: below it no pivot
+    /// of T − θ is negative (Golub and Van Loan, Matrix Computations, section 8.4).
+    pub(crate) fn smallest(&self) -> f64 {
+        let (mut low, mut high) =
+            (0.0_f64, self.diagonal.iter().copied().fold(f64::INFINITY, f64::min));
+        while high - low > 1e-3 * high {
+            let middle = 0.5 * (low + high);
+            if self.is_below(middle) {
+                low = middle;
+            } else {
+                high = middle;
+            }
+        }
+        high
+    }
+
+    /// Whether every eigenvalue is above `theta`.
+    fn is_below(&self, theta: f64) -> bool {
+        let mut pivot = f64::INFINITY;
+        self.diagonal.iter().zip(&self.beside).all(|(diagonal, square)| {
+            pivot = diagonal - theta - square / pivot;
+            pivot > 0.0
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_smallest_ritz_value_of_a_chain_is_known() {
+        // T with 2 on the diagonal and −1 beside it: 2 − 2 cos(π/(n+1)).
+        let mut ritz = Ritz::default();
+        for count in 1..30 {
+            ritz.diagonal.push(2.0);
+            ritz.beside.push(if count > 1 { 1.0 } else { 0.0 });
+            let wanted = 2.0 - 2.0 * (std::f64::consts::PI / f64::from(count + 1)).cos();
+            assert!((ritz.smallest() / wanted - 1.0).abs() < 2e-3);
+        }
+    }
+}

@@ -1,0 +1,242 @@
+//! The coarse matrix A = Φᵀ S Φ, summed over blocks of beam cells, and its factor.
+
+use super::hats::Hats;
+use crate::connectivity::DisjointSets;
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::{Real, Shape};
+use crate::geometry::{Geometry, Placement, Walk};
+use crate::linalg::Cholesky;
+use crate::parallel::Workers;
+use crate::reduced::Reduced;
+
+/// Blocks of cells along the distance of two hats.
+const BLOCKS: usize = 4;
+/// Hats further apart than this, in rows or columns of the coarse grid, meet only where exposures
+/// are turned against each other.
+const REACH: usize = 2;
+/// Places of a matrix element's row behind its column: the same coarse row, and those below.
+const STENCIL: usize = (REACH + 1) * (2 * REACH + 1);
+
+/// What is added to the diagonal, as a share of it: far below the eigenvalues that matter, which
+/// are some (spacing/size)², and above what single precision leaves in directions that do not.
+const RIDGE: f64 = 1e-6;
+
+/// The factorised coarse matrix.
+pub(super) struct Coarse {
+    /// Hats that hang together, each with its share of the sensor.
+    parts: Vec<Vec<(usize, f64)>>,
+    factor: Option<Cholesky>,
+}
+
+impl Coarse {
+    pub(super) fn new<T: Real>(
+        hats: &Hats,
+        geometry: &Geometry,
+        reduced: &Reduced<'_, '_, T>,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Self> {
+        let blocks = Blocks::new(hats, geometry);
+        let weights = blocks.weights(geometry, reduced, workers, control)?;
+        let mut matrix = Matrix::new(hats);
+        for (block, weights) in weights.chunks_exact(geometry.exposures.len()).enumerate() {
+            matrix.add_star(&blocks.star(block, weights, hats, geometry));
+        }
+        control.check()?;
+        Ok(Self::factorised(&matrix, hats))
+    }
+
+    fn factorised(matrix: &Matrix, hats: &Hats) -> Self {
+        let mut sets = DisjointSets::new(hats.count());
+        let mut entries = Vec::new();
+        matrix.for_each(|row, col, value| {
+            sets.union(row, col);
+            entries.push((row.max(col) as u32, row.min(col) as u32, value));
+        });
+        let mut parts: Vec<Vec<(usize, f64)>> = vec![Vec::new(); hats.count()];
+        for hat in 0..hats.count() {
+            let diagonal = matrix.diagonal(hat);
+            // A hat on which no weight falls stays at 0.
+            let ridge = if diagonal > 0.0 { RIDGE * diagonal } else { 1.0 };
+            entries.push((hat as u32, hat as u32, ridge));
+            parts[sets.find(hat)].push((hat, hats.share(hat)));
+        }
+        parts.retain(|part| !part.is_empty());
+        Self { parts, factor: Cholesky::new(hats.count(), &entries) }
+    }
+
+    /// Replaces a right-hand side, one value a hat, by the heights of the hats, times `factor`.
+    ///
+    /// Constants in a part are left out on either side: they are no error, and what there is of
+    /// them is rounding. If rounding in a nearly singular matrix left no factor, the heights are 0
+    /// and the first level is left alone.
+    pub(super) fn solve(&self, values: &mut [f64], factor: f64) {
+        let Some(cholesky) = &self.factor else { return values.fill(0.0) };
+        for part in &self.parts {
+            let mean = part.iter().map(|&(hat, _)| values[hat]).sum::<f64>() / part.len() as f64;
+            part.iter().for_each(|&(hat, _)| values[hat] -= mean);
+        }
+        cholesky.solve(values);
+        for part in &self.parts {
+            let (sum, area) = part.iter().fold((0.0, 0.0), |(sum, area), &(hat, share)| {
+                (sum + share * values[hat], area + share)
+            });
+            part.iter().for_each(|&(hat, _)| values[hat] = factor * (values[hat] - sum / area));
+        }
+    }
+}
+
+/// The blocks of cells, numbered row by row of the beam grid.
+struct Blocks {
+    rows: Vec<usize>,
+    cols: Vec<usize>,
+}
+
+impl Blocks {
+    fn new(hats: &Hats, geometry: &Geometry) -> Self {
+        let sizes = [hats.rows.spacing, hats.cols.spacing].map(|s| (s as usize / BLOCKS).max(1));
+        let turned = geometry.views.iter().any(|view| view.rotation.swaps_axes());
+        let [height, width] = if turned { [sizes[0].min(sizes[1]); 2] } else { sizes };
+        let edges = |length: usize, size: usize| {
+            (0..length).step_by(size).chain(std::iter::once(length)).collect()
+        };
+        Self { rows: edges(geometry.beam.rows, height), cols: edges(geometry.beam.cols, width) }
+    }
+
+    fn shape(&self) -> Shape {
+        Shape::new(self.rows.len() - 1, self.cols.len() - 1)
+    }
+
+    /// Ω of each block and exposure.
+    fn weights<T: Real>(
+        &self,
+        geometry: &Geometry,
+        reduced: &Reduced<'_, '_, T>,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Vec<f32>> {
+        let count = geometry.exposures.len();
+        let mut weights = vec![0.0; self.shape().len() * count];
+        for (index, view) in geometry.views.iter().enumerate() {
+            let [rows, cols] = view.rotation.turned_edges(&self.rows, &self.cols);
+            let blocks = Walk::new(view.rotation, self.shape());
+            let seen = |&(_, place): &(usize, &Placement)| place.view == index;
+            let exposures: Vec<_> =
+                geometry.exposures.iter().enumerate().filter(seen).map(|(k, _)| k).collect();
+            let by_row = workers.map(rows.len() - 1, |i| {
+                let mut scratch = reduced.scratch();
+                let mut found = Vec::with_capacity((cols.len() - 1) * exposures.len());
+                for &exposure in &exposures {
+                    let mut sums = vec![0.0; reduced.padding.width];
+                    for row in rows[i]..rows[i + 1] {
+                        control.check()?;
+                        reduced.weigh(exposure, row, &mut sums, &mut scratch);
+                    }
+                    found.extend(cols.windows(2).map(|c| sums[c[0]..c[1]].iter().sum::<f32>()));
+                }
+                Ok(found)
+            });
+            for (i, found) in by_row.into_iter().enumerate() {
+                let found: Vec<f32> = found?;
+                for (&exposure, found) in exposures.iter().zip(found.chunks_exact(cols.len() - 1)) {
+                    for (j, weight) in found.iter().enumerate() {
+                        weights[blocks.at(i, j) * count + exposure] = *weight;
+                    }
+                }
+            }
+        }
+        Ok(weights)
+    }
+
+    /// What one block adds: the weight of each exposure and the hats at the pixel that sees the
+    /// block's centre.
+    fn star(&self, block: usize, weights: &[f32], hats: &Hats, geometry: &Geometry) -> Vec<Arm> {
+        let (i, j) = (block / self.shape().cols, block % self.shape().cols);
+        let centre = |edges: &[usize], at: usize| (edges[at] + edges[at + 1] - 1) as f64 / 2.0;
+        let centre = [centre(&self.rows, i), centre(&self.cols, j)];
+        let seeing = geometry.exposures.iter().zip(weights).filter(|(_, weight)| **weight > 0.0);
+        seeing
+            .map(|(place, &weight)| {
+                let rotation = geometry.views[place.view].rotation;
+                let [row, col] = rotation.turned_point(centre, geometry.beam);
+                let hats = hats.over(row - place.row as f64, col - place.col as f64);
+                Arm { weight: f64::from(weight), hats }
+            })
+            .collect()
+    }
+}
+
+/// One exposure's part in a block.
+struct Arm {
+    weight: f64,
+    hats: [(usize, f64); 4],
+}
+
+/// The coarse matrix before it is factorised: elements of one triangle.
+struct Matrix {
+    cols: usize,
+    /// By hat and place in the stencil.
+    near: Vec<[f64; STENCIL]>,
+    far: Vec<(usize, usize, f64)>,
+}
+
+impl Matrix {
+    fn new(hats: &Hats) -> Self {
+        Self { cols: hats.cols.nodes, near: vec![[0.0; STENCIL]; hats.count()], far: Vec::new() }
+    }
+
+    /// Adds Σ_k Ω_k (φ_k − φ̄)(φ_k − φ̄)ᵀ, φ̄ the weighted mean.
+    fn add_star(&mut self, star: &[Arm]) {
+        let total: f64 = star.iter().map(|arm| arm.weight).sum();
+        let mut nodes: Vec<usize> = star.iter().flat_map(|arm| arm.hats.map(|hat| hat.0)).collect();
+        nodes.sort_unstable();
+        nodes.dedup();
+        let mut mean = vec![0.0; nodes.len()];
+        let mut heights = vec![0.0; star.len() * nodes.len()];
+        for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
+            for (hat, height) in arm.hats {
+                let at = nodes.partition_point(|&node| node < hat);
+                heights[at] += height;
+                mean[at] += arm.weight / total * height;
+            }
+        }
+        for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
+            for (height, mean) in heights.iter_mut().zip(&mean) {
+                *height -= mean;
+            }
+            for (a, &upper) in nodes.iter().enumerate() {
+                for (b, &lower) in nodes.iter().enumerate().skip(a) {
+                    self.add(upper, lower, arm.weight * heights[a] * heights[b]);
+                }
+            }
+        }
+    }
+
+    /// Adds to the element of two hats, the first being the one with the lower number.
+    fn add(&mut self, first: usize, second: usize, value: f64) {
+        let rows = second / self.cols - first / self.cols;
+        let cols = second % self.cols + REACH - first % self.cols;
+        if rows <= REACH && cols <= 2 * REACH {
+            self.near[first][rows * (2 * REACH + 1) + cols] += value;
+        } else {
+            self.far.push((first, second, value));
+        }
+    }
+
+    /// Calls `visit(row, col, value)` for the elements that are not 0.
+    fn for_each(&self, mut visit: impl FnMut(usize, usize, f64)) {
+        for (hat, stencil) in self.near.iter().enumerate() {
+            for (place, &value) in stencil.iter().enumerate().filter(|(_, value)| **value != 0.0) {
+                let (rows, cols) = (place / (2 * REACH + 1), place % (2 * REACH + 1));
+                visit(hat, hat + rows * self.cols + cols - REACH, value);
+            }
+        }
+        self.far.iter().for_each(|&(row, col, value)| visit(row, col, value));
+    }
+
+    /// The diagonal element of a hat.
+    fn diagonal(&self, hat: usize) -> f64 {
+        self.near[hat][REACH]
+    }
+}

@@ -1,0 +1,443 @@
+//! The linear problem of one Gauss-Newton step, with the beam eliminated.
+//!
+//! With L at its closed form for M, a step M → M + x that lowers F solves S x = b, where
+//!
+//! ```text
+//! b(p)   = Σ_k w c L (y − c L M)                       half the slope of −F
+//! S x(p) = Σ_k w c² L(u)² ( x(p) − M(p) h(u) )
+//! h(u)   = Σ_k w c² M x / Σ_k w c² M²                  over the measurements that see cell u
+//! ```
+//!
+//! that is S = D − B D_L⁻¹ Bᵀ with D(p) = Σ w c² L². In relative steps g = x/M it is a weighted
+//! graph Laplacian, gᵀSg = Σ_u Σ_k ω (g_k − ḡ)² with ω = w c² L² M² and ḡ their weighted mean: 0
+//! where g is the same in a whole connected component, which is the gauge. The steps are taken as
+//! x, not g, so that a dead pixel (M = 0) is a pixel like any other.
+//!
+//! A product reads no measurement where the weights of an exposure are all the same. It works in
+//! single precision: M, L and b are kept in double precision outside, and each Gauss-Newton step
+//! makes good what the one before left by rounding (iterative refinement).
+
+mod kernel;
+
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::{Real, Shape};
+use crate::geometry::{Geometry, Placement, View};
+use crate::model::{Model, Stretch};
+use crate::parallel::Workers;
+use kernel::{Diagonal, Divide, Gather, LANES, Line, Scatter, Weigh, Weight};
+
+/// Rows that a thread works on at a time.
+pub(crate) const BAND: usize = 8;
+/// A pixel whose weight D is less than this share of the mean has nothing to tell the others.
+const LEAST_WEIGHT: f64 = 1e-6;
+
+/// How the images of the linear problem lie in memory: rows of one width, with zeros behind each
+/// and before and after all of them.
+///
+/// A row may then be read from any column that an exposure's place asks for, and what lies outside
+/// the image is 0: the kernels know no borders.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Padding {
+    /// Length of a row, a multiple of [`LANES`].
+    pub(crate) width: usize,
+    /// Zeros before the first row and after the last.
+    lead: usize,
+}
+
+impl Padding {
+    pub(crate) fn of(geometry: &Geometry) -> Self {
+        let reach = geometry.exposures.iter().map(|place| place.col).max().unwrap_or(0);
+        let widest = geometry.views.iter().map(|view| view.shape.cols).max().unwrap_or(0);
+        let width = widest.max(geometry.sensor.cols + reach);
+        Self { width: width.next_multiple_of(LANES), lead: reach.next_multiple_of(LANES) }
+    }
+
+    /// An image of zeros.
+    pub(crate) fn zeros(&self, rows: usize) -> Vec<f32> {
+        vec![0.0; 2 * self.lead + rows * self.width]
+    }
+
+    /// All rows, without the zeros before and after.
+    pub(crate) fn body_mut<'i>(&self, image: &'i mut [f32]) -> &'i mut [f32] {
+        let end = image.len() - self.lead;
+        &mut image[self.lead..end]
+    }
+
+    /// An image of `shape` with the values that `value` gives for each position.
+    fn padded(
+        &self,
+        shape: Shape,
+        workers: &Workers,
+        value: impl Fn(usize) -> f32 + Sync + Send,
+    ) -> Vec<f32> {
+        let mut image = self.zeros(shape.rows);
+        workers.map_blocks(self.body_mut(&mut image), self.width, |row, padded| {
+            for (col, padded) in padded[..shape.cols].iter_mut().enumerate() {
+                *padded = value(row * shape.cols + col);
+            }
+        });
+        image
+    }
+
+    /// A row of `image`.
+    pub(crate) fn row<'i>(&self, image: &'i [f32], row: usize) -> &'i [f32] {
+        self.row_from(image, row, 0)
+    }
+
+    /// A row of `image`, `right` columns to the right.
+    fn row_from<'i>(&self, image: &'i [f32], row: usize, right: usize) -> &'i [f32] {
+        &image[self.lead + row * self.width + right..][..self.width]
+    }
+
+    /// A row of `image`, `left` columns to the left.
+    fn row_before<'i>(&self, image: &'i [f32], row: usize, left: usize) -> &'i [f32] {
+        &image[self.lead + row * self.width - left..][..self.width]
+    }
+}
+
+/// The operator S at one M and L, scaled so that its elements are of order 1.
+pub(crate) struct Reduced<'m, 'a, T> {
+    model: &'m Model<'a, T>,
+    workers: &'m Workers,
+    scale: Scale,
+    pub(crate) padding: Padding,
+    /// M; 0 at pixels that have left the system, whose equation is then D x = b.
+    pub(crate) sensitivity: Vec<f32>,
+    /// 1/D; 0 at pixels without measurement.
+    pub(crate) inverse_diagonal: Vec<f32>,
+    /// Σ D over all pixels.
+    pub(crate) trace: f64,
+    /// The pixels that have left the system, of those with measurements.
+    pub(crate) left_out: Vec<usize>,
+    /// (L/scale)² in each view; 0 where unobserved.
+    light: Vec<Vec<f32>>,
+    /// h in each view: room for the first half of a product.
+    hidden: Vec<Vec<f32>>,
+}
+
+/// The units of the linear problem.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Scale {
+    /// The light of a bright pixel.
+    light: f64,
+    /// The mean of w c².
+    weight: f64,
+}
+
+impl Scale {
+    pub(crate) fn of<T: Real>(model: &Model<'_, T>) -> Self {
+        let weights: f64 = model.exposure_weights().iter().sum();
+        Self { light: model.brightest(), weight: weights / model.used() as f64 }
+    }
+
+    /// What half a slope of F is multiplied by to become a right-hand side.
+    pub(crate) fn slope(&self) -> f64 {
+        1.0 / (self.weight * self.light * self.light)
+    }
+}
+
+impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
+    /// The operator at M and L, the latter in each of the geometry's views.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn new(
+        model: &'m Model<'a, T>,
+        sensitivity: &[f64],
+        beams: &[Vec<f64>],
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Self> {
+        let (padding, scale) = (Padding::of(&model.geometry), Scale::of(model));
+        let views = &model.geometry.views;
+        let light = |(view, beam): (&View, &Vec<f64>)| {
+            padding.padded(view.shape, workers, |cell| (beam[cell] / scale.light).powi(2) as f32)
+        };
+        let mut reduced = Self {
+            model,
+            workers,
+            scale,
+            padding,
+            sensitivity: padding.padded(model.sensor(), workers, |pixel| sensitivity[pixel] as f32),
+            inverse_diagonal: padding.zeros(model.sensor().rows),
+            trace: 0.0,
+            left_out: Vec::new(),
+            light: views.iter().zip(beams).map(light).collect(),
+            hidden: views.iter().map(|view| padding.zeros(view.shape.rows)).collect(),
+        };
+        reduced.invert_diagonal(control)?;
+        Ok(reduced)
+    }
+
+    /// Writes S x to `product` and returns x · S x.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled); the product is then no whole one.
+    pub(crate) fn multiply(
+        &mut self,
+        x: &[f32],
+        product: &mut [f32],
+        control: &Control,
+    ) -> Result<f64> {
+        self.hide(x, control);
+        let (padding, rows) = (self.padding, self.model.sensor().rows);
+        let bands = self.workers.map_blocks(
+            padding.body_mut(product),
+            BAND * padding.width,
+            |band, products| {
+                let mut scratch = self.scratch();
+                let mut total = 0.0;
+                for (index, product) in products.chunks_exact_mut(padding.width).enumerate() {
+                    let row = band * BAND + index;
+                    if control.is_cancelled() {
+                        return total;
+                    }
+                    let lines = self.pixel_lines(row, &mut scratch);
+                    let sensitivity = padding.row(&self.sensitivity, row);
+                    let x = padding.row(x, row);
+                    let scatter = Scatter { lines: &lines, sensitivity, x, product };
+                    total += pulp::Arch::new().dispatch(scatter);
+                }
+                total
+            },
+        );
+        debug_assert!(bands.len() == rows.div_ceil(BAND));
+        control.check()?;
+        Ok(bands.into_iter().sum())
+    }
+
+    /// The first half of a product: h, in each view.
+    fn hide(&mut self, x: &[f32], control: &Control) {
+        let mut hidden = std::mem::take(&mut self.hidden);
+        let padding = self.padding;
+        if let [hidden] = &mut hidden[..] {
+            let size = BAND * padding.width;
+            self.workers.map_blocks(padding.body_mut(hidden), size, |band, signals| {
+                let mut scratch = self.scratch();
+                let mut weight = vec![0.0; padding.width];
+                for (index, signal) in signals.chunks_exact_mut(padding.width).enumerate() {
+                    if control.is_cancelled() {
+                        return;
+                    }
+                    let lines = self.cell_lines(0, band * BAND + index, x, &mut scratch);
+                    let arch = pulp::Arch::new();
+                    arch.dispatch(Gather { lines: &lines, signal, weight: &mut weight });
+                    arch.dispatch(Divide { signal, weight: &weight });
+                }
+            });
+        } else {
+            self.hide_turned(x, &mut hidden, control);
+        }
+        self.hidden = hidden;
+    }
+
+    /// h where exposures are turned against each other: the sums of each view are brought together
+    /// on the beam grid and turned into each view.
+    fn hide_turned(&self, x: &[f32], hidden: &mut [Vec<f32>], control: &Control) {
+        let (padding, views) = (self.padding, &self.model.geometry.views);
+        let gathered = |(index, view): (usize, &View)| {
+            let mut signal = padding.zeros(view.shape.rows);
+            let mut weight = padding.zeros(view.shape.rows);
+            let (signals, weights) = (padding.body_mut(&mut signal), padding.body_mut(&mut weight));
+            let size = BAND * padding.width;
+            self.workers.map_pairs(signals, weights, size, |band, signals, weights| {
+                let mut scratch = self.scratch();
+                let signals = signals.chunks_exact_mut(padding.width);
+                let weights = weights.chunks_exact_mut(padding.width);
+                for (row, (signal, weight)) in signals.zip(weights).enumerate() {
+                    if control.is_cancelled() {
+                        return;
+                    }
+                    let lines = self.cell_lines(index, band * BAND + row, x, &mut scratch);
+                    pulp::Arch::new().dispatch(Gather { lines: &lines, signal, weight });
+                }
+            });
+            (signal, weight)
+        };
+        let sums: Vec<_> = views.iter().enumerate().map(gathered).collect();
+        let beam_cols = self.model.geometry.beam.cols;
+        for (view, hidden) in views.iter().zip(hidden) {
+            let body = padding.body_mut(hidden);
+            self.workers.map_blocks(body, padding.width, |row, cells| {
+                for (col, cell) in cells[..view.shape.cols].iter_mut().enumerate() {
+                    let place = view.cells.at(row, col);
+                    let [mut signal, mut weight] = [0.0; 2];
+                    for (view, sums) in views.iter().zip(&sums) {
+                        let place = view.places.at(place / beam_cols, place % beam_cols);
+                        let (row, col) = (place / view.shape.cols, place % view.shape.cols);
+                        signal += padding.row(&sums.0, row)[col];
+                        weight += padding.row(&sums.1, row)[col];
+                    }
+                    *cell = if weight > 0.0 { signal / weight } else { 0.0 };
+                }
+            });
+        }
+    }
+
+    /// Finds 1/D, and takes pixels that have nothing to tell out of the system.
+    fn invert_diagonal(&mut self, control: &Control) -> Result<()> {
+        let (padding, cols) = (self.padding, self.model.sensor().cols);
+        let mut diagonal = std::mem::take(&mut self.inverse_diagonal);
+        let body = padding.body_mut(&mut diagonal);
+        let bands = self.workers.map_blocks(body, BAND * padding.width, |band, rows| {
+            let mut scratch = self.scratch();
+            let (mut sum, mut measured) = (0.0, 0_usize);
+            for (index, diagonal) in rows.chunks_exact_mut(padding.width).enumerate() {
+                if control.is_cancelled() {
+                    break;
+                }
+                let lines = self.pixel_lines(band * BAND + index, &mut scratch);
+                pulp::Arch::new().dispatch(Diagonal { lines: &lines, diagonal });
+                diagonal[cols..].fill(0.0);
+                sum += diagonal.iter().map(|&d| f64::from(d)).sum::<f64>();
+                measured += diagonal.iter().filter(|&&d| d > 0.0).count();
+            }
+            (sum, measured)
+        });
+        control.check()?;
+        let (sums, counts): (Vec<f64>, Vec<usize>) = bands.into_iter().unzip();
+        self.trace = sums.iter().sum();
+        let least = (LEAST_WEIGHT * self.trace / counts.iter().sum::<usize>() as f64) as f32;
+        let sensitivity = padding.body_mut(&mut self.sensitivity);
+        let size = BAND * padding.width;
+        let left_out = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
+            let mut left_out = Vec::new();
+            for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
+                if *d > 0.0 && *d < least {
+                    *m = 0.0;
+                    let row = band * BAND + index / padding.width;
+                    left_out.push(row * cols + index % padding.width);
+                }
+                *d = if *d > 0.0 { 1.0 / *d } else { 0.0 };
+            }
+            left_out
+        });
+        self.left_out = left_out.concat();
+        self.inverse_diagonal = diagonal;
+        Ok(())
+    }
+
+    /// Adds ω = w c² L² M² of one exposure along a row of cells of its view to `sums`.
+    pub(crate) fn weigh(
+        &self,
+        exposure: usize,
+        row: usize,
+        sums: &mut [f32],
+        scratch: &mut Scratch,
+    ) {
+        let place = &self.model.geometry.exposures[exposure];
+        let Some(pixel_row) = self.row_seeing(place, row) else { return };
+        let weight = self.weight(exposure, pixel_row, &mut scratch.of_exposures[exposure]);
+        let line = Line {
+            weight: weight.before(&self.padding, place.col),
+            first: self.padding.row_before(&self.sensitivity, pixel_row, place.col),
+            second: self.padding.row(&self.light[place.view], row),
+        };
+        pulp::Arch::new().dispatch(Weigh { line, sums });
+    }
+
+    /// The row of pixels that sees a row of cells, if one does.
+    fn row_seeing(&self, place: &Placement, row: usize) -> Option<usize> {
+        row.checked_sub(place.row).filter(|&row| row < self.model.sensor().rows)
+    }
+
+    /// The exposures that see a row of cells, with M and `x` of the pixels that do.
+    fn cell_lines<'s>(
+        &'s self,
+        view: usize,
+        row: usize,
+        x: &'s [f32],
+        scratch: &'s mut Scratch,
+    ) -> Vec<Line<'s>> {
+        let places = self.model.geometry.exposures.iter().enumerate();
+        places
+            .zip(&mut scratch.of_exposures)
+            .filter(|((_, place), _)| place.view == view)
+            .filter_map(|((exposure, place), scratch)| {
+                let pixel_row = self.row_seeing(place, row)?;
+                let weight = self.weight(exposure, pixel_row, scratch);
+                Some(Line {
+                    weight: weight.before(&self.padding, place.col),
+                    first: self.padding.row_before(&self.sensitivity, pixel_row, place.col),
+                    second: self.padding.row_before(x, pixel_row, place.col),
+                })
+            })
+            .collect()
+    }
+
+    /// The exposures of a row of pixels, with L² and h of the cells that they see.
+    fn pixel_lines<'s>(&'s self, row: usize, scratch: &'s mut Scratch) -> Vec<Line<'s>> {
+        let places = self.model.geometry.exposures.iter().enumerate();
+        places
+            .zip(&mut scratch.of_exposures)
+            .map(|((exposure, place), scratch)| {
+                let view_row = row + place.row;
+                Line {
+                    weight: self.weight(exposure, row, scratch).at(&self.padding),
+                    first: self.padding.row_from(&self.light[place.view], view_row, place.col),
+                    second: self.padding.row_from(&self.hidden[place.view], view_row, place.col),
+                }
+            })
+            .collect()
+    }
+
+    /// w c² of a row of an exposure's pixels.
+    fn weight<'s>(
+        &self,
+        exposure: usize,
+        row: usize,
+        scratch: &'s mut ExposureScratch,
+    ) -> RowWeight<'s> {
+        let cols = self.model.sensor().cols;
+        let factor = self.model.flux[exposure].powi(2) / self.scale.weight;
+        scratch.double.resize(cols, 0.0);
+        match self.model.stretch(exposure, row, 0..cols, &mut scratch.double) {
+            Stretch::Uniform(_, weight) => RowWeight::Same((weight * factor) as f32),
+            Stretch::Weighted(_, weights) => {
+                scratch.padded.resize(2 * self.padding.lead + self.padding.width, 0.0);
+                let padded = &mut scratch.padded[self.padding.lead..][..cols];
+                for (padded, weight) in padded.iter_mut().zip(weights) {
+                    *padded = (weight * factor) as f32;
+                }
+                RowWeight::Padded(&scratch.padded)
+            }
+        }
+    }
+
+    pub(crate) fn scratch(&self) -> Scratch {
+        Scratch { of_exposures: vec![ExposureScratch::default(); self.model.count()] }
+    }
+}
+
+/// Room for the weights of one row of each exposure.
+pub(crate) struct Scratch {
+    of_exposures: Vec<ExposureScratch>,
+}
+
+#[derive(Clone, Default)]
+struct ExposureScratch {
+    double: Vec<f64>,
+    padded: Vec<f32>,
+}
+
+/// Weights of a row of pixels.
+enum RowWeight<'s> {
+    Same(f32),
+    /// With zeros before and after.
+    Padded(&'s [f32]),
+}
+
+impl<'s> RowWeight<'s> {
+    fn at(self, padding: &Padding) -> Weight<'s> {
+        self.before(padding, 0)
+    }
+
+    /// The weights from so many columns further left.
+    fn before(self, padding: &Padding, left: usize) -> Weight<'s> {
+        match self {
+            Self::Same(weight) => Weight::Same(weight),
+            Self::Padded(row) => Weight::Each(&row[padding.lead - left..][..padding.width]),
+        }
+    }
+}

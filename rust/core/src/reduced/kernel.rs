@@ -1,0 +1,157 @@
+//! The arithmetic of a product with S: whole rows, side by side in vector registers.
+
+/// Neighbouring values that are worked on side by side.
+pub(super) const LANES: usize = 16;
+
+/// Weights w c² of one exposure along a row.
+#[derive(Clone, Copy)]
+pub(super) enum Weight<'s> {
+    Same(f32),
+    Each(&'s [f32]),
+}
+
+impl Weight<'_> {
+    #[inline(always)]
+    fn chunk(&self, index: usize) -> [f32; LANES] {
+        match self {
+            Self::Same(weight) => [*weight; LANES],
+            Self::Each(weights) => *chunk(weights, index),
+        }
+    }
+}
+
+/// One exposure along a row: its weights and two images as it sees them.
+pub(super) struct Line<'s> {
+    pub(super) weight: Weight<'s>,
+    pub(super) first: &'s [f32],
+    pub(super) second: &'s [f32],
+}
+
+#[inline(always)]
+fn chunk(values: &[f32], index: usize) -> &[f32; LANES] {
+    &values.as_chunks().0[index]
+}
+
+/// From pixels to cells: Σ w c² M x and Σ w c² M², from lines of M and x.
+pub(super) struct Gather<'l, 's> {
+    pub(super) lines: &'l [Line<'s>],
+    pub(super) signal: &'l mut [f32],
+    pub(super) weight: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Gather<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let (signals, weights) = (self.signal.as_chunks_mut().0, self.weight.as_chunks_mut().0);
+        for (index, (signal, weight)) in signals.iter_mut().zip(weights).enumerate() {
+            let [mut signals, mut weights] = [[0.0; LANES]; 2];
+            for line in self.lines {
+                let (w, m) = (line.weight.chunk(index), chunk(line.first, index));
+                let x = chunk(line.second, index);
+                for i in 0..LANES {
+                    let wm = w[i] * m[i];
+                    signals[i] += wm * x[i];
+                    weights[i] += wm * m[i];
+                }
+            }
+            (*signal, *weight) = (signals, weights);
+        }
+    }
+}
+
+/// signal/weight in place of the signal, 0 where no measurement tells.
+pub(super) struct Divide<'l> {
+    pub(super) signal: &'l mut [f32],
+    pub(super) weight: &'l [f32],
+}
+
+impl pulp::NullaryFnOnce for Divide<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (signal, &weight) in self.signal.iter_mut().zip(self.weight) {
+            *signal = if weight > 0.0 { *signal / weight } else { 0.0 };
+        }
+    }
+}
+
+/// From cells back to pixels: S x = Σ w c² L² (x − M h), from lines of L² and h; returns x · S x.
+pub(super) struct Scatter<'l, 's> {
+    pub(super) lines: &'l [Line<'s>],
+    pub(super) sensitivity: &'l [f32],
+    pub(super) x: &'l [f32],
+    pub(super) product: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Scatter<'_, '_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn call(self) -> f64 {
+        let mut total = [0.0; LANES];
+        for (index, product) in self.product.as_chunks_mut().0.iter_mut().enumerate() {
+            let (x, m) = (chunk(self.x, index), chunk(self.sensitivity, index));
+            let mut sum = [0.0; LANES];
+            for line in self.lines {
+                let (w, light) = (line.weight.chunk(index), chunk(line.first, index));
+                let h = chunk(line.second, index);
+                for i in 0..LANES {
+                    sum[i] += w[i] * light[i] * (x[i] - m[i] * h[i]);
+                }
+            }
+            for i in 0..LANES {
+                total[i] += x[i] * sum[i];
+            }
+            *product = sum;
+        }
+        total.iter().map(|&sum| f64::from(sum)).sum()
+    }
+}
+
+/// D = Σ w c² L², from lines of L² (twice).
+pub(super) struct Diagonal<'l, 's> {
+    pub(super) lines: &'l [Line<'s>],
+    pub(super) diagonal: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Diagonal<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (index, diagonal) in self.diagonal.as_chunks_mut().0.iter_mut().enumerate() {
+            let mut sum = [0.0; LANES];
+            for line in self.lines {
+                let (w, light) = (line.weight.chunk(index), chunk(line.first, index));
+                for i in 0..LANES {
+                    sum[i] += w[i] * light[i];
+                }
+            }
+            *diagonal = sum;
+        }
+    }
+}
+
+/// Adds ω = w c² M² L² along a row of cells, from a line of M and L².
+pub(super) struct Weigh<'l, 's> {
+    pub(super) line: Line<'s>,
+    pub(super) sums: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Weigh<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (index, sum) in self.sums.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+            let (w, m) = (self.line.weight.chunk(index), chunk(self.line.first, index));
+            let light = chunk(self.line.second, index);
+            for i in 0..LANES {
+                sum[i] += w[i] * m[i] * m[i] * light[i];
+            }
+        }
+    }
+}
