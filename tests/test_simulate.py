@@ -98,7 +98,10 @@ class TestExposures:
         ("arguments", "message"),
         [
             ({"shifts": [(0, 0, 0)]}, r"'shifts' has shape \(1, 3\)"),
-            ({"shifts": [(0, 0), (np.nan, 1)]}, r"'shifts' holds \[nan, 1.0\] at 1"),
+            (
+                {"shifts": [(0, 0), (np.nan, 1)]},
+                r"'shifts' of exposure 1 is \[nan, 1.0\], expected finite",
+            ),
             ({"flux": [1.0, 2.0]}, "'flux' has 2 values, expected 1"),
             ({"rotation": [45]}, "'rotation' holds 45"),
             ({"sensitivity": np.ones(3)}, "'sensitivity' has shape"),

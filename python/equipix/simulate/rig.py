@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array
+from equipix._arrays import as_array, as_shifts
 from equipix.errors import InputError
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
-from equipix.simulate.signal import Beam, checked_shifts, window
+from equipix.simulate.signal import Beam, window
 from equipix.simulate.store import Progress, write_experiment
 
 if TYPE_CHECKING:
@@ -283,7 +283,7 @@ def experiment(
         dead=bad[:dead],
         hot=bad[dead:],
     )
-    positions = _reached(checked_shifts(shifts), stage_error, rng)
+    positions = _reached(as_shifts(shifts), stage_error, rng)
 
     def light(rows: Floats, cols: Floats) -> Floats:
         return exposure_e * beam(rows, cols)
