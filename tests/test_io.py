@@ -65,7 +65,7 @@ def test_tiff(
     )
     assert_averages(path, frames)
     np.testing.assert_array_equal(equipix._native.read_file(path, None), frames)
-    np.testing.assert_array_equal(np.concatenate(list(io._tiff_frames(path))), frames)
+    np.testing.assert_array_equal(np.concatenate(list(io.tiff.stream_frames(path))), frames)
 
 
 @pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
