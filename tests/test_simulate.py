@@ -420,7 +420,7 @@ class TestWrite:
 
     def test_a_path_that_cannot_be_made_is_named(self, tmp_path):
         (tmp_path / "file").touch()
-        with pytest.raises(FileError, match="cannot write"):
+        with pytest.raises(FileError, match="cannot be written"):
             small_experiment().write(tmp_path / "file" / "out")
 
     def test_memory_does_not_grow_with_the_number_of_frames(self, tmp_path):
