@@ -417,7 +417,7 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", [3, None, b"out.tif", "out\0.tif"])
 def test_what_is_no_name_is_refused(path: object) -> None:
     for call in (lambda: io.save_pages(path, PAGES, {}), lambda: io.load_pages(path)):  # type: ignore[arg-type]
-        with pytest.raises(InputError, match="'path' holds .*, expected the name of a file"):
+        with pytest.raises(InputError, match="'path' holds .*, expected a path"):
             call()
 
 

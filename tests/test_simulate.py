@@ -423,6 +423,11 @@ class TestWrite:
         with pytest.raises(FileError, match="cannot be written"):
             small_experiment().write(tmp_path / "file" / "out")
 
+    @pytest.mark.parametrize("folder", [3, None, b"out", "a\0b"], ids=repr)
+    def test_what_is_no_path_is_refused(self, folder):
+        with pytest.raises(InputError, match="'folder' holds .*, expected a path"):
+            small_experiment().write(folder)
+
     def test_memory_does_not_grow_with_the_number_of_frames(self, tmp_path):
         def peak(frames):
             tracemalloc.start()

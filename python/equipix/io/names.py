@@ -68,7 +68,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def as_path(name: str, value: object) -> Path:
-    """Take an argument for the name of a file.
+    """Take an argument for the name of a file or a folder.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def as_path(name: str, value: object) -> Path:
     """
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(text, str) or "\0" in text:
-        raise InputError(f"'{name}' holds {value!r}, expected the name of a file")
+        raise InputError(f"'{name}' holds {value!r}, expected a path")
     return Path(text)
 
 
