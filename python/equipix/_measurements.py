@@ -48,9 +48,6 @@ def as_variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
     variances = as_array("variance", variance, ndim=(1, 3))
     if variances.ndim == 1:
         check_count("variance", len(variances), len(values))
-        if np.isinf(variances).any():
-            k = int(np.argmax(np.isinf(variances)))
-            raise InputError(f"'variance' of exposure {k} is infinite, expected a positive number")
         return variances.astype(np.float64)
     if variances.shape != values.shape:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
