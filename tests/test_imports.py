@@ -26,7 +26,7 @@ LAYERS = (
     {"experiment"},
     {"load"},
     {"calibration", "correct_files", "frames", "shifts", "simulate"},
-    {"_manifest", "_terminal", "correction", "defects", "noise"},
+    {"_manifest", "_measurements", "_terminal", "correction", "defects", "noise"},
     {"results"},
     {"io"},
     {"_arrays", "_native", "errors"},

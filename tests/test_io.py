@@ -65,7 +65,7 @@ def test_tiff(
     )
     assert_averages(path, frames)
     np.testing.assert_array_equal(equipix._native.read_file(path, None), frames)
-    np.testing.assert_array_equal(np.concatenate(list(io._tiff_frames(path))), frames)
+    np.testing.assert_array_equal(np.concatenate(list(io.tiff.stream_frames(path))), frames)
 
 
 @pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
@@ -362,7 +362,7 @@ def test_globs_are_in_natural_order(tmp_path: Path) -> None:
     literal.touch()
     assert io.find_files(str(literal)) == [literal]
     assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
-    with pytest.raises(InputError, match="'source' holds 3, expected the name"):
+    with pytest.raises(InputError, match="'source' holds 3, expected a path"):
         equipix.average([literal, 3])  # type: ignore[list-item]
     with pytest.raises(InputError, match="'source' names no file"):
         io.read_frames([])
@@ -417,7 +417,7 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", [3, None, b"out.tif", "out\0.tif"])
 def test_what_is_no_name_is_refused(path: object) -> None:
     for call in (lambda: io.save_pages(path, PAGES, {}), lambda: io.load_pages(path)):  # type: ignore[arg-type]
-        with pytest.raises(InputError, match="'path' holds .*, expected the name of a file"):
+        with pytest.raises(InputError, match="'path' holds .*, expected a path"):
             call()
 
 

@@ -98,7 +98,10 @@ class TestExposures:
         ("arguments", "message"),
         [
             ({"shifts": [(0, 0, 0)]}, r"'shifts' has shape \(1, 3\)"),
-            ({"shifts": [(0, 0), (np.nan, 1)]}, r"'shifts' holds \[nan, 1.0\] at 1"),
+            (
+                {"shifts": [(0, 0), (np.nan, 1)]},
+                r"'shifts' of exposure 1 is \[nan, 1.0\], expected finite",
+            ),
             ({"flux": [1.0, 2.0]}, "'flux' has 2 values, expected 1"),
             ({"rotation": [45]}, "'rotation' holds 45"),
             ({"sensitivity": np.ones(3)}, "'sensitivity' has shape"),
@@ -417,8 +420,13 @@ class TestWrite:
 
     def test_a_path_that_cannot_be_made_is_named(self, tmp_path):
         (tmp_path / "file").touch()
-        with pytest.raises(FileError, match="cannot write"):
+        with pytest.raises(FileError, match="cannot be written"):
             small_experiment().write(tmp_path / "file" / "out")
+
+    @pytest.mark.parametrize("folder", [3, None, b"out", "a\0b"], ids=repr)
+    def test_what_is_no_path_is_refused(self, folder):
+        with pytest.raises(InputError, match="'folder' holds .*, expected a path"):
+            small_experiment().write(folder)
 
     def test_memory_does_not_grow_with_the_number_of_frames(self, tmp_path):
         def peak(frames):

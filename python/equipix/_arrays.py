@@ -53,6 +53,19 @@ def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> N
     return array if array.dtype == np.float32 else array.astype(np.float64, copy=False)
 
 
+def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
+    """Shifts as float64 of shape (n, 2), all finite."""
+    array = as_array("shifts", shifts, ndim=2).astype(np.float64)
+    if array.shape[1] != 2:
+        raise InputError(f"'shifts' has shape {array.shape}, expected (n, 2): row and column")
+    if not np.isfinite(array).all():
+        k = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise InputError(
+            f"'shifts' of exposure {k} is {array[k].tolist()}, expected finite numbers"
+        )
+    return array
+
+
 def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:

@@ -11,8 +11,6 @@ import numpy as np
 
 from equipix import _native
 from equipix._arrays import (
-    as_array,
-    as_floats,
     check_count,
     check_progress,
     number,
@@ -20,6 +18,10 @@ from equipix._arrays import (
     positive_count,
     positive_workers,
 )
+from equipix._measurements import as_mask as _boolean_mask
+from equipix._measurements import as_statistics as _statistics
+from equipix._measurements import as_values as _values
+from equipix._measurements import as_variances as _variances
 from equipix.correction import Flagged, apply_gain
 from equipix.errors import (
     ConvergenceWarning,
@@ -370,59 +372,6 @@ def calibrate(
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
     _warn(calibration, tolerance, _MOST_SWEEPS if max_sweeps is None else max_sweeps)
     return calibration
-
-
-def _values(frames: ArrayLike, statistics: list[FrameStatistics]) -> NDArray[Any]:
-    """Frames as (n, rows, cols); NaN, which counts as masked, where averaged samples saturated."""
-    if statistics:
-        frames = np.stack([np.where(f.saturated > 0, np.nan, f.mean) for f in statistics])
-    values = as_floats("frames", frames, ndim=3)
-    if 0 in values.shape[1:]:
-        raise InputError(f"'frames' has shape {values.shape}, expected at least one pixel")
-    return values
-
-
-def _variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
-    """Variances in the shape and dtype that the solver takes."""
-    variances = as_array("variance", variance, ndim=(1, 3))
-    if variances.ndim == 1:
-        check_count("variance", len(variances), len(values))
-        if np.isinf(variances).any():
-            k = int(np.argmax(np.isinf(variances)))
-            raise InputError(f"'variance' of exposure {k} is infinite, expected a positive number")
-        return variances.astype(np.float64)
-    if variances.shape != values.shape:
-        raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
-    with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
-        return variances.astype(values.dtype, copy=False)
-
-
-def _statistics(frames: object) -> list[FrameStatistics]:
-    """The frames as a list, if that is what they are; an empty one for arrays."""
-    if not isinstance(frames, list | tuple):
-        return []
-    statistics = [each for each in frames if isinstance(each, FrameStatistics)]
-    if statistics and len(statistics) != len(frames):
-        raise InputError("'frames' mixes FrameStatistics and arrays, expected either")
-    shapes = [each.mean.shape for each in statistics]
-    if len(set(shapes)) > 1:
-        raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
-    for k, each in enumerate(statistics):
-        if each.saturated.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {k} saturates: expose less, or correct the "
-                "'saturation' that they were averaged with"
-            )
-    return statistics
-
-
-def _boolean_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    array = as_array("mask", mask, ndim=(2, 3))
-    if array.dtype != np.bool_:
-        raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
-    if array.shape not in (shape[1:], shape):
-        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
-    return array
 
 
 def _wrapped(

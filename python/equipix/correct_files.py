@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix.errors import EquipixError, FileError, InputError
+from equipix.errors import FileError, InputError
 from equipix.frames import average, load_statistics
 from equipix.io import (
-    beside,
     find_files,
+    folder_beside,
     frame_format,
     refuse_inputs,
     stream_frames,
@@ -23,6 +20,7 @@ from equipix.io import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -95,9 +93,12 @@ def correct_files(
         with write_whole(output, force=force) as temporary:
             write_frames(temporary, corrected(files), nbytes=total * frame_bytes)
         return total
-    with _whole_folder(output) as folder:
+    with folder_beside(output) as folder:
         for file, path in zip(files, outputs, strict=True):
             write_frames(folder / path.name, corrected([file]), nbytes=counts[file] * frame_bytes)
+        output.mkdir(exist_ok=True)
+        for path in outputs:
+            (folder / path.name).replace(path)
     return total
 
 
@@ -136,21 +137,3 @@ def _dark_frame(dark: str) -> Literal["stored"] | NDArray[Any] | None:
     except (FileError, InputError):  # not averaged yet
         mean = average(dark).mean
     return mean.astype(np.float32)
-
-
-@contextmanager
-def _whole_folder(target: Path) -> Iterator[Path]:
-    """Make a folder whose files move to the target when all are written."""
-    partial = beside(target.resolve())
-    try:
-        partial.mkdir()
-        yield partial
-        target.mkdir(exist_ok=True)
-        for file in partial.iterdir():
-            file.replace(target / file.name)
-    except EquipixError:
-        raise
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written: {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import as_array
+from equipix._arrays import as_array, as_shifts
 from equipix.errors import InputError, ShiftRoundingWarning
 
 if TYPE_CHECKING:
@@ -197,14 +197,8 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
     ShiftRoundingWarning
         If a shift is more than 0.02 pixel and more than three standard errors from whole.
     """
-    exact = as_array("shifts", shifts, ndim=2).astype(np.float64)
-    if exact.shape[1] != 2:
-        raise InputError(f"'shifts' has shape {exact.shape}, expected (n, 2): row and column")
-    if not np.isfinite(exact).all():
-        k = int(np.flatnonzero(~np.isfinite(exact).all(axis=1))[0])
-        raise InputError(f"'shifts' of exposure {k} is {exact[k].tolist()}, expected numbers")
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
-    exact = np.clip(exact, -_BEYOND, _BEYOND)
+    exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
     whole = np.rint(exact)
     known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
     noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)

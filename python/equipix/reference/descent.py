@@ -53,18 +53,8 @@ def coordinate_descent(
 
     Parameters
     ----------
-    frames : array_like, shape (n, rows, cols)
-        Exposures, dark subtracted; NaN counts as masked.
-    shifts : array_like of int, shape (n, 2)
-        Shifts (row, col) in whole pixels.
-    variance : array_like, optional
-        Variance of the values, like `frames` or (n,); 1 unless given.
-    mask : array_like of bool, optional
-        True = do not use; (rows, cols) or (n, rows, cols).
-    flux : array_like, shape (n,), optional
-        Relative power of the lamp in each exposure; 1 unless given.
-    rotation : array_like, shape (n,), optional
-        Rotations of the sensor in degrees, multiples of 90; 0 unless given.
+    frames, shifts, variance, mask, flux, rotation : array_like
+        As for `equipix.reference.model.problem`.
     sweeps : int
         Number of sweeps.
 

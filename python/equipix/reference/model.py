@@ -73,7 +73,28 @@ def problem(
     flux: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
 ) -> Problem:
-    """Turn the arguments of a calibration into values, weights w = 1/σ², fluxes and cells."""
+    """Turn the arguments of a calibration into values, weights w = 1/σ², fluxes and cells.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n, rows, cols)
+        Exposures, dark subtracted; NaN counts as masked.
+    shifts : array_like of int, shape (n, 2)
+        Shifts (row, col) in whole pixels.
+    variance : array_like, optional
+        Variance of the values, like `frames` or (n,); 1 unless given.
+    mask : array_like of bool, optional
+        True = do not use; (rows, cols) or (n, rows, cols).
+    flux : array_like, shape (n,), optional
+        Relative power of the lamp in each exposure; 1 unless given.
+    rotation : array_like, shape (n,), optional
+        Rotations of the sensor in degrees, multiples of 90; 0 unless given.
+
+    Returns
+    -------
+    Problem
+        The measurements as the solvers take them.
+    """
     values = np.array(frames, np.float64)
     n, rows, cols = values.shape
     sigma2 = np.ones(1) if variance is None else np.asarray(variance, np.float64)

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._arrays import as_array
+from equipix._arrays import as_array, as_shifts
 from equipix.errors import InputError
-from equipix.simulate.signal import checked_shifts, exposures
+from equipix.simulate.signal import exposures
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -146,7 +146,7 @@ def noise_prediction(
     5.5e-04
     """
     truth = as_array("sensitivity", sensitivity, ndim=2).astype(np.float64)
-    cells = np.rint(checked_shifts(shifts)).astype(int)
+    cells = np.rint(as_shifts(shifts)).astype(int)
     signal = exposures(truth, beam, cells)
     noise = _like_signal("variance", variance, signal.shape)
     if not (np.all(noise > 0) and np.all(signal > 0)):

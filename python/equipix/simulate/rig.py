@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array
+from equipix._arrays import as_array, as_shifts
 from equipix.errors import InputError
+from equipix.io import as_path
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
-from equipix.simulate.signal import Beam, checked_shifts, window
+from equipix.simulate.signal import Beam, window
 from equipix.simulate.store import Progress, write_experiment
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Iterator
+    from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -195,8 +196,10 @@ class VirtualExperiment:
         ------
         FileError
             If the folder holds files already, or cannot be written.
+        InputError
+            If `folder` is not the name of a folder.
         """
-        return write_experiment(self, Path(folder), force=force, progress=progress)
+        return write_experiment(self, as_path("folder", folder), force=force, progress=progress)
 
 
 def experiment(
@@ -283,7 +286,7 @@ def experiment(
         dead=bad[:dead],
         hot=bad[dead:],
     )
-    positions = _reached(checked_shifts(shifts), stage_error, rng)
+    positions = _reached(as_shifts(shifts), stage_error, rng)
 
     def light(rows: Floats, cols: Floats) -> Floats:
         return exposure_e * beam(rows, cols)

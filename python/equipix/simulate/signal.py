@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from equipix._arrays import as_array
+from equipix._arrays import as_array, as_shifts
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -273,7 +273,7 @@ def exposures(
            [[2.5, 3.5, 4.5]]])
     """
     response = as_array("sensitivity", sensitivity, ndim=2)
-    positions = checked_shifts(shifts)
+    positions = as_shifts(shifts)
     n = len(positions)
     powers = np.ones(n) if flux is None else as_array("flux", flux, ndim=1)
     turns = np.zeros(n) if rotation is None else as_array("rotation", rotation, ndim=1)
@@ -294,14 +294,3 @@ def window(beam: Beam, shape: tuple[int, ...], shift: Floats, rotation: float = 
     rows, cols = shape if turns % 2 == 0 else shape[::-1]
     seen = beam(shift[0] + np.arange(rows)[:, None], shift[1] + np.arange(cols))
     return np.rot90(np.broadcast_to(seen, (rows, cols)), int(turns))
-
-
-def checked_shifts(shifts: ArrayLike) -> Floats:
-    """Check that shifts are finite and (n, 2); return them as float64."""
-    positions = as_array("shifts", shifts, ndim=2).astype(np.float64)
-    if positions.shape[1] != 2:
-        raise InputError(f"'shifts' has shape {positions.shape}, expected (n, 2)")
-    if not np.isfinite(positions).all():
-        k = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
-        raise InputError(f"'shifts' holds {positions[k].tolist()} at {k}, expected finite numbers")
-    return positions

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from equipix.errors import FileError
-from equipix.io import beside, write_frames
+from equipix.io import folder_beside, replace_folder, write_frames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,13 +27,19 @@ def write_experiment(
     """Write an experiment whole or not at all; see `VirtualExperiment.write`."""
     streams = dict(_streams(virtual))
     frame_bytes = virtual.camera.response.size * (1 if virtual.camera.bit_depth == 8 else 2)
-    with _new_folder(target, force) as folder:
+    if target.exists() and not _may_replace(target, force):
+        raise FileError(
+            f"'{target}' exists and is not empty: name another folder, or force the replacement "
+            "of a folder that holds nothing but an experiment written before"
+        )
+    with folder_beside(target) as folder:
         counter = _Counter(progress, sum(count for _, count in streams.values()))
         for name, (frames, count) in streams.items():
             (folder / name).parent.mkdir(exist_ok=True)
             write_frames(folder / name, counter.pass_on(frames), nbytes=count * frame_bytes)
         np.savez(folder / "truth.npz", **vars(virtual.truth))
         (folder / "experiment.toml").write_text(_manifest(virtual), encoding="utf-8")
+        replace_folder(target, folder)
     return target / "experiment.toml"
 
 
@@ -83,39 +87,6 @@ class _Counter:
             self._done += 1
             if self._progress is not None:
                 self._progress(self._done, self._total, "writing")
-
-
-@contextmanager
-def _new_folder(target: Path, force: bool) -> Iterator[Path]:
-    """Make a folder beside the target that takes its place when all is written."""
-    if target.exists() and not _may_replace(target, force):
-        raise FileError(
-            f"'{target}' exists and is not empty: name another folder, or force the replacement "
-            "of a folder that holds nothing but an experiment written before"
-        )
-    partial, old = beside(target.resolve()), beside(target.resolve())
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        _replace(target.resolve(), partial, old)
-    except OSError as error:
-        raise FileError(f"cannot write '{target}': {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _replace(target: Path, new: Path, old: Path) -> None:
-    """Put a folder in the place of another, which goes away last of all."""
-    if not target.exists():
-        new.rename(target)
-        return
-    target.rename(old)
-    try:
-        new.rename(target)
-    except OSError:
-        old.rename(target)
-        raise
-    shutil.rmtree(old)
 
 
 def _may_replace(target: Path, force: bool) -> bool:

@@ -286,13 +286,15 @@ impl<'a, T: Real> Model<'a, T> {
         let by_row = workers.map(rows, |row| {
             control.check()?;
             let mut scratch = vec![0.0; cols];
+            let mask = self.mask_row(exposure, row);
             let mut tally = Tally::default();
             if let Stretch::Weighted(values, weights) =
                 self.stretch(exposure, row, 0..cols, &mut scratch)
             {
                 for (col, (&value, &weight)) in values.iter().zip(weights).enumerate() {
-                    if weight == 0.0 {
-                        self.check_left_out(exposure, row, col, value)?;
+                    // A weight of 0 also comes from an infinite variance, which is an error.
+                    let masked = || mask.is_some_and(|mask| mask[col]);
+                    if weight == 0.0 && (masked() || !value.to_f64().is_finite()) {
                         continue;
                     }
                     if !VARIANCES.contains(&(1.0 / weight)) {
@@ -315,18 +317,6 @@ impl<'a, T: Real> Model<'a, T> {
                 largest: sum.largest.max(row.largest),
             })
         })
-    }
-
-    /// A weight of 0 comes from the mask or from a value that is no number, not from the variance.
-    fn check_left_out(&self, exposure: usize, row: usize, col: usize, value: T) -> Result<()> {
-        let masked = self.mask_row(exposure, row).is_some_and(|mask| mask[col]);
-        match self.variance {
-            Variance::Measurements(variance) if !masked && value.to_f64().is_finite() => {
-                let variance = variance.row(exposure, row)[col].to_f64();
-                Err(self.bad_variance(exposure, row, col, variance))
-            }
-            _ => Ok(()),
-        }
     }
 
     fn bad_variance(&self, exposure: usize, row: usize, col: usize, variance: f64) -> Error {

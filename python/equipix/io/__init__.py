@@ -1,0 +1,25 @@
+"""Frames, arrays and metadata to and from files."""
+
+from equipix.io.images import frame_format, read_frames, stream_frames
+from equipix.io.names import as_path, find_files, refuse_inputs
+from equipix.io.pages import SUFFIXES, check_format, check_pages, load_pages, save_pages
+from equipix.io.tiff import write_frames
+from equipix.io.whole import folder_beside, replace_folder, write_whole
+
+__all__ = [
+    "SUFFIXES",
+    "as_path",
+    "check_format",
+    "check_pages",
+    "find_files",
+    "folder_beside",
+    "frame_format",
+    "load_pages",
+    "read_frames",
+    "refuse_inputs",
+    "replace_folder",
+    "save_pages",
+    "stream_frames",
+    "write_frames",
+    "write_whole",
+]

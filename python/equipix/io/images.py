@@ -1,0 +1,105 @@
+"""Frames from image files, by whichever reader decodes them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix import _native
+from equipix.errors import FileError, UnsupportedFileError
+from equipix.io import tiff
+from equipix.io.names import find_files
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from os import PathLike
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+def read_frames(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, workers: int | None = None
+) -> NDArray[Any]:
+    """All frames of some files at once; `equipix.average` takes them without holding them.
+
+    Parameters
+    ----------
+    source : path, glob, or list of these
+        Files as in `find_files`.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+
+    Returns
+    -------
+    ndarray, shape (n, rows, cols)
+        The numbers in the files, in their own dtype.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or differs from the first in shape or dtype.
+    """
+    return np.concatenate([frames for _, frames in stream_frames(source, workers=workers)])
+
+
+def stream_frames(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, workers: int | None = None
+) -> Iterator[tuple[Path, NDArray[Any]]]:
+    """Frames of some files, a few at a time, by whichever reader decodes them.
+
+    Parameters
+    ----------
+    source : path, glob, or list of these
+        Files as in `find_files`.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+
+    Yields
+    ------
+    path : Path
+        The file.
+    frames : ndarray, shape (n, rows, cols)
+        Some of its frames, in the file's order.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or differs from the first in shape or dtype.
+    """
+    first: tuple[Path, NDArray[Any]] | None = None
+    for path in find_files(source):
+        for frames in _frames(path, workers):
+            first = first or (path, frames[:1])
+            if frames.shape[1:] != first[1].shape[1:] or frames.dtype != first[1].dtype:
+                raise FileError(
+                    f"{path}: is {_format(frames)}, expected {_format(first[1])} as in {first[0]}"
+                )
+            yield path, frames
+
+
+def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
+    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or holds no grey image.
+    """
+    try:
+        count, rows, cols, bits = _native.file_format(path)
+    except UnsupportedFileError:
+        return tiff.frame_format(path)
+    return (count, rows, cols), np.dtype(f"uint{bits}")
+
+
+def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
+    try:
+        yield _native.read_file(path, workers)
+    except UnsupportedFileError:
+        yield from tiff.stream_frames(path)
+
+
+def _format(frames: NDArray[Any]) -> str:
+    return f"{frames.shape[-2]} x {frames.shape[-1]} (rows x columns), {frames.dtype}"

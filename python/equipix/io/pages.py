@@ -1,0 +1,168 @@
+"""Named arrays with metadata, to and from the files that equipix saves."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.errors import FileError, InputError
+from equipix.io import tiff
+from equipix.io.names import as_path
+from equipix.io.reading import reading
+from equipix.io.whole import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from os import PathLike
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+def save_pages(
+    path: str | PathLike[str],
+    pages: Mapping[str, NDArray[Any]],
+    metadata: Mapping[str, Any],
+    *,
+    force: bool = False,
+) -> None:
+    """Write named arrays and metadata to a .tif or .npz file, which appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Output; its suffix names the format.
+    pages : mapping of str to ndarray
+        Arrays by name, each kept in its own dtype; of shape (rows, cols) in a TIFF.
+    metadata : mapping
+        JSON values; in a TIFF they are the first page's description.
+    force : bool, optional
+        Replace a file that is there.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    InputError
+        If the suffix is unknown or a page is not an array of numbers in two dimensions.
+    """
+    write = _WRITERS.get(as_path("path", path).suffix.lower())
+    if write is None:
+        raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
+    for name, array in pages.items():
+        if array.ndim != 2 or array.dtype.kind not in "iuf":
+            raise InputError(
+                f"page '{name}' is {array.dtype} of shape {array.shape}, expected numbers in two"
+                " dimensions"
+            )
+    description = json.dumps(dict(metadata))
+    with write_whole(path, force=force) as temporary:
+        write(temporary, pages, description)
+
+
+def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read what `save_pages` wrote.
+
+    Parameters
+    ----------
+    path : path
+        A .tif or .npz file.
+
+    Returns
+    -------
+    pages : dict of str to ndarray
+        The arrays by name.
+    metadata : dict
+        The metadata.
+
+    Raises
+    ------
+    FileError
+        If the file is not readable or was not written by `save_pages`.
+    InputError
+        If the suffix is unknown.
+    """
+    path = as_path("path", path)
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(f"'path' is {str(path)!r}, expected the suffix .tif or .npz")
+    with reading(path):
+        pages, description = read(path)
+    try:
+        metadata = json.loads(description)
+    except ValueError as error:
+        raise FileError(f"{path}: was not written by equipix: it lacks its metadata") from error
+    return pages, metadata
+
+
+def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:
+    """Refuse the metadata of another kind of file than `kind`, or of a format above `newest`.
+
+    Raises
+    ------
+    FileError
+        If the metadata are not of such a file.
+    """
+    if not isinstance(content, dict) or content.get("kind") != kind:
+        raise FileError(f"{path}: holds something else than {kind} that equipix has saved")
+    number = content.get("format")
+    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+        raise FileError(f"{path}: is damaged: its format is {number!r}, expected a whole number")
+    if number > newest:
+        raise FileError(
+            f"{path}: has format {number}, this version of equipix reads up to {newest}: install"
+            " a newer one"
+        )
+
+
+def check_pages(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], wanted: Mapping[str, type]
+) -> None:
+    """Refuse pages that lack one of those wanted, or are not all maps of one sensor.
+
+    Parameters
+    ----------
+    path : path
+        The file they are from.
+    pages : mapping of str to ndarray
+        Arrays by name.
+    wanted : mapping of str to type
+        Dtype, or kind of dtype, of each page that must be there.
+
+    Raises
+    ------
+    FileError
+        If a page is missing, or has another dtype, rank or shape.
+    """
+    shape = None
+    for name, dtype in wanted.items():
+        if name not in pages:
+            raise FileError(f"{path}: is damaged: lacks the page '{name}'")
+        page = pages[name]
+        shape = shape or page.shape
+        if page.ndim != 2 or page.shape != shape or not np.issubdtype(page.dtype, dtype):
+            raise FileError(
+                f"{path}: is damaged: page '{name}' is {page.dtype} of shape {page.shape},"
+                f" expected {dtype.__name__} in two dimensions, as large as '{next(iter(wanted))}'"
+            )
+
+
+def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, metadata=np.array(description), **pages)
+
+
+def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        pages = {name: file[name] for name in file.files}
+    return pages, str(pages.pop("metadata"))
+
+
+SUFFIXES = (".tif", ".tiff", ".npz")
+"""Formats of `save_pages`."""
+
+_WRITERS = {".tif": tiff.write_pages, ".tiff": tiff.write_pages, ".npz": _write_npz}
+_READERS = {".tif": tiff.read_pages, ".tiff": tiff.read_pages, ".npz": _read_npz}

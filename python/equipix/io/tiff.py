@@ -1,0 +1,116 @@
+"""TIFF files by tifffile: frames that the compiled reader leaves to it, and all that is written.
+
+The only module that imports tifffile.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import tifffile
+
+from equipix.errors import FileError
+from equipix.io.reading import reading
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from os import PathLike
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+_PAGE_NAME = 285  # TIFF tag
+_SUBFILE_TYPE = 255  # TIFF tag
+_PHOTOMETRIC = 262  # TIFF tag
+_MAX_COMPRESSION = 4096  # no lossless coding packs tighter
+_TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that still leave room for the directories
+
+
+def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
+    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded."""
+    with reading(path), tifffile.TiffFile(path) as file:
+        page: Any = file.pages[0]
+        _check_page(path, page, file.filehandle.size)
+        count = max(len(file.pages), file.series[0].size // page.size)
+        return (count, *page.shape), page.dtype
+
+
+def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
+    """Frames of a file, one at a time, each of shape (1, rows, cols)."""
+    with reading(path), tifffile.TiffFile(path) as file:
+        pages = len(file.pages)
+        if pages == 0:
+            raise FileError(f"{path}: is broken: it has no pages")
+        for page in file.pages:
+            _check_page(path, page, file.filehandle.size)
+        if pages == 1 and file.series[0].size > file.pages[0].size:
+            # A stack with a directory for its first frame only: mapped, not read at once.
+            yield from tifffile.memmap(path, mode="r")[..., None, :, :].reshape(
+                -1, 1, *file.pages[0].shape
+            )
+            return
+        for page in file.pages:
+            frame = page.asarray()
+            if frame.shape != page.shape:  # tifffile's way to say that the pixels are not there
+                raise FileError(f"{path}: is broken: a page has no pixels")
+            yield frame[None]
+
+
+def _check_page(path: Path, page: Any, length: int) -> None:
+    """Refuse what the compiled reader refuses: colour, white at 0, and what is no frame."""
+    old_type = page.tags.valueof(_SUBFILE_TYPE, default=1)
+    if page.is_reduced or page.is_mask or page.subifds or old_type == 2:
+        raise FileError(
+            f"{path}: holds a reduced copy or a mask beside its frames, expected frames only:"
+            " export them to a file of their own"
+        )
+    if _PHOTOMETRIC in page.tags and page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+        raise FileError(f"{path}: has white at 0 (MinIsWhite), expected black at 0")
+    grey = _PHOTOMETRIC not in page.tags or page.photometric == tifffile.PHOTOMETRIC.MINISBLACK
+    if not grey or page.samplesperpixel != 1 or page.ndim != 2:
+        raise FileError(
+            f"{path}: is {page.photometric.name} of shape {page.shape}, expected one grey channel"
+        )
+    if page.nbytes > _MAX_COMPRESSION * length:
+        raise FileError(f"{path}: claims {page.nbytes} bytes of pixels in a file of {length}")
+
+
+def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, nbytes: int) -> None:
+    """Write frames as the pages of a TIFF file, holding one at a time.
+
+    Parameters
+    ----------
+    path : path
+        Output, written in place: give it a folder that nobody reads yet.
+    frames : iterable of ndarray, shape (rows, cols)
+        The frames.
+    nbytes : int
+        Bytes of all frames together; above 4 GB they need BigTIFF.
+    """
+    with tifffile.TiffWriter(path, bigtiff=nbytes > _TIFF_LIMIT) as file:
+        for frame in frames:
+            file.write(frame, photometric="minisblack", metadata=None)
+
+
+def write_pages(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
+    """Write named arrays as pages, with a description of the first."""
+    big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
+    with tifffile.TiffWriter(path, bigtiff=big) as file:
+        for name, array in pages.items():
+            file.write(
+                array,
+                photometric="minisblack",
+                metadata=None,
+                description=description,
+                extratags=[(_PAGE_NAME, "s", 0, name, True)],
+            )
+            description = ""
+
+
+def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    """Read what `write_pages` wrote: arrays by name, and the description."""
+    with tifffile.TiffFile(path) as file:
+        every: Sequence[Any] = file.pages
+        pages = {page.tags[_PAGE_NAME].value: page.asarray() for page in every}
+        return pages, every[0].description
