@@ -31,6 +31,7 @@
 //! geometry        shifts, rotations, the padded grid of the beam
 //! parallel        threads; the same bytes for any number of them
 //! transform       cosine transforms of images
+//! memory          what memory may still be had
 //! control         cancellation and progress
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
@@ -113,6 +114,7 @@ pub mod frames;
 pub mod geometry;
 #[cfg(feature = "io")]
 pub mod io;
+pub mod memory;
 pub mod model;
 pub mod parallel;
 pub mod statistics;
