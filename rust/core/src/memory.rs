@@ -36,13 +36,18 @@ const VERSION_1: Controller = Controller {
 const VERSION_2: Controller =
     Controller { mount: "/sys/fs/cgroup", limit: "memory.max", used: "memory.current", totals: "" };
 
+/// What allocators may add to the bytes that are asked of them: freed arrays of up to 32 MiB linger in
+/// the heap of glibc (mallopt(3), `M_MMAP_THRESHOLD`), and each thread begins a heap of its own.
+const LINGERING: u64 = 64 << 20;
+
 /// Refuses work that needs more memory than this process may still have.
 ///
-/// `what` says which work, as the beginning of a sentence. A tenth of a millisecond.
+/// `what` says which work, as the beginning of a sentence. The allocator's share comes on top.
 ///
 /// # Errors
 /// [`Error::Memory`] if fewer than `needed` bytes are to be had.
 pub fn check(needed: u64, what: impl FnOnce() -> String) -> Result<()> {
+    let needed = needed.saturating_add(needed.min(LINGERING));
     let bounds = [
         (machine(), "end other work"),
         (groups(), "raise the memory limit of this container or job"),

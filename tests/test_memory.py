@@ -1,0 +1,110 @@
+"""Memory that cannot be had: an error that names the bytes, before the work starts."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.errors import EquipixError, InsufficientMemoryError
+
+CROSS = equipix.cross_pattern(2, 3)
+
+LIMIT = """
+import os, re, resource, sys
+def limit(extra):
+    used = 1024 * int(re.search(r"VmSize:\\s+(\\d+)", open("/proc/self/status").read())[1])
+    resource.setrlimit(resource.RLIMIT_AS, (used + extra, used + extra))
+"""
+"""Leaves a process `extra` bytes of address space beyond what it has."""
+
+
+def run(code, *arguments):
+    command = [sys.executable, "-c", LIMIT + code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+class TestArraysThatNoMachineHolds:
+    """Of more bytes than a process can address, so nothing depends on the machine."""
+
+    @pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+    def test_calibrate(self, dtype):
+        frames = np.broadcast_to(dtype(1), (5, 2**20, 2**29))
+        with pytest.raises(InsufficientMemoryError, match=r"calibrating: .* PiB") as caught:
+            equipix.calibrate(frames, CROSS)
+        assert isinstance(caught.value, EquipixError)
+        assert isinstance(caught.value, MemoryError)
+
+    def test_calibrate_variance(self):
+        variance = np.broadcast_to(1.0, (5, 2**20, 2**29))
+        with pytest.raises(InsufficientMemoryError, match=r"calibrating: .* PiB"):
+            equipix.calibrate(np.ones((5, 8, 9)), CROSS, variance=variance)
+
+    @pytest.mark.parametrize("shape", [(2, 2**25, 2**25), (2, 2**31, 2**29)])
+    def test_average(self, shape):
+        words = r"averaging frames of .* needs .* \(\d{17,} bytes\) .* are available: "
+        with pytest.raises(InsufficientMemoryError, match=words):
+            equipix.average(np.broadcast_to(np.uint8(1), shape))
+
+
+REFUSED, DONE = 10, 11
+
+SCAN = f"""
+import json, numpy as np, equipix
+frames = np.random.default_rng(0).uniform(1, 2, (5, 1000, 1000)).astype(np.float32)
+def outcome(megabytes):
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    limit(megabytes * 10**6)
+    try:
+        equipix.calibrate(frames, {CROSS.tolist()}, max_sweeps=9, workers=2)
+    except equipix.errors.InsufficientMemoryError as error:
+        print(error, file=sys.stderr, flush=True)
+        os._exit({REFUSED})
+    os._exit({DONE})
+print(json.dumps([outcome(megabytes) for megabytes in (*range(60, 480, 20), 1000)]))
+"""
+
+
+def test_a_process_is_refused_or_finishes_whatever_its_limit():
+    """If the bytes asked for were too few, some child would die in between."""
+    done = run(SCAN)
+    outcomes = json.loads(done.stdout)
+    assert (outcomes[0], outcomes[-1]) == (REFUSED, DONE)
+    assert set(outcomes) == {REFUSED, DONE}
+    words = r"calibrating 5 exposures of \(1000, 1000\) needs (.*) MB \((\d+) bytes\) beside its"
+    needed, number = re.search(words, done.stderr).groups()
+    assert float(needed) == pytest.approx(int(number) / 1e6, abs=0.05)
+
+
+def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
+    shape = (800, 800)
+    sensitivity, beam = simulate.paper_sensitivity(shape, rng=1), simulate.gaussian_beam(shape)
+    virtual = simulate.experiment(sensitivity, beam, CROSS, frames=2, dead=0, hot=0, rng=1)
+    experiment = virtual.write(tmp_path / "experiment")
+    before = sorted(tmp_path.rglob("*"))
+    command = "from equipix import cli; limit(60 * 10**6); cli.main(sys.argv[1:])"
+    done = run(command, "calibrate", experiment, "-o", tmp_path / "cal.tif", "--workers", 2)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(
+        r"equipix: error: .* needs .* \(\d+ bytes\) .* raise the limit.*\n", done.stderr
+    )
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_small_job_runs_beside_a_low_limit():
+    code = f"""
+import numpy as np, equipix
+limit(40 * 10**6)
+frames = np.random.default_rng(0).uniform(1, 2, (5, 40, 50))
+equipix.calibrate(frames, {CROSS.tolist()}, tolerance=1e-3, workers=1)
+"""
+    done = run(code)
+    assert (done.returncode, done.stderr) == (0, "")
