@@ -58,35 +58,57 @@ class TestArraysThatNoMachineHolds:
             equipix.average(np.broadcast_to(np.uint8(1), shape))
 
 
-REFUSED, DONE = 10, 11
-
-SCAN = f"""
-import json, numpy as np, equipix
+CHILDREN = f"""
+import json, numpy as np, equipix, warnings
+warnings.simplefilter("ignore")
 frames = np.random.default_rng(0).uniform(1, 2, (5, 1500, 1500)).astype(np.float32)
-def outcome(megabytes):
-    child = os.fork()
-    if child:
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+def peak():
+    return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
+def calibrate(megabytes, turn):
+    \"\"\"By how much a child of this process grows that has so many megabytes, or its error.\"\"\"
+    read, write = os.pipe()
+    if child := os.fork():
+        os.close(write)
+        with open(read) as answer:
+            said = answer.read()
+        return said if os.waitpid(child, 0)[1] == 0 else "died"
+    before = peak()
     limit(megabytes * 10**6)
     try:
-        equipix.calibrate(frames, {CROSS.tolist()}, max_sweeps=9, workers=2)
+        rotation = [0, 0, 0, 0, turn]
+        equipix.calibrate(frames, {CROSS.tolist()}, rotation=rotation, max_sweeps=9, workers=2)
+        answer = str(peak() - before)
     except equipix.errors.InsufficientMemoryError as error:
-        print(error, file=sys.stderr, flush=True)
-        os._exit({REFUSED})
-    os._exit({DONE})
-print(json.dumps([outcome(megabytes) for megabytes in range(60, 280, 10)]))
+        answer = str(error)
+    os.write(write, answer.encode())
+    os._exit(0)
+limits, turn = json.loads(sys.argv[1])
+print(json.dumps([calibrate(megabytes, turn) for megabytes in limits]))
 """
 
 
-def test_a_process_is_refused_or_finishes_whatever_its_limit():
-    """If the bytes asked for were too few, some child would die in between."""
-    done = run(SCAN)
-    outcomes = json.loads(done.stdout)
-    assert (outcomes[0], outcomes[-1]) == (REFUSED, DONE)
-    assert set(outcomes) == {REFUSED, DONE}
+def calibrations(limits, turn=0):
+    done = run(CHILDREN, json.dumps([limits, turn]))
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("turn", [0, 90])
+def test_the_bytes_named_are_those_it_takes(turn):
+    """All that is counted is used, and the allocator's share covers what is not."""
+    allocator = 2**26
+    refused, grown = calibrations([40, 2000], turn)
     words = r"calibrating 5 exposures of \(1500, 1500\) needs (.*) MB \((\d+) bytes\) beside its"
-    needed, number = re.search(words, done.stderr).groups()
-    assert float(needed) == pytest.approx(int(number) / 1e6, abs=0.05)
+    short, needed = re.match(words, refused).groups()
+    assert float(short) == pytest.approx(int(needed) / 1e6, abs=0.05)
+    assert int(needed) - allocator <= int(grown) <= int(needed)
+
+
+def test_a_process_is_refused_or_finishes_whatever_its_limit():
+    """Nobody dies of too few bytes in between."""
+    answers = calibrations([*range(60, 260, 20)])
+    assert "needs" in answers[0]
+    assert answers[-1].isdigit()
+    assert "died" not in answers
 
 
 def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
