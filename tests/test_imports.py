@@ -50,7 +50,7 @@ CHAIN = (
     {"connectivity"},
     {"model"},
     {"geometry"},
-    {"parallel", "transform"},
+    {"memory", "parallel", "transform"},
     {"control"},
     {"frames"},
     {"error"},

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.errors import InputError
+from equipix.errors import InputError, InsufficientMemoryError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import ArrayLike, NDArray
 
 _MOST_WORKERS = 1024
+
+
+@contextmanager
+def naming_memory(what: str) -> Iterator[None]:
+    """Make NumPy's MemoryError, which names the bytes, one of the package that says what for."""
+    try:
+        yield
+    except InsufficientMemoryError:
+        raise
+    except MemoryError as error:
+        reason = str(error) or "the system gives no more memory"
+        raise InsufficientMemoryError(f"{what}: {reason}") from error
 
 
 def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:

@@ -13,6 +13,7 @@ from equipix import _native
 from equipix._arrays import (
     check_count,
     check_progress,
+    naming_memory,
     number,
     per_exposure,
     positive_count,
@@ -298,6 +299,9 @@ def calibrate(
     ------
     InputError
         If an argument has a wrong shape or value, or an exposure shows no light.
+    InsufficientMemoryError
+        If the memory that it takes cannot be had; where the system tells (Linux), before the
+        work starts.
 
     Warns
     -----
@@ -337,9 +341,12 @@ def calibrate(
         raise InputError(f"'method' is {method!r}, expected 'coordinate-descent'")
     check_progress(progress)
     statistics = _statistics(frames)
-    values = _values(cast("ArrayLike", frames), statistics)
-    if variance is None and statistics:
-        variance = smoothed_variances(statistics)
+    with naming_memory("calibrating"):
+        values = _values(cast("ArrayLike", frames), statistics)
+        if variance is None and statistics:
+            variance = smoothed_variances(statistics)
+        variances = None if variance is None else _variances(variance, values)
+        masked = None if mask is None else _boolean_mask(mask, values.shape)
     count = len(values)
     positions = round_shifts(shifts)
     check_count("shifts", len(positions), count)
@@ -352,8 +359,8 @@ def calibrate(
         positions,
         rotation=turns.astype(int).tolist(),
         flux=fluxes.tolist(),
-        variance=None if variance is None else _variances(variance, values),
-        mask=None if mask is None else _boolean_mask(mask, values.shape),
+        variance=variances,
+        mask=masked,
         tolerance=number("tolerance", tolerance),
         max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
         workers=positive_workers(workers),

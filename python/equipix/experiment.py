@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
-from equipix._arrays import number, positive_count, positive_workers
+from equipix._arrays import naming_memory, number, positive_count, positive_workers
 from equipix._manifest import find_files, read_manifest
 from equipix.calibration import calibrate
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
@@ -193,20 +193,23 @@ class Experiment:
             If a file cannot be read, or the images differ in size or depth.
         InputError
             If an option is out of range, or the exposures do not make a calibration.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
         """
         started = datetime.now(UTC)
         _check_options(tolerance, max_sweeps, workers)
         self.check_formats()
         shifts, std = self.measure_shifts()
         whole_shifts = round_shifts(shifts, std)
-        measured = self._average(workers, progress)
-        noise = self._noise(measured)
-        variances = _variances(measured, noise)
-        flags = pixel_flags(
-            dead_pixels(measured.signals, variances),
-            hot_pixels(measured.dark, noise),
-            measured.saturated,
-        )
+        with naming_memory("averaging"):
+            measured = self._average(workers, progress)
+            noise = self._noise(measured)
+            variances = _variances(measured, noise)
+            flags = pixel_flags(
+                dead_pixels(measured.signals, variances),
+                hot_pixels(measured.dark, noise),
+                measured.saturated,
+            )
         solved = calibrate(
             measured.signals,
             whole_shifts,

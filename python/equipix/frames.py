@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native, io
-from equipix._arrays import as_array, as_floats, positive_workers
+from equipix._arrays import as_array, as_floats, naming_memory, positive_workers
 from equipix.errors import InputError, UnsupportedFileError
 from equipix.results import FrameStatistics
 
@@ -74,6 +74,9 @@ def average(
         If an argument is not what is wanted.
     FileError
         If a file is missing, broken, in colour, or differs from the first in shape or depth.
+    InsufficientMemoryError
+        If the memory that it takes cannot be had; where the system tells (Linux), before the
+        work starts.
 
     Notes
     -----
@@ -103,12 +106,14 @@ def average(
     level = _level(saturation)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     frames = _paths_or_frames(source)
-    if isinstance(frames, list):
-        maps = _average_files(frames, level, workers, progress)
-    else:
-        maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
-    mean, variance, count, saturated = maps
-    return _subtract(FrameStatistics(mean, variance, variance / count, count, saturated), offset)
+    with naming_memory("averaging"):
+        if isinstance(frames, list):
+            maps = _average_files(frames, level, workers, progress)
+        else:
+            maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
+        mean, variance, count, saturated = maps
+        statistics = FrameStatistics(mean, variance, variance / count, count, saturated)
+        return _subtract(statistics, offset)
 
 
 def save_statistics(

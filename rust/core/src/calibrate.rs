@@ -6,6 +6,8 @@ use crate::descent;
 use crate::error::Result;
 use crate::estimate::{History, Stop};
 use crate::frames::{Real, flag};
+use crate::geometry::Geometry;
+use crate::memory;
 use crate::model::Model;
 use crate::multiscale;
 use crate::parallel::Workers;
@@ -42,7 +44,8 @@ pub struct Solution {
 /// pixels that their measurements leave almost no weight are flagged and not in the mean.
 ///
 /// # Errors
-/// As [`multiscale::solve`] and [`descent::solve`].
+/// [`Error::Memory`](crate::Error::Memory) before anything else if the memory for it cannot be had;
+/// then as [`multiscale::solve`] and [`descent::solve`].
 pub fn calibrate<T: Real>(
     model: &Model<'_, T>,
     method: Method,
@@ -50,6 +53,9 @@ pub fn calibrate<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Solution> {
+    memory::check(bytes_needed(&model.geometry), || {
+        format!("calibrating {} exposures of {}", model.count(), model.sensor())
+    })?;
     let components = Components::of(model, control)?;
     let (descent, history, left_out) = match method {
         Method::Multiscale => multiscale::solve(model, stop, workers, control)?,
@@ -78,6 +84,24 @@ pub fn calibrate<T: Real>(
         components,
         history,
     })
+}
+
+/// What coordinate descent holds beside the measurements at its fullest, in bytes:
+///
+/// | array | for each pixel | for each cell of the beam |
+/// |---|---|---|
+/// | M; M before the sweep, then its step | 8 + 8 | |
+/// | labels of the components, with the room they were made in | 4 | 4 + 4 |
+/// | L in each view | | 8 a view |
+/// | the step, turned to and fro by the estimate | 8 + 8 | |
+/// | or, with turned exposures, L and each view's sums in a sweep | | 8 + 16 a view |
+///
+/// Union-find comes before all these, with less: 21 for each pixel and 13 for each cell.
+const fn bytes_needed(geometry: &Geometry) -> u64 {
+    let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
+    let views = geometry.views.len() as u64;
+    let passing = if views > 1 { (8 + 16 * views) * cells } else { 16 * pixels };
+    20 * pixels + (8 + 8 * views) * cells + passing
 }
 
 /// Replaces each value by `scaled(value, label)`.

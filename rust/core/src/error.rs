@@ -5,7 +5,8 @@ use std::path::PathBuf;
 /// The result of everything in this crate that can fail.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// What went wrong, grouped as validation, input and output, and control.
+/// What went wrong, grouped as validation, input and output, resources, and
+/// control.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -58,6 +59,23 @@ pub enum Error {
         path: PathBuf,
         /// What the file has that the decoder lacks.
         feature: String,
+    },
+
+    // Resources.
+    /// The work needs more memory than this process may still have.
+    #[error(
+        "{what} needs {} ({needed} bytes) beside its input, {} are available: {remedy}",
+        size(*needed), size(*available)
+    )]
+    Memory {
+        /// The work, as the beginning of a sentence.
+        what: String,
+        /// Bytes that it needs.
+        needed: u64,
+        /// Bytes to be had.
+        available: u64,
+        /// How more could be had.
+        remedy: &'static str,
     },
 
     // Control.
@@ -133,6 +151,12 @@ pub enum SpotProblem {
         /// The saturation level.
         level: f64,
     },
+}
+
+/// Bytes in the unit that people expect.
+fn size(bytes: u64) -> String {
+    let bytes = bytes as f64;
+    if bytes < 1e9 { format!("{:.1} MB", bytes / 1e6) } else { format!("{:.2} GB", bytes / 1e9) }
 }
 
 impl Error {

@@ -17,6 +17,7 @@ use ::tiff::decoder::DecodingBuffer;
 use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::frames::{Shape, Stack};
+use crate::memory;
 use crate::parallel::Workers;
 use crate::statistics::{Accumulator, Statistics, Summable};
 use source::Source;
@@ -57,7 +58,8 @@ pub enum AnyFrames {
 ///
 /// # Errors
 /// [`Error::File`] or [`Error::Unsupported`] for the first file, in the order given, that is not
-/// a whole grey image of the shape and depth of the first; [`Error::Value`] if there is no file.
+/// a whole grey image of the shape and depth of the first; [`Error::Value`] if there is no file;
+/// [`Error::Memory`] if there is no room.
 pub fn average(
     paths: &[PathBuf],
     saturation: Option<f64>,
@@ -75,7 +77,7 @@ pub fn average(
 /// All pages of one file.
 ///
 /// # Errors
-/// [`Error::File`] or [`Error::Unsupported`], as in [`average`].
+/// [`Error::File`], [`Error::Unsupported`] or [`Error::Memory`], as in [`average`].
 pub fn read(path: &Path, workers: &Workers, control: &Control) -> Result<AnyFrames> {
     let format = format(path, control)?;
     Ok(match format.depth {
@@ -290,6 +292,9 @@ fn average_as<T: FileSample>(
     control: &Control,
 ) -> Result<Statistics> {
     let size = (BATCH_BYTES / format.bytes()).clamp(workers.count().min(BATCH), BATCH);
+    let bytes = size.saturating_mul(format.bytes()) as u64;
+    let bytes = bytes.saturating_add(Accumulator::<T>::bytes(format.shape));
+    memory::check(bytes, || format!("averaging frames of {}", format.shape))?;
     let mut buffer = vec![T::default(); size * format.shape.len()];
     let mut sums = Accumulator::<T>::new(format.shape, saturation)?;
     let (mut done, mut total) = (0, paths.len());
@@ -315,6 +320,8 @@ fn read_as<T: FileSample>(
     control: &Control,
 ) -> Result<Frames<T>> {
     let pages = pages(path, control)?;
+    let bytes = pages.len().saturating_mul(format.bytes());
+    memory::check(bytes as u64, || format!("reading {}", path.display()))?;
     let mut data = vec![T::default(); pages.len() * format.shape.len()];
     load(&pages, format, path, &mut data, workers, control)?;
     Ok(Frames { count: pages.len(), shape: format.shape, data })

@@ -35,6 +35,7 @@
 //! geometry        shifts, rotations, the padded grid of the beam
 //! linalg          sparse Cholesky factors
 //! parallel        threads; the same bytes for any number of them
+//! memory          what memory may still be had
 //! control         cancellation and progress
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
@@ -118,12 +119,13 @@ pub mod frames;
 pub mod geometry;
 #[cfg(feature = "io")]
 pub mod io;
+mod linalg;
+pub mod memory;
 pub mod model;
 pub mod multiscale;
 pub mod parallel;
 mod precondition;
 mod reduced;
 pub mod statistics;
-mod linalg;
 
 pub use error::{Error, Result};

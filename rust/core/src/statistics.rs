@@ -23,6 +23,7 @@
 use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::frames::{Sample, Shape, Stack};
+use crate::memory;
 use crate::parallel::Workers;
 
 /// Pixels of one block: their sums stay in the first-level cache while a batch passes.
@@ -46,6 +47,11 @@ pub struct Statistics {
     pub saturated: Vec<u32>,
 }
 
+impl Statistics {
+    /// Bytes of one pixel.
+    const BYTES: usize = 8 + 8 + 4 + 4;
+}
+
 /// A sample that can be summed.
 pub trait Summable: Sample {
     /// The partial sums that suit it.
@@ -56,6 +62,8 @@ pub trait Summable: Sample {
 
 /// Partial sums of a block of pixels.
 pub trait PartialSums<T>: Clone + std::fmt::Debug + Send + Sync {
+    /// Bytes of the sums of one pixel.
+    const BYTES: usize;
     /// Sums of no samples at all for `pixels` pixels.
     fn new(pixels: usize) -> Self;
     /// Adds the same block of several frames.
@@ -92,6 +100,8 @@ pub struct ExactSums {
 }
 
 impl<T: Sample + Into<u32>> PartialSums<T> for ExactSums {
+    const BYTES: usize = 8 + 8 + 4;
+
     fn new(pixels: usize) -> Self {
         let zeros = || vec![0; pixels];
         Self { count: 0, sum: zeros(), squares: zeros(), saturated: vec![0; pixels] }
@@ -173,6 +183,8 @@ impl Moments {
 }
 
 impl<T: Sample> PartialSums<T> for Moments {
+    const BYTES: usize = 4 + 8 + 8 + 4;
+
     fn new(pixels: usize) -> Self {
         let zeros = || vec![0.0; pixels];
         let counts = || vec![0; pixels];
@@ -226,13 +238,15 @@ impl<T: Summable> Accumulator<T> {
     /// those at the full scale of an integer type.
     ///
     /// # Errors
-    /// [`Error::Value`] if `saturation` is NaN; [`Error::Shape`] if a frame has no pixel.
+    /// [`Error::Value`] if `saturation` is NaN; [`Error::Shape`] if a frame has no pixel;
+    /// [`Error::Memory`] if there is no room for the sums and what comes of them.
     pub fn new(shape: Shape, saturation: Option<f64>) -> Result<Self> {
         Stack::<T>::new("frames", &[], 0, shape)?;
         let saturation = saturation.or(T::FULL_SCALE).unwrap_or(f64::INFINITY);
         if saturation.is_nan() {
             return Err(Error::value("saturation", "is NaN, expected a level in DN"));
         }
+        memory::check(Self::bytes(shape), || format!("averaging frames of {shape}"))?;
         let blocks = (0..shape.len()).step_by(BLOCK);
         let blocks = blocks.map(|start| T::Sums::new(BLOCK.min(shape.len() - start))).collect();
         Ok(Self { shape, saturation, frames: 0, blocks })
@@ -242,6 +256,11 @@ impl<T: Summable> Accumulator<T> {
     #[must_use]
     pub const fn shape(&self) -> Shape {
         self.shape
+    }
+
+    /// Bytes of the sums over frames of `shape` and of what comes of them.
+    pub(crate) const fn bytes(shape: Shape) -> u64 {
+        (shape.len() as u64).saturating_mul((T::Sums::BYTES + Statistics::BYTES) as u64)
     }
 
     /// Adds frames.

@@ -11,6 +11,7 @@ pub(crate) fn exception(py: Python<'_>, error: &Error) -> PyErr {
         Error::Spot { .. } => "SpotError",
         Error::File { .. } => "FileError",
         Error::Unsupported { .. } => "UnsupportedFileError",
+        Error::Memory { .. } => "InsufficientMemoryError",
         Error::Cancelled => return PyKeyboardInterrupt::new_err(()),
         _ => "EquipixError",
     };

@@ -1,0 +1,139 @@
+"""Memory that cannot be had: an error that names the bytes, before the work starts."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix.errors import EquipixError, InsufficientMemoryError
+from equipix.io import write_frames
+
+CROSS = equipix.cross_pattern(2, 3)
+
+LIMIT = """
+import os, re, resource, sys
+def limit(extra):
+    used = 1024 * int(re.search(r"VmSize:\\s+(\\d+)", open("/proc/self/status").read())[1])
+    resource.setrlimit(resource.RLIMIT_AS, (used + extra, used + extra))
+"""
+"""Leaves a process `extra` bytes of address space beyond what it has."""
+
+
+def run(code, *arguments):
+    """Run code in a process whose threads share one heap: each else reserves 64 MiB for its own."""
+    command = [sys.executable, "-c", LIMIT + code, *map(str, arguments)]
+    env = os.environ | {"MALLOC_ARENA_MAX": "1"}
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False, env=env
+    )
+
+
+class TestArraysThatNoMachineHolds:
+    """Of more bytes than a process can address, so nothing depends on the machine."""
+
+    @pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+    def test_calibrate(self, dtype):
+        frames = np.broadcast_to(dtype(1), (5, 2**20, 2**29))
+        with pytest.raises(InsufficientMemoryError, match=r"calibrating: .* PiB") as caught:
+            equipix.calibrate(frames, CROSS)
+        assert isinstance(caught.value, EquipixError)
+        assert isinstance(caught.value, MemoryError)
+
+    def test_calibrate_variance(self):
+        variance = np.broadcast_to(1.0, (5, 2**20, 2**29))
+        with pytest.raises(InsufficientMemoryError, match=r"calibrating: .* PiB"):
+            equipix.calibrate(np.ones((5, 8, 9)), CROSS, variance=variance)
+
+    @pytest.mark.parametrize("shape", [(2, 2**25, 2**25), (2, 2**31, 2**29)])
+    def test_average(self, shape):
+        words = r"averaging frames of .* needs .* \(\d{17,} bytes\) .* are available: "
+        with pytest.raises(InsufficientMemoryError, match=words):
+            equipix.average(np.broadcast_to(np.uint8(1), shape))
+
+
+CHILDREN = f"""
+import json, numpy as np, equipix, warnings
+warnings.simplefilter("ignore")
+frames = np.random.default_rng(0).uniform(1, 2, (5, 1500, 1500)).astype(np.float32)
+def peak():
+    return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
+def calibrate(megabytes, turn):
+    \"\"\"By how much a child of this process grows that has so many megabytes, or its error.\"\"\"
+    read, write = os.pipe()
+    if child := os.fork():
+        os.close(write)
+        with open(read) as answer:
+            said = answer.read()
+        return said if os.waitpid(child, 0)[1] == 0 else "died"
+    before = peak()
+    limit(megabytes * 10**6)
+    try:
+        rotation = [0, 0, 0, 0, turn]
+        equipix.calibrate(frames, {CROSS.tolist()}, rotation=rotation, max_sweeps=9, workers=2)
+        answer = str(peak() - before)
+    except equipix.errors.InsufficientMemoryError as error:
+        answer = str(error)
+    os.write(write, answer.encode())
+    os._exit(0)
+limits, turn = json.loads(sys.argv[1])
+print(json.dumps([calibrate(megabytes, turn) for megabytes in limits]))
+"""
+
+
+def calibrations(limits, turn=0):
+    done = run(CHILDREN, json.dumps([limits, turn]))
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("turn", [0, 90])
+def test_the_bytes_named_are_those_it_takes(turn):
+    """All that is counted is used, and the allocator's share covers what is not."""
+    allocator = 2**26
+    refused, grown = calibrations([40, 2000], turn)
+    words = r"calibrating 5 exposures of \(1500, 1500\) needs (.*) MB \((\d+) bytes\) beside its"
+    short, needed = re.match(words, refused).groups()
+    assert float(short) == pytest.approx(int(needed) / 1e6, abs=0.05)
+    assert int(needed) - allocator <= int(grown) <= int(needed)
+
+
+def test_a_process_is_refused_or_finishes_whatever_its_limit():
+    """Nobody dies of too few bytes in between."""
+    answers = calibrations([*range(60, 260, 20)])
+    assert "needs" in answers[0]
+    assert answers[-1].isdigit()
+    assert "died" not in answers
+
+
+def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
+    lines = ['[dark]\nframes = "0.tif"']
+    for k, shift in enumerate(CROSS.tolist()):
+        write_frames(tmp_path / f"{k}.tif", np.ones((2, 800, 800), np.uint16), nbytes=0)
+        lines.append(f'[[exposure]]\nname = "{k}"\nframes = "{k}.tif"\nshift = {shift}')
+    experiment = tmp_path / "experiment.toml"
+    experiment.write_text("\n".join(lines))
+    before = sorted(tmp_path.rglob("*"))
+    command = "from equipix import cli; limit(60 * 10**6); cli.main(sys.argv[1:])"
+    done = run(command, "calibrate", experiment, "-o", tmp_path / "cal.tif", "--workers", 2)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(
+        r"equipix: error: .* needs .* \(\d+ bytes\) .* raise the limit.*\n", done.stderr
+    )
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_small_job_runs_beside_a_low_limit():
+    code = f"""
+import numpy as np, equipix
+limit(40 * 10**6)
+frames = np.random.default_rng(0).uniform(1, 2, (5, 40, 50))
+equipix.calibrate(frames, {CROSS.tolist()}, tolerance=1e-3, workers=1)
+"""
+    done = run(code)
+    assert (done.returncode, done.stderr) == (0, "")
