@@ -9,14 +9,17 @@ from equipix.reference.connectivity import components
 from equipix.reference.descent import Solution, coordinate_descent
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
+from equipix.reference.multiscale import MultiscaleSolution, multiscale
 
 __all__ = [
+    "MultiscaleSolution",
     "Solution",
     "average",
     "components",
     "coordinate_descent",
     "exposures",
     "grid_cells",
+    "multiscale",
     "objective",
     "solve_dense",
 ]
