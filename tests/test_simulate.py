@@ -224,6 +224,16 @@ class TestCamera:
         ratio = frames.var(axis=0, ddof=1) / variance
         assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(2 / (count * z.size)))
 
+    def test_few_photons_are_counted(self):
+        camera = simulate.Camera(
+            sensitivity=np.ones((200, 200)), dark=0.0, gain_dn_per_e=1, read_noise_e=0
+        )
+        (frame,) = camera.frames(np.full((200, 200), 3.0), 1, rng=1)
+        for count, probability in enumerate(np.exp(-3) * np.array([1, 3, 9 / 2, 27 / 6])):
+            # Binomial, within four standard deviations.
+            scatter = np.sqrt(probability * (1 - probability) / frame.size)
+            assert np.mean(frame == count) == pytest.approx(probability, abs=4 * scatter)
+
     @pytest.mark.parametrize(("bits", "dtype"), [(8, np.uint8), (10, np.uint16), (16, np.uint16)])
     def test_values_clip_at_both_ends(self, bits, dtype):
         light = np.array([[0.0, 1e9]])
