@@ -18,6 +18,7 @@ bench: $(BIN)/.built-release
 
 figures: $(BIN)/.built-release
 	$(BIN)/python docs/figures.py
+	$(BIN)/python docs/section3.py
 
 docs:
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps -p equipix-core

@@ -122,20 +122,21 @@ def solve_paper() -> tuple[NDArray, NDArray, equipix.Calibration]:
     return truth, frames, equipix.calibrate(frames, shifts, tolerance=1e-6)
 
 
-def draw_figure_1(frame: NDArray, result: equipix.Calibration) -> Figure:
-    """Draw an exposure, the beam and the sensitivity, and row 120 of each."""
+def draw_maps(frame: NDArray, result: equipix.Calibration, drawn: int) -> Figure:
+    """Draw an exposure, the beam and the sensitivity, and one row of each."""
+    rows, cols = frame.shape
     row, col = result.beam_origin
-    beam = result.beam[row : row + SHAPE[0], col : col + SHAPE[1]]
+    beam = result.beam[row : row + rows, col : col + cols]
     figure = Figure(figsize=(12, 6.2), layout="constrained")
     images, profiles = figure.subplots(2, 3, height_ratios=(1, 0.8))
     maps = {"exposure $y_1$": frame, "beam $L$": beam, "sensitivity $M$": result.sensitivity}
     for axes, below, (name, values) in zip(images, profiles, maps.items(), strict=True):
         image = axes.imshow(values, cmap="gray")
         figure.colorbar(image, ax=axes, shrink=0.85)
-        axes.axhline(ROW, color=AFTER, lw=1)
+        axes.axhline(drawn, color=AFTER, lw=1)
         axes.set(title=name, xlabel="column", ylabel="row")
-        below.plot(values[ROW], color=INK, lw=0.8)
-        below.set(xlabel="column", title=f"{name}, row {ROW}", xlim=(0, SHAPE[1] - 1))
+        below.plot(values[drawn], color=INK, lw=0.8)
+        below.set(xlabel="column", title=f"{name}, row {drawn}", xlim=(0, cols - 1))
         below.grid(alpha=0.3)
     return figure
 
@@ -159,7 +160,7 @@ def main() -> None:
     truth, frames, result = solve_paper()
     pictures = {
         "scheme": draw_scheme(),
-        "figure1": draw_figure_1(frames[0], result),
+        "figure1": draw_maps(frames[0], result, ROW),
         "figure2": draw_figure_2(simulate.relative_error(result.sensitivity, truth)),
     }
     for name, figure in pictures.items():

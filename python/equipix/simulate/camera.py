@@ -26,6 +26,12 @@ DEAD_RESPONSE = 0.02
 HOT_LEVEL = 0.915
 """Dark level of a hot pixel, as a fraction of full scale: daylight saturates it."""
 
+MANY_E = 1000.0
+"""Electrons from which on a Poisson number is drawn as a normal one."""
+
+WELL_MARGIN = 10.0
+"""Standard deviations by which such a number stays below the full well."""
+
 
 def _no_pixels() -> Pixels:
     return np.empty(0, np.int64)
@@ -154,16 +160,36 @@ class Camera:
         ------
         ndarray, shape (rows, cols), uint8 up to 8 bits, else uint16
             The next frame, in DN.
+
+        Notes
+        -----
+        Photons of a Poisson and read noise of a normal distribution. From 1000 electrons on, where
+        that is well below the full well, one normal number of the mean and variance of both takes
+        their place: a quarter of the time, for a skewness of 0.03 at most. Values are computed in
+        float32, which rounds them by less than 0.005 DN at 16 bits.
         """
         rng = np.random.default_rng(rng)
         electrons = light * self.response
-        dtype = np.uint8 if self.bit_depth == 8 else np.uint16
+        normal = self._is_normal(electrons)
+        mean = np.where(normal, electrons, 0.0)
+        level = np.float32(self.gain_dn_per_e * mean + self.offset)
+        noise = np.float32(self.gain_dn_per_e * np.sqrt(mean + self.read_noise_e**2))
+        counted = np.flatnonzero((electrons != 0) & ~normal)
         for _ in range(count):
-            yield self._digitised(self._collected(electrons, rng)).astype(dtype)
+            frame = rng.standard_normal(self.shape, dtype=np.float32)
+            frame *= noise
+            frame += level
+            collected = np.minimum(rng.poisson(electrons.flat[counted]), self.full_well_e)
+            frame.flat[counted] += self.gain_dn_per_e * collected
+            yield self._digitised(frame)
 
-    def _collected(self, electrons: Floats, rng: np.random.Generator) -> Floats:
-        collected: Floats = np.minimum(rng.poisson(electrons), self.full_well_e)
-        return collected + self.read_noise_e * rng.standard_normal(self.shape)
+    def _is_normal(self, electrons: Floats) -> NDArray[np.bool_]:
+        """Whether so many photons are as good as normally distributed, the well far from full."""
+        room = self.full_well_e - electrons
+        return (electrons >= MANY_E) & (room > WELL_MARGIN * np.sqrt(electrons))
 
-    def _digitised(self, electrons: Floats) -> Floats:
-        return np.clip(np.rint(self.gain_dn_per_e * electrons + self.offset), 0, self.full_scale)
+    def _digitised(self, values: NDArray[np.float32]) -> NDArray[Any]:
+        """Convert to whole DN; `values` is overwritten."""
+        np.rint(values, out=values)
+        np.clip(values, 0, self.full_scale, out=values)
+        return values.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
