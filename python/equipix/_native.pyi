@@ -60,11 +60,13 @@ class Solution:
     @property
     def objective(self) -> NDArray[Any]: ...
     @property
-    def estimates(self) -> list[tuple[int, float]]: ...
+    def sweeps(self) -> NDArray[Any]: ...
+    @property
+    def error_estimate(self) -> NDArray[Any]: ...
+    @property
+    def ended(self) -> str: ...
     @property
     def degrees_of_freedom(self) -> int: ...
-    @property
-    def converged(self) -> bool: ...
 
 def calibrate_frames(
     frames: NDArray[Any],
@@ -74,6 +76,7 @@ def calibrate_frames(
     flux: list[float],
     variance: NDArray[Any] | None,
     mask: NDArray[Any] | None,
+    method: str,
     tolerance: float,
     max_sweeps: int | None,
     workers: int | None,

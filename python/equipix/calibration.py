@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -19,10 +19,7 @@ from equipix._arrays import (
     positive_count,
     positive_workers,
 )
-from equipix._measurements import as_mask as _boolean_mask
-from equipix._measurements import as_statistics as _statistics
-from equipix._measurements import as_values as _values
-from equipix._measurements import as_variances as _variances
+from equipix._measurements import as_mask, as_statistics, as_values, as_variances
 from equipix.correction import Flagged, apply_gain
 from equipix.errors import (
     ConvergenceWarning,
@@ -42,29 +39,28 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int, int, str], object]
 
+Method = Literal["multiscale", "coordinate-descent"]
+
 FORMAT = 1
 """Number of the file format; a file with a higher one is refused."""
-
-_MOST_SWEEPS = 1_000_000
-"""Where the compiled part stops unless told otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """How a calibration went.
+    """How a calibration went, at some moments on its way.
 
     Attributes
     ----------
-    objective : ndarray, shape (sweeps,), float64
-        Objective F after each sweep; it never rises.
-    sweep : ndarray, int64
-        Numbers of the sweeps at which the error was estimated.
-    error_estimate : ndarray, float64
-        The estimated largest relative error of the sensitivity at those sweeps.
+    sweep : ndarray, shape (looks,), uint64
+        How many sweeps had been made.
+    objective : ndarray, shape (looks,), float64
+        Objective F; it never rises.
+    error_estimate : ndarray, shape (looks,), float64
+        The estimated largest relative error of the sensitivity.
     """
 
-    objective: NDArray[Any]
     sweep: NDArray[Any]
+    objective: NDArray[Any]
     error_estimate: NDArray[Any]
 
 
@@ -98,7 +94,8 @@ class Calibration:
     component_labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     sweeps : int
-        Passes over the data.
+        Sweeps of coordinate descent; of the multiscale method, passes over the data or its weights
+        of about a sweep's worth each.
     converged : bool
         Whether `error_estimate` is within the tolerance.
     error_estimate : float
@@ -226,8 +223,8 @@ class Calibration:
             "converged": self.converged,
             "error_estimate": self.error_estimate,
             "history": {
-                "objective": self.history.objective.tolist(),
                 "sweep": self.history.sweep.tolist(),
+                "objective": self.history.objective.tolist(),
                 "error_estimate": self.history.error_estimate.tolist(),
             },
         }
@@ -248,7 +245,7 @@ def calibrate(
     mask: ArrayLike | None = None,
     flux: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
-    method: Literal["coordinate-descent"] = "coordinate-descent",
+    method: Method = "multiscale",
     tolerance: float = 1e-6,
     max_sweeps: int | None = None,
     workers: int | None = None,
@@ -276,14 +273,17 @@ def calibrate(
     rotation : array_like of int, shape (n,), optional
         How far each exposure is turned, in degrees: 0, 90, 180 or 270, as by ``numpy.rot90`` of
         the beam's window; 0 unless given.
-    method : {"coordinate-descent"}
-        How to minimise the objective.
+    method : {"multiscale", "coordinate-descent"}
+        How to minimise the objective: by Gauss-Newton steps on all scales at once, in a number of
+        passes that does not depend on the size of the sensor; or by the paper's method, which
+        takes some (sensor size / shift)² of them.
     tolerance : float
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Most passes over the data; unless given, as many as it takes, at most a million. It
-        also ends where rounding keeps the error estimate from falling.
+        Most passes over the data or its weights; unless given, as many as it takes. It also ends
+        where rounding keeps the error estimate from falling. Passes that only estimate the error
+        of coordinate descent are not counted.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.
@@ -337,16 +337,16 @@ def calibrate(
     True
     """
     started = datetime.now(UTC)
-    if method != "coordinate-descent":
-        raise InputError(f"'method' is {method!r}, expected 'coordinate-descent'")
+    if method not in get_args(Method):
+        raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
-    statistics = _statistics(frames)
+    statistics = as_statistics(frames)
     with naming_memory("calibrating"):
-        values = _values(cast("ArrayLike", frames), statistics)
+        values = as_values(cast("ArrayLike", frames), statistics)
         if variance is None and statistics:
             variance = smoothed_variances(statistics)
-        variances = None if variance is None else _variances(variance, values)
-        masked = None if mask is None else _boolean_mask(mask, values.shape)
+        variances = None if variance is None else as_variances(variance, values)
+        masked = None if mask is None else as_mask(mask, values.shape)
     count = len(values)
     positions = round_shifts(shifts)
     check_count("shifts", len(positions), count)
@@ -361,6 +361,7 @@ def calibrate(
         flux=fluxes.tolist(),
         variance=variances,
         mask=masked,
+        method=method,
         tolerance=number("tolerance", tolerance),
         max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
         workers=positive_workers(workers),
@@ -377,7 +378,7 @@ def calibrate(
     calibration.flags[calibration.sensitivity <= 0] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
-    _warn(calibration, tolerance, _MOST_SWEEPS if max_sweeps is None else max_sweeps)
+    _warn(calibration, tolerance, result.ended)
     return calibration
 
 
@@ -387,7 +388,6 @@ def _wrapped(
     shifts: NDArray[np.int64],
     flux: NDArray[np.float64],
 ) -> Calibration:
-    sweeps, estimates = zip(*result.estimates, strict=True)
     objective = float(result.objective[-1])
     freedom = result.degrees_of_freedom
     return Calibration(
@@ -401,14 +401,14 @@ def _wrapped(
         reduced_chi2=objective / freedom if freedom > 0 else float("nan"),
         components=result.components,
         component_labels=result.component_labels,
-        sweeps=len(result.objective),
-        converged=result.converged,
-        error_estimate=float(estimates[-1]),
-        history=History(result.objective, np.array(sweeps), np.array(estimates)),
+        sweeps=int(result.sweeps[-1]),
+        converged=result.ended == "converged",
+        error_estimate=float(result.error_estimate[-1]),
+        history=History(result.sweeps, result.objective, result.error_estimate),
     )
 
 
-def _warn(calibration: Calibration, tolerance: float, max_sweeps: int) -> None:
+def _warn(calibration: Calibration, tolerance: float, ended: str) -> None:
     if calibration.components > 1:
         left = int(np.count_nonzero(calibration.component_labels > 0))
         warnings.warn(
@@ -418,8 +418,8 @@ def _warn(calibration: Calibration, tolerance: float, max_sweeps: int) -> None:
             stacklevel=3,
         )
     if not calibration.converged:
-        used_up = calibration.sweeps >= max_sweeps
-        remedy = "allow more sweeps" if used_up else "rounding is the limit, ask for a larger one"
+        used_up = ended == "sweeps used"
+        remedy = "allow more sweeps" if used_up else "it falls no further, ask for a larger one"
         warnings.warn(
             f"stopped after {calibration.sweeps} sweeps with an estimated error of "
             f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: {remedy}",

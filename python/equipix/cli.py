@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -15,7 +15,7 @@ from rich.table import Table
 
 from equipix._native import __version__
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
-from equipix.calibration import Calibration
+from equipix.calibration import Calibration, Method
 from equipix.correct_files import correct_files, is_folder
 from equipix.correction import Flagged
 from equipix.demo import run_demo, virtual_experiment
@@ -86,8 +86,8 @@ def calibrate(
     experiment: Annotated[Path, typer.Argument(help="The experiment.toml.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Calibration: .tif or .npz.")],
     method: Annotated[
-        Literal["coordinate-descent"], typer.Option(help="How to solve.")
-    ] = "coordinate-descent",
+        Method, typer.Option(help="How to solve: fast, or as the paper does.")
+    ] = "multiscale",
     tolerance: Tolerance = 1e-6,
     max_sweeps: MaxSweeps = None,
     workers: Workers = None,

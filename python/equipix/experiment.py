@@ -7,7 +7,7 @@ import math
 import os
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix._manifest import Exposure, Manifest
-    from equipix.calibration import Calibration
+    from equipix.calibration import Calibration, Method
     from equipix.results import FrameStatistics
     from equipix.shifts import ShiftMeasurement, Spot
 
@@ -160,7 +160,7 @@ class Experiment:
     def run(
         self,
         *,
-        method: Literal["coordinate-descent"] = "coordinate-descent",
+        method: Method = "multiscale",
         tolerance: float = 1e-6,
         max_sweeps: int | None = None,
         workers: int | None = None,
@@ -170,7 +170,7 @@ class Experiment:
 
         Parameters
         ----------
-        method : {"coordinate-descent"}
+        method : {"multiscale", "coordinate-descent"}
             How to minimise the objective.
         tolerance : float
             Largest relative error of the sensitivity at which the solver stops.

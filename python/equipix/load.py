@@ -66,8 +66,8 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         converged=numbers["converged"],
         error_estimate=numbers["error_estimate"],
         history=History(
+            np.array(history["sweep"], dtype=np.uint64),
             np.array(history["objective"]),
-            np.array(history["sweep"], dtype=np.int64),
             np.array(history["error_estimate"]),
         ),
         dark=pages.get("dark"),

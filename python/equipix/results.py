@@ -24,6 +24,7 @@ class Flag(IntFlag):
     DEAD = 1 << 10
     HOT = 1 << 11
     NO_FLAT_FIELD = 1 << 18
+    UNRELIABLE_FLAT = 1 << 25
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,8 @@ impl Rotation {
 
     /// Where a point of a grid of `shape` comes to lie after this rotation.
     pub(crate) fn turned_point(self, [row, col]: [f64; 2], shape: Shape) -> [f64; 2] {
-        let (from_bottom, from_right) = (shape.rows as f64 - 1.0 - row, shape.cols as f64 - 1.0 - col);
+        let (from_bottom, from_right) =
+            (shape.rows as f64 - 1.0 - row, shape.cols as f64 - 1.0 - col);
         match self {
             Self::None => [row, col],
             Self::Quarter => [from_right, row],

@@ -57,7 +57,8 @@ pub fn solve<'m, 'a, T: Real>(
         let (residual, objective) = descent.slopes(scale.slope(), control)?;
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long.
-        let rise = looks.last().is_some_and(|last| objective > last.objective + rounding(model, last));
+        let rise =
+            looks.last().is_some_and(|last| objective > last.objective + rounding(model, last));
         if rise && products < limit && step.halve(&mut descent) {
             continue;
         }
@@ -112,7 +113,9 @@ fn go<T: Real>(
     let reachable = (first * search.size()).max(PRECISION * first);
     for made in 0..most {
         let near = search.largest <= reachable || smallest.left(search) <= aim;
-        if (near && smallest.iterations >= FEWEST_ITERATIONS) || !smallest.iterate(search, control)? {
+        if (near && smallest.iterations >= FEWEST_ITERATIONS)
+            || !smallest.iterate(search, control)?
+        {
             return Ok(made);
         }
     }

@@ -87,8 +87,10 @@ impl<'m> TwoLevel<'m> {
         product: &[f32],
     ) -> f64 {
         let (padding, hats) = (self.padding, &self.hats);
-        let bands =
-            self.workers.map_blocks(padding.body_mut(residual), SUMMED * padding.width, |band, rows| {
+        let bands = self.workers.map_blocks(
+            padding.body_mut(residual),
+            SUMMED * padding.width,
+            |band, rows| {
                 let mut sums = CoarseSums::new(hats, padding.width);
                 let mut total = 0.0;
                 for (index, residual) in rows.chunks_exact_mut(padding.width).enumerate() {
@@ -106,7 +108,8 @@ impl<'m> TwoLevel<'m> {
                     });
                 }
                 (total, sums.finish())
-            });
+            },
+        );
         self.heights.fill(0.0);
         let mut by_diagonal = 0.0;
         for (total, sums) in bands {
@@ -241,7 +244,8 @@ impl<'h> CoarseSums<'h> {
 fn spacing(geometry: &Geometry) -> [usize; 2] {
     let reach = |along: fn(&Placement) -> usize| {
         let of_view = |view| {
-            let places = geometry.exposures.iter().filter(move |place| place.view == view).map(along);
+            let places =
+                geometry.exposures.iter().filter(move |place| place.view == view).map(along);
             places.clone().max().unwrap_or(0) - places.min().unwrap_or(0)
         };
         (0..geometry.views.len()).map(of_view).max().unwrap_or(0)

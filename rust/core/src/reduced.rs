@@ -301,18 +301,19 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         let least = (LEAST_WEIGHT * self.trace / counts.iter().sum::<usize>() as f64) as f32;
         let sensitivity = padding.body_mut(&mut self.sensitivity);
         let size = BAND * padding.width;
-        let left_out = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
-            let mut left_out = Vec::new();
-            for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
-                if *d > 0.0 && *d < least {
-                    *m = 0.0;
-                    let row = band * BAND + index / padding.width;
-                    left_out.push(row * cols + index % padding.width);
+        let left_out =
+            self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
+                let mut left_out = Vec::new();
+                for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
+                    if *d > 0.0 && *d < least {
+                        *m = 0.0;
+                        let row = band * BAND + index / padding.width;
+                        left_out.push(row * cols + index % padding.width);
+                    }
+                    *d = if *d > 0.0 { 1.0 / *d } else { 0.0 };
                 }
-                *d = if *d > 0.0 { 1.0 / *d } else { 0.0 };
-            }
-            left_out
-        });
+                left_out
+            });
         self.left_out = left_out.concat();
         self.inverse_diagonal = diagonal;
         Ok(())

@@ -184,7 +184,8 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
                 let sought = &beam[row * shape.cols..][..shape.cols];
                 let seen = BeamRow { model, sensitivity, view, row };
                 seen.for_each_stretch(&mut scratch, |lines, cells| {
-                    let (slopes, weights) = (&mut slopes[cells.clone()], &mut weights[cells.clone()]);
+                    let (slopes, weights) =
+                        (&mut slopes[cells.clone()], &mut weights[cells.clone()]);
                     measure(lines, &sought[cells], slopes, weights);
                 });
             }

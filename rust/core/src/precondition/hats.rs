@@ -38,8 +38,7 @@ pub(super) struct Hats {
 
 impl Hats {
     pub(super) fn new(sensor: Shape, spacing: [usize; 2]) -> Self {
-        let (rows, cols) =
-            (Axis::new(sensor.rows, spacing[0]), Axis::new(sensor.cols, spacing[1]));
+        let (rows, cols) = (Axis::new(sensor.rows, spacing[0]), Axis::new(sensor.cols, spacing[1]));
         let place = |col| {
             let (node, height) = cols.at(col as f64);
             (node as u32, height as f32)
