@@ -29,8 +29,8 @@ pub(crate) struct Search<'m, 'a, T> {
     product: Vec<f32>,
     /// r · P⁻¹ r.
     square: f64,
-    /// The largest size of P⁻¹ r.
-    pub(crate) largest: f64,
+    /// The largest size of P⁻¹ r, in the units of M.
+    largest: f64,
     pub(crate) ritz: Ritz,
 }
 
@@ -95,12 +95,17 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         Ok(square > 0.0)
     }
 
-    /// The largest size of the step found so far.
+    /// The largest relative size of P⁻¹ r.
+    pub(crate) fn largest(&self) -> f64 {
+        self.largest / self.reduced.mean
+    }
+
+    /// The largest relative size of the step found so far.
     pub(crate) fn found(&self) -> f64 {
         let blocks: Vec<&[f32]> = self.x.chunks(BLOCK).collect();
         let size = |largest: f32, value: &f32| largest.max(value.abs());
         let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
-        f64::from(tops.into_iter().fold(0.0, f32::max))
+        f64::from(tops.into_iter().fold(0.0, f32::max)) / self.reduced.mean
     }
 
     /// The pixels that have left the system.
@@ -108,9 +113,9 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         self.reduced.left_out
     }
 
-    /// The root mean square of P⁻¹ b as the first look has it, weighted by D.
+    /// The root mean square of the relative size of P⁻¹ r, weighted by D.
     pub(crate) fn size(&self) -> f64 {
-        (self.square.max(0.0) / self.reduced.trace).sqrt()
+        (self.square.max(0.0) / self.reduced.trace).sqrt() / self.reduced.mean
     }
 
     fn descend(&mut self, step: f64) -> f64 {

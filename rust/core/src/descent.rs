@@ -91,7 +91,7 @@ fn look<T: Real>(
     search.start(&descent.sensitivity, descent.beams(), control)?;
     let mut smallest = Smallest::default();
     while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}
-    Ok(smallest.error(search) / descent.mean_sensitivity())
+    Ok(smallest.error(search))
 }
 
 /// Whether the estimate is tiny and no smaller than it was at half the sweeps.

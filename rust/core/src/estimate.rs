@@ -135,6 +135,6 @@ impl Smallest {
 
     /// What is left of the error once the step that `search` has found is made.
     pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
-        search.largest / self.value
+        search.largest() / self.value
     }
 }

@@ -55,27 +55,34 @@ pub fn solve<'m, 'a, T: Real>(
     loop {
         let objective = descent.slopes(scale.slope(), &mut search.residual, control)?;
         products += 1;
-        // F is no parabola in M far from its minimum: a step may be too long.
+        // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
+        // where that takes more products than allowed.
         let rise =
             looks.last().is_some_and(|last| objective > last.objective + rounding(model, last));
-        if rise && halvings < MOST_HALVINGS && products < limit {
+        if rise && halvings < MOST_HALVINGS {
             halvings += 1;
             descent.advance(&search.x, -(0.5_f64.powi(halvings)));
             continue;
         }
         halvings = 0;
         search.start(&descent.sensitivity, descent.beams(), control)?;
-        let mean = descent.mean_sensitivity();
-        let error = smallest.error(&search) / mean;
-        looks.push(Look { sweep: products, objective, error });
-        control.report("calibrate", products, forecast(&looks, stop.tolerance).min(limit));
+        looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         if let Some(ended) = ended(&looks, &smallest, &stop, limit) {
             return Ok((descent, History { looks, ended }, search.left_out()));
         }
         descent.forget_beams();
-        let aim = AIM * stop.tolerance * mean;
-        let made = go(&mut search, &mut smallest, aim, limit - products - 1, control)?;
-        products += made;
+        let total = forecast(&looks, stop.tolerance).min(limit);
+        let aim = AIM * stop.tolerance;
+        let reachable = reachable(&search);
+        while products + 1 < limit {
+            control.report("calibrate", products, total.max(products));
+            let near = search.largest() <= reachable || smallest.left(&search) <= aim;
+            let enough = near && smallest.iterations >= FEWEST_ITERATIONS;
+            if enough || !smallest.iterate(&mut search, control)? {
+                break;
+            }
+            products += 1;
+        }
         descent.advance(&search.x, 1.0);
     }
 }
@@ -96,27 +103,10 @@ fn ended(looks: &[Look], smallest: &Smallest, stop: &Stop, limit: u64) -> Option
     }
 }
 
-/// Iterates until what is left of the error is `aim`, or no more than what linearising adds, or
-/// what single precision holds; returns the number of iterations.
-fn go<T: Real>(
-    search: &mut Search<'_, '_, T>,
-    smallest: &mut Smallest,
-    aim: f64,
-    most: u64,
-    control: &Control,
-) -> Result<u64> {
-    let first = search.largest;
-    // The term of second order is a product of relative steps in M and in L.
-    let reachable = (first * search.size()).max(PRECISION * first);
-    for made in 0..most {
-        let near = search.largest <= reachable || smallest.left(search) <= aim;
-        if (near && smallest.iterations >= FEWEST_ITERATIONS)
-            || !smallest.iterate(search, control)?
-        {
-            return Ok(made);
-        }
-    }
-    Ok(most)
+/// The size of P⁻¹ r that a step can reach: what linearising adds, which is a product of relative
+/// steps in M and in L, or what single precision holds.
+fn reachable<T: Real>(search: &Search<'_, '_, T>) -> f64 {
+    search.largest() * search.size().max(PRECISION)
 }
 
 /// What F may rise by through rounding: that of a sum, and of residuals that are rounding alone.

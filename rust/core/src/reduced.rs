@@ -33,6 +33,9 @@ pub(crate) const BAND: usize = 8;
 /// A pixel whose weight D is less than this share of the mean has nothing to tell the others.
 const LEAST_WEIGHT: f64 = 1e-6;
 
+/// A weight D below which single precision has no inverse.
+const FAINTEST: f32 = 1e-30;
+
 /// How the images of the linear problem lie in memory: rows of one width, with zeros behind each
 /// and before and after all of them.
 ///
@@ -123,6 +126,8 @@ pub(crate) struct Reduced<'m, 'a, T> {
     pub(crate) inverse_diagonal: Vec<f32>,
     /// Σ D over all pixels.
     pub(crate) trace: f64,
+    /// The mean of M over the pixels of the system.
+    pub(crate) mean: f64,
     /// The pixels that have left the system, of those with measurements.
     pub(crate) left_out: Vec<usize>,
     /// (L/scale)² in each view; 0 where unobserved.
@@ -166,6 +171,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             sensitivity: of_sensor(),
             inverse_diagonal: of_sensor(),
             trace: 0.0,
+            mean: 1.0,
             left_out: Vec::new(),
             light: of_views(),
             hidden: of_views(),
@@ -324,20 +330,29 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         let least = (LEAST_WEIGHT * self.trace / counts.iter().sum::<usize>() as f64) as f32;
         let sensitivity = padding.body_mut(&mut self.sensitivity);
         let size = BAND * padding.width;
-        let left_out =
-            self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
-                let mut left_out = Vec::new();
-                for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
-                    if *d > 0.0 && *d < least {
-                        *m = 0.0;
-                        let row = band * BAND + index / padding.width;
-                        left_out.push(row * cols + index % padding.width);
-                    }
-                    *d = if *d > 0.0 { 1.0 / *d } else { 0.0 };
+        let bands = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
+            let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
+            for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
+                if *d > 0.0 && *d < least {
+                    *m = 0.0;
+                    let row = band * BAND + index / padding.width;
+                    left_out.push(row * cols + index % padding.width);
+                } else if *d > 0.0 {
+                    sum += f64::from(*m);
+                    count += 1;
                 }
-                left_out
-            });
-        self.left_out = left_out.concat();
+                *d = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
+            }
+            (sum, count, left_out)
+        });
+        self.left_out.clear();
+        let (mut sum, mut count) = (0.0, 0);
+        for (of_band, in_band, left_out) in bands {
+            sum += of_band;
+            count += in_band;
+            self.left_out.extend(left_out);
+        }
+        self.mean = sum / count as f64;
         self.inverse_diagonal = diagonal;
         Ok(())
     }

@@ -131,13 +131,6 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         beam
     }
 
-    /// The mean of M.
-    pub(crate) fn mean_sensitivity(&self) -> f64 {
-        let blocks: Vec<&[f64]> = self.sensitivity.chunks(PART).collect();
-        let sums = self.workers.map(blocks.len(), |index| blocks[index].iter().sum::<f64>());
-        sums.into_iter().sum::<f64>() / self.sensitivity.len() as f64
-    }
-
     /// Updates some rows of the beam, which has one view.
     fn update_beam(&mut self, rows: Range<usize>, control: &Control) {
         let cols = self.model.geometry.views[0].shape.cols;

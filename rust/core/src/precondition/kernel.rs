@@ -30,7 +30,7 @@ impl pulp::NullaryFnOnce for Descend<'_> {
             for i in 0..LANES {
                 let r = residual[i] - self.step * q[i];
                 residual[i] = r;
-                total[i] += r * r * d[i];
+                total[i] += r * (r * d[i]);
                 let part = self.height * (m[i] * r);
                 below[i] += part;
                 above[i] += m[i] * r - part;
