@@ -124,6 +124,8 @@ pub mod memory;
 pub mod model;
 pub mod multiscale;
 pub mod parallel;
+#[doc(hidden)]
+pub mod parts;
 mod precondition;
 mod reduced;
 pub mod statistics;
