@@ -55,12 +55,9 @@ fn measure<T: Real>(shape: Shape, precision: &str, convert: fn(f64) -> T, worker
     for _ in 0..((1 << 26) / shape.len()).clamp(3, 15) {
         let [sweep, assemble, factorise, product] = pieces(&model, workers, &control);
         let whole = seconds(1, || {
-            let found = calibrate(&model, Method::Multiscale, STOP, workers, &control).unwrap();
-            solution = Some(found);
+            solution = calibrate(&model, Method::Multiscale, STOP, workers, &control).ok();
         });
-        let alone = seconds(1, || {
-            multiscale::solve(&model, STOP, workers, &control).map(drop).unwrap();
-        });
+        let alone = seconds(1, || multiscale::solve(&model, STOP, workers, &control).unwrap());
         let taken = [sweep, assemble, factorise, product, whole, alone];
         times.iter_mut().zip(taken).for_each(|(times, taken)| times.push(taken));
     }
@@ -91,13 +88,10 @@ fn pieces<T: Real>(model: &Model<'_, T>, workers: &Workers, control: &Control) -
     // Enough rounds that the clock and the first touch of memory do not count.
     let rounds = (1 << 23) / model.sensor().len() + 2;
     let mut descent = Descent::new(model, workers);
-    let sweep = seconds(rounds, || {
-        let _ = descent.sweep(control).unwrap();
-    });
-    let assemble = seconds(rounds, || {
-        Parts::assemble(model, &descent, workers, control).map(drop).unwrap();
-    });
-    let mut parts = Parts::assemble(model, &descent, workers, control).unwrap();
+    let sweep = seconds(rounds, || descent.sweep(control).unwrap());
+    let parts = || Parts::assemble(model, &descent, workers, control).unwrap();
+    let assemble = seconds(rounds, parts);
+    let mut parts = parts();
     let factorise = seconds(rounds, || parts.factorise(control).unwrap());
     let mut product = parts.product(control);
     [sweep, assemble, factorise, seconds(rounds, || product().unwrap())]
@@ -112,9 +106,7 @@ fn await_descent<T: Real>(
     let mut descent = Descent::new(model, workers);
     let (mut sweeps, mut taken) = (0, 0.0);
     while true_error(&descent.sensitivity, model.sensor(), workers) > AWAITED.1 {
-        let each = seconds(CHECK_EVERY, || {
-            let _ = descent.sweep(control).unwrap();
-        });
+        let each = seconds(CHECK_EVERY, || descent.sweep(control).unwrap());
         sweeps += CHECK_EVERY;
         taken += CHECK_EVERY as f64 * each;
     }
@@ -135,10 +127,10 @@ fn true_error(found: &[f64], shape: Shape, workers: &Workers) -> f64 {
     worst.into_iter().fold(0.0, f64::max)
 }
 
-fn seconds(rounds: usize, mut work: impl FnMut()) -> f64 {
+fn seconds<R>(rounds: usize, mut work: impl FnMut() -> R) -> f64 {
     let start = Instant::now();
     for _ in 0..rounds {
-        work();
+        drop(work());
     }
     start.elapsed().as_secs_f64() / rounds as f64
 }
