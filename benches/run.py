@@ -16,6 +16,7 @@ from pathlib import Path
 
 import averaging
 import numpy as np
+from peers import table as peers
 
 import equipix
 from equipix import simulate
@@ -32,6 +33,7 @@ def main(*, smoke: bool) -> None:
     rows = [rate_row(rate) for rate in rates]
     rows.append(numpy_row(rates[0], repetitions=1 if smoke else 7))
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
+    rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
     table = markdown(rows, rates[0]["threads"])
     print(table)
     if not smoke:
