@@ -4,7 +4,7 @@ D. C.-L. Fong, M. Saunders, "LSMR: An iterative algorithm for sparse least-squar
 J. Sci. Comput. 33, 2950 (2011). Weights 1 of y are weights y² of ln y, since a small step of ln y
 is that of y over y: each row of the matrix and its right side are multiplied by y. Columns are
 scaled to norm 1, which is LSMR's diagonal preconditioner (782×582 to 1e-4 with some 230 instead of
-280 iterations). The gauge is left to LSMR, whose solution is the shortest.
+270 iterations). The gauge is left to LSMR, whose solution is the shortest.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def race(
     by 2 %, so that nobody waits for it; a count is too high by at most as much.
     """
     spent, check, error = 0.0, 1, math.inf
-    for passes in range(1, 1 << 62):
+    for passes in count(1):
         start = time.perf_counter()
         estimate = next(estimates)
         spent += time.perf_counter() - start
