@@ -17,6 +17,7 @@ import cargo
 import large
 import multiscale
 import numpy as np
+from peers import table as peers
 
 import equipix
 from equipix import simulate
@@ -35,6 +36,7 @@ def main(*, smoke: bool) -> None:
     rows += multiscale.rows(smoke=smoke)
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
+    rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
     table = markdown(rows, rates[0]["threads"])
     print(table)
     if not smoke:
