@@ -52,7 +52,7 @@ fn measure<T: Real>(shape: Shape, precision: &str, convert: fn(f64) -> T, worker
     let model = Model::new(stack, geometry, &[1.0; 5], variance, mask, workers, &control).unwrap();
     let mut solution = None;
     let mut times: [Vec<f64>; 6] = Default::default();
-    for _ in 0..((1 << 26) / shape.len()).clamp(3, 15) {
+    for _ in 0..((1 << 25) / shape.len()).clamp(2, 9) {
         let [sweep, assemble, factorise, product] = pieces(&model, workers, &control);
         let whole = seconds(1, || {
             solution = calibrate(&model, Method::Multiscale, STOP, workers, &control).ok();
