@@ -121,14 +121,14 @@ def wait_after_interrupt(frames: np.ndarray, seconds: float) -> float:
         pressed.append(time.perf_counter())
         os.kill(os.getpid(), signal.SIGINT)
 
-    threading.Timer(seconds, press).start()
     try:
+        threading.Timer(seconds, press).start()
         equipix.calibrate(frames, SHIFTS)
         # Faster than before: there is nothing left to break off.
-        time.sleep(2 * seconds)
+        while True:
+            time.sleep(1)
     except KeyboardInterrupt:
-        pass
-    return time.perf_counter() - pressed[0]
+        return time.perf_counter() - pressed[0]
 
 
 if __name__ == "__main__":

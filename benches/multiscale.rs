@@ -86,15 +86,14 @@ fn measure<T: Real>(shape: Shape, precision: &str, convert: fn(f64) -> T, worker
 /// product with S.
 fn pieces<T: Real>(model: &Model<'_, T>, workers: &Workers, control: &Control) -> [f64; 4] {
     // Enough rounds that the clock and the first touch of memory do not count.
-    let rounds = (1 << 23) / model.sensor().len() + 2;
+    let rounds = (1 << 21) / model.sensor().len() + 2;
     let mut descent = Descent::new(model, workers);
     let sweep = seconds(rounds, || descent.sweep(control).unwrap());
-    let parts = || Parts::assemble(model, &descent, workers, control).unwrap();
-    let assemble = seconds(rounds, parts);
-    let mut parts = parts();
+    let mut parts = Parts::new(model, workers);
+    let assemble = seconds(rounds, || parts.assemble(&descent, control).unwrap());
     let factorise = seconds(rounds, || parts.factorise(control).unwrap());
-    let mut product = parts.product(control);
-    [sweep, assemble, factorise, seconds(rounds, || product().unwrap())]
+    let product = seconds(rounds, || parts.multiply(control).unwrap());
+    [sweep, assemble, factorise, product]
 }
 
 /// The sweeps and the seconds that coordinate descent takes.

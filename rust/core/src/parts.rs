@@ -15,21 +15,24 @@ pub struct Parts<'m, 'a, T> {
     model: &'m Model<'a, T>,
     workers: &'m Workers,
     reduced: Reduced<'m, 'a, T>,
+    x: Vec<f32>,
+    product: Vec<f32>,
 }
 
 impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
+    /// Room for it.
+    pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+        let reduced = Reduced::new(model, workers);
+        let [x, product] = [(); 2].map(|()| reduced.padding.zeros(model.sensor().rows, workers));
+        Self { model, workers, reduced, x, product }
+    }
+
     /// Assembles S at an estimate of M and L.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
-    pub fn assemble(
-        model: &'m Model<'a, T>,
-        descent: &Descent<'_, '_, T>,
-        workers: &'m Workers,
-        control: &Control,
-    ) -> Result<Self> {
-        let reduced = Reduced::new(model, &descent.sensitivity, descent.beams(), workers, control)?;
-        Ok(Self { model, workers, reduced })
+    pub fn assemble(&mut self, descent: &Descent<'_, '_, T>, control: &Control) -> Result<()> {
+        self.reduced.linearise(&descent.sensitivity, descent.beams(), control)
     }
 
     /// Assembles and factorises the coarse matrix.
@@ -37,13 +40,15 @@ impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     /// # Errors
     /// As [`assemble`](Self::assemble).
     pub fn factorise(&self, control: &Control) -> Result<()> {
-        TwoLevel::new(self.model, &self.reduced, self.workers, control).map(drop)
+        let mut two_level = TwoLevel::new(self.model, self.reduced.padding, self.workers);
+        two_level.prepare(&self.reduced, control)
     }
 
-    /// What multiplies S by M.
-    pub fn product(&mut self, control: &Control) -> impl FnMut() -> Result<()> {
-        let x = self.reduced.sensitivity.clone();
-        let mut product = vec![0.0; x.len()];
-        move || self.reduced.multiply(&x, &mut product, control).map(drop)
+    /// Multiplies S by an x.
+    ///
+    /// # Errors
+    /// As [`assemble`](Self::assemble).
+    pub fn multiply(&mut self, control: &Control) -> Result<f64> {
+        self.reduced.multiply(&self.x, &mut self.product, control)
     }
 }
