@@ -13,7 +13,7 @@ test: $(BIN)/.built-ci
 	$(BIN)/python -m pytest -m timing
 	$(BIN)/python -m pytest -m "not timing" -n 2 --dist worksteal
 
-bench: $(BIN)/.built-release
+bench: $(BIN)/.built-release $(BIN)/.installed-bench
 	$(BIN)/python benches/run.py
 
 figures: $(BIN)/.built-release
@@ -35,12 +35,17 @@ lint: $(BIN)/.built-ci docs
 audit:
 	@if command -v cargo-deny; then cargo deny --locked check; \
 	else echo "no cargo-deny: cargo install --locked cargo-deny"; fi
-	@if command -v pip-audit; then pip-audit -r requirements-dev.txt; \
+	@if command -v pip-audit; then pip-audit -r requirements-dev.txt -r requirements-bench.txt; \
 	else echo "no pip-audit: pipx install pip-audit"; fi
 
 $(BIN)/.installed: requirements-dev.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	touch $@
+
+# What the rivals in benches/peers need, and nothing else does.
+$(BIN)/.installed-bench: $(BIN)/.installed requirements-bench.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-bench.txt
 	touch $@
 
 # Only one build is installed at a time: that of the target asked for.

@@ -31,7 +31,7 @@ fn main() {
 fn measure(shape: Shape, repetitions: usize) {
     let workers = Workers::new(None).unwrap();
     let control = Control::new();
-    let data = frames(shape);
+    let data = frames(shape, &workers, |value| value as f32);
     let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
     let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
     let (variance, mask) = (Variance::Unknown, Mask::None);

@@ -6,16 +6,18 @@ from minute to minute. With ``--smoke`` everything runs once on little data and 
 
 from __future__ import annotations
 
-import json
 import os
 import platform
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import averaging
+import cargo
+import large
+import multiscale
 import numpy as np
+from peers import table as peers
 
 import equipix
 from equipix import simulate
@@ -28,23 +30,17 @@ SHIFTS = equipix.cross_pattern(11, 19)
 
 def main(*, smoke: bool) -> None:
     """Run all measurements."""
-    rates = sweep_rates(smoke=smoke)
+    rates = cargo.bench("rates", smoke=smoke)
     rows = [rate_row(rate) for rate in rates]
     rows.append(numpy_row(rates[0], repetitions=1 if smoke else 7))
+    rows += multiscale.rows(smoke=smoke)
+    rows += large.rows((96, 128)) if smoke else large.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
+    rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
     table = markdown(rows, rates[0]["threads"])
     print(table)
     if not smoke:
         (HERE / "RESULTS.md").write_text(table)
-
-
-def sweep_rates(*, smoke: bool) -> list[dict[str, float]]:
-    """One sweep beside a copy of its data, measured by benches/rates.rs."""
-    command = ["cargo", "bench", "--quiet", "--locked", "-p", "equipix-core", "--bench", "rates"]
-    if smoke:
-        command += ["--", "--test"]
-    output = subprocess.run(command, cwd=HERE.parent, check=True, capture_output=True, text=True)
-    return [json.loads(line) for line in output.stdout.splitlines() if line.startswith("{")]
 
 
 def rate_row(rate: dict[str, float]) -> Row:

@@ -45,7 +45,7 @@ fn naive_sweep(frames: &[f32], shape: Shape, sensitivity: &mut [f64], beam: &mut
 fn sweep(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("sweep");
     for shape in [Shape::new(240, 320), Shape::new(582, 782), Shape::new(1164, 1564)] {
-        let data = frames(shape);
+        let data = frames(shape, &Workers::new(None).unwrap(), |value| value as f32);
         group.throughput(Throughput::Elements(data.len() as u64));
         let mut sensitivity = vec![1.0; shape.len()];
         let mut beam = vec![0.0; (shape.rows + PAD) * (shape.cols + PAD)];

@@ -61,7 +61,12 @@ CHAIN = (
 )
 """The core: a module uses those to its right; none of two in one place uses the other."""
 
-BESIDE = {"centroid": {"connectivity"}, "io": {"statistics"}, "statistics": set[str]()}
+BESIDE = {
+    "centroid": {"connectivity"},
+    "io": {"statistics"},
+    "parts": {"descent", "model", "precondition", "reduced"},
+    "statistics": set[str](),
+}
 """Core modules beside the chain: they use these, and what is right of `geometry`."""
 
 CRATES = {

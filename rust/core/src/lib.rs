@@ -43,6 +43,7 @@
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
 //! centroid        a spot's centroid with its standard error     (uses connectivity)
+//! parts           the parts of a step of multiscale, for a bench (uses descent and below)
 //! ```
 //!
 //! # Where to start
@@ -124,6 +125,8 @@ pub mod memory;
 pub mod model;
 pub mod multiscale;
 pub mod parallel;
+#[doc(hidden)]
+pub mod parts;
 mod precondition;
 mod reduced;
 pub mod statistics;

@@ -1,0 +1,54 @@
+//! The parts of a step of [`multiscale`](crate::multiscale), one by one: for the bench that tells
+//! what assembling and factorising cost in products. No interface to rely on.
+
+use crate::control::Control;
+use crate::descent::Descent;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::model::Model;
+use crate::parallel::Workers;
+use crate::precondition::TwoLevel;
+use crate::reduced::Reduced;
+
+/// The linear problem of a step.
+pub struct Parts<'m, 'a, T> {
+    model: &'m Model<'a, T>,
+    workers: &'m Workers,
+    reduced: Reduced<'m, 'a, T>,
+    x: Vec<f32>,
+    product: Vec<f32>,
+}
+
+impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
+    /// Room for it.
+    pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+        let reduced = Reduced::new(model, workers);
+        let [x, product] = [(); 2].map(|()| reduced.padding.zeros(model.sensor().rows, workers));
+        Self { model, workers, reduced, x, product }
+    }
+
+    /// Assembles S at an estimate of M and L.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
+    pub fn assemble(&mut self, descent: &Descent<'_, '_, T>, control: &Control) -> Result<()> {
+        self.reduced.linearise(&descent.sensitivity, descent.beams(), control)
+    }
+
+    /// Assembles and factorises the coarse matrix.
+    ///
+    /// # Errors
+    /// As [`assemble`](Self::assemble).
+    pub fn factorise(&self, control: &Control) -> Result<()> {
+        let mut two_level = TwoLevel::new(self.model, self.reduced.padding, self.workers);
+        two_level.prepare(&self.reduced, control)
+    }
+
+    /// Multiplies S by an x.
+    ///
+    /// # Errors
+    /// As [`assemble`](Self::assemble).
+    pub fn multiply(&mut self, control: &Control) -> Result<f64> {
+        self.reduced.multiply(&self.x, &mut self.product, control)
+    }
+}
