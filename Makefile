@@ -18,6 +18,7 @@ bench: $(BIN)/.built-release
 
 figures: $(BIN)/.built-release
 	$(BIN)/python docs/figures.py
+	$(BIN)/python docs/convergence.py
 	$(BIN)/python docs/section3.py
 
 docs:
