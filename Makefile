@@ -19,6 +19,8 @@ bench: $(BIN)/.built-release
 figures: $(BIN)/.built-release
 	$(BIN)/python docs/figures.py
 	$(BIN)/python docs/convergence.py
+	$(BIN)/python docs/spectrum.py
+	$(BIN)/python docs/estimate.py
 	$(BIN)/python docs/section3.py
 
 docs:
