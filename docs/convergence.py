@@ -35,11 +35,11 @@ PRODUCTS = (1, *range(2, 20, 2), *range(20, 73, 4))
 """Where multiscale is stopped, unless it has ended."""
 
 
-def hard_case(shape: tuple[int, int]) -> tuple[NDArray, NDArray]:
+def hard_case(shape: tuple[int, int], arms: tuple[int, int] = ARMS) -> tuple[NDArray, NDArray]:
     """Make a sensor with 5 % of cosine over its whole size, and noise-free exposures of it."""
     truth = simulate.cosine_sensitivity(shape, rng=1)
     beam = simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782))
-    return truth, simulate.exposures(truth, beam, equipix.cross_pattern(*ARMS))
+    return truth, simulate.exposures(truth, beam, equipix.cross_pattern(*arms))
 
 
 def stopped(frames: NDArray, shifts: NDArray, method: str, limit: int) -> equipix.Calibration:

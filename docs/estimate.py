@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PROBLEMS = 500
-LIMITS = {"multiscale": (12, 60), "coordinate-descent": (1, 1000)}
+LIMITS = {"multiscale": (3, 60), "coordinate-descent": (1, 1000)}
 """Between which numbers of products or sweeps a method is stopped."""
 SHARP = 1e-10
 """Tolerance of what counts as the minimum; smaller errors are not compared with it."""
