@@ -11,6 +11,7 @@ use crate::memory;
 use crate::model::Model;
 use crate::multiscale;
 use crate::parallel::Workers;
+use crate::reduced::Padding;
 
 /// How to minimise F.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,11 +57,12 @@ pub fn calibrate<T: Real>(
     memory::check(bytes_needed(&model.geometry), || {
         format!("calibrating {} exposures of {}", model.count(), model.sensor())
     })?;
-    let components = Components::of(model, control)?;
     let (descent, history, left_out) = match method {
         Method::Multiscale => multiscale::solve(model, stop, workers, control)?,
         Method::CoordinateDescent => descent::solve(model, stop, workers, control)?,
     };
+    // After the solver, whose vectors then make room for the sets.
+    let components = Components::of(model, control)?;
     let mut beam = descent.beam();
     let mut sensitivity = descent.sensitivity;
     let means = component_means(&sensitivity, &components, &left_out);
@@ -86,22 +88,26 @@ pub fn calibrate<T: Real>(
     })
 }
 
-/// What coordinate descent holds beside the measurements at its fullest, in bytes:
+/// What a solver holds beside the measurements at its fullest, in bytes, where a *place* is a pixel
+/// of an image padded to the width of the beam:
 ///
-/// | array | for each pixel | for each cell of the beam |
-/// |---|---|---|
-/// | M; M before the sweep, then its step | 8 + 8 | |
-/// | labels of the components, with the room they were made in | 4 | 4 + 4 |
-/// | L in each view | | 8 a view |
-/// | the step, turned to and fro by the estimate | 8 + 8 | |
-/// | or, with turned exposures, L and each view's sums in a sweep | | 8 + 16 a view |
+/// | array | in bytes |
+/// |---|---|
+/// | M | 8 for each pixel |
+/// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
+/// | L², h | 2 · 4 for each place of each view |
+/// | L | 8 for each cell of each view |
+/// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
-/// Union-find comes before all these, with less: 21 for each pixel and 13 for each cell.
-const fn bytes_needed(geometry: &Geometry) -> u64 {
+/// The components come after the solver, with less: M, L, 21 for each pixel and 13 for each cell.
+fn bytes_needed(geometry: &Geometry) -> u64 {
+    let padding = Padding::of(geometry);
+    let places = |rows| padding.size(rows) as u64;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let views = geometry.views.len() as u64;
-    let passing = if views > 1 { (8 + 16 * views) * cells } else { 16 * pixels };
-    20 * pixels + (8 + 8 * views) * cells + passing
+    let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
+    let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
+    8 * pixels + 24 * places(geometry.sensor.rows) + of_views + 8 * views * cells + turned
 }
 
 /// Replaces each value by `scaled(value, label)`.

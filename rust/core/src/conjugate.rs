@@ -7,43 +7,72 @@
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::model::Model;
+use crate::parallel::Workers;
 use crate::precondition::TwoLevel;
 use crate::reduced::Reduced;
 
+/// Values that a thread takes at a time.
+const BLOCK: usize = 1 << 16;
 /// No eigenvalue that matters is smaller than 1/this: single precision could not tell it from 0.
 const LONGEST_STEP: f64 = 1e6;
 
-/// A solution in the making.
-pub(crate) struct Search<'s, 'm, 'a, T> {
-    reduced: &'s mut Reduced<'m, 'a, T>,
-    two_level: &'s mut TwoLevel<'m>,
+/// A solution in the making: all that it needs stays in one place from one problem to the next.
+pub(crate) struct Search<'m, 'a, T> {
+    workers: &'m Workers,
+    reduced: Reduced<'m, 'a, T>,
+    two_level: TwoLevel<'m>,
     /// b − S x.
-    residual: Vec<f32>,
+    pub(crate) residual: Vec<f32>,
     pub(crate) x: Vec<f32>,
     direction: Vec<f32>,
     product: Vec<f32>,
     /// r · P⁻¹ r.
     square: f64,
-    /// The largest size of P⁻¹ r.
-    pub(crate) largest: f64,
+    /// The largest size of P⁻¹ r, in the units of M.
+    largest: f64,
     pub(crate) ritz: Ritz,
 }
 
-impl<'s, 'm, 'a, T: Real> Search<'s, 'm, 'a, T> {
-    /// Starts from x = 0, where the residual is b.
-    pub(crate) fn new(
-        reduced: &'s mut Reduced<'m, 'a, T>,
-        two_level: &'s mut TwoLevel<'m>,
-        residual: Vec<f32>,
-    ) -> Self {
-        let [x, direction, product] = [(); 3].map(|()| vec![0.0; residual.len()]);
-        let ritz = Ritz::default();
-        let (square, largest) = (0.0, 0.0);
-        let mut search =
-            Self { reduced, two_level, residual, x, direction, product, square, largest, ritz };
-        search.square = search.descend(0.0);
-        search.largest = search.turn(0.0, 0.0);
-        search
+impl<'m, 'a, T: Real> Search<'m, 'a, T> {
+    /// Room for a search.
+    pub(crate) fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+        let reduced = Reduced::new(model, workers);
+        let [residual, x, direction, product] =
+            [(); 4].map(|()| reduced.padding.zeros(model.sensor().rows, workers));
+        Self {
+            workers,
+            two_level: TwoLevel::new(model, reduced.padding, workers),
+            reduced,
+            residual,
+            x,
+            direction,
+            product,
+            square: 0.0,
+            largest: 0.0,
+            ritz: Ritz::default(),
+        }
+    }
+
+    /// Starts from x = 0, where the residual is b, with S at M and L. The preconditioner is that of
+    /// the first start: it need not be exact.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn start(
+        &mut self,
+        sensitivity: &[f64],
+        beams: &[Vec<f64>],
+        control: &Control,
+    ) -> Result<()> {
+        self.reduced.linearise(sensitivity, beams, control)?;
+        self.two_level.prepare(&self.reduced, control)?;
+        self.reduced.padding.clear(&mut self.x, self.workers);
+        self.ritz = Ritz::default();
+        self.square = self.descend(0.0);
+        control.check()?;
+        self.largest = self.turn(0.0, 0.0);
+        Ok(())
     }
 
     /// One iteration: a step along the direction, and a new direction. `false` if there was none to
@@ -58,6 +87,7 @@ impl<'s, 'm, 'a, T: Real> Search<'s, 'm, 'a, T> {
             return Ok(false);
         }
         let square = self.descend(step);
+        control.check()?;
         let keep = square / self.square;
         self.square = square;
         self.largest = self.turn(step, keep);
@@ -65,23 +95,36 @@ impl<'s, 'm, 'a, T: Real> Search<'s, 'm, 'a, T> {
         Ok(square > 0.0)
     }
 
-    /// The largest size of the step found so far.
-    pub(crate) fn found(&self) -> f64 {
-        self.two_level.largest(&self.x)
+    /// The largest relative size of P⁻¹ r.
+    pub(crate) fn largest(&self) -> f64 {
+        self.largest / self.reduced.mean
     }
 
-    /// The root mean square of P⁻¹ b as the first look has it, weighted by D.
+    /// The largest relative size of the step found so far.
+    pub(crate) fn found(&self) -> f64 {
+        let blocks: Vec<&[f32]> = self.x.chunks(BLOCK).collect();
+        let size = |largest: f32, value: &f32| largest.max(value.abs());
+        let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
+        f64::from(tops.into_iter().fold(0.0, f32::max)) / self.reduced.mean
+    }
+
+    /// The pixels that have left the system.
+    pub(crate) fn left_out(self) -> Vec<usize> {
+        self.reduced.left_out
+    }
+
+    /// The root mean square of the relative size of P⁻¹ r, weighted by D.
     pub(crate) fn size(&self) -> f64 {
-        (self.square.max(0.0) / self.reduced.trace).sqrt()
+        (self.square.max(0.0) / self.reduced.trace).sqrt() / self.reduced.mean
     }
 
     fn descend(&mut self, step: f64) -> f64 {
-        self.two_level.descend(self.reduced, &mut self.residual, step, &self.product)
+        self.two_level.descend(&self.reduced, &mut self.residual, step, &self.product)
     }
 
     fn turn(&mut self, step: f64, keep: f64) -> f64 {
         let vectors = [&mut self.x[..], &mut self.direction[..]];
-        self.two_level.turn(self.reduced, &self.residual, vectors, [step, keep])
+        self.two_level.turn(&self.reduced, &self.residual, vectors, [step, keep])
     }
 }
 
@@ -101,6 +144,11 @@ impl Ritz {
         self.diagonal.push(1.0 / step + self.carried[0]);
         self.beside.push(self.carried[1]);
         self.carried = [keep / step, keep / (step * step)];
+    }
+
+    /// Whether no iteration was made.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.diagonal.is_empty()
     }
 
     /// The smallest eigenvalue, to three digits, by bisection on Sturm's count: below it no pivot

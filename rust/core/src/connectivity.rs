@@ -47,6 +47,10 @@ impl DisjointSets {
 
     /// Makes one set of the sets of `a` and `b`.
     pub fn union(&mut self, a: usize, b: usize) {
+        // Most are of one set already, and next to its root.
+        if self.parents[a] == self.parents[b] {
+            return;
+        }
         let (a, b) = (self.find(a), self.find(b));
         if a != b {
             self.parents[a.max(b)] = a.min(b) as u32;

@@ -27,8 +27,7 @@ use crate::estimate::{Ended, FEWEST_ITERATIONS, History, Look, Smallest, Stop};
 use crate::frames::Real;
 use crate::model::Model;
 use crate::parallel::Workers;
-use crate::precondition::TwoLevel;
-use crate::reduced::{Reduced, Scale};
+use crate::reduced::Scale;
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
@@ -51,7 +50,7 @@ pub fn solve<'m, 'a, T: Real>(
 ) -> Result<(Descent<'m, 'a, T>, History, Vec<usize>)> {
     let limit = stop.limit(MOST_SWEEPS)?;
     let mut descent = Descent::new(model, workers);
-    let mut estimator = Estimator { model, workers, two_level: None };
+    let (scale, mut search) = (Scale::of(model), Search::new(model, workers));
     let mut looks: Vec<Look> = Vec::new();
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
@@ -61,7 +60,7 @@ pub fn solve<'m, 'a, T: Real>(
         if sweep < next_look {
             continue;
         }
-        let (error, left_out) = estimator.look(&mut descent, control)?;
+        let error = look(&mut descent, scale, &mut search, control)?;
         looks.push(Look { sweep, objective, error });
         let ended = if error <= stop.tolerance {
             Ended::Converged
@@ -77,38 +76,22 @@ pub fn solve<'m, 'a, T: Real>(
             next_look = limit.min(sweep + wait);
             continue;
         };
-        return Ok((descent, History { looks, ended }, left_out));
+        return Ok((descent, History { looks, ended }, search.left_out()));
     }
 }
 
-/// Estimates the error of M between sweeps.
-struct Estimator<'m, 'a, T> {
-    model: &'m Model<'a, T>,
-    workers: &'m Workers,
-    two_level: Option<TwoLevel<'m>>,
-}
-
-impl<T: Real> Estimator<'_, '_, T> {
-    /// The estimated error after a sweep, and the pixels with almost no weight.
-    fn look(
-        &mut self,
-        descent: &mut Descent<'_, '_, T>,
-        control: &Control,
-    ) -> Result<(f64, Vec<usize>)> {
-        let Self { model, workers, two_level } = self;
-        let (residual, _) = descent.slopes(Scale::of(model).slope(), control)?;
-        let mut reduced =
-            Reduced::new(model, &descent.sensitivity, descent.beams(), workers, control)?;
-        let two_level = match two_level {
-            Some(two_level) => two_level,
-            none => none.insert(TwoLevel::new(model, &reduced, workers, control)?),
-        };
-        let mut search = Search::new(&mut reduced, two_level, residual);
-        let mut smallest = Smallest::default();
-        while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(&mut search, control)? {}
-        let error = smallest.error(&search) / descent.mean_sensitivity();
-        Ok((error, std::mem::take(&mut reduced.left_out)))
-    }
+/// The estimated error after a sweep.
+fn look<T: Real>(
+    descent: &mut Descent<'_, '_, T>,
+    scale: Scale,
+    search: &mut Search<'_, '_, T>,
+    control: &Control,
+) -> Result<f64> {
+    descent.slopes(scale.slope(), &mut search.residual, control)?;
+    search.start(&descent.sensitivity, descent.beams(), control)?;
+    let mut smallest = Smallest::default();
+    while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}
+    Ok(smallest.error(search))
 }
 
 /// Whether the estimate is tiny and no smaller than it was at half the sweeps.

@@ -99,12 +99,14 @@ impl History {
 pub(crate) struct Smallest {
     value: f64,
     pub(crate) iterations: u64,
+    /// Whether a search found no direction to go at once.
+    pub(crate) exhausted: bool,
 }
 
 impl Default for Smallest {
     /// The eigenvalue of smooth errors, known beforehand.
     fn default() -> Self {
-        Self { value: DAMPING, iterations: 0 }
+        Self { value: DAMPING, iterations: 0, exhausted: false }
     }
 }
 
@@ -112,24 +114,26 @@ impl Smallest {
     /// One more iteration of `search`; `false` if there was none to make.
     pub(crate) fn iterate<T: Real>(
         &mut self,
-        search: &mut Search<'_, '_, '_, T>,
+        search: &mut Search<'_, '_, T>,
         control: &Control,
     ) -> Result<bool> {
         let went = search.iterate(control)?;
         if went {
             self.iterations += 1;
             self.value = self.value.min(search.ritz.smallest());
+        } else {
+            self.exhausted = search.ritz.is_empty();
         }
         Ok(went)
     }
 
     /// The largest error, before the step that `search` has found is made.
-    pub(crate) fn error<T: Real>(&self, search: &Search<'_, '_, '_, T>) -> f64 {
+    pub(crate) fn error<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
         search.found() + self.left(search)
     }
 
     /// What is left of the error once the step that `search` has found is made.
-    pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, '_, T>) -> f64 {
-        search.largest / self.value
+    pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+        search.largest() / self.value
     }
 }

@@ -205,9 +205,8 @@ impl<'a, T: Real> Model<'a, T> {
         'a: 's,
     {
         let values = &self.frames.row(exposure, row)[cols.clone()];
-        let whole = self.tallies.get(exposure).is_some_and(|t| t.used == self.sensor().len());
-        if whole && !matches!(self.variance, Variance::Measurements(_)) {
-            return Stretch::Uniform(values, self.exposure_weight(exposure));
+        if let Some(weight) = self.uniform_weight(exposure) {
+            return Stretch::Uniform(values, weight);
         }
         let weights = &mut scratch[..values.len()];
         let variance = match self.variance {
@@ -218,6 +217,13 @@ impl<'a, T: Real> Model<'a, T> {
         let same = self.exposure_weight(exposure);
         pulp::Arch::new().dispatch(Weigh { values, variance, mask, same, weights: &mut *weights });
         Stretch::Weighted(values, weights)
+    }
+
+    /// The weight of an exposure's measurements if it is the same for all and all are used.
+    pub(crate) fn uniform_weight(&self, exposure: usize) -> Option<f64> {
+        let whole = self.tallies.get(exposure).is_some_and(|t| t.used == self.sensor().len());
+        let same = !matches!(self.variance, Variance::Measurements(_));
+        (whole && same).then(|| self.exposure_weight(exposure))
     }
 
     /// The weight of an exposure's measurements where it is the same for all.

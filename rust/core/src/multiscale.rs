@@ -16,8 +16,7 @@ use crate::estimate::{Ended, FEWEST_ITERATIONS, History, Look, Smallest, Stop};
 use crate::frames::Real;
 use crate::model::Model;
 use crate::parallel::Workers;
-use crate::precondition::TwoLevel;
-use crate::reduced::{Reduced, Scale};
+use crate::reduced::Scale;
 
 /// Products that nobody waits for: what takes so many is no experiment that this method can solve.
 const MOST_PRODUCTS: u64 = 100_000;
@@ -28,7 +27,7 @@ const PRECISION: f64 = 1e-5;
 /// Steps that may fail to lower the estimate before it counts as stalled.
 const PATIENCE: usize = 3;
 /// How often a step is halved before it is taken as it is.
-const MOST_HALVINGS: u32 = 10;
+const MOST_HALVINGS: i32 = 10;
 /// Products that an ordinary calibration takes: what progress is measured against at first.
 const TYPICAL: u64 = 60;
 
@@ -48,97 +47,66 @@ pub fn solve<'m, 'a, T: Real>(
     let limit = stop.limit(MOST_PRODUCTS)?;
     let scale = Scale::of(model);
     let mut descent = Descent::new(model, workers);
-    let mut two_level = None;
+    let mut search = Search::new(model, workers);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();
-    let mut step = Step::default();
+    let mut halvings = 0;
     let mut products = 0;
     loop {
-        let (residual, objective) = descent.slopes(scale.slope(), control)?;
+        let objective = descent.slopes(scale.slope(), &mut search.residual, control)?;
         products += 1;
-        // F is no parabola in M far from its minimum: a step may be too long.
+        // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
+        // where that takes more products than allowed.
         let rise =
             looks.last().is_some_and(|last| objective > last.objective + rounding(model, last));
-        if rise && products < limit && step.halve(&mut descent) {
+        if rise && halvings < MOST_HALVINGS {
+            halvings += 1;
+            descent.advance(&search.x, -(0.5_f64.powi(halvings)));
             continue;
         }
-        step = Step::default();
-        let mut reduced =
-            Reduced::new(model, &descent.sensitivity, descent.beams(), workers, control)?;
-        let two_level = match &mut two_level {
-            Some(two_level) => two_level,
-            none => none.insert(TwoLevel::new(model, &reduced, workers, control)?),
-        };
-        let mut search = Search::new(&mut reduced, two_level, residual);
-        let mean = descent.mean_sensitivity();
-        let error = smallest.error(&search) / mean;
-        looks.push(Look { sweep: products, objective, error });
-        control.report("calibrate", products, forecast(&looks, stop.tolerance).min(limit));
-        let certain = smallest.iterations >= FEWEST_ITERATIONS;
-        let ended = if certain && error <= stop.tolerance {
-            Some(Ended::Converged)
-        } else if products >= limit {
-            Some(Ended::SweepsUsed)
-        } else if stalled(&looks) {
-            Some(Ended::Stalled)
-        } else {
-            let aim = AIM * stop.tolerance * mean;
-            let made = go(&mut search, &mut smallest, aim, limit - products - 1, control)?;
-            products += made;
-            // Without a direction to go there is nothing left to find.
-            let exhausted = if error <= stop.tolerance { Ended::Converged } else { Ended::Stalled };
-            (made == 0 && products + 1 < limit).then_some(exhausted)
-        };
-        step.x = std::mem::take(&mut search.x);
-        if let Some(ended) = ended {
-            let left_out = std::mem::take(&mut reduced.left_out);
-            return Ok((descent, History { looks, ended }, left_out));
+        halvings = 0;
+        search.start(&descent.sensitivity, descent.beams(), control)?;
+        looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
+        if let Some(ended) = ended(&looks, &smallest, &stop, limit) {
+            return Ok((descent, History { looks, ended }, search.left_out()));
         }
-        drop(reduced);
-        descent.advance(&step.x, 1.0);
+        descent.forget_beams();
+        let total = forecast(&looks, stop.tolerance).min(limit);
+        let aim = AIM * stop.tolerance;
+        let reachable = reachable(&search);
+        while products + 1 < limit {
+            control.report("calibrate", products, total.max(products));
+            let near = search.largest() <= reachable || smallest.left(&search) <= aim;
+            let enough = near && smallest.iterations >= FEWEST_ITERATIONS;
+            if enough || !smallest.iterate(&mut search, control)? {
+                break;
+            }
+            products += 1;
+        }
+        descent.advance(&search.x, 1.0);
     }
 }
 
-/// Iterates until what is left of the error is `aim`, or no more than what linearising adds, or
-/// what single precision holds; returns the number of iterations.
-fn go<T: Real>(
-    search: &mut Search<'_, '_, '_, T>,
-    smallest: &mut Smallest,
-    aim: f64,
-    most: u64,
-    control: &Control,
-) -> Result<u64> {
-    let first = search.largest;
-    // The term of second order is a product of relative steps in M and in L.
-    let reachable = (first * search.size()).max(PRECISION * first);
-    for made in 0..most {
-        let near = search.largest <= reachable || smallest.left(search) <= aim;
-        if (near && smallest.iterations >= FEWEST_ITERATIONS)
-            || !smallest.iterate(search, control)?
-        {
-            return Ok(made);
-        }
+/// Why it has ended, if it has.
+fn ended(looks: &[Look], smallest: &Smallest, stop: &Stop, limit: u64) -> Option<Ended> {
+    let last = looks.last()?;
+    // Where there was no direction to go, there is nothing left to find.
+    let certain = smallest.iterations >= FEWEST_ITERATIONS || smallest.exhausted;
+    if certain && last.error <= stop.tolerance {
+        Some(Ended::Converged)
+    } else if last.sweep >= limit {
+        Some(Ended::SweepsUsed)
+    } else if smallest.exhausted || stalled(looks) {
+        Some(Ended::Stalled)
+    } else {
+        None
     }
-    Ok(most)
 }
 
-/// The last step taken, which may turn out to be too long.
-#[derive(Default)]
-struct Step {
-    x: Vec<f32>,
-    halvings: u32,
-}
-
-impl Step {
-    /// Takes half of what is left of the step back, if there is something left.
-    fn halve<T: Real>(&mut self, descent: &mut Descent<'_, '_, T>) -> bool {
-        if self.x.is_empty() || self.halvings == MOST_HALVINGS {
-            return false;
-        }
-        self.halvings += 1;
-        descent.advance(&self.x, -(0.5_f64.powi(self.halvings as i32)));
-        true
-    }
+/// The size of P⁻¹ r that a step can reach: what linearising adds, which is a product of relative
+/// steps in M and in L, or what single precision holds.
+fn reachable<T: Real>(search: &Search<'_, '_, T>) -> f64 {
+    search.largest() * search.size().max(PRECISION)
 }
 
 /// What F may rise by through rounding: that of a sum, and of residuals that are rounding alone.

@@ -44,15 +44,17 @@ pub(crate) const DAMPING: f64 = 0.25;
 const SPACING: usize = 3;
 /// Pixels between hats at least: closer ones cost more than they save.
 const LEAST_SPACING: usize = 8;
-/// Most hats: beyond, they cost more time and memory than the iterations that they save.
-const MOST_HATS: usize = 200_000;
+/// Most hats: their matrix is factorised in one go, which nothing interrupts, in less than half a
+/// second.
+const MOST_HATS: usize = 50_000;
 
 /// The preconditioner, at the weights for which it was made.
 pub(crate) struct TwoLevel<'m> {
     workers: &'m Workers,
+    geometry: &'m Geometry,
     padding: Padding,
     hats: Hats,
-    coarse: Coarse,
+    coarse: Option<Coarse>,
     /// One value a hat: Φᵀ r, then the heights y.
     heights: Vec<f64>,
     /// Those heights along the rows of the coarse grid, at every column of the sensor.
@@ -60,22 +62,34 @@ pub(crate) struct TwoLevel<'m> {
 }
 
 impl<'m> TwoLevel<'m> {
-    /// Sums and factorises the coarse matrix.
+    /// The hats over the sensor of `model`.
+    pub(crate) fn new<T: Real>(
+        model: &'m Model<'_, T>,
+        padding: Padding,
+        workers: &'m Workers,
+    ) -> Self {
+        let geometry = &model.geometry;
+        let hats = Hats::new(model.sensor(), spacing(geometry));
+        let spread = vec![0.0; hats.rows.nodes * padding.width];
+        let heights = vec![0.0; hats.count()];
+        Self { workers, geometry, padding, hats, coarse: None, heights, spread }
+    }
+
+    /// Sums and factorises the coarse matrix, unless that has been done at other weights: it need
+    /// not be exact.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn new<T: Real>(
-        model: &Model<'_, T>,
+    pub(crate) fn prepare<T: Real>(
+        &mut self,
         reduced: &Reduced<'_, '_, T>,
-        workers: &'m Workers,
         control: &Control,
-    ) -> Result<Self> {
-        let hats = Hats::new(model.sensor(), spacing(&model.geometry));
-        let coarse = Coarse::new(&hats, &model.geometry, reduced, workers, control)?;
-        let padding = reduced.padding;
-        let (heights, spread) =
-            (vec![0.0; hats.count()], vec![0.0; hats.rows.nodes * padding.width]);
-        Ok(Self { workers, padding, hats, coarse, heights, spread })
+    ) -> Result<()> {
+        if self.coarse.is_none() {
+            let Self { hats, geometry, workers, .. } = self;
+            self.coarse = Some(Coarse::new(hats, geometry, reduced, workers, control)?);
+        }
+        Ok(())
     }
 
     /// r ← r − a q, and finds P⁻¹ r, which [`turn`](Self::turn) makes use of; returns r · P⁻¹ r.
@@ -121,17 +135,12 @@ impl<'m> TwoLevel<'m> {
             }
         }
         let right = self.heights.clone();
-        self.coarse.solve(&mut self.heights, DAMPING);
+        match &self.coarse {
+            Some(coarse) => coarse.solve(&mut self.heights, DAMPING),
+            None => self.heights.fill(0.0),
+        }
         self.spread();
         by_diagonal + right.iter().zip(&self.heights).map(|(b, y)| b * y).sum::<f64>()
-    }
-
-    /// The largest size of an image's values.
-    pub(crate) fn largest(&self, image: &[f32]) -> f64 {
-        let blocks: Vec<&[f32]> = image.chunks(BAND * self.padding.width).collect();
-        let size = |largest: f32, value: &f32| largest.max(value.abs());
-        let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
-        f64::from(tops.into_iter().fold(0.0, f32::max))
     }
 
     /// The heights of the hats along the rows of the coarse grid.
@@ -185,7 +194,7 @@ impl<'m> TwoLevel<'m> {
 }
 
 /// Rows whose sums over hats a thread makes at a time.
-const SUMMED: usize = 16;
+const SUMMED: usize = 32;
 
 /// Φᵀ r over some rows of the sensor.
 struct CoarseSums<'h> {

@@ -23,14 +23,18 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Geometry, Placement, View};
-use crate::model::{Model, Stretch};
+use crate::model::Model;
 use crate::parallel::Workers;
-use kernel::{Diagonal, Divide, Gather, LANES, Line, Scatter, Weigh, Weight};
+use kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
+pub(crate) use kernel::{LANES, chunk};
 
 /// Rows that a thread works on at a time.
 pub(crate) const BAND: usize = 8;
 /// A pixel whose weight D is less than this share of the mean has nothing to tell the others.
 const LEAST_WEIGHT: f64 = 1e-6;
+
+/// A weight D below which single precision has no inverse.
+const FAINTEST: f32 = 1e-30;
 
 /// How the images of the linear problem lie in memory: rows of one width, with zeros behind each
 /// and before and after all of them.
@@ -53,9 +57,24 @@ impl Padding {
         Self { width: width.next_multiple_of(LANES), lead: reach.next_multiple_of(LANES) }
     }
 
+    /// Values of an image of so many rows.
+    pub(crate) const fn size(&self, rows: usize) -> usize {
+        2 * self.lead + rows * self.width
+    }
+
     /// An image of zeros.
-    pub(crate) fn zeros(&self, rows: usize) -> Vec<f32> {
-        vec![0.0; 2 * self.lead + rows * self.width]
+    ///
+    /// The zeros are written, by the threads that will use them: memory that is only reserved would
+    /// be mapped twice where it is read before it is written.
+    pub(crate) fn zeros(&self, rows: usize, workers: &Workers) -> Vec<f32> {
+        let mut image = vec![0.0; self.size(rows)];
+        self.clear(&mut image, workers);
+        image
+    }
+
+    /// Fills an image with zeros.
+    pub(crate) fn clear(&self, image: &mut [f32], workers: &Workers) {
+        workers.map_blocks(image, BAND * self.width, |_, part| part.fill(0.0));
     }
 
     /// All rows, without the zeros before and after.
@@ -64,20 +83,19 @@ impl Padding {
         &mut image[self.lead..end]
     }
 
-    /// An image of `shape` with the values that `value` gives for each position.
-    fn padded(
+    /// Writes an image of `shape` with the values that `value` gives for each position.
+    fn copy(
         &self,
         shape: Shape,
         workers: &Workers,
+        image: &mut [f32],
         value: impl Fn(usize) -> f32 + Sync + Send,
-    ) -> Vec<f32> {
-        let mut image = self.zeros(shape.rows);
-        workers.map_blocks(self.body_mut(&mut image), self.width, |row, padded| {
+    ) {
+        workers.map_blocks(self.body_mut(image), self.width, |row, padded| {
             for (col, padded) in padded[..shape.cols].iter_mut().enumerate() {
                 *padded = value(row * shape.cols + col);
             }
         });
-        image
     }
 
     /// A row of `image`.
@@ -108,6 +126,8 @@ pub(crate) struct Reduced<'m, 'a, T> {
     pub(crate) inverse_diagonal: Vec<f32>,
     /// Σ D over all pixels.
     pub(crate) trace: f64,
+    /// The mean of M over the pixels of the system.
+    pub(crate) mean: f64,
     /// The pixels that have left the system, of those with measurements.
     pub(crate) left_out: Vec<usize>,
     /// (L/scale)² in each view; 0 where unobserved.
@@ -138,36 +158,45 @@ impl Scale {
 }
 
 impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
-    /// The operator at M and L, the latter in each of the geometry's views.
+    /// Room for the operator of `model`.
+    pub(crate) fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+        let (padding, views) = (Padding::of(&model.geometry), &model.geometry.views);
+        let of_views = || views.iter().map(|v| padding.zeros(v.shape.rows, workers)).collect();
+        let of_sensor = || padding.zeros(model.sensor().rows, workers);
+        Self {
+            model,
+            workers,
+            scale: Scale::of(model),
+            padding,
+            sensitivity: of_sensor(),
+            inverse_diagonal: of_sensor(),
+            trace: 0.0,
+            mean: 1.0,
+            left_out: Vec::new(),
+            light: of_views(),
+            hidden: of_views(),
+        }
+    }
+
+    /// Makes it the operator at M and L, the latter in each of the geometry's views.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn new(
-        model: &'m Model<'a, T>,
+    pub(crate) fn linearise(
+        &mut self,
         sensitivity: &[f64],
         beams: &[Vec<f64>],
-        workers: &'m Workers,
         control: &Control,
-    ) -> Result<Self> {
-        let (padding, scale) = (Padding::of(&model.geometry), Scale::of(model));
-        let views = &model.geometry.views;
-        let light = |(view, beam): (&View, &Vec<f64>)| {
-            padding.padded(view.shape, workers, |cell| (beam[cell] / scale.light).powi(2) as f32)
-        };
-        let mut reduced = Self {
-            model,
-            workers,
-            scale,
-            padding,
-            sensitivity: padding.padded(model.sensor(), workers, |pixel| sensitivity[pixel] as f32),
-            inverse_diagonal: padding.zeros(model.sensor().rows),
-            trace: 0.0,
-            left_out: Vec::new(),
-            light: views.iter().zip(beams).map(light).collect(),
-            hidden: views.iter().map(|view| padding.zeros(view.shape.rows)).collect(),
-        };
-        reduced.invert_diagonal(control)?;
-        Ok(reduced)
+    ) -> Result<()> {
+        let Self { model, workers, padding, scale, .. } = *self;
+        padding.copy(model.sensor(), workers, &mut self.sensitivity, |p| sensitivity[p] as f32);
+        let views = model.geometry.views.iter().zip(beams).zip(&mut self.light);
+        for ((view, beam), light) in views {
+            let square = |cell: usize| (beam[cell] / scale.light).powi(2) as f32;
+            padding.copy(view.shape, workers, light, square);
+            control.check()?;
+        }
+        self.invert_diagonal(control)
     }
 
     /// Writes S x to `product` and returns x · S x.
@@ -237,8 +266,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     fn hide_turned(&self, x: &[f32], hidden: &mut [Vec<f32>], control: &Control) {
         let (padding, views) = (self.padding, &self.model.geometry.views);
         let gathered = |(index, view): (usize, &View)| {
-            let mut signal = padding.zeros(view.shape.rows);
-            let mut weight = padding.zeros(view.shape.rows);
+            let mut signal = padding.zeros(view.shape.rows, self.workers);
+            let mut weight = padding.zeros(view.shape.rows, self.workers);
             let (signals, weights) = (padding.body_mut(&mut signal), padding.body_mut(&mut weight));
             let size = BAND * padding.width;
             self.workers.map_pairs(signals, weights, size, |band, signals, weights| {
@@ -301,20 +330,29 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         let least = (LEAST_WEIGHT * self.trace / counts.iter().sum::<usize>() as f64) as f32;
         let sensitivity = padding.body_mut(&mut self.sensitivity);
         let size = BAND * padding.width;
-        let left_out =
-            self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
-                let mut left_out = Vec::new();
-                for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
-                    if *d > 0.0 && *d < least {
-                        *m = 0.0;
-                        let row = band * BAND + index / padding.width;
-                        left_out.push(row * cols + index % padding.width);
-                    }
-                    *d = if *d > 0.0 { 1.0 / *d } else { 0.0 };
+        let bands = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
+            let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
+            for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
+                if *d > 0.0 && *d < least {
+                    *m = 0.0;
+                    let row = band * BAND + index / padding.width;
+                    left_out.push(row * cols + index % padding.width);
+                } else if *d > 0.0 {
+                    sum += f64::from(*m);
+                    count += 1;
                 }
-                left_out
-            });
-        self.left_out = left_out.concat();
+                *d = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
+            }
+            (sum, count, left_out)
+        });
+        self.left_out.clear();
+        let (mut sum, mut count) = (0.0, 0);
+        for (of_band, in_band, left_out) in bands {
+            sum += of_band;
+            count += in_band;
+            self.left_out.extend(left_out);
+        }
+        self.mean = sum / count as f64;
         self.inverse_diagonal = diagonal;
         Ok(())
     }
@@ -390,20 +428,19 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         row: usize,
         scratch: &'s mut ExposureScratch,
     ) -> RowWeight<'s> {
-        let cols = self.model.sensor().cols;
         let factor = self.model.flux[exposure].powi(2) / self.scale.weight;
-        scratch.double.resize(cols, 0.0);
-        match self.model.stretch(exposure, row, 0..cols, &mut scratch.double) {
-            Stretch::Uniform(_, weight) => RowWeight::Same((weight * factor) as f32),
-            Stretch::Weighted(_, weights) => {
-                scratch.padded.resize(2 * self.padding.lead + self.padding.width, 0.0);
-                let padded = &mut scratch.padded[self.padding.lead..][..cols];
-                for (padded, weight) in padded.iter_mut().zip(weights) {
-                    *padded = (weight * factor) as f32;
-                }
-                RowWeight::Padded(&scratch.padded)
-            }
+        if let Some(weight) = self.model.uniform_weight(exposure) {
+            return RowWeight::Same((weight * factor) as f32);
         }
+        let cols = self.model.sensor().cols;
+        scratch.double.resize(cols, 1.0);
+        scratch.padded.resize(2 * self.padding.lead + self.padding.width, 0.0);
+        let padded = &mut scratch.padded[self.padding.lead..][..cols];
+        let _ = self.model.stretch(exposure, row, 0..cols, &mut scratch.double);
+        for (padded, weight) in padded.iter_mut().zip(&scratch.double) {
+            *padded = (weight * factor) as f32;
+        }
+        RowWeight::Padded(&scratch.padded)
     }
 
     pub(crate) fn scratch(&self) -> Scratch {

@@ -32,12 +32,11 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     /// Starts from a sensor of equal pixels, M = 1.
     #[must_use]
     pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
-        let cells = model.geometry.beam.len();
         Self {
             model,
             workers,
             sensitivity: vec![1.0; model.sensor().len()],
-            beams: vec![vec![0.0; cells]; model.geometry.views.len()],
+            beams: vec![Vec::new(); model.geometry.views.len()],
         }
     }
 
@@ -49,19 +48,37 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         self.with_best_beam(control, |descent, rows| descent.update_sensitivity(rows, control))
     }
 
-    /// Updates all L; returns half the slope of −F along each pixel's M, times `scale`, and F.
+    /// Updates all L; writes half the slope of −F along each pixel's M, times `scale`, to `slopes`
+    /// and returns F.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn slopes(&mut self, scale: f64, control: &Control) -> Result<(Vec<f32>, f64)> {
+    pub(crate) fn slopes(
+        &mut self,
+        scale: f64,
+        slopes: &mut [f32],
+        control: &Control,
+    ) -> Result<f64> {
         let padding = Padding::of(&self.model.geometry);
-        let mut slopes = padding.zeros(self.model.sensor().rows);
-        let body = padding.body_mut(&mut slopes);
-        let objective = self.with_best_beam(control, |descent, rows| {
+        let body = padding.body_mut(slopes);
+        self.with_best_beam(control, |descent, rows| {
             let body = &mut body[rows.start * padding.width..rows.end * padding.width];
             descent.measure_slopes(rows, scale, &padding, body, control)
-        })?;
-        Ok((slopes, objective))
+        })
+    }
+
+    /// Makes room for L where there is none, by the threads that will use it.
+    fn remember_beams(&mut self) {
+        let cells = self.model.geometry.beam.len();
+        for beam in self.beams.iter_mut().filter(|beam| beam.is_empty()) {
+            *beam = vec![0.0; cells];
+            self.workers.map_blocks(beam, PART, |_, part| part.fill(0.0));
+        }
+    }
+
+    /// Gives the memory of L back until it is found anew from M.
+    pub(crate) fn forget_beams(&mut self) {
+        self.beams.iter_mut().for_each(|beam| *beam = Vec::new());
     }
 
     /// Updates all L, and calls `work` for ranges of pixel rows, in order, once the cells that they
@@ -71,6 +88,7 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         control: &Control,
         mut work: impl FnMut(&mut Self, Range<usize>) -> Vec<f64>,
     ) -> Result<f64> {
+        self.remember_beams();
         let rows = self.model.sensor().rows;
         let mut bands = Vec::with_capacity(rows.div_ceil(BAND));
         if self.beams.len() == 1 {
@@ -111,13 +129,6 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
             }
         });
         beam
-    }
-
-    /// The mean of M.
-    pub(crate) fn mean_sensitivity(&self) -> f64 {
-        let blocks: Vec<&[f64]> = self.sensitivity.chunks(PART).collect();
-        let sums = self.workers.map(blocks.len(), |index| blocks[index].iter().sum::<f64>());
-        sums.into_iter().sum::<f64>() / self.sensitivity.len() as f64
     }
 
     /// Updates some rows of the beam, which has one view.

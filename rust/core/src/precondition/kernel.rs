@@ -1,12 +1,6 @@
 //! The arithmetic of the preconditioner and of the vectors of conjugate gradients, row by row.
 
-/// Neighbouring values that are worked on side by side.
-const LANES: usize = 16;
-
-#[inline(always)]
-fn chunk(values: &[f32], index: usize) -> &[f32; LANES] {
-    &values.as_chunks().0[index]
-}
+use crate::reduced::{LANES, chunk};
 
 /// r ← r − a q; returns r · r/D, and adds M r to the sums of the two coarse rows around.
 pub(super) struct Descend<'l> {
@@ -36,7 +30,7 @@ impl pulp::NullaryFnOnce for Descend<'_> {
             for i in 0..LANES {
                 let r = residual[i] - self.step * q[i];
                 residual[i] = r;
-                total[i] += r * r * d[i];
+                total[i] += r * (r * d[i]);
                 let part = self.height * (m[i] * r);
                 below[i] += part;
                 above[i] += m[i] * r - part;

@@ -1,7 +1,8 @@
 //! The arithmetic of a product with S: whole rows, side by side in vector registers.
 
-/// Neighbouring values that are worked on side by side.
-pub(super) const LANES: usize = 16;
+/// Neighbouring values that are worked on side by side: several registers full, so that what is done
+/// once a line and chunk does not count.
+pub(crate) const LANES: usize = 32;
 
 /// Weights w c² of one exposure along a row.
 #[derive(Clone, Copy)]
@@ -27,8 +28,9 @@ pub(super) struct Line<'s> {
     pub(super) second: &'s [f32],
 }
 
+/// Chunk number `index` of some values.
 #[inline(always)]
-fn chunk(values: &[f32], index: usize) -> &[f32; LANES] {
+pub(crate) fn chunk(values: &[f32], index: usize) -> &[f32; LANES] {
     &values.as_chunks().0[index]
 }
 
