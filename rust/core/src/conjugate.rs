@@ -17,6 +17,9 @@ const BLOCK: usize = 1 << 16;
 /// No eigenvalue that matters is smaller than 1/this: single precision could not tell it from 0.
 const LONGEST_STEP: f64 = 1e6;
 
+/// A relative error that is rounding alone.
+const ROUNDING: f64 = 4.0 * f64::EPSILON;
+
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
 pub(crate) struct Search<'m, 'a, T> {
     workers: &'m Workers,
@@ -68,6 +71,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         self.reduced.linearise(sensitivity, beams, control)?;
         self.two_level.prepare(&self.reduced, control)?;
         self.reduced.padding.clear(&mut self.x, self.workers);
+        self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
         self.square = self.descend(0.0);
         control.check()?;
@@ -83,7 +87,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     pub(crate) fn iterate(&mut self, control: &Control) -> Result<bool> {
         let curvature = self.reduced.multiply(&self.direction, &mut self.product, control)?;
         let step = self.square / curvature;
-        if !(step > 0.0 && step < LONGEST_STEP) {
+        if !(step > 0.0 && step < LONGEST_STEP) || self.largest() < ROUNDING {
             return Ok(false);
         }
         let square = self.descend(step);
@@ -95,9 +99,14 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         Ok(square > 0.0)
     }
 
+    /// A size of M in units of its mean.
+    fn relative(&self, size: f64) -> f64 {
+        if self.reduced.mean > 0.0 { size / self.reduced.mean } else { f64::INFINITY }
+    }
+
     /// The largest relative size of P⁻¹ r.
     pub(crate) fn largest(&self) -> f64 {
-        self.largest / self.reduced.mean
+        self.relative(self.largest)
     }
 
     /// The largest relative size of the step found so far.
@@ -105,17 +114,17 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         let blocks: Vec<&[f32]> = self.x.chunks(BLOCK).collect();
         let size = |largest: f32, value: &f32| largest.max(value.abs());
         let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
-        f64::from(tops.into_iter().fold(0.0, f32::max)) / self.reduced.mean
+        self.relative(f64::from(tops.into_iter().fold(0.0, f32::max)))
     }
 
-    /// The pixels that have left the system.
-    pub(crate) fn left_out(self) -> Vec<usize> {
-        self.reduced.left_out
+    /// The pixels that have left the system, with the step to the closed form of their M.
+    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
+        self.reduced.left_out()
     }
 
     /// The root mean square of the relative size of P⁻¹ r, weighted by D.
     pub(crate) fn size(&self) -> f64 {
-        (self.square.max(0.0) / self.reduced.trace).sqrt() / self.reduced.mean
+        self.relative((self.square.max(0.0) / self.reduced.trace).sqrt())
     }
 
     fn descend(&mut self, step: f64) -> f64 {

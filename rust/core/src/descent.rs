@@ -76,7 +76,8 @@ pub fn solve<'m, 'a, T: Real>(
             next_look = limit.min(sweep + wait);
             continue;
         };
-        return Ok((descent, History { looks, ended }, search.left_out()));
+        let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
+        return Ok((descent, History { looks, ended }, left_out));
     }
 }
 

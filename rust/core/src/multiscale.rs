@@ -50,6 +50,8 @@ pub fn solve<'m, 'a, T: Real>(
     let mut search = Search::new(model, workers);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();
+    let mut left_out: Vec<usize> = Vec::new();
+    let mut comparable = true;
     let mut halvings = 0;
     let mut products = 0;
     loop {
@@ -57,9 +59,11 @@ pub fn solve<'m, 'a, T: Real>(
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
-        let rise =
-            looks.last().is_some_and(|last| objective > last.objective + rounding(model, last));
-        if rise && halvings < MOST_HALVINGS {
+        let highest =
+            looks.last().map_or(f64::INFINITY, |last| last.objective + rounding(model, last));
+        // A number that is none is no fall either.
+        let fell = objective <= highest || (objective.is_finite() && !comparable);
+        if !fell && halvings < MOST_HALVINGS {
             halvings += 1;
             descent.advance(&search.x, -(0.5_f64.powi(halvings)));
             continue;
@@ -68,8 +72,17 @@ pub fn solve<'m, 'a, T: Real>(
         search.start(&descent.sensitivity, descent.beams(), control)?;
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         if let Some(ended) = ended(&looks, &smallest, &stop, limit) {
-            return Ok((descent, History { looks, ended }, search.left_out()));
+            for (pixel, step) in search.left_out() {
+                descent.sensitivity[pixel] += step;
+            }
+            let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
+            return Ok((descent, History { looks, ended }, left_out));
         }
+        // With M = 0 a pixel that has left the system does not bend L. F is another one then.
+        let now: Vec<usize> = search.left_out().map(|(pixel, _)| pixel).collect();
+        now.iter().for_each(|&pixel| descent.sensitivity[pixel] = 0.0);
+        comparable = now == left_out;
+        left_out = now;
         descent.forget_beams();
         let total = forecast(&looks, stop.tolerance).min(limit);
         let aim = AIM * stop.tolerance;

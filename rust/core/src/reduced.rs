@@ -30,8 +30,10 @@ pub(crate) use kernel::{LANES, chunk};
 
 /// Rows that a thread works on at a time.
 pub(crate) const BAND: usize = 8;
-/// A pixel whose weight D is less than this share of the mean has nothing to tell the others.
+/// A pixel whose weight D is less than this share of the median has nothing to tell the others.
 const LEAST_WEIGHT: f64 = 1e-6;
+/// Pixels that the median is taken from.
+const SAMPLES: usize = 4096;
 
 /// A weight D below which single precision has no inverse.
 const FAINTEST: f32 = 1e-30;
@@ -120,20 +122,40 @@ pub(crate) struct Reduced<'m, 'a, T> {
     workers: &'m Workers,
     scale: Scale,
     pub(crate) padding: Padding,
-    /// M; 0 at pixels that have left the system, whose equation is then D x = b.
+    /// M; 0 at pixels that have left the system.
     pub(crate) sensitivity: Vec<f32>,
-    /// 1/D; 0 at pixels without measurement.
+    /// 1/D; 0 at pixels without measurement and at those that have left the system.
     pub(crate) inverse_diagonal: Vec<f32>,
     /// Σ D over all pixels.
     pub(crate) trace: f64,
     /// The mean of M over the pixels of the system.
     pub(crate) mean: f64,
-    /// The pixels that have left the system, of those with measurements.
-    pub(crate) left_out: Vec<usize>,
+    left_out: Vec<LeftOut>,
     /// (L/scale)² in each view; 0 where unobserved.
     light: Vec<Vec<f32>>,
     /// h in each view: room for the first half of a product.
     hidden: Vec<Vec<f32>>,
+}
+
+/// A pixel that its measurements leave almost no weight.
+#[derive(Clone, Copy, Debug)]
+struct LeftOut {
+    /// Where it lies in an image, from the first row on.
+    place: usize,
+    /// 1/D.
+    inverse: f32,
+    /// The step to the closed form of its M.
+    step: f32,
+}
+
+/// The median of a sample of the values above 0: a few bright pixels do not move it.
+fn typical(values: &[f32]) -> f64 {
+    let step = values.len().div_ceil(SAMPLES);
+    // An odd step meets all columns.
+    let mut sample: Vec<f32> =
+        values.iter().copied().step_by(step | 1).filter(|&value| value > 0.0).collect();
+    sample.sort_unstable_by(f32::total_cmp);
+    sample.get(sample.len() / 2).map_or(0.0, |&median| f64::from(median))
 }
 
 /// The units of the linear problem.
@@ -311,7 +333,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         let body = padding.body_mut(&mut diagonal);
         let bands = self.workers.map_blocks(body, BAND * padding.width, |band, rows| {
             let mut scratch = self.scratch();
-            let (mut sum, mut measured) = (0.0, 0_usize);
+            let mut sum = 0.0;
             for (index, diagonal) in rows.chunks_exact_mut(padding.width).enumerate() {
                 if control.is_cancelled() {
                     break;
@@ -320,28 +342,27 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                 pulp::Arch::new().dispatch(Diagonal { lines: &lines, diagonal });
                 diagonal[cols..].fill(0.0);
                 sum += diagonal.iter().map(|&d| f64::from(d)).sum::<f64>();
-                measured += diagonal.iter().filter(|&&d| d > 0.0).count();
             }
-            (sum, measured)
+            sum
         });
         control.check()?;
-        let (sums, counts): (Vec<f64>, Vec<usize>) = bands.into_iter().unzip();
-        self.trace = sums.iter().sum();
-        let least = (LEAST_WEIGHT * self.trace / counts.iter().sum::<usize>() as f64) as f32;
+        self.trace = bands.into_iter().sum();
+        let least = (LEAST_WEIGHT * typical(body)) as f32;
         let sensitivity = padding.body_mut(&mut self.sensitivity);
         let size = BAND * padding.width;
         let bands = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
             let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
             for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
+                let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
                 if *d > 0.0 && *d < least {
-                    *m = 0.0;
-                    let row = band * BAND + index / padding.width;
-                    left_out.push(row * cols + index % padding.width);
+                    let place = band * size + index;
+                    left_out.push(LeftOut { place, inverse, step: 0.0 });
+                    (*m, *d) = (0.0, 0.0);
                 } else if *d > 0.0 {
+                    *d = inverse;
                     sum += f64::from(*m);
                     count += 1;
                 }
-                *d = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
             }
             (sum, count, left_out)
         });
@@ -355,6 +376,22 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         self.mean = sum / count as f64;
         self.inverse_diagonal = diagonal;
         Ok(())
+    }
+
+    /// Takes the pixels that have left the system out of the right-hand side.
+    pub(crate) fn settle(&mut self, residual: &mut [f32]) {
+        let residual = self.padding.body_mut(residual);
+        for out in &mut self.left_out {
+            out.step = residual[out.place] * out.inverse;
+            residual[out.place] = 0.0;
+        }
+    }
+
+    /// The pixels that have left the system, with the step to the closed form of their M.
+    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
+        let (width, cols) = (self.padding.width, self.model.sensor().cols);
+        let pixel = move |place: usize| place / width * cols + place % width;
+        self.left_out.iter().map(move |out| (pixel(out.place), f64::from(out.step)))
     }
 
     /// Adds ω = w c² L² M² of one exposure along a row of cells of its view to `sums`.

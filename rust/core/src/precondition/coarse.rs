@@ -18,9 +18,17 @@ const REACH: usize = 2;
 /// Places of a matrix element's row behind its column: the same coarse row, and those below.
 const STENCIL: usize = (REACH + 1) * (2 * REACH + 1);
 
-/// What is added to the diagonal, as a share of it: far below the eigenvalues that matter, which
-/// are some (spacing/size)², and above what single precision leaves in directions that do not.
+/// What is added to the diagonal, as a share of it: less than the eigenvalues of parts that hang
+/// together weakly.
 const RIDGE: f64 = 1e-6;
+/// A share of the diagonal that rounding alone leaves of an eigenvalue.
+const NOTHING: f64 = 1e-10;
+/// What is added if there are such eigenvalues, besides those of constants in a part, divided by the
+/// square of the nodes along a side: a tenth of the smallest eigenvalue of a sensor that hangs
+/// together. Single precision leaves errors in those directions, which must not be magnified.
+const SINGULAR_RIDGE: f64 = 0.3;
+/// Enough for eigenvalues that stand so far apart.
+const INVERSE_ITERATIONS: usize = 3;
 
 /// The factorised coarse matrix.
 pub(super) struct Coarse {
@@ -49,21 +57,41 @@ impl Coarse {
 
     fn factorised(matrix: &Matrix, hats: &Hats) -> Self {
         let mut sets = DisjointSets::new(hats.count());
-        let mut entries = Vec::new();
-        matrix.for_each(|row, col, value| {
-            sets.union(row, col);
-            entries.push((row.max(col) as u32, row.min(col) as u32, value));
-        });
+        matrix.for_each(|row, col, _| sets.union(row, col));
         let mut parts: Vec<Vec<(usize, f64)>> = vec![Vec::new(); hats.count()];
         for hat in 0..hats.count() {
-            let diagonal = matrix.diagonal(hat);
-            // A hat on which no weight falls stays at 0.
-            let ridge = if diagonal > 0.0 { RIDGE * diagonal } else { 1.0 };
-            entries.push((hat as u32, hat as u32, ridge));
             parts[sets.find(hat)].push((hat, hats.share(hat)));
         }
         parts.retain(|part| !part.is_empty());
-        Self { parts, factor: Cholesky::new(hats.count(), &entries) }
+        let coarse = Self { parts, factor: matrix.factor(RIDGE) };
+        if !coarse.is_singular(matrix) {
+            return coarse;
+        }
+        let nodes = hats.rows.nodes.max(hats.cols.nodes) as f64;
+        Self { factor: matrix.factor(SINGULAR_RIDGE / (nodes * nodes)), ..coarse }
+    }
+
+    /// Whether heights that are not constant in a part weigh nothing, by inverse iteration from
+    /// heights without any order.
+    fn is_singular(&self, matrix: &Matrix) -> bool {
+        let mut heights: Vec<f64> =
+            (0..matrix.near.len()).map(|hat| (hat as f64 * 2.4).sin()).collect();
+        let mut quotient = f64::INFINITY;
+        for _ in 0..INVERSE_ITERATIONS {
+            for (hat, height) in heights.iter_mut().enumerate() {
+                *height *= matrix.diagonal(hat);
+            }
+            self.solve(&mut heights, 1.0);
+            let scale: f64 = (0..heights.len())
+                .map(|hat| matrix.diagonal(hat) * heights[hat] * heights[hat])
+                .sum::<f64>()
+                .sqrt();
+            if scale > 0.0 {
+                heights.iter_mut().for_each(|height| *height /= scale);
+            }
+            quotient = matrix.energy(&heights);
+        }
+        quotient < NOTHING
     }
 
     /// Replaces a right-hand side, one value a hat, by the heights of the hats, times `factor`.
@@ -233,6 +261,31 @@ impl Matrix {
             }
         }
         self.far.iter().for_each(|&(row, col, value)| visit(row, col, value));
+    }
+
+    /// The factor of the matrix with a share `ridge` added to its diagonal. A hat on which no
+    /// weight falls stays at 0.
+    fn factor(&self, ridge: f64) -> Option<Cholesky> {
+        let mut entries = Vec::new();
+        self.for_each(|row, col, value| {
+            entries.push((row.max(col) as u32, row.min(col) as u32, value));
+        });
+        for hat in 0..self.near.len() {
+            let diagonal = self.diagonal(hat);
+            let more = if diagonal > 0.0 { ridge * diagonal } else { 1.0 };
+            entries.push((hat as u32, hat as u32, more));
+        }
+        Cholesky::new(self.near.len(), &entries)
+    }
+
+    /// yᵀAy for heights y.
+    fn energy(&self, heights: &[f64]) -> f64 {
+        let mut energy = 0.0;
+        self.for_each(|row, col, value| {
+            let both = if row == col { 1.0 } else { 2.0 };
+            energy += both * value * heights[row] * heights[col];
+        });
+        energy
     }
 
     /// The diagonal element of a hat.
