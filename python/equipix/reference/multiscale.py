@@ -12,7 +12,7 @@ there. It is 0 for x = M in each component, to which b is orthogonal. The step s
 
 Neighbouring pixels settle by the diagonal D(p) = Σ_k w·c²·L² of S; errors as wide as the sensor
 would take (sensor/shift) steps. So the preconditioner adds a solution for wide errors alone, on
-hats some shifts apart [1]_.
+hats some shifts apart [1]_: docs/method.md is a course on it.
 
 .. [1] W. L. Briggs, V. E. Henson, S. F. McCormick, A Multigrid Tutorial, 2nd ed., SIAM 2000.
 """
@@ -36,6 +36,8 @@ SPACING = 3
 """Distance of the hats, in extents of the shifts."""
 LEAST_SPACING = 8
 """The same in pixels, where shifts are small."""
+DAMPING = 0.25
+"""Factor of the solution on hats: errors that the diagonal sees as well would count twice."""
 LEAST_WEIGHT = 1e-6
 """Share of the mean weight D below which a pixel leaves the system."""
 LEAST_PRODUCTS = 10
@@ -157,7 +159,8 @@ def multiscale(
     hats = _hats(shape, np.ptp(np.asarray(shifts), axis=0))
     state = _state(data, np.ones(shape))
     history = [state.objective]
-    used, inner, theta, exhausted = 1, 0, 1.0, False
+    # What the hats alone see has the eigenvalue DAMPING.
+    used, inner, theta, exhausted = 1, 0, DAMPING, False
     while True:
         precondition = _two_levels(state, hats)
         estimate = state.size(precondition(state.slope)) / theta
@@ -300,14 +303,15 @@ def _hats(shape: tuple[int, ...], extent: NDArray[Any]) -> NDArray[Any]:
 
 
 def _hats_along(length: int, spacing: int) -> NDArray[Any]:
-    """Hats of one axis, shape (hats, length), no further apart than the spacing."""
-    nodes = np.linspace(0, length - 1, -(-(length - 1) // spacing) + 1)
+    """Hats of one axis, shape (hats, length), two at least and about the spacing apart."""
+    span = max(1, length - 1)
+    nodes = np.linspace(0, span, max(1, span // spacing) + 1)
     pixels = np.arange(length)
     return np.array([np.interp(pixels, nodes, peak) for peak in np.eye(len(nodes))])
 
 
 def _two_levels(state: _State, hats: NDArray[Any]) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    """P⁻¹·r = r/D + Φ·A⁺·Φᵀ·r, with Φ the hats times M and A = Φᵀ·S·Φ.
+    """P⁻¹·r = r/D + γ·Φ·A⁺·Φᵀ·r, with Φ the hats times M, A = Φᵀ·S·Φ and γ the damping.
 
     A is singular: waves that no shift sees are left out, to begin with that which is the same
     everywhere.
@@ -322,7 +326,7 @@ def _two_levels(state: _State, hats: NDArray[Any]) -> Callable[[NDArray[Any]], N
 
     def precondition(residual: NDArray[Any]) -> NDArray[Any]:
         wave = np.tensordot(inverse @ np.tensordot(phi, residual, 2), hats, 1)
-        return np.asarray(diagonal * residual + inner * (wave - wave.mean()))
+        return np.asarray(diagonal * residual + DAMPING * inner * (wave - wave.mean()))
 
     return precondition
 
