@@ -16,9 +16,9 @@ use crate::reduced::Padding;
 /// How to minimise F.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Method {
-    /// Gauss-Newton on all scales at once: see [`multiscale`](crate::multiscale).
+    /// Gauss-Newton on all scales at once: see [`multiscale`].
     Multiscale,
-    /// The method of the paper: see [`descent`](crate::descent).
+    /// The method of the paper: see [`descent`].
     CoordinateDescent,
 }
 

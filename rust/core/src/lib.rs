@@ -48,8 +48,9 @@
 //!
 //! # Where to start
 //!
-//! - To **calibrate from Rust**: the example below, then [`calibrate`] and [`descent::Stop`].
-//! - To **understand the method**: [`model`], [`descent`] and [`estimate`], in this order.
+//! - To **calibrate from Rust**: the example below, then [`calibrate`] and [`estimate::Stop`].
+//! - To **understand the method**: docs/method.md of the repository, then [`model`], [`descent`],
+//!   [`multiscale`] and [`estimate`].
 //! - To **average or read frames**: [`statistics::Accumulator`], and `io` for files.
 //! - To **work on this crate**: ARCHITECTURE.md and CONTRIBUTING.md of the repository; a new kernel
 //!   starts from the NumPy reference in `python/equipix/reference`.

@@ -1,8 +1,8 @@
 //! The fast solver: Gauss-Newton steps on all scales at once.
 //!
-//! Each step solves the linear problem of [`reduced`](crate::reduced) by conjugate gradients with
-//! the preconditioner of [`precondition`](crate::precondition), in single precision, and then takes
-//! M → M + x in double precision, with L at its closed form. The number of products does not depend
+//! Each step solves a linear problem (`reduced.rs`) by conjugate gradients with a preconditioner of
+//! two levels (`precondition.rs`), in single precision, and then takes M → M + x in double precision,
+//! with L at its closed form. The number of products does not depend
 //! on the size of the sensor, where coordinate descent takes (size/shift)² sweeps.
 //!
 //! The steps are linear in M. With M → M·eᵍ a dead pixel whose best M is below 0 would never get

@@ -21,7 +21,7 @@ mod kernel;
 
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::{Real, Shape};
+use crate::frames::Real;
 use crate::geometry::{Geometry, Placement, View};
 use crate::model::Model;
 use crate::parallel::Workers;
@@ -33,7 +33,7 @@ pub(crate) const BAND: usize = 8;
 /// A pixel whose weight D is less than this share of the median has nothing to tell the others.
 const LEAST_WEIGHT: f64 = 1e-6;
 /// Pixels that the median is taken from.
-const SAMPLES: usize = 4096;
+const SAMPLES: usize = 1024;
 
 /// A weight D below which single precision has no inverse.
 const FAINTEST: f32 = 1e-30;
@@ -85,17 +85,21 @@ impl Padding {
         &mut image[self.lead..end]
     }
 
-    /// Writes an image of `shape` with the values that `value` gives for each position.
+    /// Writes `values`, rows of `cols`, to an image.
     fn copy(
         &self,
-        shape: Shape,
+        values: &[f64],
+        cols: usize,
         workers: &Workers,
         image: &mut [f32],
-        value: impl Fn(usize) -> f32 + Sync + Send,
+        converted: impl Fn(f64) -> f32 + Sync + Send,
     ) {
-        workers.map_blocks(self.body_mut(image), self.width, |row, padded| {
-            for (col, padded) in padded[..shape.cols].iter_mut().enumerate() {
-                *padded = value(row * shape.cols + col);
+        workers.map_blocks(self.body_mut(image), BAND * self.width, |band, rows| {
+            let values = values[band * BAND * cols..].chunks_exact(cols);
+            for (row, values) in rows.chunks_exact_mut(self.width).zip(values) {
+                for (padded, &value) in row.iter_mut().zip(values) {
+                    *padded = converted(value);
+                }
             }
         });
     }
@@ -154,8 +158,11 @@ fn typical(values: &[f32]) -> f64 {
     // An odd step meets all columns.
     let mut sample: Vec<f32> =
         values.iter().copied().step_by(step | 1).filter(|&value| value > 0.0).collect();
-    sample.sort_unstable_by(f32::total_cmp);
-    sample.get(sample.len() / 2).map_or(0.0, |&median| f64::from(median))
+    if sample.is_empty() {
+        return 0.0;
+    }
+    let middle = sample.len() / 2;
+    f64::from(*sample.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 /// The units of the linear problem.
@@ -211,11 +218,12 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         control: &Control,
     ) -> Result<()> {
         let Self { model, workers, padding, scale, .. } = *self;
-        padding.copy(model.sensor(), workers, &mut self.sensitivity, |p| sensitivity[p] as f32);
+        let cols = model.sensor().cols;
+        padding.copy(sensitivity, cols, workers, &mut self.sensitivity, |m| m as f32);
         let views = model.geometry.views.iter().zip(beams).zip(&mut self.light);
         for ((view, beam), light) in views {
-            let square = |cell: usize| (beam[cell] / scale.light).powi(2) as f32;
-            padding.copy(view.shape, workers, light, square);
+            let square = |l: f64| (l / scale.light).powi(2) as f32;
+            padding.copy(beam, view.shape.cols, workers, light, square);
             control.check()?;
         }
         self.invert_diagonal(control)

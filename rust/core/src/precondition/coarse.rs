@@ -11,7 +11,7 @@ use crate::parallel::Workers;
 use crate::reduced::Reduced;
 
 /// Blocks of cells along the distance of two hats.
-const BLOCKS: usize = 4;
+const BLOCKS: usize = 3;
 /// Hats further apart than this, in rows or columns of the coarse grid, meet only where exposures
 /// are turned against each other.
 const REACH: usize = 2;
