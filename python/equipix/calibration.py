@@ -419,7 +419,8 @@ def _warn(calibration: Calibration, tolerance: float, ended: str) -> None:
         )
     if not calibration.converged:
         used_up = ended == "sweeps used"
-        remedy = "allow more sweeps" if used_up else "it falls no further, ask for a larger one"
+        stuck = "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
+        remedy = "allow more sweeps" if used_up else stuck
         warnings.warn(
             f"stopped after {calibration.sweeps} sweeps with an estimated error of "
             f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: {remedy}",

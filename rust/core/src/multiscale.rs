@@ -47,6 +47,7 @@ pub fn solve<'m, 'a, T: Real>(
     let limit = stop.limit(MOST_PRODUCTS)?;
     let scale = Scale::of(model);
     let mut descent = Descent::new(model, workers);
+    descent.start_bright(control)?;
     let mut search = Search::new(model, workers);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();

@@ -7,7 +7,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Placement, View};
-use crate::model::Model;
+use crate::model::{Model, Stretch};
 use crate::parallel::Workers;
 use crate::reduced::Padding;
 
@@ -17,6 +17,11 @@ const PART: usize = 1 << 16;
 const BAND: usize = 8;
 /// Bytes of data that may be expected to stay in the last-level cache.
 const IN_CACHE: usize = 1 << 25;
+
+/// How many times brighter than those around a pixel starts from its own brightness.
+const BRIGHT: f64 = 4.0;
+/// So many pixels on either side of it.
+const AROUND: usize = 4;
 
 /// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
 pub struct Descent<'m, 'a, T> {
@@ -38,6 +43,37 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
             sensitivity: vec![1.0; model.sensor().len()],
             beams: vec![Vec::new(); model.geometry.views.len()],
         }
+    }
+
+    /// Starts pixels that are much brighter than those around, in every exposure, from what they
+    /// show: with M = 1 they would make the beam bright that they see, and their neighbours dark.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn start_bright(&mut self, control: &Control) -> Result<()> {
+        let (model, cols) = (self.model, self.model.sensor().cols);
+        self.workers.map_blocks(&mut self.sensitivity, BAND * cols, |band, rows| {
+            let mut scratch = vec![0.0; cols];
+            for (index, pixels) in rows.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
+                }
+                let shown = darkest(model, band * BAND + index, &mut scratch);
+                for (col, m) in pixels.iter_mut().enumerate() {
+                    let around = &shown[col.saturating_sub(AROUND)..cols.min(col + AROUND + 1)];
+                    // Most are settled by the two at the ends.
+                    if shown[col] > BRIGHT * around[0].min(around[around.len() - 1]) {
+                        let mut around = around.to_vec();
+                        let middle = around.len() / 2;
+                        let median = *around.select_nth_unstable_by(middle, f64::total_cmp).1;
+                        if median > 0.0 && shown[col] > BRIGHT * median && shown[col].is_finite() {
+                            *m = shown[col] / median;
+                        }
+                    }
+                }
+            }
+        });
+        control.check()
     }
 
     /// One sweep: all L, then all M. Returns F after it.
@@ -276,6 +312,27 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     pub(crate) fn beams(&self) -> &[Vec<f64>] {
         &self.beams
     }
+}
+
+/// The least y/c of each pixel of a row; infinite without measurement.
+fn darkest<T: Real>(model: &Model<'_, T>, row: usize, scratch: &mut [f64]) -> Vec<f64> {
+    let mut least = vec![f64::INFINITY; scratch.len()];
+    for (exposure, flux) in model.flux.iter().enumerate() {
+        match model.stretch(exposure, row, 0..least.len(), scratch) {
+            Stretch::Uniform(values, _) => {
+                for (least, value) in least.iter_mut().zip(values) {
+                    *least = least.min(value.to_f64() / flux);
+                }
+            }
+            Stretch::Weighted(values, weights) => {
+                for ((least, value), &weight) in least.iter_mut().zip(values).zip(weights) {
+                    let value = if weight > 0.0 { value.to_f64() / flux } else { f64::INFINITY };
+                    *least = least.min(value);
+                }
+            }
+        }
+    }
+    least
 }
 
 /// Copies `beam` into the orientation of `view`.
