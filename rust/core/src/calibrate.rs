@@ -11,6 +11,7 @@ use crate::memory;
 use crate::model::Model;
 use crate::multiscale;
 use crate::parallel::Workers;
+use crate::precondition;
 use crate::reduced::Padding;
 
 /// How to minimise F.
@@ -97,6 +98,7 @@ pub fn calibrate<T: Real>(
 /// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
 /// | L², h | 2 · 4 for each place of each view |
 /// | L | 8 for each cell of each view |
+/// | the coarse matrix and its factor | some 2700 for each hat |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
 /// The components come after the solver, with less: M, L, 21 for each pixel and 13 for each cell.
@@ -107,7 +109,8 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let views = geometry.views.len() as u64;
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
-    8 * pixels + 24 * places(geometry.sensor.rows) + of_views + 8 * views * cells + turned
+    let images = 24 * places(geometry.sensor.rows) + of_views;
+    8 * pixels + images + 8 * views * cells + turned + precondition::bytes_needed(geometry)
 }
 
 /// Replaces each value by `scaled(value, label)`.
