@@ -105,7 +105,7 @@ def test_the_bytes_named_are_those_it_takes(turn):
 
 def test_a_process_is_refused_or_finishes_whatever_its_limit():
     """Nobody dies of too few bytes in between."""
-    answers = calibrations([*range(60, 260, 20)])
+    answers = calibrations([*range(60, 320, 20)])
     assert "needs" in answers[0]
     assert answers[-1].isdigit()
     assert "died" not in answers

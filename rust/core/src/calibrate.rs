@@ -98,7 +98,7 @@ pub fn calibrate<T: Real>(
 /// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
 /// | L², h | 2 · 4 for each place of each view |
 /// | L | 8 for each cell of each view |
-/// | the coarse matrix and its factor | some 2700 for each hat |
+/// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
 /// The components come after the solver, with less: M, L, 21 for each pixel and 13 for each cell.

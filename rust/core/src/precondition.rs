@@ -48,6 +48,10 @@ const LEAST_SPACING: usize = 8;
 /// second.
 const MOST_HATS: usize = 50_000;
 
+/// Most hats where exposures are turned against each other: hats far apart meet then, and the factor
+/// of their matrix is nearly full.
+const MOST_HATS_TURNED: usize = 1000;
+
 /// The preconditioner, at the weights for which it was made.
 pub(crate) struct TwoLevel<'m> {
     workers: &'m Workers,
@@ -249,10 +253,11 @@ impl<'h> CoarseSums<'h> {
     }
 }
 
-/// What the matrix of the hats and its factor take in bytes, as measured for 28 000 and 51 000 hats.
+/// What the matrix of the hats and its factor take in bytes: as measured for 28 000 and 51 000 hats,
+/// or those of a full matrix, twice, where exposures are turned against each other.
 pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
-    const BYTES_A_HAT: usize = 2700;
-    (BYTES_A_HAT * Hats::new(geometry.sensor, spacing(geometry)).count()) as u64
+    let hats = Hats::new(geometry.sensor, spacing(geometry)).count() as u64;
+    if geometry.views.len() > 1 { 16 * hats * hats } else { 2700 * hats }
 }
 
 /// How far apart hats stand, along rows and columns of the sensor.
@@ -266,6 +271,7 @@ fn spacing(geometry: &Geometry) -> [usize; 2] {
         (0..geometry.views.len()).map(of_view).max().unwrap_or(0)
     };
     let reach = [reach(|place| place.row), reach(|place| place.col)];
-    let area = (geometry.sensor.len() / MOST_HATS).isqrt();
+    let most = if geometry.views.len() > 1 { MOST_HATS_TURNED } else { MOST_HATS };
+    let area = (geometry.sensor.len() / most).isqrt();
     reach.map(|reach| (SPACING * reach).max(LEAST_SPACING).max(area))
 }

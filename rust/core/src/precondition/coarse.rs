@@ -1,5 +1,7 @@
 //! The coarse matrix A = Φᵀ S Φ, summed over blocks of beam cells, and its factor.
 
+use std::collections::HashMap;
+
 use super::hats::Hats;
 use crate::connectivity::DisjointSets;
 use crate::control::Control;
@@ -206,12 +208,17 @@ struct Matrix {
     cols: usize,
     /// By hat and place in the stencil.
     near: Vec<[f64; STENCIL]>,
-    far: Vec<(usize, usize, f64)>,
+    /// Of hats that meet only because exposures are turned against each other.
+    far: HashMap<(usize, usize), f64>,
 }
 
 impl Matrix {
     fn new(hats: &Hats) -> Self {
-        Self { cols: hats.cols.nodes, near: vec![[0.0; STENCIL]; hats.count()], far: Vec::new() }
+        Self {
+            cols: hats.cols.nodes,
+            near: vec![[0.0; STENCIL]; hats.count()],
+            far: HashMap::new(),
+        }
     }
 
     /// Adds Σ_k Ω_k (φ_k − φ̄)(φ_k − φ̄)ᵀ, φ̄ the weighted mean.
@@ -244,11 +251,11 @@ impl Matrix {
     /// Adds to the element of two hats, the first being the one with the lower number.
     fn add(&mut self, first: usize, second: usize, value: f64) {
         let rows = second / self.cols - first / self.cols;
-        let cols = second % self.cols + REACH - first % self.cols;
-        if rows <= REACH && cols <= 2 * REACH {
-            self.near[first][rows * (2 * REACH + 1) + cols] += value;
-        } else {
-            self.far.push((first, second, value));
+        match (second % self.cols + REACH).checked_sub(first % self.cols) {
+            Some(cols) if rows <= REACH && cols <= 2 * REACH => {
+                self.near[first][rows * (2 * REACH + 1) + cols] += value;
+            }
+            _ => *self.far.entry((first, second)).or_default() += value,
         }
     }
 
@@ -260,7 +267,10 @@ impl Matrix {
                 visit(hat, hat + rows * self.cols + cols - REACH, value);
             }
         }
-        self.far.iter().for_each(|&(row, col, value)| visit(row, col, value));
+        // The order of the map is another one each time, that of the elements is not.
+        let mut far: Vec<_> = self.far.iter().collect();
+        far.sort_unstable_by_key(|(place, _)| **place);
+        far.iter().for_each(|&(&(row, col), &value)| visit(row, col, value));
     }
 
     /// The factor of the matrix with a share `ridge` added to its diagonal. A hat on which no
