@@ -244,11 +244,11 @@ impl Matrix {
     /// Adds to the element of two hats, the first being the one with the lower number.
     fn add(&mut self, first: usize, second: usize, value: f64) {
         let rows = second / self.cols - first / self.cols;
-        let cols = second % self.cols + REACH - first % self.cols;
-        if rows <= REACH && cols <= 2 * REACH {
-            self.near[first][rows * (2 * REACH + 1) + cols] += value;
-        } else {
-            self.far.push((first, second, value));
+        match (second % self.cols + REACH).checked_sub(first % self.cols) {
+            Some(cols) if rows <= REACH && cols <= 2 * REACH => {
+                self.near[first][rows * (2 * REACH + 1) + cols] += value;
+            }
+            _ => self.far.push((first, second, value)),
         }
     }
 
