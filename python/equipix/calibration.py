@@ -78,8 +78,8 @@ class Calibration:
     beam_origin : tuple of int
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0 is
-        ``DEAD | DO_NOT_USE``.
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0, or by no
+        more than the tolerance, is ``DEAD | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     flux : ndarray, shape (n,), float64
@@ -375,7 +375,9 @@ def calibrate(
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    calibration.flags[calibration.sensitivity <= 0] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
+    calibration.flags[calibration.sensitivity <= tolerance] |= np.uint32(
+        Flag.DEAD | Flag.DO_NOT_USE
+    )
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
     _warn(calibration, tolerance, result.ended)
@@ -419,7 +421,9 @@ def _warn(calibration: Calibration, tolerance: float, ended: str) -> None:
         )
     if not calibration.converged:
         used_up = ended == "sweeps used"
-        stuck = "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
+        stuck = (
+            "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
+        )
         remedy = "allow more sweeps" if used_up else stuck
         warnings.warn(
             f"stopped after {calibration.sweeps} sweeps with an estimated error of "
