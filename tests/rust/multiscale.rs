@@ -81,10 +81,10 @@ fn explained() -> impl Strategy<Value = Experiment> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(64))]
+    #![proptest_config(ProptestConfig::with_cases(32))]
     #[test]
     fn the_minimum_is_that_of_many_sweeps(experiment in explained()) {
-        let stop = Stop { tolerance: 1e-7, max_sweeps: Some(100_000) };
+        let stop = Stop { tolerance: 1e-7, max_sweeps: Some(20_000) };
         if let Ok((objective, true)) = swept(&experiment, stop) {
             let (_, history) = solved(&experiment, stop, 2).unwrap();
             // Values of order 1 that are off by ten times the tolerance, in F squared.
