@@ -92,7 +92,7 @@ def test_calibrate_names_what_is_wrong(options, message):
 def test_an_unmet_tolerance_says_what_would_meet_it():
     with pytest.warns(ConvergenceWarning, match="allow more sweeps"):
         equipix.calibrate(frames(), CROSS, max_sweeps=2)
-    with pytest.warns(ConvergenceWarning, match="rounding is the limit, ask for a larger"):
+    with pytest.warns(ConvergenceWarning, match="it falls no further: ask for a larger"):
         equipix.calibrate(frames(), CROSS, tolerance=1e-300)
 
 

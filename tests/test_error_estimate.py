@@ -1,4 +1,9 @@
-"""The estimated error of the sensitivity where light or masks nearly cut the sensor in two."""
+"""The estimated error of the sensitivity: honest at any moment, whatever the experiment.
+
+It is one of order, no bound. What is asked of it: the true error, the largest distance of M to the
+minimum of F, is below three times the estimate in 95 % of all cases and never above ten times; and
+the median of estimate over true error is at most ten.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,80 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import simulate
+from equipix import reference, simulate
 
 CROSS = equipix.cross_pattern(5, 7)
+METHODS = ["multiscale", "coordinate-descent"]
+MOST_SWEEPS = {"multiscale": 60, "coordinate-descent": 1000}
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::equipix.errors.ConvergenceWarning", "ignore::equipix.errors.IdentifiabilityWarning"
+)
+
+
+def random_experiment(seed, smallest=16, largest=128):
+    """Frames, shifts and mask of a small experiment of any kind."""
+    rng = np.random.default_rng(seed)
+    shape = tuple(np.exp(rng.uniform(np.log(smallest), np.log(largest + 1), 2)).astype(int))
+    shifts = random_pattern(rng, shape)
+    beam = simulate.gaussian_beam(shape, width=max(shape) * np.exp(rng.uniform(-0.3, 2)))
+    if rng.random() < 0.3:
+        beam = simulate.striped_beam(shape)
+    truth = simulate.cosine_sensitivity(shape, rng=rng)
+    frames = simulate.exposures(truth, beam, shifts)
+    noise, missing = rng.choice([0, rng.uniform(0, 1e-2)]), rng.choice([0, rng.uniform(0, 0.2)])
+    frames += noise * rng.standard_normal(frames.shape)
+    return frames, shifts, rng.random(frames.shape) < missing
+
+
+def random_pattern(rng, shape):
+    """A cross, or from three to eight positions up to half a sensor apart."""
+    half = np.array(shape) // 2
+    if rng.random() < 0.4:
+        return equipix.cross_pattern(*rng.choice(np.arange(1, min(half)), 2, replace=False))
+    reach = rng.integers(1, half + 1)
+    return rng.integers(-reach // 2, reach // 2 + 1, (rng.integers(3, 9), 2))
+
+
+def minimiser(frames, shifts, mask):
+    return equipix.calibrate(frames, shifts, mask=mask, tolerance=1e-12)
+
+
+def test_the_minimiser_that_errors_are_measured_from_is_that_of_dense_algebra():
+    for seed in range(12):
+        frames, shifts, mask = random_experiment(seed, smallest=8, largest=12)
+        dense = reference.solve_dense(frames, shifts, mask=mask)
+        found = minimiser(frames, shifts, mask)
+        # Ten times what the estimate says, and the rounding of a dense solution, whose condition
+        # is that of the data alone: below 1e5.
+        atol = 10 * found.error_estimate + 1e5 * np.finfo(float).eps
+        np.testing.assert_allclose(found.sensitivity, dense.sensitivity, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_it_is_honest_wherever_a_run_is_stopped(method):
+    ratios = []
+    for seed in range(200):
+        frames, shifts, mask = random_experiment(seed)
+        rng = np.random.default_rng([seed, 1])
+        best = minimiser(frames, shifts, mask)
+        stopped = equipix.calibrate(
+            frames,
+            shifts,
+            mask=mask,
+            method=method,
+            max_sweeps=int(np.exp(rng.uniform(0, np.log(MOST_SWEEPS[method])))),
+            tolerance=1e-8,
+        )
+        assert stopped.converged == (stopped.error_estimate <= 1e-8)
+        true = np.nanmax(abs(stopped.sensitivity - best.sensitivity))
+        # How far the minimum itself is known.
+        true = max(true - best.error_estimate, 0)
+        ratios.append(true / stopped.error_estimate)
+    ratios = np.array(ratios)
+    assert (ratios < 3).mean() >= 0.95
+    assert ratios.max() <= 10
+    assert 1 / np.median(ratios) <= 10
 
 
 def dark_stripe(rows, cols):
@@ -38,15 +114,22 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-6])
+@pytest.mark.parametrize(
+    ("method", "tolerance"),
+    # Coordinate descent to 1e-6 takes some ten thousand sweeps.
+    [("multiscale", t) for t in (1e-2, 1e-3, 1e-4, 1e-6)]
+    + [("coordinate-descent", t) for t in (1e-2, 1e-3, 1e-4)],
+)
 @pytest.mark.parametrize("case", CASES)
-def test_what_has_converged_is_within_an_order_of_the_estimate(case, tolerance):
+def test_what_has_converged_is_within_an_order_of_the_estimate(case, tolerance, method):
     shape, beam, mask = CASES[case]
     halves = np.where(np.arange(shape[1]) < shape[1] // 2, 1.02, 0.98)
     truth = simulate.paper_sensitivity(shape, rng=1) * halves
     frames = simulate.exposures(truth, beam, CROSS)
-    cal = equipix.calibrate(frames, CROSS, mask=mask, tolerance=tolerance)
+    cal = equipix.calibrate(frames, CROSS, mask=mask, method=method, tolerance=tolerance)
     true = np.nanmax(np.abs(simulate.relative_error(cal.sensitivity, truth)))
     assert cal.converged
-    # The band that the hard case has to keep: the estimate is one of order, not a bound.
-    assert 1 / 10 <= cal.error_estimate / true <= 10
+    assert true <= 10 * cal.error_estimate
+    # By how much it is too large is asked of the median of all experiments alone; but coordinate
+    # descent makes the step that ten products find part of its estimate, which sharpens it.
+    assert method == "multiscale" or cal.error_estimate <= 10 * true

@@ -54,7 +54,7 @@ class History:
     sweep : ndarray, shape (looks,), uint64
         How many sweeps had been made.
     objective : ndarray, shape (looks,), float64
-        Objective F; it never rises.
+        Objective F; it never rises but for rounding.
     error_estimate : ndarray, shape (looks,), float64
         The estimated largest relative error of the sensitivity.
     """
@@ -78,8 +78,8 @@ class Calibration:
     beam_origin : tuple of int
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0 is
-        ``DEAD | DO_NOT_USE``.
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0, or by no
+        more than the tolerance, is ``DEAD | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     flux : ndarray, shape (n,), float64
@@ -281,8 +281,9 @@ def calibrate(
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Most passes over the data or its weights; unless given, as many as it takes. It also ends
-        where rounding keeps the error estimate from falling. Passes that only estimate the error
+        Most passes over the data or its weights, but for a few where a step turns out too long;
+        unless given, as many as it takes. It also ends where rounding keeps the error estimate
+        from falling. Passes that only estimate the error
         of coordinate descent are not counted.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
@@ -375,7 +376,9 @@ def calibrate(
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    calibration.flags[calibration.sensitivity <= 0] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
+    calibration.flags[calibration.sensitivity <= tolerance] |= np.uint32(
+        Flag.DEAD | Flag.DO_NOT_USE
+    )
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
     _warn(calibration, tolerance, result.ended)
@@ -419,7 +422,9 @@ def _warn(calibration: Calibration, tolerance: float, ended: str) -> None:
         )
     if not calibration.converged:
         used_up = ended == "sweeps used"
-        stuck = "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
+        stuck = (
+            "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
+        )
         remedy = "allow more sweeps" if used_up else stuck
         warnings.warn(
             f"stopped after {calibration.sweeps} sweeps with an estimated error of "

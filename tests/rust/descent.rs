@@ -1,5 +1,7 @@
 //! Coordinate descent beside the same sweep in its plainest form, and the laws it must obey.
 
+mod experiment;
+
 use std::num::NonZeroUsize;
 
 use equipix_core::Result;
@@ -9,36 +11,10 @@ use equipix_core::frames::{Shape, Stack};
 use equipix_core::geometry::{Geometry, Rotation};
 use equipix_core::model::{Mask, Model, Variance};
 use equipix_core::parallel::Workers;
+use experiment::{Experiment, experiments, rounding_of_objective};
 use proptest::prelude::*;
 
-/// Everything that one small experiment consists of.
-#[derive(Clone, Debug)]
-struct Experiment {
-    shape: Shape,
-    shifts: Vec<[i64; 2]>,
-    rotations: Vec<Rotation>,
-    flux: Vec<f64>,
-    frames: Vec<f64>,
-    variance: Vec<f64>,
-    mask: Vec<bool>,
-}
-
 impl Experiment {
-    /// Calls `visit` with the model of this experiment.
-    fn with_model<R>(
-        &self,
-        workers: &Workers,
-        visit: impl FnOnce(&Model<'_, f64>) -> Result<R>,
-    ) -> Result<R> {
-        let (count, shape) = (self.shifts.len(), self.shape);
-        let frames = Stack::new("frames", &self.frames, count, shape)?;
-        let variance = Stack::new("variance", &self.variance, count, shape)?;
-        let geometry = Geometry::new(shape, &self.shifts, &self.rotations)?;
-        let (variance, mask) = (Variance::Measurements(variance), Mask::Measurements(&self.mask));
-        let control = Control::new();
-        visit(&Model::new(frames, geometry, &self.flux, variance, mask, workers, &control)?)
-    }
-
     /// F after each sweep, and M and L after the last.
     fn swept(&self, sweeps: usize, workers: usize) -> Result<(Vec<f64>, Vec<f64>, Vec<f64>)> {
         let workers = Workers::new(NonZeroUsize::new(workers))?;
@@ -105,47 +81,11 @@ fn replace(values: &mut [f64], sums: &[[f64; 2]]) {
     }
 }
 
-/// Small sensors and ones longer than a vector, with gaps, noise and any rotation.
-fn experiments() -> impl Strategy<Value = Experiment> {
-    let rotation = prop::sample::select(vec![
-        Rotation::None,
-        Rotation::Quarter,
-        Rotation::Half,
-        Rotation::ThreeQuarters,
-    ]);
-    let sizes = (1..12_usize, 1..40_usize, 2..6_usize, any::<bool>());
-    sizes.prop_flat_map(move |(rows, cols, count, turned)| {
-        let side = rows.min(cols) as i64 - 1;
-        let reach = if turned { [side, side] } else { [rows as i64 - 1, cols as i64 - 1] };
-        let shift = (-reach[0]..=reach[0], -reach[1]..=reach[1]).prop_map(|(r, c)| [r, c]);
-        let rotation = if turned { rotation.clone().boxed() } else { Just(Rotation::None).boxed() };
-        let size = rows * cols * count;
-        let value = prop_oneof![12 => 0.5..1.5, 1 => Just(f64::NAN)];
-        let each = (
-            prop::collection::vec(shift, count),
-            prop::collection::vec(rotation, count),
-            prop::collection::vec(0.5..2.0, count),
-            prop::collection::vec(value, size),
-            prop::collection::vec(0.5..2.0, size),
-            prop::collection::vec(prop::bool::weighted(0.1), size),
-        );
-        each.prop_map(move |(shifts, rotations, flux, frames, variance, mask)| {
-            let shape = Shape::new(rows, cols);
-            Experiment { shape, shifts, rotations, flux, frames, variance, mask }
-        })
-    })
-}
-
 /// Rounding of `sweeps` sweeps: each takes two quotients of sums of some n + 3 roundings of
 /// numbers of one sign, whose errors the next sweep averages.
 fn close(got: &[f64], wanted: &[f64], sweeps: usize) -> bool {
     let rounding = (8 * sweeps * 9) as f64 * f64::EPSILON;
     got.iter().zip(wanted).all(|(a, b)| (a - b).abs() <= rounding * b.abs())
-}
-
-/// What rounding leaves of F where everything is fitted exactly: the residuals are not 0 then.
-fn rounding_of_objective(experiment: &Experiment) -> f64 {
-    experiment.frames.len() as f64 * (10.0 * f64::EPSILON).powi(2)
 }
 
 proptest! {
@@ -158,8 +98,10 @@ proptest! {
             let wanted = experiment.naively_swept(sweeps).unwrap();
             prop_assert!(close(&sensitivity, &wanted.1, sweeps));
             prop_assert!(close(&beam, &wanted.2, sweeps));
-            let floor = rounding_of_objective(&experiment);
+            // √F is a norm of the residuals: it is off by no more than that of their rounding.
+            let floor = rounding_of_objective(&experiment).sqrt();
             for (got, wanted) in objective.iter().zip(wanted.0) {
+                let (got, wanted) = (got.sqrt(), wanted.sqrt());
                 prop_assert!((got - wanted).abs() <= 1e-9 * wanted + floor);
             }
         }

@@ -131,20 +131,19 @@ fn rescale(
 /// The mean sensitivity of each component, without the pixels `left_out` unless nothing else is
 /// there.
 fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usize]) -> Vec<f64> {
-    let mut sums = vec![(0.0, 0_usize); components.sizes.len()];
-    for (&value, &label) in sensitivity.iter().zip(&components.pixels) {
-        if let Ok(label) = usize::try_from(label) {
-            sums[label] = (sums[label].0 + value, sums[label].1 + 1);
+    let mut kept = vec![(0.0, 0_usize); components.sizes.len()];
+    let mut all = kept.clone();
+    let mut left_out = left_out.iter().peekable();
+    for (pixel, (&value, &label)) in sensitivity.iter().zip(&components.pixels).enumerate() {
+        let is_out = left_out.next_if_eq(&&pixel).is_some();
+        let Ok(label) = usize::try_from(label) else { continue };
+        all[label] = (all[label].0 + value, all[label].1 + 1);
+        if !is_out {
+            kept[label] = (kept[label].0 + value, kept[label].1 + 1);
         }
     }
-    let whole = sums.clone();
-    for &pixel in left_out {
-        if let Ok(label) = usize::try_from(components.pixels[pixel]) {
-            sums[label] = (sums[label].0 - sensitivity[pixel], sums[label].1 - 1);
-        }
-    }
-    let mean = |(sum, count): (f64, usize)| sum / count as f64;
-    sums.into_iter().zip(whole).map(|(s, all)| mean(if s.1 > 0 { s } else { all })).collect()
+    let chosen = kept.iter().zip(&all).map(|(kept, all)| if kept.1 > 0 { kept } else { all });
+    chosen.map(|(sum, count)| sum / *count as f64).collect()
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge.

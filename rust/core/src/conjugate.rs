@@ -71,6 +71,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         self.reduced.linearise(sensitivity, beams, control)?;
         self.two_level.prepare(&self.reduced, control)?;
         self.reduced.padding.clear(&mut self.x, self.workers);
+        self.reduced.padding.clear(&mut self.direction, self.workers);
         self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
         self.square = self.descend(0.0);
@@ -87,7 +88,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     pub(crate) fn iterate(&mut self, control: &Control) -> Result<bool> {
         let curvature = self.reduced.multiply(&self.direction, &mut self.product, control)?;
         let step = self.square / curvature;
-        if !(step > 0.0 && step < LONGEST_STEP) || self.largest() < ROUNDING {
+        if !(step > 0.0 && step < LONGEST_STEP) || self.is_settled() {
             return Ok(false);
         }
         let square = self.descend(step);
@@ -101,7 +102,13 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
 
     /// A size of M in units of its mean.
     fn relative(&self, size: f64) -> f64 {
-        if self.reduced.mean > 0.0 { size / self.reduced.mean } else { f64::INFINITY }
+        let known = self.reduced.mean > 0.0 && self.square.is_finite() && size.is_finite();
+        if known { size / self.reduced.mean } else { f64::INFINITY }
+    }
+
+    /// Whether what is left is rounding alone.
+    pub(crate) fn is_settled(&self) -> bool {
+        self.largest() < ROUNDING
     }
 
     /// The largest relative size of P⁻¹ r.

@@ -99,14 +99,16 @@ impl History {
 pub(crate) struct Smallest {
     value: f64,
     pub(crate) iterations: u64,
-    /// Whether a search found no direction to go at once.
-    pub(crate) exhausted: bool,
+    /// Whether the last search found no direction to go at once: nothing is left but rounding, or
+    /// else rounding has spoilt the problem.
+    pub(crate) settled: bool,
+    pub(crate) stuck: bool,
 }
 
 impl Default for Smallest {
     /// The eigenvalue of smooth errors, known beforehand.
     fn default() -> Self {
-        Self { value: DAMPING, iterations: 0, exhausted: false }
+        Self { value: DAMPING, iterations: 0, settled: false, stuck: false }
     }
 }
 
@@ -122,7 +124,8 @@ impl Smallest {
             self.iterations += 1;
             self.value = self.value.min(search.ritz.smallest());
         } else {
-            self.exhausted = search.ritz.is_empty();
+            self.settled = search.is_settled();
+            self.stuck = search.ritz.is_empty() && !self.settled;
         }
         Ok(went)
     }

@@ -24,6 +24,8 @@ const MOST_PRODUCTS: u64 = 100_000;
 const AIM: f64 = 0.8;
 /// The most that one step reduces the error by: single precision holds no more.
 const PRECISION: f64 = 1e-5;
+/// What linearising adds at most counts as this share of a step, far from the minimum.
+const MOST_CURVED: f64 = 0.1;
 /// Steps that may fail to lower the estimate before it counts as stalled.
 const PATIENCE: usize = 3;
 /// How often a step is halved before it is taken as it is.
@@ -51,8 +53,6 @@ pub fn solve<'m, 'a, T: Real>(
     let mut search = Search::new(model, workers);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();
-    let mut left_out: Vec<usize> = Vec::new();
-    let mut comparable = true;
     let mut halvings = 0;
     let mut products = 0;
     loop {
@@ -60,30 +60,28 @@ pub fn solve<'m, 'a, T: Real>(
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
-        let highest =
-            looks.last().map_or(f64::INFINITY, |last| last.objective + rounding(model, last));
+        let noise = looks.last().map_or(f64::INFINITY, |last| rounding(model, last));
+        let highest = looks.last().map_or(f64::INFINITY, |last| last.objective + noise);
         // A number that is none is no fall either.
-        let fell = objective <= highest || (objective.is_finite() && !comparable);
-        if !fell && halvings < MOST_HALVINGS {
+        if !(objective <= highest) && halvings <= MOST_HALVINGS {
             halvings += 1;
-            descent.advance(&search.x, -(0.5_f64.powi(halvings)));
+            // The last time, what is left of the step is taken back.
+            let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS));
+            descent.advance(&search.x, -share);
             continue;
         }
+        let stuck = halvings > MOST_HALVINGS;
         halvings = 0;
         search.start(&descent.sensitivity, descent.beams(), control)?;
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
-        if let Some(ended) = ended(&looks, &smallest, &stop, limit) {
+        smallest.stuck |= stuck;
+        if let Some(ended) = ended(&looks, &smallest, &stop, limit, noise) {
             for (pixel, step) in search.left_out() {
                 descent.sensitivity[pixel] += step;
             }
             let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
             return Ok((descent, History { looks, ended }, left_out));
         }
-        // With M = 0 a pixel that has left the system does not bend L. F is another one then.
-        let now: Vec<usize> = search.left_out().map(|(pixel, _)| pixel).collect();
-        now.iter().for_each(|&pixel| descent.sensitivity[pixel] = 0.0);
-        comparable = now == left_out;
-        left_out = now;
         descent.forget_beams();
         let total = forecast(&looks, stop.tolerance).min(limit);
         let aim = AIM * stop.tolerance;
@@ -102,15 +100,20 @@ pub fn solve<'m, 'a, T: Real>(
 }
 
 /// Why it has ended, if it has.
-fn ended(looks: &[Look], smallest: &Smallest, stop: &Stop, limit: u64) -> Option<Ended> {
+fn ended(
+    looks: &[Look],
+    smallest: &Smallest,
+    stop: &Stop,
+    limit: u64,
+    rounding: f64,
+) -> Option<Ended> {
     let last = looks.last()?;
-    // Where there was no direction to go, there is nothing left to find.
-    let certain = smallest.iterations >= FEWEST_ITERATIONS || smallest.exhausted;
+    let certain = smallest.iterations >= FEWEST_ITERATIONS || smallest.settled;
     if certain && last.error <= stop.tolerance {
         Some(Ended::Converged)
     } else if last.sweep >= limit {
         Some(Ended::SweepsUsed)
-    } else if smallest.exhausted || stalled(looks) {
+    } else if smallest.settled || smallest.stuck || stalled(looks, rounding) {
         Some(Ended::Stalled)
     } else {
         None
@@ -120,7 +123,7 @@ fn ended(looks: &[Look], smallest: &Smallest, stop: &Stop, limit: u64) -> Option
 /// The size of P⁻¹ r that a step can reach: what linearising adds, which is a product of relative
 /// steps in M and in L, or what single precision holds.
 fn reachable<T: Real>(search: &Search<'_, '_, T>) -> f64 {
-    search.largest() * search.size().max(PRECISION)
+    search.largest() * search.size().clamp(PRECISION, MOST_CURVED)
 }
 
 /// What F may rise by through rounding: that of a sum, and of residuals that are rounding alone.
@@ -130,11 +133,12 @@ fn rounding<T: Real>(model: &Model<'_, T>, last: &Look) -> f64 {
     1e-12 * last.objective + weights * residual * residual
 }
 
-/// Whether the estimate has not fallen by half for some steps.
-fn stalled(looks: &[Look]) -> bool {
+/// Whether neither the estimate has fallen by half for some steps, nor F by more than rounding.
+fn stalled(looks: &[Look], rounding: f64) -> bool {
     let Some(earlier) = looks.len().checked_sub(PATIENCE + 1) else { return false };
     let best = |looks: &[Look]| looks.iter().map(|look| look.error).fold(f64::INFINITY, f64::min);
-    2.0 * best(&looks[earlier + 1..]) > best(&looks[..=earlier])
+    let fell = looks[earlier].objective - looks[looks.len() - 1].objective;
+    2.0 * best(&looks[earlier + 1..]) > best(&looks[..=earlier]) && fell <= rounding
 }
 
 /// The number of products in all, if the error goes on to fall as it did from the first look on.
@@ -142,5 +146,9 @@ fn forecast(looks: &[Look], tolerance: f64) -> u64 {
     let [first, .., last] = looks else { return TYPICAL };
     let rate = (first.error / last.error).ln() / (last.sweep - first.sweep) as f64;
     let missing = (last.error / tolerance).ln() / rate;
-    if missing.is_finite() && rate > 0.0 { last.sweep + missing.max(0.0) as u64 } else { TYPICAL }
+    if missing.is_finite() && rate > 0.0 {
+        last.sweep.saturating_add(missing.max(0.0) as u64)
+    } else {
+        TYPICAL
+    }
 }

@@ -35,6 +35,9 @@ const LEAST_WEIGHT: f64 = 1e-6;
 /// Pixels that the median is taken from.
 const SAMPLES: usize = 1024;
 
+/// The largest squared light and weight, in units of an ordinary one: products of several stay within
+/// single precision. Beyond, S is softer than it is, and steps are shortened.
+const LARGEST: f64 = 1e12;
 /// A weight D below which single precision has no inverse.
 const FAINTEST: f32 = 1e-30;
 
@@ -126,7 +129,7 @@ pub(crate) struct Reduced<'m, 'a, T> {
     workers: &'m Workers,
     scale: Scale,
     pub(crate) padding: Padding,
-    /// M; 0 at pixels that have left the system.
+    /// M.
     pub(crate) sensitivity: Vec<f32>,
     /// 1/D; 0 at pixels without measurement and at those that have left the system.
     pub(crate) inverse_diagonal: Vec<f32>,
@@ -155,7 +158,6 @@ struct LeftOut {
 /// The median of a sample of the values above 0: a few bright pixels do not move it.
 fn typical(values: &[f32]) -> f64 {
     let step = values.len().div_ceil(SAMPLES);
-    // An odd step meets all columns.
     let mut sample: Vec<f32> =
         values.iter().copied().step_by(step | 1).filter(|&value| value > 0.0).collect();
     if sample.is_empty() {
@@ -168,16 +170,15 @@ fn typical(values: &[f32]) -> f64 {
 /// The units of the linear problem.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scale {
-    /// The light of a bright pixel.
+    /// The light that an ordinary pixel sees.
     light: f64,
-    /// The mean of w c².
+    /// An ordinary w c².
     weight: f64,
 }
 
 impl Scale {
     pub(crate) fn of<T: Real>(model: &Model<'_, T>) -> Self {
-        let weights: f64 = model.exposure_weights().iter().sum();
-        Self { light: model.brightest(), weight: weights / model.used() as f64 }
+        Self { light: model.typical_light(), weight: model.typical_weight() }
     }
 
     /// What half a slope of F is multiplied by to become a right-hand side.
@@ -222,7 +223,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         padding.copy(sensitivity, cols, workers, &mut self.sensitivity, |m| m as f32);
         let views = model.geometry.views.iter().zip(beams).zip(&mut self.light);
         for ((view, beam), light) in views {
-            let square = |l: f64| (l / scale.light).powi(2) as f32;
+            let square = |l: f64| (l / scale.light).powi(2).min(LARGEST) as f32;
             padding.copy(beam, view.shape.cols, workers, light, square);
             control.check()?;
         }
@@ -355,21 +356,20 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         });
         control.check()?;
         self.trace = bands.into_iter().sum();
-        let least = (LEAST_WEIGHT * typical(body)) as f32;
+        let least = ((LEAST_WEIGHT * typical(body)) as f32).max(FAINTEST);
         let sensitivity = padding.body_mut(&mut self.sensitivity);
         let size = BAND * padding.width;
         let bands = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
             let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
-            for (index, (m, d)) in sensitivity.iter_mut().zip(rows).enumerate() {
-                let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
-                if *d > 0.0 && *d < least {
-                    let place = band * size + index;
-                    left_out.push(LeftOut { place, inverse, step: 0.0 });
-                    (*m, *d) = (0.0, 0.0);
-                } else if *d > 0.0 {
-                    *d = inverse;
+            for (index, (m, d)) in sensitivity.iter().zip(rows).enumerate() {
+                if *d > least {
+                    *d = 1.0 / *d;
                     sum += f64::from(*m);
                     count += 1;
+                } else if *d > 0.0 {
+                    let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
+                    left_out.push(LeftOut { place: band * size + index, inverse, step: 0.0 });
+                    *d = 0.0;
                 }
             }
             (sum, count, left_out)
@@ -475,7 +475,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     ) -> RowWeight<'s> {
         let factor = self.model.flux[exposure].powi(2) / self.scale.weight;
         if let Some(weight) = self.model.uniform_weight(exposure) {
-            return RowWeight::Same((weight * factor) as f32);
+            return RowWeight::Same((weight * factor).min(LARGEST) as f32);
         }
         let cols = self.model.sensor().cols;
         scratch.double.resize(cols, 1.0);
@@ -483,7 +483,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         let padded = &mut scratch.padded[self.padding.lead..][..cols];
         let _ = self.model.stretch(exposure, row, 0..cols, &mut scratch.double);
         for (padded, weight) in padded.iter_mut().zip(&scratch.double) {
-            *padded = (weight * factor) as f32;
+            *padded = (weight * factor).min(LARGEST) as f32;
         }
         RowWeight::Padded(&scratch.padded)
     }

@@ -104,8 +104,10 @@ impl Coarse {
     pub(super) fn solve(&self, values: &mut [f64], factor: f64) {
         let Some(cholesky) = &self.factor else { return values.fill(0.0) };
         for part in &self.parts {
-            let mean = part.iter().map(|&(hat, _)| values[hat]).sum::<f64>() / part.len() as f64;
-            part.iter().for_each(|&(hat, _)| values[hat] -= mean);
+            let (sum, area) = part
+                .iter()
+                .fold((0.0, 0.0), |(sum, area), &(hat, share)| (sum + values[hat], area + share));
+            part.iter().for_each(|&(hat, share)| values[hat] -= share * sum / area);
         }
         cholesky.solve(values);
         for part in &self.parts {

@@ -28,7 +28,8 @@ impl pulp::NullaryFnOnce for Descend<'_> {
             let (q, d) = (chunk(self.product, index), chunk(self.inverse_diagonal, index));
             let m = chunk(self.sensitivity, index);
             for i in 0..LANES {
-                let r = residual[i] - self.step * q[i];
+                // A pixel that is not in the system takes no part.
+                let r = if d[i] > 0.0 { residual[i] - self.step * q[i] } else { 0.0 };
                 residual[i] = r;
                 total[i] += r * (r * d[i]);
                 let part = self.height * (m[i] * r);
@@ -68,7 +69,7 @@ impl pulp::NullaryFnOnce for Direction<'_> {
             let (above, below) = (chunk(self.above, index), chunk(self.below, index));
             for i in 0..LANES {
                 let smooth = above[i] + self.height * (below[i] - above[i]);
-                let z = r[i] * d[i] + m[i] * smooth;
+                let z = if d[i] > 0.0 { r[i] * d[i] + m[i] * smooth } else { 0.0 };
                 x[i] += self.step * direction[i];
                 direction[i] = z + self.keep * direction[i];
                 largest[i] = largest[i].max(z.abs());

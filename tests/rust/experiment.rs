@@ -1,0 +1,74 @@
+//! Small experiments of every kind, for the tests of the solvers.
+
+use equipix_core::Result;
+use equipix_core::control::Control;
+use equipix_core::frames::{Shape, Stack};
+use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::model::{Mask, Model, Variance};
+use equipix_core::parallel::Workers;
+use proptest::prelude::*;
+
+/// Everything that one small experiment consists of.
+#[derive(Clone, Debug)]
+pub(crate) struct Experiment {
+    pub(crate) shape: Shape,
+    pub(crate) shifts: Vec<[i64; 2]>,
+    pub(crate) rotations: Vec<Rotation>,
+    pub(crate) flux: Vec<f64>,
+    pub(crate) frames: Vec<f64>,
+    pub(crate) variance: Vec<f64>,
+    pub(crate) mask: Vec<bool>,
+}
+
+impl Experiment {
+    /// Calls `visit` with the model of this experiment.
+    pub(crate) fn with_model<R>(
+        &self,
+        workers: &Workers,
+        visit: impl FnOnce(&Model<'_, f64>) -> Result<R>,
+    ) -> Result<R> {
+        let (count, shape) = (self.shifts.len(), self.shape);
+        let frames = Stack::new("frames", &self.frames, count, shape)?;
+        let variance = Stack::new("variance", &self.variance, count, shape)?;
+        let geometry = Geometry::new(shape, &self.shifts, &self.rotations)?;
+        let (variance, mask) = (Variance::Measurements(variance), Mask::Measurements(&self.mask));
+        let control = Control::new();
+        visit(&Model::new(frames, geometry, &self.flux, variance, mask, workers, &control)?)
+    }
+}
+
+/// Small sensors and ones longer than a vector, with gaps, noise and any rotation.
+pub(crate) fn experiments() -> impl Strategy<Value = Experiment> {
+    let rotation = prop::sample::select(vec![
+        Rotation::None,
+        Rotation::Quarter,
+        Rotation::Half,
+        Rotation::ThreeQuarters,
+    ]);
+    let sizes = (1..12_usize, 1..40_usize, 2..6_usize, any::<bool>());
+    sizes.prop_flat_map(move |(rows, cols, count, turned)| {
+        let side = rows.min(cols) as i64 - 1;
+        let reach = if turned { [side, side] } else { [rows as i64 - 1, cols as i64 - 1] };
+        let shift = (-reach[0]..=reach[0], -reach[1]..=reach[1]).prop_map(|(r, c)| [r, c]);
+        let rotation = if turned { rotation.clone().boxed() } else { Just(Rotation::None).boxed() };
+        let size = rows * cols * count;
+        let value = prop_oneof![12 => 0.5..1.5, 1 => Just(f64::NAN)];
+        let each = (
+            prop::collection::vec(shift, count),
+            prop::collection::vec(rotation, count),
+            prop::collection::vec(0.5..2.0, count),
+            prop::collection::vec(value, size),
+            prop::collection::vec(0.5..2.0, size),
+            prop::collection::vec(prop::bool::weighted(0.1), size),
+        );
+        each.prop_map(move |(shifts, rotations, flux, frames, variance, mask)| {
+            let shape = Shape::new(rows, cols);
+            Experiment { shape, shifts, rotations, flux, frames, variance, mask }
+        })
+    })
+}
+
+/// What rounding leaves of F where everything is fitted exactly: the residuals are not 0 then.
+pub(crate) fn rounding_of_objective(experiment: &Experiment) -> f64 {
+    experiment.frames.len() as f64 * (10.0 * f64::EPSILON).powi(2)
+}
