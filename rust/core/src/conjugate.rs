@@ -80,6 +80,11 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         Ok(())
     }
 
+    /// Forgets the step that was found.
+    pub(crate) fn forget(&mut self) {
+        self.reduced.padding.clear(&mut self.x, self.workers);
+    }
+
     /// One iteration: a step along the direction, and a new direction. `false` if there was none to
     /// go: the residual is 0, or nothing but rounding along which S does not change.
     ///

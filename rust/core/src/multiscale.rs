@@ -24,6 +24,9 @@ const MOST_PRODUCTS: u64 = 100_000;
 const AIM: f64 = 0.8;
 /// The most that one step reduces the error by: single precision holds no more.
 const PRECISION: f64 = 1e-5;
+/// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
+const RESCUE_SWEEPS: u64 = 32;
+const MOST_RESCUES: u32 = 8;
 /// What linearising adds at most counts as this share of a step, far from the minimum.
 const MOST_CURVED: f64 = 0.1;
 /// Steps that may fail to lower the estimate before it counts as stalled.
@@ -53,7 +56,7 @@ pub fn solve<'m, 'a, T: Real>(
     let mut search = Search::new(model, workers);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();
-    let mut halvings = 0;
+    let (mut halvings, mut rescues) = (0, 0);
     let mut products = 0;
     loop {
         let objective = descent.slopes(scale.slope(), &mut search.residual, control)?;
@@ -63,7 +66,8 @@ pub fn solve<'m, 'a, T: Real>(
         let noise = looks.last().map_or(f64::INFINITY, |last| rounding(model, last));
         let highest = looks.last().map_or(f64::INFINITY, |last| last.objective + noise);
         // A number that is none is no fall either.
-        if !(objective <= highest) && halvings <= MOST_HALVINGS {
+        let fell = objective <= highest;
+        if !fell && halvings <= MOST_HALVINGS {
             halvings += 1;
             // The last time, what is left of the step is taken back.
             let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS));
@@ -75,7 +79,18 @@ pub fn solve<'m, 'a, T: Real>(
         search.start(&descent.sensitivity, descent.beams(), control)?;
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
-        if let Some(ended) = ended(&looks, &smallest, &stop, limit, noise) {
+        let ended = ended(&looks, &smallest, &stop, limit, noise);
+        if ended == Some(Ended::Stalled) && !smallest.settled && rescues < MOST_RESCUES {
+            rescues += 1;
+            smallest.stuck = false;
+            for _ in 0..RESCUE_SWEEPS.min(limit.saturating_sub(products)) {
+                descent.sweep(control)?;
+                products += 1;
+            }
+            search.forget();
+            continue;
+        }
+        if let Some(ended) = ended {
             for (pixel, step) in search.left_out() {
                 descent.sensitivity[pixel] += step;
             }

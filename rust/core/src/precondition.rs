@@ -37,8 +37,8 @@ use hats::Hats;
 use kernel::{Descend, Direction};
 
 /// The factor γ of the second level. Errors that both levels see would count twice with γ = 1, and
-/// the largest eigenvalue of P⁻¹S be 1.8; with this it is 1, and a quarter of the iterations is
-/// saved (docs/method.md). Errors that the second level alone sees get an eigenvalue of γ.
+/// the largest eigenvalue of P⁻¹S be 1.8; with this it is 1, which saves iterations
+/// (docs/method.md). Errors that the second level alone sees get an eigenvalue of γ.
 pub(crate) const DAMPING: f64 = 0.25;
 /// Hats are as far apart as this times the largest shift.
 const SPACING: usize = 3;
@@ -46,7 +46,7 @@ const SPACING: usize = 3;
 const LEAST_SPACING: usize = 8;
 /// Most hats: their matrix is factorised in one go, which nothing interrupts, in less than half a
 /// second.
-const MOST_HATS: usize = 50_000;
+const MOST_HATS: usize = 20_000;
 
 /// Most hats where exposures are turned against each other: hats far apart meet then, and the factor
 /// of their matrix is nearly full.

@@ -29,6 +29,8 @@ const NOTHING: f64 = 1e-10;
 /// square of the nodes along a side: a tenth of the smallest eigenvalue of a sensor that hangs
 /// together. Single precision leaves errors in those directions, which must not be magnified.
 const SINGULAR_RIDGE: f64 = 0.3;
+/// Blocks between two looks at whether to stop.
+const CHECK_EVERY: usize = 1 << 12;
 /// Enough for eigenvalues that stand so far apart.
 const INVERSE_ITERATIONS: usize = 3;
 
@@ -51,13 +53,16 @@ impl Coarse {
         let weights = blocks.weights(geometry, reduced, workers, control)?;
         let mut matrix = Matrix::new(hats);
         for (block, weights) in weights.chunks_exact(geometry.exposures.len()).enumerate() {
+            if block % CHECK_EVERY == 0 {
+                control.check()?;
+            }
             matrix.add_star(&blocks.star(block, weights, hats, geometry));
         }
         control.check()?;
-        Ok(Self::factorised(&matrix, hats))
+        Self::factorised(&matrix, hats, control)
     }
 
-    fn factorised(matrix: &Matrix, hats: &Hats) -> Self {
+    fn factorised(matrix: &Matrix, hats: &Hats, control: &Control) -> Result<Self> {
         let mut sets = DisjointSets::new(hats.count());
         matrix.for_each(|row, col, _| sets.union(row, col));
         let mut parts: Vec<Vec<(usize, f64)>> = vec![Vec::new(); hats.count()];
@@ -66,11 +71,13 @@ impl Coarse {
         }
         parts.retain(|part| !part.is_empty());
         let coarse = Self { parts, factor: matrix.factor(RIDGE) };
+        control.check()?;
         if !coarse.is_singular(matrix) {
-            return coarse;
+            return Ok(coarse);
         }
+        control.check()?;
         let nodes = hats.rows.nodes.max(hats.cols.nodes) as f64;
-        Self { factor: matrix.factor(SINGULAR_RIDGE / (nodes * nodes)), ..coarse }
+        Ok(Self { factor: matrix.factor(SINGULAR_RIDGE / (nodes * nodes)), ..coarse })
     }
 
     /// Whether heights that are not constant in a part weigh nothing, by inverse iteration from
