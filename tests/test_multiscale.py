@@ -9,7 +9,10 @@ import equipix
 from equipix import Flag, reference, simulate
 from equipix.errors import ConvergenceWarning, IdentifiabilityWarning
 
-open_fault = pytest.mark.xfail(strict=True, reason="the estimate is far too large: S is singular")
+open_fault = pytest.mark.xfail(
+    strict=True,
+    reason="many pieces: not converged and said so; or the dense run fails",
+)
 
 CROSS = equipix.cross_pattern(5, 7)
 HARD_CROSS = equipix.cross_pattern(11, 19)
@@ -94,8 +97,9 @@ class TestTheHardCase:
         assert largest_difference(cal.sensitivity, swept.sensitivity) < 1e-6
 
 
-UNSOLVED = {0, 5, 11, 17, 23, 26, 34, 36}
-"""Seeds of experiments with many small components."""
+UNSOLVED = {17, 23, 34, 36}
+"""Seeds of experiments with many small components and a negative pixel; in 23 it is the dense
+solution that ends far above the minimum."""
 
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
@@ -193,7 +197,6 @@ class TestAnyPattern:
         frames, _ = small_case((30, 40), shifts)
         assert self.check(frames, shifts).converged
 
-    @open_fault
     def test_the_same_position_throughout(self):
         frames, _ = small_case((12, 14), np.zeros((3, 2), int))
         cal = self.check(frames, np.zeros((3, 2), int))
@@ -270,7 +273,6 @@ class TestSingularCoarseMatrices:
         wanted = np.where(mask, np.nan, truth / truth[~mask].mean())
         assert largest_difference(cal.sensitivity, wanted) < 10 * 1e-10
 
-    @open_fault
     def test_a_dark_corner(self):
         shape = (60, 80)
         truth = simulate.cosine_sensitivity(shape, rng=1)

@@ -254,10 +254,10 @@ impl<'h> CoarseSums<'h> {
 }
 
 /// What the matrix of the hats and its factor take in bytes: as measured for 28 000 and 51 000 hats,
-/// or those of a full matrix, twice, where exposures are turned against each other.
+/// or those of a full triangle, twice, where exposures are turned against each other.
 pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
     let hats = Hats::new(geometry.sensor, spacing(geometry)).count() as u64;
-    if geometry.views.len() > 1 { 16 * hats * hats } else { 2700 * hats }
+    if geometry.views.len() > 1 { 8 * hats * hats } else { 2700 * hats }
 }
 
 /// How far apart hats stand, along rows and columns of the sensor.

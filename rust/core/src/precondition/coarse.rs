@@ -217,6 +217,8 @@ struct Matrix {
     cols: usize,
     /// By hat and place in the stencil.
     near: Vec<[f64; STENCIL]>,
+    /// Σ Ω φ² of each hat: what its diagonal element is compared with.
+    masses: Vec<f64>,
     /// Of hats that meet only because exposures are turned against each other.
     far: HashMap<(usize, usize), f64>,
 }
@@ -226,6 +228,7 @@ impl Matrix {
         Self {
             cols: hats.cols.nodes,
             near: vec![[0.0; STENCIL]; hats.count()],
+            masses: vec![0.0; hats.count()],
             far: HashMap::new(),
         }
     }
@@ -240,6 +243,7 @@ impl Matrix {
         let mut heights = vec![0.0; star.len() * nodes.len()];
         for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
             for (hat, height) in arm.hats {
+                self.masses[hat] += arm.weight * height * height;
                 let at = nodes.partition_point(|&node| node < hat);
                 heights[at] += height;
                 mean[at] += arm.weight / total * height;
@@ -282,16 +286,21 @@ impl Matrix {
         far.iter().for_each(|&(&(row, col), &value)| visit(row, col, value));
     }
 
-    /// The factor of the matrix with a share `ridge` added to its diagonal. A hat on which no
-    /// weight falls stays at 0.
+    /// The factor of the matrix with a share `ridge` added to its diagonal.
     fn factor(&self, ridge: f64) -> Option<Cholesky> {
         let mut entries = Vec::new();
         self.for_each(|row, col, value| {
             entries.push((row.max(col) as u32, row.min(col) as u32, value));
         });
         for hat in 0..self.near.len() {
-            let diagonal = self.diagonal(hat);
-            let more = if diagonal > 0.0 { ridge * diagonal } else { 1.0 };
+            let (diagonal, mass) = (self.diagonal(hat), self.masses[hat]);
+            // Exposures at one place compare nothing, and what is left of S is rounding: such a hat
+            // gets a matrix of its own. So does one on which no weight falls.
+            let more = match mass {
+                0.0 => 1.0,
+                mass if diagonal < NOTHING * mass => mass,
+                _ => ridge * diagonal,
+            };
             entries.push((hat as u32, hat as u32, more));
         }
         Cholesky::new(self.near.len(), &entries)
