@@ -39,10 +39,10 @@ pub(crate) struct Search<'m, 'a, T> {
 
 impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     /// Room for a search.
-    pub(crate) fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
-        let reduced = Reduced::new(model, workers);
+    pub(crate) fn new(model: &'m Model<'a, T>, workers: &'m Workers, control: &Control) -> Self {
+        let reduced = Reduced::new(model, workers, control);
         let [residual, x, direction, product] =
-            [(); 4].map(|()| reduced.padding.zeros(model.sensor().rows, workers));
+            [(); 4].map(|()| reduced.padding.zeros(model.sensor().rows, workers, control));
         Self {
             workers,
             two_level: TwoLevel::new(model, reduced.padding, workers),
@@ -70,8 +70,8 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     ) -> Result<()> {
         self.reduced.linearise(sensitivity, beams, control)?;
         self.two_level.prepare(&self.reduced, control)?;
-        self.reduced.padding.clear(&mut self.x, self.workers);
-        self.reduced.padding.clear(&mut self.direction, self.workers);
+        self.reduced.padding.clear(&mut self.x, self.workers, control);
+        self.reduced.padding.clear(&mut self.direction, self.workers, control);
         self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
         self.square = self.descend(0.0);
@@ -81,8 +81,8 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     }
 
     /// Forgets the step that was found.
-    pub(crate) fn forget(&mut self) {
-        self.reduced.padding.clear(&mut self.x, self.workers);
+    pub(crate) fn forget(&mut self, control: &Control) {
+        self.reduced.padding.clear(&mut self.x, self.workers, control);
     }
 
     /// One iteration: a step along the direction, and a new direction. `false` if there was none to

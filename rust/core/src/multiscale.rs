@@ -53,7 +53,7 @@ pub fn solve<'m, 'a, T: Real>(
     let scale = Scale::of(model);
     let mut descent = Descent::new(model, workers);
     descent.start_bright(control)?;
-    let mut search = Search::new(model, workers);
+    let mut search = Search::new(model, workers, control);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();
     let (mut halvings, mut rescues) = (0, 0);
@@ -87,7 +87,7 @@ pub fn solve<'m, 'a, T: Real>(
                 descent.sweep(control)?;
                 products += 1;
             }
-            search.forget();
+            search.forget(control);
             continue;
         }
         if let Some(ended) = ended {

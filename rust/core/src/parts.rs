@@ -22,8 +22,10 @@ pub struct Parts<'m, 'a, T> {
 impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     /// Room for it.
     pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
-        let reduced = Reduced::new(model, workers);
-        let [x, product] = [(); 2].map(|()| reduced.padding.zeros(model.sensor().rows, workers));
+        let control = Control::new();
+        let reduced = Reduced::new(model, workers, &control);
+        let [x, product] =
+            [(); 2].map(|()| reduced.padding.zeros(model.sensor().rows, workers, &control));
         Self { model, workers, reduced, x, product }
     }
 

@@ -71,15 +71,19 @@ impl Padding {
     ///
     /// The zeros are written, by the threads that will use them: memory that is only reserved would
     /// be mapped twice where it is read before it is written.
-    pub(crate) fn zeros(&self, rows: usize, workers: &Workers) -> Vec<f32> {
+    pub(crate) fn zeros(&self, rows: usize, workers: &Workers, control: &Control) -> Vec<f32> {
         let mut image = vec![0.0; self.size(rows)];
-        self.clear(&mut image, workers);
+        self.clear(&mut image, workers, control);
         image
     }
 
-    /// Fills an image with zeros.
-    pub(crate) fn clear(&self, image: &mut [f32], workers: &Workers) {
-        workers.map_blocks(image, BAND * self.width, |_, part| part.fill(0.0));
+    /// Fills an image with zeros, unless `control` asks to stop.
+    pub(crate) fn clear(&self, image: &mut [f32], workers: &Workers, control: &Control) {
+        workers.map_blocks(image, BAND * self.width, |_, part| {
+            if !control.is_cancelled() {
+                part.fill(0.0);
+            }
+        });
     }
 
     /// All rows, without the zeros before and after.
@@ -189,10 +193,11 @@ impl Scale {
 
 impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     /// Room for the operator of `model`.
-    pub(crate) fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+    pub(crate) fn new(model: &'m Model<'a, T>, workers: &'m Workers, control: &Control) -> Self {
         let (padding, views) = (Padding::of(&model.geometry), &model.geometry.views);
-        let of_views = || views.iter().map(|v| padding.zeros(v.shape.rows, workers)).collect();
-        let of_sensor = || padding.zeros(model.sensor().rows, workers);
+        let of_views =
+            || views.iter().map(|v| padding.zeros(v.shape.rows, workers, control)).collect();
+        let of_sensor = || padding.zeros(model.sensor().rows, workers, control);
         Self {
             model,
             workers,
@@ -297,8 +302,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     fn hide_turned(&self, x: &[f32], hidden: &mut [Vec<f32>], control: &Control) {
         let (padding, views) = (self.padding, &self.model.geometry.views);
         let gathered = |(index, view): (usize, &View)| {
-            let mut signal = padding.zeros(view.shape.rows, self.workers);
-            let mut weight = padding.zeros(view.shape.rows, self.workers);
+            let mut signal = padding.zeros(view.shape.rows, self.workers, control);
+            let mut weight = padding.zeros(view.shape.rows, self.workers, control);
             let (signals, weights) = (padding.body_mut(&mut signal), padding.body_mut(&mut weight));
             let size = BAND * padding.width;
             self.workers.map_pairs(signals, weights, size, |band, signals, weights| {

@@ -104,11 +104,15 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     }
 
     /// Makes room for L where there is none, by the threads that will use it.
-    fn remember_beams(&mut self) {
+    fn remember_beams(&mut self, control: &Control) {
         let cells = self.model.geometry.beam.len();
         for beam in self.beams.iter_mut().filter(|beam| beam.is_empty()) {
             *beam = vec![0.0; cells];
-            self.workers.map_blocks(beam, PART, |_, part| part.fill(0.0));
+            self.workers.map_blocks(beam, PART, |_, part| {
+                if !control.is_cancelled() {
+                    part.fill(0.0);
+                }
+            });
         }
     }
 
@@ -124,7 +128,7 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         control: &Control,
         mut work: impl FnMut(&mut Self, Range<usize>) -> Vec<f64>,
     ) -> Result<f64> {
-        self.remember_beams();
+        self.remember_beams(control);
         let rows = self.model.sensor().rows;
         let mut bands = Vec::with_capacity(rows.div_ceil(BAND));
         if self.beams.len() == 1 {
