@@ -87,7 +87,7 @@ fn measure<T: Real>(shape: Shape, precision: &str, convert: fn(f64) -> T, worker
 fn pieces<T: Real>(model: &Model<'_, T>, workers: &Workers, control: &Control) -> [f64; 4] {
     // Enough rounds that the clock and the first touch of memory do not count.
     let rounds = (1 << 21) / model.sensor().len() + 2;
-    let mut descent = Descent::new(model, workers);
+    let mut descent = Descent::new(model, workers, control);
     let sweep = seconds(rounds, || descent.sweep(control).unwrap());
     let mut parts = Parts::new(model, workers);
     let assemble = seconds(rounds, || parts.assemble(&descent, control).unwrap());
@@ -102,7 +102,7 @@ fn await_descent<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> (usize, f64) {
-    let mut descent = Descent::new(model, workers);
+    let mut descent = Descent::new(model, workers, control);
     let (mut sweeps, mut taken) = (0, 0.0);
     while true_error(&descent.sensitivity, model.sensor(), workers) > AWAITED.1 {
         let each = seconds(CHECK_EVERY, || descent.sweep(control).unwrap());

@@ -36,7 +36,7 @@ fn measure(shape: Shape, repetitions: usize) {
     let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
     let (variance, mask) = (Variance::Unknown, Mask::None);
     let model = Model::new(stack, geometry, &[1.0; 5], variance, mask, &workers, &control).unwrap();
-    let mut descent = Descent::new(&model, &workers);
+    let mut descent = Descent::new(&model, &workers, &Control::new());
     let mut target = vec![0.0_f32; data.len()];
     // Enough rounds that the clock's and the threads' start do not count.
     let rounds = (1 << 25) / data.len() + 1;

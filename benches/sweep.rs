@@ -67,7 +67,7 @@ fn sweep(criterion: &mut Criterion) {
                 &control,
             )
             .unwrap();
-            let mut descent = Descent::new(&model, &workers);
+            let mut descent = Descent::new(&model, &workers, &Control::new());
             group.bench_function(BenchmarkId::new(name, shape), |bencher| {
                 bencher.iter(|| descent.sweep(&control).unwrap());
             });

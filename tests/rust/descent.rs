@@ -19,7 +19,7 @@ impl Experiment {
     fn swept(&self, sweeps: usize, workers: usize) -> Result<(Vec<f64>, Vec<f64>, Vec<f64>)> {
         let workers = Workers::new(NonZeroUsize::new(workers))?;
         self.with_model(&workers, |model| {
-            let mut descent = Descent::new(model, &workers);
+            let mut descent = Descent::new(model, &workers, &Control::new());
             let objective = (0..sweeps).map(|_| descent.sweep(&Control::new()));
             let objective = objective.collect::<Result<_>>()?;
             let beam = descent.beam();
@@ -137,7 +137,7 @@ fn rows_that_do_not_fit_the_cache_make_no_difference() {
         let (variance, mask, control) = (Variance::Unknown, Mask::None, Control::new());
         let model =
             Model::new(stack, geometry, &[1.0; 2], variance, mask, &workers, &control).unwrap();
-        let mut descent = Descent::new(&model, &workers);
+        let mut descent = Descent::new(&model, &workers, &Control::new());
         (descent.sweep(&control).unwrap().to_bits(), descent.sensitivity)
     };
     // Three workers take more rows at a time than one.

@@ -70,8 +70,8 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     ) -> Result<()> {
         self.reduced.linearise(sensitivity, beams, control)?;
         self.two_level.prepare(&self.reduced, control)?;
-        self.reduced.padding.clear(&mut self.x, self.workers, control);
-        self.reduced.padding.clear(&mut self.direction, self.workers, control);
+        self.workers.fill(&mut self.x, 0.0, control);
+        self.workers.fill(&mut self.direction, 0.0, control);
         self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
         self.square = self.descend(0.0);
@@ -82,7 +82,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
 
     /// Forgets the step that was found.
     pub(crate) fn forget(&mut self, control: &Control) {
-        self.reduced.padding.clear(&mut self.x, self.workers, control);
+        self.workers.fill(&mut self.x, 0.0, control);
     }
 
     /// One iteration: a step along the direction, and a new direction. `false` if there was none to

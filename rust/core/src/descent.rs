@@ -49,7 +49,7 @@ pub fn solve<'m, 'a, T: Real>(
     control: &Control,
 ) -> Result<(Descent<'m, 'a, T>, History, Vec<usize>)> {
     let limit = stop.limit(MOST_SWEEPS)?;
-    let mut descent = Descent::new(model, workers);
+    let mut descent = Descent::new(model, workers, control);
     let (scale, mut search) = (Scale::of(model), Search::new(model, workers, control));
     let mut looks: Vec<Look> = Vec::new();
     let mut next_look = limit.min(CHECK_EVERY / 2);

@@ -51,7 +51,7 @@ pub fn solve<'m, 'a, T: Real>(
 ) -> Result<(Descent<'m, 'a, T>, History, Vec<usize>)> {
     let limit = stop.limit(MOST_PRODUCTS)?;
     let scale = Scale::of(model);
-    let mut descent = Descent::new(model, workers);
+    let mut descent = Descent::new(model, workers, control);
     descent.start_bright(control)?;
     let mut search = Search::new(model, workers, control);
     let mut smallest = Smallest::default();

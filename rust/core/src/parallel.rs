@@ -9,7 +9,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
+use crate::control::Control;
 use crate::error::{Error, Result};
+
+/// Values that a thread writes between two looks at whether to stop.
+const FILLED: usize = 1 << 16;
 
 /// A pool of worker threads.
 #[derive(Clone, Debug)]
@@ -78,6 +82,33 @@ impl Workers {
                 .map(|(index, block)| work(index, block))
                 .collect()
         })
+    }
+
+    /// So many of one value, written by the threads that will use them, unless `control` asks to
+    /// stop.
+    ///
+    /// A fresh page costs some microseconds when it is touched for the first time, so that a large
+    /// array takes longer than Ctrl-C may; and memory that is only reserved would be mapped twice
+    /// where it is read before it is written.
+    pub(crate) fn filled<T>(&self, length: usize, value: T, control: &Control) -> Vec<T>
+    where
+        T: Copy + Default + Send + Sync,
+    {
+        let mut values = vec![T::default(); length];
+        self.fill(&mut values, value, control);
+        values
+    }
+
+    /// Writes one value everywhere, unless `control` asks to stop.
+    pub(crate) fn fill<T>(&self, values: &mut [T], value: T, control: &Control)
+    where
+        T: Copy + Send + Sync,
+    {
+        self.map_blocks(values, FILLED, |_, part| {
+            if !control.is_cancelled() {
+                part.fill(value);
+            }
+        });
     }
 
     /// Like [`map_blocks`](Self::map_blocks) over two slices at once.

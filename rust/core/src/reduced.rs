@@ -67,23 +67,9 @@ impl Padding {
         2 * self.lead + rows * self.width
     }
 
-    /// An image of zeros.
-    ///
-    /// The zeros are written, by the threads that will use them: memory that is only reserved would
-    /// be mapped twice where it is read before it is written.
+    /// An image of zeros, unless `control` asks to stop.
     pub(crate) fn zeros(&self, rows: usize, workers: &Workers, control: &Control) -> Vec<f32> {
-        let mut image = vec![0.0; self.size(rows)];
-        self.clear(&mut image, workers, control);
-        image
-    }
-
-    /// Fills an image with zeros, unless `control` asks to stop.
-    pub(crate) fn clear(&self, image: &mut [f32], workers: &Workers, control: &Control) {
-        workers.map_blocks(image, BAND * self.width, |_, part| {
-            if !control.is_cancelled() {
-                part.fill(0.0);
-            }
-        });
+        workers.filled(self.size(rows), 0.0, control)
     }
 
     /// All rows, without the zeros before and after.

@@ -11,8 +11,6 @@ use crate::model::{Model, Stretch};
 use crate::parallel::Workers;
 use crate::reduced::Padding;
 
-/// Pixels that a thread takes at a time where rows do not matter.
-const PART: usize = 1 << 16;
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
 /// Bytes of data that may be expected to stay in the last-level cache.
@@ -36,11 +34,11 @@ pub struct Descent<'m, 'a, T> {
 impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     /// Starts from a sensor of equal pixels, M = 1.
     #[must_use]
-    pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+    pub fn new(model: &'m Model<'a, T>, workers: &'m Workers, control: &Control) -> Self {
         Self {
             model,
             workers,
-            sensitivity: vec![1.0; model.sensor().len()],
+            sensitivity: workers.filled(model.sensor().len(), 1.0, control),
             beams: vec![Vec::new(); model.geometry.views.len()],
         }
     }
@@ -107,12 +105,7 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
     fn remember_beams(&mut self, control: &Control) {
         let cells = self.model.geometry.beam.len();
         for beam in self.beams.iter_mut().filter(|beam| beam.is_empty()) {
-            *beam = vec![0.0; cells];
-            self.workers.map_blocks(beam, PART, |_, part| {
-                if !control.is_cancelled() {
-                    part.fill(0.0);
-                }
-            });
+            *beam = self.workers.filled(cells, 0.0, control);
         }
     }
 
