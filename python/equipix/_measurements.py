@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix._arrays import as_array, as_floats, check_count
+from equipix._arrays import as_array, as_floats, check_count, per_exposure
 from equipix.errors import InputError
 from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
+
+FluxModel = Literal["fit", "linear"]
 
 
 def as_statistics(frames: object) -> list[FrameStatistics]:
@@ -63,3 +65,45 @@ def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     if array.shape not in (shape[1:], shape):
         raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
     return array
+
+
+def as_flux(
+    flux: ArrayLike | FluxModel | None,
+    flux_std: ArrayLike | None,
+    time: ArrayLike | None,
+    count: int,
+) -> tuple[NDArray[np.float64], tuple[str, list[float]]]:
+    """Fluxes, and how the solver is to take them: its kind, with standard deviations or times."""
+    if isinstance(flux, str):
+        if flux not in ("fit", "linear"):
+            raise InputError(f"'flux' is {flux!r}, expected numbers, 'fit' or 'linear'")
+        if flux_std is not None:
+            raise InputError(f"'flux_std' goes with fluxes that are given, but 'flux' is {flux!r}")
+        if (time is None) == (flux == "linear"):
+            raise InputError("'time' and flux='linear' go together: give both or neither")
+        times = [] if time is None else per_exposure("time", time, count, default=0).tolist()
+        if times and (not np.isfinite(times).all() or len(set(times)) < 2):
+            raise InputError(f"'time' is {times}, expected seconds, not all the same")
+        return np.ones(count), (flux, times)
+    if time is not None:
+        raise InputError("'time' is given but 'flux' is not 'linear'")
+    values = per_exposure("flux", flux, count, default=1)
+    if flux_std is None:
+        return values, ("known", [])
+    std = np.broadcast_to(as_array("flux_std", flux_std, ndim=(0, 1)), count).astype(np.float64)
+    if not (np.isfinite(std).all() and (std > 0).all()):
+        raise InputError(f"'flux_std' is {std.tolist()}, expected positive numbers")
+    return values, ("prior", std.tolist())
+
+
+def as_shift_std(shift_std: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Standard deviations of the shifts, (n, 2)."""
+    array = as_array("shift_std", shift_std, ndim=(0, 1, 2))
+    if array.ndim == 1:
+        array = array[:, np.newaxis]
+    if array.ndim and array.shape not in ((count, 1), (count, 2)):
+        raise InputError(f"'shift_std' has shape {array.shape}, expected ({count},) or ({count}, 2)")
+    std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
+    if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
+        raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
+    return std

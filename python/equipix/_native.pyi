@@ -54,6 +54,18 @@ class Solution:
     @property
     def flags(self) -> NDArray[Any]: ...
     @property
+    def flux(self) -> list[float]: ...
+    @property
+    def shifts(self) -> list[list[float]] | None: ...
+    @property
+    def offset(self) -> NDArray[Any] | None: ...
+    @property
+    def leaves_tilt(self) -> bool: ...
+    @property
+    def smallest_ritz(self) -> float | None: ...
+    @property
+    def misfit(self) -> float: ...
+    @property
     def component_labels(self) -> NDArray[Any]: ...
     @property
     def components(self) -> int: ...
@@ -72,8 +84,11 @@ def calibrate_frames(
     frames: NDArray[Any],
     shifts: NDArray[Any],
     *,
+    shift_std: NDArray[Any] | None,
     rotation: list[int],
     flux: list[float],
+    flux_model: tuple[str, list[float]],
+    offset: bool,
     variance: NDArray[Any] | None,
     mask: NDArray[Any] | None,
     method: str,

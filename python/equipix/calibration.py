@@ -19,7 +19,15 @@ from equipix._arrays import (
     positive_count,
     positive_workers,
 )
-from equipix._measurements import as_mask, as_statistics, as_values, as_variances
+from equipix._measurements import (
+    FluxModel,
+    as_flux,
+    as_mask,
+    as_shift_std,
+    as_statistics,
+    as_values,
+    as_variances,
+)
 from equipix.correction import Flagged, apply_gain
 from equipix.errors import (
     ConvergenceWarning,
@@ -29,7 +37,7 @@ from equipix.errors import (
 from equipix.io import save_pages
 from equipix.noise import smoothed_variances
 from equipix.results import Flag, FrameStatistics
-from equipix.shifts import round_shifts
+from equipix.shifts import as_positions, round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -40,6 +48,10 @@ if TYPE_CHECKING:
     Progress = Callable[[int, int, str], object]
 
 Method = Literal["multiscale", "coordinate-descent"]
+
+UNTOLD = 1e-4
+"""A Ritz value this small stands for a pattern that no measurement tells: 300 products would be needed
+to find it, and noise in it is 100 times what it is elsewhere."""
 
 FORMAT = 1
 """Number of the file format; a file with a higher one is refused."""
@@ -243,8 +255,12 @@ def calibrate(
     *,
     variance: ArrayLike | None = None,
     mask: ArrayLike | None = None,
-    flux: ArrayLike | None = None,
+    flux: ArrayLike | FluxModel | None = None,
+    flux_std: ArrayLike | None = None,
+    time: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
+    shift_std: ArrayLike | None = None,
+    dark: Literal["subtracted", "fit"] = "subtracted",
     method: Method = "multiscale",
     tolerance: float = 1e-6,
     max_sweeps: int | None = None,
@@ -263,16 +279,28 @@ def calibrate(
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
         unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result without
-        any residual to show it. Rounded to whole pixels.
+        any residual to show it. Where they are not whole numbers the beam is a cubic spline;
+        coordinate descent rounds them.
     variance : array_like, shape (n,) or (n, rows, cols), optional
         Variance of the values given. Without it all weights are 1.
     mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
         True = do not use.
-    flux : array_like, shape (n,), optional
-        Known relative flux of each exposure; 1 unless given.
+    flux : array_like, shape (n,), "fit" or "linear", optional
+        Known relative flux of each exposure, 1 unless given; or what is to be found: a flux for
+        each exposure, or ln c linear in `time`.
+    flux_std : float or array_like, shape (n,), optional
+        Relative standard deviations of `flux`, which is then a prior and not taken as exact.
+    time : array_like, shape (n,), optional
+        When each exposure was taken, in seconds; for ``flux="linear"``.
     rotation : array_like of int, shape (n,), optional
         How far each exposure is turned, in degrees: 0, 90, 180 or 270, as by ``numpy.rot90`` of
         the beam's window; 0 unless given.
+    shift_std : float or array_like, shape (n,) or (n, 2), optional
+        Standard deviations of `shifts`, in pixels: the shifts are then refined, with this prior.
+        What moves all exposures alike stays as given.
+    dark : {"subtracted", "fit"}
+        Whether the dark is already subtracted, or to be found as an offset of each pixel: for
+        exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.
     method : {"multiscale", "coordinate-descent"}
         How to minimise the objective: by Gauss-Newton steps on all scales at once, in a number of
         passes that does not depend on the size of the sensor; or by the paper's method, which
@@ -307,9 +335,10 @@ def calibrate(
     Warns
     -----
     ShiftRoundingWarning
-        If a shift is rounded by more than 0.02 pixel.
+        If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
-        If the measurements leave parts of the sensor uncompared.
+        If the measurements leave parts of the sensor uncompared, hardly tell some pattern, or free
+        fluxes leave a tilt of the sensitivity undetermined.
     ConvergenceWarning
         If the tolerance was not reached.
 
@@ -318,12 +347,20 @@ def calibrate(
     Minimises :math:`F = \sum_k \sum_p w_k(p) [y_k(p) - c_k L(u_k(p)) M(p)]^2` over the sensitivity
     M and the beam L, with weights w = 1/variance, fluxes c and the position u of pixel p in the
     beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
-    mean(M) = 1 over valid pixels.
+    mean(M) = 1 over valid pixels. With fitted fluxes the mean of ln c is 0; then a tilt of ln M
+    can be told only if exposures are turned against each other (or by `flux_std`, or by `time`):
+    else its least-squares slope over valid pixels is set to 0, and a warning says so.
+
+    With shifts between pixels L is a cubic B-spline on the padded grid, with a penalty of 1e-5 of a
+    cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
+    Gauss-Newton steps in which M follows at its closed form.
 
     References
     ----------
     .. [1] S. E. Stukachev, I. E. Kozhevatov, "Calibration method for spatial distribution of light
        sensitivity of matrix photo receivers", Radiophysics and Quantum Electronics, 2011.
+    .. [2] P. H. C. Eilers, B. D. Marx, "Flexible smoothing with B-splines and penalties",
+       Statistical Science 11 (1996) 89-121.
 
     Examples
     --------
@@ -349,17 +386,30 @@ def calibrate(
         variances = None if variance is None else as_variances(variance, values)
         masked = None if mask is None else as_mask(mask, values.shape)
     count = len(values)
-    positions = round_shifts(shifts)
+    positions = as_positions(shifts) if method == "multiscale" else round_shifts(shifts)
     check_count("shifts", len(positions), count)
     turns = per_exposure("rotation", rotation, count, default=0)
     if not np.all(np.isin(turns, (0, 90, 180, 270))):
         raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
-    fluxes = per_exposure("flux", flux, count, default=1)
+    fluxes, flux_model = as_flux(flux, flux_std, time, count)
+    shift_error = None if shift_std is None else as_shift_std(shift_std, count)
+    if dark not in ("subtracted", "fit"):
+        raise InputError(f"'dark' is {dark!r}, expected 'subtracted' or 'fit'")
+    if method != "multiscale" and (
+        flux_model[0] != "known" or shift_error is not None or dark == "fit"
+    ):
+        raise InputError(
+            "'method' is 'coordinate-descent', which knows whole shifts and given fluxes: to fit "
+            "fluxes, shifts or the dark take 'multiscale'"
+        )
     result = _native.calibrate_frames(
         values,
-        positions,
+        positions.astype(np.float64),
+        shift_std=shift_error,
         rotation=turns.astype(int).tolist(),
         flux=fluxes.tolist(),
+        flux_model=flux_model,
+        offset=dark == "fit",
         variance=variances,
         mask=masked,
         method=method,
@@ -368,8 +418,10 @@ def calibrate(
         workers=positive_workers(workers),
         progress=progress,
     )
-    options = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps}
-    calibration = _wrapped(result, values.dtype, positions, fluxes)
+    options = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps, "dark": dark}
+    if flux_model[0] != "known":
+        options["flux"] = flux_model[0]
+    calibration = _wrapped(result, values.dtype, positions)
     calibration.metadata.update(
         versions={"equipix": _native.__version__, "numpy": np.__version__},
         options=options | {"rotation": turns.astype(int).tolist()},
@@ -381,25 +433,22 @@ def calibrate(
     )
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
-    _warn(calibration, tolerance, result.ended)
+    _warn(calibration, tolerance, result)
     return calibration
 
 
 def _wrapped(
-    result: _native.Solution,
-    dtype: np.dtype[Any],
-    shifts: NDArray[np.int64],
-    flux: NDArray[np.float64],
+    result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any]
 ) -> Calibration:
-    objective = float(result.objective[-1])
+    objective = result.misfit
     freedom = result.degrees_of_freedom
     return Calibration(
         sensitivity=result.sensitivity.astype(dtype, copy=False),
         beam=result.beam,
         beam_origin=result.beam_origin,
         flags=result.flags,
-        shifts=shifts.astype(np.float64),
-        flux=flux,
+        shifts=np.array(shifts if result.shifts is None else result.shifts, dtype=np.float64),
+        flux=np.array(result.flux),
         objective=objective,
         reduced_chi2=objective / freedom if freedom > 0 else float("nan"),
         components=result.components,
@@ -408,10 +457,11 @@ def _wrapped(
         converged=result.ended == "converged",
         error_estimate=float(result.error_estimate[-1]),
         history=History(result.sweeps, result.objective, result.error_estimate),
+        dark=None if result.offset is None else result.offset.astype(dtype, copy=False),
     )
 
 
-def _warn(calibration: Calibration, tolerance: float, ended: str) -> None:
+def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) -> None:
     if calibration.components > 1:
         left = int(np.count_nonzero(calibration.component_labels > 0))
         warnings.warn(
@@ -420,8 +470,22 @@ def _warn(calibration: Calibration, tolerance: float, ended: str) -> None:
             IdentifiabilityWarning,
             stacklevel=3,
         )
+    if result.smallest_ritz is not None and result.smallest_ritz < UNTOLD:
+        warnings.warn(
+            f"the measurements hardly tell some pattern of the sensitivity (smallest Ritz value "
+            f"{result.smallest_ritz:.1e}, below {UNTOLD:g}): choose other shifts",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
+    if result.leaves_tilt:
+        warnings.warn(
+            "free fluxes leave a tilt of the sensitivity undetermined: its slope is set to 0; turn "
+            "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
     if not calibration.converged:
-        used_up = ended == "sweeps used"
+        used_up = result.ended == "sweeps used"
         stuck = (
             "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
         )

@@ -5,8 +5,9 @@ use crate::control::Control;
 use crate::descent;
 use crate::error::Result;
 use crate::estimate::{History, Stop};
-use crate::frames::{Real, flag};
-use crate::geometry::Geometry;
+use crate::frames::{Real, Shape, flag};
+use crate::geometry::{Geometry, Rotation};
+use crate::joint::{self, Unknowns};
 use crate::memory;
 use crate::model::Model;
 use crate::multiscale;
@@ -30,6 +31,22 @@ pub struct Solution {
     pub sensitivity: Vec<f64>,
     /// The beam L on its padded grid, row by row, in the units of the frames; NaN where unobserved.
     pub beam: Vec<f64>,
+    /// Sizes of that grid.
+    pub beam_shape: Shape,
+    /// The cell that the sensor's first pixel sees at shift 0, unturned.
+    pub beam_origin: [usize; 2],
+    /// The flux c of each exposure.
+    pub flux: Vec<f64>,
+    /// The shift (row, column) of each exposure as fitted, or as it was given to a joint fit.
+    pub shifts: Option<Vec<[f64; 2]>>,
+    /// The offset O of each pixel, if it was sought; NaN outside the largest component.
+    pub offset: Option<Vec<f64>>,
+    /// F of the measurements at the end, without penalty and priors.
+    pub objective: f64,
+    /// Whether free fluxes leave a tilt of ln M undetermined: then its slope is 0.
+    pub leaves_tilt: bool,
+    /// The smallest Ritz value of a joint fit.
+    pub smallest_ritz: Option<f64>,
     /// Bits of [`flag`] for each pixel.
     pub flags: Vec<u32>,
     /// What the measurements can compare.
@@ -40,7 +57,7 @@ pub struct Solution {
     pub degrees_of_freedom: i64,
 }
 
-/// Minimises F.
+/// Minimises F, with whole shifts and known fluxes.
 ///
 /// M is given in the gauge mean(M) = 1 over the pixels of a component, each component for itself;
 /// pixels that their measurements leave almost no weight are flagged and not in the mean.
@@ -64,9 +81,82 @@ pub fn calibrate<T: Real>(
     };
     // After the solver, whose vectors then make room for the sets.
     let components = Components::of(model, control)?;
-    let mut beam = descent.beam();
-    let mut sensitivity = descent.sensitivity;
-    let means = component_means(&sensitivity, &components, &left_out);
+    let beam = descent.beam();
+    let (sensitivity, beam, flags) =
+        gauged(descent.sensitivity, beam, &components, &left_out, workers);
+    Ok(Solution {
+        sensitivity,
+        beam,
+        beam_shape: model.geometry.beam,
+        beam_origin: model.geometry.origin,
+        flux: model.flux.clone(),
+        shifts: None,
+        offset: None,
+        leaves_tilt: false,
+        smallest_ritz: None,
+        objective: history.last().objective,
+        flags,
+        degrees_of_freedom: degrees_of_freedom(model.used(), &components),
+        components,
+        history,
+    })
+}
+
+/// Minimises F over `unknowns` too: see [`joint`].
+///
+/// # Errors
+/// [`Error::Memory`](crate::Error::Memory) before anything else if the memory for it cannot be had;
+/// then as [`joint::solve`].
+pub fn calibrate_jointly<T: Real>(
+    model: &Model<'_, T>,
+    rotations: &[Rotation],
+    unknowns: &Unknowns,
+    stop: Stop,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Solution> {
+    memory::check(joint::bytes_needed(model), || {
+        format!("fitting {} exposures of {} jointly", model.count(), model.sensor())
+    })?;
+    let fit = joint::solve(model, rotations, unknowns, stop, workers, control)?;
+    let components = fit.components;
+    let (sensitivity, beam, flags) = gauged(fit.sensitivity, fit.beam, &components, &[], workers);
+    let offset = fit.offset.map(|mut offset| {
+        rescale(&mut offset, &components.pixels, workers, |value, label| {
+            if label == 0 { value } else { f64::NAN }
+        });
+        offset
+    });
+    let pixels = components.pixels.iter().filter(|&&label| label != NONE).count();
+    let offsets = if offset.is_some() { pixels } else { 0 };
+    let unknowns = fit.unknowns + pixels + offsets - components.sizes.len();
+    Ok(Solution {
+        sensitivity,
+        beam,
+        beam_shape: fit.beam_shape,
+        beam_origin: fit.origin,
+        flux: fit.flux,
+        shifts: Some(fit.shifts),
+        offset,
+        leaves_tilt: fit.leaves_tilt,
+        smallest_ritz: Some(fit.smallest_ritz),
+        objective: fit.misfit,
+        flags,
+        degrees_of_freedom: model.used() as i64 - unknowns as i64,
+        components,
+        history: fit.history,
+    })
+}
+
+/// M and L in the gauge mean(M) = 1, each component for itself, and the pixels' flags.
+fn gauged(
+    mut sensitivity: Vec<f64>,
+    mut beam: Vec<f64>,
+    components: &Components,
+    left_out: &[usize],
+    workers: &Workers,
+) -> (Vec<f64>, Vec<f64>, Vec<u32>) {
+    let means = component_means(&sensitivity, components, left_out);
     rescale(&mut sensitivity, &components.pixels, workers, |value, label| {
         if label == 0 { value / means[0] } else { f64::NAN }
     });
@@ -76,17 +166,10 @@ pub fn calibrate<T: Real>(
     let undetermined = flag::NO_FLAT_FIELD | flag::DO_NOT_USE;
     let mut flags: Vec<u32> =
         components.pixels.iter().map(|&l| if l == 0 { 0 } else { undetermined }).collect();
-    for &pixel in &left_out {
+    for &pixel in left_out {
         flags[pixel] |= flag::UNRELIABLE_FLAT | flag::DO_NOT_USE;
     }
-    Ok(Solution {
-        sensitivity,
-        beam,
-        flags,
-        degrees_of_freedom: degrees_of_freedom(model.used(), &components),
-        components,
-        history,
-    })
+    (sensitivity, beam, flags)
 }
 
 /// What a solver holds beside the measurements at its fullest, in bytes, where a *place* is a pixel

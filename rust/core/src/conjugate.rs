@@ -161,7 +161,7 @@ pub(crate) struct Ritz {
 }
 
 impl Ritz {
-    fn push(&mut self, step: f64, keep: f64) {
+    pub(crate) fn push(&mut self, step: f64, keep: f64) {
         self.diagonal.push(1.0 / step + self.carried[0]);
         self.beside.push(self.carried[1]);
         self.carried = [keep / step, keep / (step * step)];

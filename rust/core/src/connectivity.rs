@@ -88,11 +88,23 @@ impl Components {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
     pub fn of<T: Real>(model: &Model<'_, T>, control: &Control) -> Result<Self> {
-        let geometry = &model.geometry;
-        let pixels = geometry.sensor.len();
-        let mut sets = DisjointSets::new(pixels + geometry.beam.len());
-        let mut used = vec![false; pixels + geometry.beam.len()];
-        model.for_each_used(control, |pixel, cell| {
+        let sizes = [model.geometry.sensor.len(), model.geometry.beam.len()];
+        Self::linked(sizes, control, |link| model.for_each_used(control, link))
+    }
+
+    /// Finds the components of so many pixels and cells, of which `for_each_link` names those that
+    /// a measurement links.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+    pub(crate) fn linked(
+        [pixels, cells]: [usize; 2],
+        control: &Control,
+        for_each_link: impl FnOnce(&mut dyn FnMut(usize, usize)) -> Result<()>,
+    ) -> Result<Self> {
+        let mut sets = DisjointSets::new(pixels + cells);
+        let mut used = vec![false; pixels + cells];
+        for_each_link(&mut |pixel, cell| {
             sets.union(pixel, pixels + cell);
             used[pixel] = true;
             used[pixels + cell] = true;

@@ -24,6 +24,7 @@
 //!
 //! ```text
 //! calibrate       from measurements to a Solution: method, gauge, flags
+//! joint           the joint fit of beam, fluxes and shifts, with the pixels eliminated
 //! multiscale      the fast solver: Gauss-Newton steps on all scales at once
 //! descent         coordinate descent, the method of the paper
 //! estimate        how far M still is from the minimum, large scales included; when to stop
@@ -121,6 +122,7 @@ pub mod frames;
 pub mod geometry;
 #[cfg(feature = "io")]
 pub mod io;
+pub mod joint;
 mod linalg;
 pub mod memory;
 pub mod model;

@@ -156,6 +156,12 @@ impl<'a, T: Real> Model<'a, T> {
         self.tallies.iter().map(|tally| tally.used).sum()
     }
 
+    /// Whether the variance of the values is known.
+    #[must_use]
+    pub const fn variance_is_known(&self) -> bool {
+        !matches!(self.variance, Variance::Unknown)
+    }
+
     /// The light of an ordinary measurement: the median |y|/c of a sample.
     pub(crate) fn typical_light(&self) -> f64 {
         self.sampled(|value, _, flux| value.abs() / flux)
@@ -213,10 +219,26 @@ impl<'a, T: Real> Model<'a, T> {
         control: &Control,
         mut visit: impl FnMut(usize, usize),
     ) -> Result<()> {
+        let cols = self.sensor().cols;
+        self.for_each_measurement(control, |exposure, row, col| {
+            let place = &self.geometry.exposures[exposure];
+            let cells = self.geometry.views[place.view].cells;
+            visit(row * cols + col, cells.at(row + place.row, col + place.col));
+        })
+    }
+
+    /// Calls `visit(exposure, row, column)` for each used measurement.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] if `control` asks to stop.
+    pub(crate) fn for_each_measurement(
+        &self,
+        control: &Control,
+        mut visit: impl FnMut(usize, usize, usize),
+    ) -> Result<()> {
         let Shape { rows, cols } = self.sensor();
         let mut scratch = vec![0.0; cols];
-        for (exposure, place) in self.geometry.exposures.iter().enumerate() {
-            let cells = self.geometry.views[place.view].cells;
+        for exposure in 0..self.count() {
             for row in 0..rows {
                 control.check()?;
                 let stretch = self.stretch(exposure, row, 0..cols, &mut scratch);
@@ -226,7 +248,7 @@ impl<'a, T: Real> Model<'a, T> {
                         Stretch::Weighted(_, weights) => weights[col] > 0.0,
                     };
                     if used {
-                        visit(row * cols + col, cells.at(row + place.row, col + place.col));
+                        visit(exposure, row, col);
                     }
                 }
             }

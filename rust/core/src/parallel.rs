@@ -111,12 +111,31 @@ impl Workers {
         });
     }
 
-    /// Like [`map_blocks`](Self::map_blocks) over two slices at once.
+    /// a · b.
+    pub(crate) fn dot(&self, a: &[f64], b: &[f64]) -> f64 {
+        let blocks: Vec<_> = a.chunks(FILLED).zip(b.chunks(FILLED)).collect();
+        let sums = self.map(blocks.len(), |index| {
+            let (a, b) = blocks[index];
+            a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>()
+        });
+        sums.into_iter().sum()
+    }
+
+    /// y ← y + f x.
+    pub(crate) fn add_multiple(&self, y: &mut [f64], factor: f64, x: &[f64]) {
+        self.map_blocks(y, FILLED, |index, part| {
+            for (y, x) in part.iter_mut().zip(&x[index * FILLED..]) {
+                *y += factor * x;
+            }
+        });
+    }
+
+    /// Like [`map_blocks`](Self::map_blocks) over two slices at once, cut into as many blocks.
     pub fn map_pairs<A, B, R>(
         &self,
         first: &mut [A],
         second: &mut [B],
-        size: usize,
+        sizes: [usize; 2],
         work: impl Fn(usize, &mut [A], &mut [B]) -> R + Sync + Send,
     ) -> Vec<R>
     where
@@ -124,9 +143,9 @@ impl Workers {
         B: Send,
         R: Send,
     {
-        let size = size.max(1);
+        let [one, other] = sizes.map(|size| size.max(1));
         self.pool.install(|| {
-            let pairs = first.par_chunks_mut(size).zip(second.par_chunks_mut(size));
+            let pairs = first.par_chunks_mut(one).zip(second.par_chunks_mut(other));
             pairs.enumerate().map(|(index, (first, second))| work(index, first, second)).collect()
         })
     }

@@ -21,8 +21,8 @@
 //! A slight ridge makes it definite: what it is not definite in, by constants in pieces that do not
 //! hang together or by shifts along one line only, is no error that S can see.
 
-mod coarse;
-mod hats;
+pub(crate) mod coarse;
+pub(crate) mod hats;
 mod kernel;
 
 use crate::control::Control;
@@ -171,7 +171,7 @@ impl<'m> TwoLevel<'m> {
         let (padding, hats) = (self.padding, &self.hats);
         let (x, direction) = (padding.body_mut(x), padding.body_mut(direction));
         let size = BAND * padding.width;
-        let bands = self.workers.map_pairs(x, direction, size, |band, x, direction| {
+        let bands = self.workers.map_pairs(x, direction, [size; 2], |band, x, direction| {
             let rows = x.chunks_exact_mut(padding.width);
             let rows = rows.zip(direction.chunks_exact_mut(padding.width)).enumerate();
             let by_row = rows.map(|(index, (x, direction))| {
@@ -261,7 +261,7 @@ pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
 }
 
 /// How far apart hats stand, along rows and columns of the sensor.
-fn spacing(geometry: &Geometry) -> [usize; 2] {
+pub(crate) fn spacing(geometry: &Geometry) -> [usize; 2] {
     let reach = |along: fn(&Placement) -> usize| {
         let of_view = |view| {
             let places =

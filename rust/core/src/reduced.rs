@@ -292,7 +292,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             let mut weight = padding.zeros(view.shape.rows, self.workers, control);
             let (signals, weights) = (padding.body_mut(&mut signal), padding.body_mut(&mut weight));
             let size = BAND * padding.width;
-            self.workers.map_pairs(signals, weights, size, |band, signals, weights| {
+            self.workers.map_pairs(signals, weights, [size; 2], |band, signals, weights| {
                 let mut scratch = self.scratch();
                 let signals = signals.chunks_exact_mut(padding.width);
                 let weights = weights.chunks_exact_mut(padding.width);
@@ -350,21 +350,22 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         let least = ((LEAST_WEIGHT * typical(body)) as f32).max(FAINTEST);
         let sensitivity = padding.body_mut(&mut self.sensitivity);
         let size = BAND * padding.width;
-        let bands = self.workers.map_pairs(sensitivity, body, size, |band, sensitivity, rows| {
-            let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
-            for (index, (m, d)) in sensitivity.iter().zip(rows).enumerate() {
-                if *d > least {
-                    *d = 1.0 / *d;
-                    sum += f64::from(*m);
-                    count += 1;
-                } else if *d > 0.0 {
-                    let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
-                    left_out.push(LeftOut { place: band * size + index, inverse, step: 0.0 });
-                    *d = 0.0;
+        let bands =
+            self.workers.map_pairs(sensitivity, body, [size; 2], |band, sensitivity, rows| {
+                let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
+                for (index, (m, d)) in sensitivity.iter().zip(rows).enumerate() {
+                    if *d > least {
+                        *d = 1.0 / *d;
+                        sum += f64::from(*m);
+                        count += 1;
+                    } else if *d > 0.0 {
+                        let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
+                        left_out.push(LeftOut { place: band * size + index, inverse, step: 0.0 });
+                        *d = 0.0;
+                    }
                 }
-            }
-            (sum, count, left_out)
-        });
+                (sum, count, left_out)
+            });
         self.left_out.clear();
         let (mut sum, mut count) = (0.0, 0);
         for (of_band, in_band, left_out) in bands {

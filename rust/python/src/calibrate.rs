@@ -3,19 +3,20 @@
 //! | argument | dtype and rank | here | how |
 //! |---|---|---|---|
 //! | frames | float32 or float64, 3 | `Stack<f32>` or `Stack<f64>` | view |
-//! | shifts | int64, 2 | `Vec<[i64; 2]>` | copy of a few numbers |
-//! | rotation, flux | int64, float64, 1 | `Vec` | copy of a few numbers |
+//! | shifts, shift_std | float64, 2 | `Vec<[f64; 2]>` | copy of a few numbers |
+//! | rotation, flux, flux_std, time | int64, float64, 1 | `Vec` | copy of a few numbers |
 //! | variance | float64, 1, or the frames' dtype, 3 | `Variance` | view |
 //! | mask | bool, 2 or 3 | `Mask` | view |
 
 use std::num::NonZeroUsize;
 
-use equipix_core::calibrate::{Method, Solution, calibrate};
+use equipix_core::calibrate::{Method, Solution, calibrate, calibrate_jointly};
 use equipix_core::control::Control;
 use equipix_core::error::{Error, Result};
 use equipix_core::estimate::{Ended, History, Look, Stop};
 use equipix_core::frames::{Real, Shape, Stack};
 use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::joint::{Flux, Unknowns};
 use equipix_core::model::{Mask, Model, Variance};
 use equipix_core::parallel::Workers;
 use numpy::{
@@ -62,11 +63,17 @@ pub(crate) struct PySolution {
     error_estimate: Py<PyArray1<f64>>,
     ended: &'static str,
     degrees_of_freedom: i64,
+    flux: Vec<f64>,
+    shifts: Option<Vec<[f64; 2]>>,
+    offset: Option<Py<PyArray2<f64>>>,
+    leaves_tilt: bool,
+    smallest_ritz: Option<f64>,
+    misfit: f64,
 }
 
 /// Everything but the frames and their variances, which have a type of their own.
 struct Setting<'a> {
-    shifts: Vec<[i64; 2]>,
+    unknowns: Unknowns,
     rotation: Vec<i64>,
     flux: Vec<f64>,
     mask: Mask<'a>,
@@ -77,15 +84,18 @@ struct Setting<'a> {
 
 /// Solves for sensitivity and beam.
 #[pyfunction]
-#[pyo3(signature = (frames, shifts, *, rotation, flux, variance, mask, method, tolerance,
-                    max_sweeps, workers, progress))]
+#[pyo3(signature = (frames, shifts, *, shift_std, rotation, flux, flux_model, offset, variance, mask,
+                    method, tolerance, max_sweeps, workers, progress))]
 #[expect(clippy::too_many_arguments, reason = "the keywords of equipix.calibrate")]
 pub(crate) fn calibrate_frames(
     py: Python<'_>,
     frames: Frames<'_>,
-    shifts: PyReadonlyArray2<'_, i64>,
+    shifts: PyReadonlyArray2<'_, f64>,
+    shift_std: Option<PyReadonlyArray2<'_, f64>>,
     rotation: Vec<i64>,
     flux: Vec<f64>,
+    flux_model: (String, Vec<f64>),
+    offset: bool,
     variance: Option<PyVariance<'_>>,
     mask: Option<PyMask<'_>>,
     method: &str,
@@ -94,11 +104,18 @@ pub(crate) fn calibrate_frames(
     workers: Option<NonZeroUsize>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<PySolution> {
-    let shifts = shifts.as_slice()?.chunks_exact(2).map(|d| [d[0], d[1]]).collect();
+    let unknowns = Unknowns {
+        shifts: shifts.as_slice()?.as_chunks().0.to_vec(),
+        shift_std: shift_std
+            .map(|std| Ok::<_, PyErr>(std.as_slice()?.as_chunks().0.to_vec()))
+            .transpose()?,
+        flux: flux_named(flux_model).map_err(|error| errors::exception(py, &error))?,
+        offset,
+    };
     let stop = Stop { tolerance, max_sweeps };
     let mask = mask.as_ref().map_or(Ok(Mask::None), view_mask)?;
     let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
-    let setting = Setting { shifts, rotation, flux, mask, method, stop, workers };
+    let setting = Setting { unknowns, rotation, flux, mask, method, stop, workers };
     let progress = progress.as_ref();
     let outcome = match (&frames, &variance) {
         (Frames::Single(frames), Some(PyVariance::Single(variance))) => {
@@ -120,8 +137,8 @@ pub(crate) fn calibrate_frames(
             run::interruptible(py, progress, |c| solve(frames, variance, &setting, c))
         }
     };
-    let (solution, geometry) = outcome?;
-    wrap(py, solution, &geometry)
+    let (solution, sensor) = outcome?;
+    wrap(py, solution, sensor)
 }
 
 fn solve<T: Real>(
@@ -129,15 +146,22 @@ fn solve<T: Real>(
     variance: Variance<'_, T>,
     setting: &Setting<'_>,
     control: &Control,
-) -> Result<(Solution, Geometry)> {
+) -> Result<(Solution, Shape)> {
     let workers = Workers::new(setting.workers)?;
     let rotations = setting.rotation.iter().map(|&degrees| rotation(degrees));
     let rotations = rotations.collect::<Result<Vec<_>>>()?;
-    let geometry = Geometry::new(frames.shape(), &setting.shifts, &rotations)?;
+    let nearest = |shift: &[f64; 2]| shift.map(|d| d.round_ties_even() as i64);
+    let unknowns = &setting.unknowns;
+    let shifts: Vec<_> = unknowns.shifts.iter().map(nearest).collect();
+    let geometry = Geometry::new(frames.shape(), &shifts, &rotations)?;
     let model =
         Model::new(frames, geometry, &setting.flux, variance, setting.mask, &workers, control)?;
-    let solution = calibrate(&model, setting.method, setting.stop, &workers, control)?;
-    Ok((solution, model.geometry))
+    let solution = if unknowns.is_none() {
+        calibrate(&model, setting.method, setting.stop, &workers, control)?
+    } else {
+        calibrate_jointly(&model, &rotations, unknowns, setting.stop, &workers, control)?
+    };
+    Ok((solution, model.sensor()))
 }
 
 fn method_named(name: &str) -> Result<Method> {
@@ -148,6 +172,17 @@ fn method_named(name: &str) -> Result<Method> {
             argument: "method",
             problem: format!("is '{other}': expected 'multiscale' or 'coordinate-descent'"),
         }),
+    }
+}
+
+/// What is known of the fluxes: the kind, with times or standard deviations.
+fn flux_named((kind, values): (String, Vec<f64>)) -> Result<Flux> {
+    match kind.as_str() {
+        "known" => Ok(Flux::Known),
+        "fit" => Ok(Flux::Free),
+        "linear" => Ok(Flux::Linear(values)),
+        "prior" => Ok(Flux::Prior(values)),
+        other => Err(Error::Value { argument: "flux", problem: format!("is '{other}'") }),
     }
 }
 
@@ -183,17 +218,17 @@ fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
     })
 }
 
-fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PySolution> {
+fn wrap(py: Python<'_>, solution: Solution, sensor: Shape) -> PyResult<PySolution> {
     let History { looks, ended } = solution.history;
     let column = |value: fn(&Look) -> f64| {
         looks.iter().map(value).collect::<Vec<_>>().into_pyarray(py).unbind()
     };
     Ok(PySolution {
-        sensitivity: image(py, solution.sensitivity, geometry.sensor)?,
-        beam: image(py, solution.beam, geometry.beam)?,
-        beam_origin: geometry.origin.into(),
-        flags: image(py, solution.flags, geometry.sensor)?,
-        component_labels: image(py, solution.components.pixels, geometry.sensor)?,
+        sensitivity: image(py, solution.sensitivity, sensor)?,
+        beam: image(py, solution.beam, solution.beam_shape)?,
+        beam_origin: solution.beam_origin.into(),
+        flags: image(py, solution.flags, sensor)?,
+        component_labels: image(py, solution.components.pixels, sensor)?,
         components: solution.components.sizes.len(),
         sweeps: looks.iter().map(|look| look.sweep).collect::<Vec<_>>().into_pyarray(py).unbind(),
         objective: column(|look| look.objective),
@@ -204,6 +239,12 @@ fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PyS
             Ended::Stalled => "stalled",
         },
         degrees_of_freedom: solution.degrees_of_freedom,
+        flux: solution.flux,
+        shifts: solution.shifts,
+        offset: solution.offset.map(|offset| image(py, offset, sensor)).transpose()?,
+        leaves_tilt: solution.leaves_tilt,
+        smallest_ritz: solution.smallest_ritz,
+        misfit: solution.objective,
     })
 }
 

@@ -216,7 +216,7 @@ impl<'m, 'a, T: Real> Descent<'m, 'a, T> {
         let mut slopes = vec![0.0; shape.len()];
         let mut weights = vec![0.0; shape.len()];
         let size = BAND * shape.cols;
-        self.workers.map_pairs(&mut slopes, &mut weights, size, |band, slopes, weights| {
+        self.workers.map_pairs(&mut slopes, &mut weights, [size; 2], |band, slopes, weights| {
             let mut scratch = Scratch::new(model.count());
             let rows = slopes.chunks_exact_mut(shape.cols);
             let rows = rows.zip(weights.chunks_exact_mut(shape.cols)).enumerate();

@@ -35,8 +35,8 @@ const CHECK_EVERY: usize = 1 << 12;
 const INVERSE_ITERATIONS: usize = 3;
 
 /// The factorised coarse matrix.
-pub(super) struct Coarse {
-    /// Hats that hang together, each with its share of the sensor.
+pub(crate) struct Coarse {
+    /// Hats that hang together, each with its share of the area; other unknowns have none.
     parts: Vec<Vec<(usize, f64)>>,
     factor: Option<Cholesky>,
 }
@@ -51,12 +51,32 @@ impl Coarse {
     ) -> Result<Self> {
         let blocks = Blocks::new(hats, geometry);
         let weights = blocks.weights(geometry, reduced, workers, control)?;
-        let mut matrix = Matrix::new(hats);
-        for (block, weights) in weights.chunks_exact(geometry.exposures.len()).enumerate() {
+        let stars = weights
+            .chunks_exact(geometry.exposures.len())
+            .enumerate()
+            .map(|(block, weights)| blocks.star(block, weights, hats, geometry));
+        Self::of_stars(hats, &[], stars, control)
+    }
+
+    /// The matrix of the hats and other unknowns, whose own diagonal elements are `others`, summed
+    /// over blocks: what each exposure sees of them there.
+    pub(crate) fn of_stars(
+        hats: &Hats,
+        others: &[f64],
+        stars: impl Iterator<Item = Vec<Arm>>,
+        control: &Control,
+    ) -> Result<Self> {
+        let mut matrix = Matrix::new(hats, others.len());
+        for (block, star) in stars.enumerate() {
             if block % CHECK_EVERY == 0 {
                 control.check()?;
             }
-            matrix.add_star(&blocks.star(block, weights, hats, geometry));
+            matrix.add_star(&star);
+        }
+        for (index, &value) in others.iter().enumerate() {
+            let place = hats.count() + index;
+            matrix.add(place, place, value);
+            matrix.masses[place] += value;
         }
         control.check()?;
         Self::factorised(&matrix, hats, control)
@@ -64,7 +84,11 @@ impl Coarse {
 
     fn factorised(matrix: &Matrix, hats: &Hats, control: &Control) -> Result<Self> {
         let mut sets = DisjointSets::new(hats.count());
-        matrix.for_each(|row, col, _| sets.union(row, col));
+        matrix.for_each(|row, col, _| {
+            if row.max(col) < hats.count() {
+                sets.union(row, col);
+            }
+        });
         let mut parts: Vec<Vec<(usize, f64)>> = vec![Vec::new(); hats.count()];
         for hat in 0..hats.count() {
             parts[sets.find(hat)].push((hat, hats.share(hat)));
@@ -108,7 +132,7 @@ impl Coarse {
     /// Constants in a part are left out on either side: they are no error, and what there is of
     /// them is rounding. If rounding in a nearly singular matrix left no factor, the heights are 0
     /// and the first level is left alone.
-    pub(super) fn solve(&self, values: &mut [f64], factor: f64) {
+    pub(crate) fn solve(&self, values: &mut [f64], factor: f64) {
         let Some(cholesky) = &self.factor else { return values.fill(0.0) };
         for part in &self.parts {
             let (sum, area) = part
@@ -200,16 +224,24 @@ impl Blocks {
                 let rotation = geometry.views[place.view].rotation;
                 let [row, col] = rotation.turned_point(centre, geometry.beam);
                 let hats = hats.over(row - place.row as f64, col - place.col as f64);
-                Arm { weight: f64::from(weight), hats }
+                Arm { weight: f64::from(weight), hats, others: Vec::new() }
             })
             .collect()
     }
 }
 
-/// One exposure's part in a block.
-struct Arm {
-    weight: f64,
-    hats: [(usize, f64); 4],
+/// One exposure's part in a block: its weight there, and what it sees of the unknowns.
+pub(crate) struct Arm {
+    pub(crate) weight: f64,
+    pub(crate) hats: [(usize, f64); 4],
+    /// Behind the hats.
+    pub(crate) others: Vec<(usize, f64)>,
+}
+
+impl Arm {
+    fn heights(&self) -> impl Iterator<Item = (usize, f64)> {
+        self.hats.iter().chain(&self.others).copied()
+    }
 }
 
 /// The coarse matrix before it is factorised: elements of one triangle.
@@ -224,11 +256,11 @@ struct Matrix {
 }
 
 impl Matrix {
-    fn new(hats: &Hats) -> Self {
+    fn new(hats: &Hats, others: usize) -> Self {
         Self {
             cols: hats.cols.nodes,
-            near: vec![[0.0; STENCIL]; hats.count()],
-            masses: vec![0.0; hats.count()],
+            near: vec![[0.0; STENCIL]; hats.count() + others],
+            masses: vec![0.0; hats.count() + others],
             far: HashMap::new(),
         }
     }
@@ -236,13 +268,14 @@ impl Matrix {
     /// Adds Σ_k Ω_k (φ_k − φ̄)(φ_k − φ̄)ᵀ, φ̄ the weighted mean.
     fn add_star(&mut self, star: &[Arm]) {
         let total: f64 = star.iter().map(|arm| arm.weight).sum();
-        let mut nodes: Vec<usize> = star.iter().flat_map(|arm| arm.hats.map(|hat| hat.0)).collect();
+        let mut nodes: Vec<usize> =
+            star.iter().flat_map(|arm| arm.heights().map(|hat| hat.0)).collect();
         nodes.sort_unstable();
         nodes.dedup();
         let mut mean = vec![0.0; nodes.len()];
         let mut heights = vec![0.0; star.len() * nodes.len()];
         for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
-            for (hat, height) in arm.hats {
+            for (hat, height) in arm.heights() {
                 self.masses[hat] += arm.weight * height * height;
                 let at = nodes.partition_point(|&node| node < hat);
                 heights[at] += height;

@@ -1,0 +1,471 @@
+//! The joint fit of beam, fluxes and shifts: what whole shifts and a steady lamp do not need.
+//!
+//! ```text
+//! F = Σ_k Σ_p w [ y − c_k L(A p + t + d_k) M(p) − O(p) ]² + τ ‖G a‖² + priors on ln c and d
+//! ```
+//!
+//! L is a spline of coefficients a where shifts are no whole numbers (`joint/grid.rs`), so its part of
+//! the normal matrix is banded while that of M stays diagonal. Hence M is eliminated, not L as in
+//! [`multiscale`](crate::multiscale), and Gauss-Newton steps are taken in (a, ln c, d)
+//! (`joint/system.rs`), by conjugate gradients in double precision with a preconditioner on two scales
+//! (`joint/precondition.rs`). The penalty (`joint/penalty.rs`) is slight: τ is 1e-5 of the mean
+//! weight of a cell.
+
+mod flux;
+mod gauge;
+mod grid;
+mod kernel;
+mod penalty;
+mod precondition;
+mod system;
+
+pub use flux::Flux;
+
+use crate::conjugate::Ritz;
+use crate::connectivity::Components;
+use crate::control::Control;
+use crate::descent::Descent;
+use crate::error::Result;
+use crate::estimate::{Ended, FEWEST_ITERATIONS, History, Look, Stop};
+use crate::frames::{Real, Shape};
+use crate::geometry::Rotation;
+use crate::model::Model;
+use crate::parallel::Workers;
+use flux::Fluxes;
+use grid::Grid;
+use precondition::Preconditioner;
+use system::{ShiftPrior, State, System};
+
+/// The weight τ of the penalty, as a share of the mean weight of a cell.
+pub const SMOOTHING: f64 = 1e-5;
+/// Products that nobody waits for.
+const MOST_PRODUCTS: u64 = 20_000;
+/// Sweeps that make the first beam.
+const FIRST_SWEEPS: usize = 4;
+/// A shift that is known is one with this standard deviation, in pixels.
+const EXACT_SHIFT: f64 = 1e-6;
+/// How much of the tolerance a search aims at; the rest is for what linearising adds.
+const AIM: f64 = 0.5;
+/// What linearising adds counts as this share of a step at most, and at least.
+const CURVED: [f64; 2] = [1e-8, 0.03];
+/// How often a step is halved before it is taken back.
+const MOST_HALVINGS: u32 = 10;
+/// Steps that may fail to lower the estimate before it counts as stalled.
+const PATIENCE: usize = 3;
+/// Steps after which the variance of a measurement, where it is not known, counts as found.
+const SETTLING: usize = 3;
+/// Products that an ordinary fit takes: what progress is measured against at first.
+const TYPICAL: u64 = 120;
+
+/// What is unknown besides sensitivity and beam.
+#[derive(Clone, Debug)]
+pub struct Unknowns {
+    /// The shift (row, column) of each exposure, in pixels.
+    pub shifts: Vec<[f64; 2]>,
+    /// Their standard deviations, if they are to be refined.
+    pub shift_std: Option<Vec<[f64; 2]>>,
+    /// What is known of the fluxes.
+    pub flux: Flux,
+    /// Whether frames hold an offset, to be found with M.
+    pub offset: bool,
+}
+
+impl Unknowns {
+    /// Whether there are none: whole shifts, known fluxes, no offset.
+    #[must_use]
+    pub fn is_none(&self) -> bool {
+        let whole = self.shifts.iter().flatten().all(|shift| shift.fract() == 0.0);
+        whole && self.shift_std.is_none() && self.flux == Flux::Known && !self.offset
+    }
+}
+
+/// What was found.
+#[derive(Clone, Debug)]
+pub struct Fit {
+    /// M, row by row; 1 where no measurement tells.
+    pub sensitivity: Vec<f64>,
+    /// O, row by row, if it was sought.
+    pub offset: Option<Vec<f64>>,
+    /// L at the cells of its grid, row by row; 0 where no measurement tells.
+    pub beam: Vec<f64>,
+    /// Sizes of the grid.
+    pub beam_shape: Shape,
+    /// The cell that the sensor's first pixel sees at shift 0, unturned.
+    pub origin: [usize; 2],
+    /// c of each exposure.
+    pub flux: Vec<f64>,
+    /// The shift of each exposure.
+    pub shifts: Vec<[f64; 2]>,
+    /// Whether the fluxes leave a tilt of ln M undetermined.
+    pub leaves_tilt: bool,
+    /// What the measurements can compare.
+    pub components: Components,
+    /// The smallest Ritz value: near 0 where the measurements do not tell some pattern.
+    pub smallest_ritz: f64,
+    /// F of the measurements alone.
+    pub misfit: f64,
+    /// Numbers of coefficients and parameters sought.
+    pub unknowns: usize,
+    /// The way here.
+    pub history: History,
+}
+
+/// Minimises F until the estimated error of M is at most the tolerance, the products are used up, or
+/// the estimate no longer falls.
+///
+/// # Errors
+/// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
+/// 0, [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+pub fn solve<T: Real>(
+    model: &Model<'_, T>,
+    rotations: &[Rotation],
+    unknowns: &Unknowns,
+    stop: Stop,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Fit> {
+    let limit = stop.limit(MOST_PRODUCTS)?;
+    let mut system = start(model, rotations, unknowns, workers, control)?;
+    let mut search = Search::default();
+    let mut looks: Vec<Look> = Vec::new();
+    let mut products = FIRST_SWEEPS as u64;
+    let mut taken: Option<Vec<f64>> = None;
+    let mut halvings = 0;
+    let mut stuck = false;
+    let mut preconditioner = None;
+    loop {
+        let (objective, slope) = system.linearise(SMOOTHING, control)?;
+        products += 1;
+        let highest = looks.last().map_or(f64::INFINITY, |last| last.objective * (1.0 + 1e-12));
+        // A number that is none is no fall either.
+        let fell = objective <= highest + rounding(model);
+        if let Some(x) = &taken
+            && !fell
+            && halvings <= MOST_HALVINGS
+        {
+            // The last time, what is left of the step is taken back.
+            halvings += 1;
+            stuck = halvings > MOST_HALVINGS;
+            let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS) as i32);
+            advance(&mut system, x, -share);
+            continue;
+        }
+        halvings = 0;
+        let before = system.unit;
+        if looks.len() < SETTLING && !model.variance_is_known() {
+            system.unit = system.misfit(objective) / freedom(&system);
+        }
+        let (objective, slope) = if system.unit == before {
+            (objective, slope)
+        } else {
+            system.linearise(SMOOTHING, control)?
+        };
+        if preconditioner.is_none() {
+            preconditioner = Some(Preconditioner::new(&mut system, control)?);
+        }
+        let Some(preconditioner) = &preconditioner else { continue };
+        search.begin(&system, preconditioner, slope);
+        let first = search.product(&mut system, control)?;
+        products += 1;
+        looks.push(Look { sweep: products, objective, error: first / search.smallest });
+        if let Some(ended) = ended(&looks, &search, &stop, limit, stuck) {
+            let history = History { looks, ended };
+            let mut fit = finish(&system, &search, objective, history, control)?;
+            if unknowns.flux != Flux::Known && !matches!(unknowns.flux, Flux::Prior(_)) {
+                gauge::fix(&mut fit, rotations[0], model.sensor());
+            }
+            return Ok(fit);
+        }
+        let reachable = first * first.clamp(CURVED[0], CURVED[1]);
+        while products + 1 < limit {
+            control.report("calibrate", products, TYPICAL.max(products).min(limit));
+            if !search.step(&system, preconditioner) {
+                break;
+            }
+            let size = search.product(&mut system, control)?;
+            products += 1;
+            let near = size <= reachable || size / search.smallest <= AIM * stop.tolerance;
+            if near && search.iterations >= FEWEST_ITERATIONS {
+                break;
+            }
+        }
+        advance(&mut system, &search.x, 1.0);
+        taken = Some(search.x.clone());
+    }
+}
+
+/// What the joint fit holds beside the measurements at its fullest, in bytes: the light and the pulls
+/// of each measurement, five numbers a pixel, and for each cell five vectors, weights, penalty and two
+/// copies for each view.
+pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>) -> u64 {
+    let geometry = &model.geometry;
+    let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
+    let (count, views) = (model.count() as u64, geometry.views.len() as u64);
+    8 * ((2 * count + 7) * pixels + (16 + 2 * views) * cells)
+        + crate::precondition::bytes_needed(geometry)
+}
+
+/// Why it has ended, if it has.
+fn ended(looks: &[Look], search: &Search, stop: &Stop, limit: u64, stuck: bool) -> Option<Ended> {
+    let last = looks.last()?;
+    let settled = last.error == 0.0;
+    let best = |looks: &[Look]| looks.iter().map(|look| look.error).fold(f64::INFINITY, f64::min);
+    let stalled = looks.len().checked_sub(PATIENCE + 1).is_some_and(|earlier| {
+        earlier >= SETTLING && 2.0 * best(&looks[earlier + 1..]) > best(&looks[..=earlier])
+    });
+    if (search.iterations >= FEWEST_ITERATIONS || settled) && last.error <= stop.tolerance {
+        Some(Ended::Converged)
+    } else if last.sweep + 1 >= limit {
+        Some(Ended::SweepsUsed)
+    } else if stuck || stalled {
+        Some(Ended::Stalled)
+    } else {
+        None
+    }
+}
+
+/// The problem at a first beam, from some sweeps at the nearest whole shifts.
+fn start<'m, 'a, T: Real>(
+    model: &'m Model<'a, T>,
+    rotations: &[Rotation],
+    unknowns: &Unknowns,
+    workers: &'m Workers,
+    control: &Control,
+) -> Result<System<'m, 'a, T>> {
+    let grid =
+        Grid::new(model.sensor(), &unknowns.shifts, rotations, unknowns.shift_std.is_some())?;
+    let fluxes = Fluxes::new(&unknowns.flux, &unknowns.shifts, rotations);
+    let mut descent = Descent::new(model, workers, control);
+    descent.start_bright(control)?;
+    for _ in 0..FIRST_SWEEPS {
+        descent.sweep(control)?;
+    }
+    let state = State {
+        beam: first_beam(&grid, model, &descent.beam()),
+        theta: vec![0.0; fluxes.columns.len()],
+        shifts: unknowns.shifts.clone(),
+    };
+    let prior = unknowns.shift_std.as_ref().map(|std| ShiftPrior {
+        measured: unknowns.shifts.clone(),
+        precisions: std.iter().map(|std| std.map(|std| std.max(EXACT_SHIFT).powi(-2))).collect(),
+    });
+    Ok(System::new(model, grid, fluxes, prior, unknowns.offset, state, workers, control))
+}
+
+/// A beam known where pixels look at whole shifts, on the grid: cells around take what is beside them.
+fn first_beam<T: Real>(grid: &Grid, model: &Model<'_, T>, known: &[f64]) -> Vec<f64> {
+    let (shape, origin) = (grid.geometry.beam, grid.geometry.origin);
+    let (from, start) = (model.geometry.beam, model.geometry.origin);
+    let mut beam = vec![0.0; shape.len()];
+    for (cell, value) in beam.iter_mut().enumerate() {
+        let row = (cell / shape.cols + start[0]).checked_sub(origin[0]);
+        let col = (cell % shape.cols + start[1]).checked_sub(origin[1]);
+        if let (Some(row), Some(col)) = (row, col)
+            && row < from.rows
+            && col < from.cols
+        {
+            *value = known[row * from.cols + col];
+        }
+    }
+    if !grid.is_spline() {
+        return beam;
+    }
+    // As far as factors and margins reach beyond the nearest whole shift.
+    for _ in 0..grid.width {
+        let before = beam.clone();
+        for (cell, value) in beam.iter_mut().enumerate().filter(|(_, value)| **value == 0.0) {
+            let (row, col) = (cell / shape.cols, cell % shape.cols);
+            let beside = [
+                (row > 0).then(|| cell - shape.cols),
+                (row + 1 < shape.rows).then(|| cell + shape.cols),
+                (col > 0).then(|| cell - 1),
+                (col + 1 < shape.cols).then(|| cell + 1),
+            ];
+            let lit = beside.into_iter().flatten().map(|cell| before[cell]).filter(|&a| a != 0.0);
+            let (sum, count) = lit.fold((0.0, 0.0), |(sum, count), a| (sum + a, count + 1.0));
+            if count > 0.0 {
+                *value = sum / count;
+            }
+        }
+    }
+    beam
+}
+
+/// Takes a share of a step.
+fn advance<T: Real>(system: &mut System<'_, '_, T>, x: &[f64], share: f64) {
+    let cells = system.state.beam.len();
+    system.workers.add_multiple(&mut system.state.beam, share, &x[..cells]);
+    let params = system.state.theta.len();
+    for (theta, step) in system.state.theta.iter_mut().zip(&x[cells..]) {
+        *theta += share * step;
+    }
+    let moves = system.centred(&x[cells + params..]);
+    let shifts = system.state.shifts.as_flattened_mut().iter_mut();
+    shifts.zip(moves.as_flattened()).for_each(|(shift, step)| *shift += share * step);
+}
+
+/// Measurements less unknowns; a coefficient that is seen counts whole.
+fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
+    let pixels = system.model.sensor().len() * (1 + usize::from(system.with_offset));
+    system.model.used().saturating_sub(pixels + unknowns(system)).max(1) as f64
+}
+
+fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
+    let seen = system.weights.iter().filter(|&&weight| weight > 0.0).count();
+    seen + system.size() - system.state.beam.len()
+}
+
+/// What F may rise by through rounding, of residuals that are rounding alone.
+fn rounding<T: Real>(model: &Model<'_, T>) -> f64 {
+    let residual = 4.0 * f64::EPSILON * model.brightest();
+    model.exposure_weights().iter().sum::<f64>() * residual * residual
+}
+
+fn finish<T: Real>(
+    system: &System<'_, '_, T>,
+    search: &Search,
+    objective: f64,
+    history: History,
+    control: &Control,
+) -> Result<Fit> {
+    let [sensitivity, offset] = system.pixels();
+    Ok(Fit {
+        components: components(system, control)?,
+        sensitivity,
+        offset: system.with_offset.then_some(offset),
+        beam: values_at_cells(system),
+        beam_shape: system.grid.geometry.beam,
+        origin: system.grid.geometry.origin,
+        flux: system.flux.clone(),
+        shifts: system.state.shifts.clone(),
+        leaves_tilt: system.fluxes.leaves_tilt,
+        smallest_ritz: search.smallest,
+        misfit: system.misfit(objective),
+        unknowns: unknowns(system),
+        history,
+    })
+}
+
+/// The components of pixels and cells. Where all shifts differ by whole numbers of pixels, a pixel
+/// hangs on one value of the beam; else on the four cells around it, which is a necessary condition
+/// alone: then a Ritz value near 0 tells of patterns that nothing compares.
+fn components<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Components> {
+    let Grid { geometry, sensor, .. } = &system.grid;
+    let shifts = &system.state.shifts;
+    let whole =
+        shifts.iter().all(|d| (0..2).all(|axis| (d[axis] - shifts[0][axis]).fract() == 0.0));
+    let around: &[[usize; 2]] = match (system.grid.is_spline(), whole) {
+        (false, _) => &[[0, 0]],
+        (true, true) => &[[1, 1]],
+        (true, false) => &[[1, 1], [1, 2], [2, 1], [2, 2]],
+    };
+    let windows = system.grid.windows(shifts);
+    let sizes = [sensor.len(), geometry.beam.len()];
+    Components::linked(sizes, control, |link| {
+        system.model.for_each_measurement(control, |exposure, row, col| {
+            let window = &windows[exposure];
+            let cells = geometry.views[window.view].cells;
+            for [i, j] in around {
+                let cell = cells.at(row + window.row + i, col + window.col + j);
+                link(row * sensor.cols + col, cell);
+            }
+        })
+    })
+}
+
+/// L at the cells: Σ_j a_j B(u − j) with B = 1/6, 4/6, 1/6 at whole numbers; 0 where a coefficient
+/// that it takes is not seen.
+fn values_at_cells<T: Real>(system: &System<'_, '_, T>) -> Vec<f64> {
+    let beam = &system.state.beam;
+    let seen = |cell: usize| system.weights[cell] > 0.0;
+    if !system.grid.is_spline() {
+        return (0..beam.len()).map(|cell| if seen(cell) { beam[cell] } else { 0.0 }).collect();
+    }
+    const FACTORS: [f64; 3] = [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0];
+    let Shape { rows, cols } = system.grid.geometry.beam;
+    let mut values = vec![0.0; beam.len()];
+    system.workers.map_blocks(&mut values, cols, |row, values| {
+        if row == 0 || row + 1 == rows {
+            return;
+        }
+        for (col, value) in values.iter_mut().enumerate().take(cols - 1).skip(1) {
+            let around = (0..9).map(|i| ((row + i / 3 - 1) * cols + col + i % 3 - 1, i));
+            if around.clone().all(|(cell, _)| seen(cell)) {
+                *value = around.map(|(cell, i)| FACTORS[i / 3] * FACTORS[i % 3] * beam[cell]).sum();
+            }
+        }
+    });
+    values
+}
+
+/// Conjugate gradients for S x = b, in double precision.
+#[derive(Default)]
+struct Search {
+    x: Vec<f64>,
+    residual: Vec<f64>,
+    direction: Vec<f64>,
+    product: Vec<f64>,
+    square: f64,
+    keep: f64,
+    ritz: Ritz,
+    /// The change of M that goes with the direction.
+    change: Vec<f64>,
+    /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
+    smallest: f64,
+    iterations: u64,
+}
+
+impl Search {
+    fn begin<T: Real>(
+        &mut self,
+        system: &System<'_, '_, T>,
+        preconditioner: &Preconditioner,
+        slope: Vec<f64>,
+    ) {
+        if self.iterations == 0 {
+            self.smallest = crate::precondition::DAMPING;
+        }
+        self.x = vec![0.0; slope.len()];
+        self.direction = preconditioner.apply(system, &slope);
+        self.square = system.workers.dot(&slope, &self.direction);
+        self.residual = slope;
+        self.keep = 0.0;
+        self.ritz = Ritz::default();
+        self.change.clear();
+    }
+
+    /// Multiplies S by the direction; returns the largest relative change of M that goes with P⁻¹ r.
+    fn product<T: Real>(
+        &mut self,
+        system: &mut System<'_, '_, T>,
+        control: &Control,
+    ) -> Result<f64> {
+        self.product = system.multiply(&self.direction, control)?;
+        Ok(system.largest_change(self.keep, &mut self.change) / system.mean_sensitivity())
+    }
+
+    /// A step along the direction, and a new direction; `false` if there was none to go.
+    fn step<T: Real>(
+        &mut self,
+        system: &System<'_, '_, T>,
+        preconditioner: &Preconditioner,
+    ) -> bool {
+        let workers = system.workers;
+        let step = self.square / workers.dot(&self.direction, &self.product);
+        if !(step > 0.0 && step.is_finite()) {
+            return false;
+        }
+        workers.add_multiple(&mut self.x, step, &self.direction);
+        workers.add_multiple(&mut self.residual, -step, &self.product);
+        let mut direction = preconditioner.apply(system, &self.residual);
+        let square = workers.dot(&self.residual, &direction);
+        self.keep = square / self.square;
+        workers.add_multiple(&mut direction, self.keep, &self.direction);
+        self.direction = direction;
+        self.ritz.push(step, self.keep);
+        self.square = square;
+        self.smallest = self.smallest.min(self.ritz.smallest());
+        self.iterations += 1;
+        square > 0.0
+    }
+}

@@ -1,0 +1,149 @@
+//! Which fluxes are unknown: ln c = ln c₀ + T θ, with a prior on θ or none.
+//!
+//! Two tilts of ln M cannot be told from fluxes: with M → M·exp(α·p), L → L·exp(−α·u) and
+//! ln c_k → ln c_k + α·d_k nothing that is measured changes, unless exposures are turned against each
+//! other. So free fluxes are sought where ln c has no part that is affine in the shifts, and what
+//! remains undetermined is left to the gauge.
+
+use crate::geometry::Rotation;
+
+/// What is known of the fluxes.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Flux {
+    /// They are as given.
+    Known,
+    /// Nothing, but that the mean of ln c is 0.
+    Free,
+    /// ln c is linear in time: the times of the exposures.
+    Linear(Vec<f64>),
+    /// They are as given up to relative errors of these standard deviations.
+    Prior(Vec<f64>),
+}
+
+/// ln c = ln c₀ + T θ.
+pub(super) struct Fluxes {
+    /// The columns of T.
+    pub(super) columns: Vec<Vec<f64>>,
+    /// The weight of θ² in F, for each column, where the noise is known.
+    pub(super) precisions: Vec<f64>,
+    /// Whether a tilt of ln M is left undetermined.
+    pub(super) leaves_tilt: bool,
+}
+
+/// What rounding leaves of a vector of length 1.
+const NOTHING: f64 = 1e-9;
+
+impl Fluxes {
+    pub(super) fn new(flux: &Flux, shifts: &[[f64; 2]], rotations: &[Rotation]) -> Self {
+        let count = shifts.len();
+        let turned = rotations.iter().any(|rotation| *rotation != rotations[0]);
+        let unit = |k| (0..count).map(|i| if i == k { 1.0 } else { 0.0 }).collect::<Vec<_>>();
+        let hidden = |turned: bool| {
+            let mut hidden = vec![vec![1.0; count]];
+            if !turned {
+                hidden.extend([0, 1].map(|axis| shifts.iter().map(|d| d[axis]).collect()));
+            }
+            hidden
+        };
+        let (columns, precisions, leaves_tilt) = match flux {
+            Flux::Known => (Vec::new(), Vec::new(), false),
+            Flux::Free => {
+                let free = complement(&hidden(turned), (0..count).map(unit));
+                (free, Vec::new(), !turned)
+            }
+            Flux::Linear(times) => {
+                let told = complement(&hidden(turned), std::iter::once(times.clone()));
+                let centred = complement(&hidden(true), std::iter::once(times.clone()));
+                (if told.is_empty() { Vec::new() } else { centred }, Vec::new(), told.is_empty())
+            }
+            Flux::Prior(std) => {
+                let precisions = std.iter().map(|std| 1.0 / (std * std)).collect();
+                ((0..count).map(unit).collect(), precisions, false)
+            }
+        };
+        let precisions = if precisions.is_empty() { vec![0.0; columns.len()] } else { precisions };
+        Self { columns, precisions, leaves_tilt }
+    }
+
+    /// T θ.
+    pub(super) fn spread(&self, theta: &[f64], count: usize) -> Vec<f64> {
+        let mut logs = vec![0.0; count];
+        for (column, value) in self.columns.iter().zip(theta) {
+            logs.iter_mut().zip(column).for_each(|(log, t)| *log += t * value);
+        }
+        logs
+    }
+
+    /// Tᵀ b.
+    pub(super) fn gather(&self, slopes: &[f64]) -> Vec<f64> {
+        let dot = |column: &Vec<f64>| column.iter().zip(slopes).map(|(t, b)| t * b).sum();
+        self.columns.iter().map(dot).collect()
+    }
+}
+
+/// An orthonormal basis of what `vectors` add to the span of `hidden` (Gram and Schmidt, twice).
+fn complement(hidden: &[Vec<f64>], vectors: impl Iterator<Item = Vec<f64>>) -> Vec<Vec<f64>> {
+    let mut basis: Vec<Vec<f64>> = Vec::new();
+    let mut found = Vec::new();
+    let tagged = hidden.iter().cloned().map(|v| (v, true)).chain(vectors.map(|v| (v, false)));
+    for (mut vector, is_hidden) in tagged {
+        let before = norm(&vector);
+        for other in basis.iter().chain(&basis) {
+            let share: f64 = vector.iter().zip(other).map(|(a, b)| a * b).sum();
+            vector.iter_mut().zip(other).for_each(|(a, b)| *a -= share * b);
+        }
+        let size = norm(&vector);
+        if size > NOTHING * before {
+            vector.iter_mut().for_each(|value| *value /= size);
+            if !is_hidden {
+                found.push(vector.clone());
+            }
+            basis.push(vector);
+        }
+    }
+    found
+}
+
+fn norm(vector: &[f64]) -> f64 {
+    vector.iter().map(|value| value * value).sum::<f64>().sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CROSS: [[f64; 2]; 5] = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
+
+    #[test]
+    fn free_fluxes_have_no_part_that_looks_like_a_tilt() {
+        let fluxes = Fluxes::new(&Flux::Free, &CROSS, &[Rotation::None; 5]);
+        assert!(fluxes.leaves_tilt);
+        assert_eq!(fluxes.columns.len(), 2);
+        for column in &fluxes.columns {
+            for weight in [|_: &[f64; 2]| 1.0, |d: &[f64; 2]| d[0], |d: &[f64; 2]| d[1]] {
+                let dot: f64 = column.iter().zip(&CROSS).map(|(t, d)| t * weight(d)).sum();
+                assert!(dot.abs() < 1e-13);
+            }
+        }
+    }
+
+    #[test]
+    fn a_turned_exposure_tells_all_but_the_mean() {
+        let mut rotations = [Rotation::None; 5];
+        rotations[4] = Rotation::Half;
+        let fluxes = Fluxes::new(&Flux::Free, &CROSS, &rotations);
+        assert!(!fluxes.leaves_tilt);
+        assert_eq!(fluxes.columns.len(), 4);
+    }
+
+    #[test]
+    fn a_drift_that_is_linear_along_the_shifts_cannot_be_told() {
+        let line = [[0.0, 0.0], [0.0, 3.0], [0.0, 6.0], [0.0, 9.0]];
+        let times = |scale: f64| Flux::Linear((0..4).map(|k| scale * f64::from(k)).collect());
+        let fluxes = Fluxes::new(&times(60.0), &line, &[Rotation::None; 4]);
+        assert!(fluxes.leaves_tilt && fluxes.columns.is_empty());
+        let fluxes =
+            Fluxes::new(&Flux::Linear(vec![0.0, 3.0, 1.0, 2.0]), &line, &[Rotation::None; 4]);
+        assert!(!fluxes.leaves_tilt && fluxes.columns.len() == 1);
+    }
+}

@@ -1,0 +1,173 @@
+//! The penalty on the beam's fourth differences, τ ‖G a‖², along rows and columns.
+//!
+//! It tells what the measurements do not: a spline's finest pattern, and its cells behind the edge.
+//! Differences count where all five cells are seen. Since the beam has no scale of its own, the
+//! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
+//! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
+
+use crate::frames::Shape;
+use crate::parallel::Workers;
+
+const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
+/// Rows that a thread takes at a time.
+const BAND: usize = 16;
+
+pub(super) struct Penalty {
+    shape: Shape,
+    pub(super) tau: f64,
+    /// Whether the five cells from here on count, down a column and along a row.
+    counted: Vec<[bool; 2]>,
+    /// D a and aᵀ D a.
+    pull: Vec<f64>,
+    norm: f64,
+}
+
+impl Penalty {
+    /// The penalty at a beam of weights D, seen where they are above 0.
+    pub(super) fn new(shape: Shape, beam: &[f64], weights: &[f64], tau: f64) -> Self {
+        let Shape { rows, cols } = shape;
+        let seen = |row, col| weights[row * cols + col] > 0.0;
+        let cells = (0..rows).flat_map(|row| (0..cols).map(move |col| (row, col)));
+        let counted = cells.map(|(row, col)| {
+            let down = row + 4 < rows && (0..5).all(|i| seen(row + i, col));
+            let along = col + 4 < cols && (0..5).all(|j| seen(row, col + j));
+            [down, along]
+        });
+        let counted = counted.collect();
+        let pull: Vec<f64> = weights.iter().zip(beam).map(|(d, a)| d * a).collect();
+        let norm = pull.iter().zip(beam).map(|(da, a)| da * a).sum();
+        Self { shape, tau, counted, pull, norm }
+    }
+
+    /// The diagonal of τ GᵀG.
+    pub(super) fn diagonal(&self) -> Vec<f64> {
+        let cols = self.shape.cols;
+        let mut diagonal = vec![0.0; self.counted.len()];
+        for (cell, counted) in self.counted.iter().enumerate() {
+            for (step, counted) in [cols, 1].into_iter().zip(counted) {
+                if *counted {
+                    for (i, factor) in FOURTH.iter().enumerate() {
+                        diagonal[cell + i * step] += self.tau * factor * factor;
+                    }
+                }
+            }
+        }
+        diagonal
+    }
+
+    /// P x.
+    pub(super) fn relative(&self, beam: &[f64], x: &[f64], workers: &Workers) -> Vec<f64> {
+        let scale = workers.dot(&self.pull, x) / self.norm;
+        let mut relative = x.to_vec();
+        workers.add_multiple(&mut relative, -scale, beam);
+        relative
+    }
+
+    /// Adds `share` τ Pᵀ GᵀG x to `sums`; returns τ ‖G x‖².
+    pub(super) fn add(
+        &self,
+        beam: &[f64],
+        mut x: Vec<f64>,
+        share: f64,
+        sums: &mut [f64],
+        workers: &Workers,
+    ) -> f64 {
+        let (differences, energy) = self.differences(&x, workers);
+        self.adjoint(&differences, &mut x, workers);
+        let scale = workers.dot(beam, &x) / self.norm;
+        workers.add_multiple(&mut x, -scale, &self.pull);
+        workers.add_multiple(sums, share * self.tau, &x);
+        self.tau * energy
+    }
+
+    /// G x, down and along, and ‖G x‖².
+    fn differences(&self, x: &[f64], workers: &Workers) -> (Vec<[f64; 2]>, f64) {
+        let cols = self.shape.cols;
+        let mut differences = vec![[0.0; 2]; x.len()];
+        let energies = workers.map_blocks(&mut differences, BAND * cols, |band, part| {
+            let first = band * BAND * cols;
+            let mut energy = 0.0;
+            for (index, difference) in part.iter_mut().enumerate() {
+                let cell = first + index;
+                for (axis, step) in [cols, 1].into_iter().enumerate() {
+                    if self.counted[cell][axis] {
+                        let terms = FOURTH.iter().enumerate();
+                        let sum: f64 = terms.map(|(i, b)| b * x[cell + i * step]).sum();
+                        difference[axis] = sum;
+                        energy += sum * sum;
+                    }
+                }
+            }
+            energy
+        });
+        (differences, energies.into_iter().sum())
+    }
+
+    /// Gᵀ of differences, which are 0 where they do not count.
+    fn adjoint(&self, differences: &[[f64; 2]], sums: &mut [f64], workers: &Workers) {
+        let cols = self.shape.cols;
+        workers.map_blocks(sums, BAND * cols, |band, part| {
+            let first = band * BAND * cols;
+            for (index, sum) in part.iter_mut().enumerate() {
+                let cell = first + index;
+                *sum = 0.0;
+                for (axis, step) in [cols, 1].into_iter().enumerate() {
+                    for (i, b) in FOURTH.iter().enumerate() {
+                        if let Some(start) = cell.checked_sub(i * step) {
+                            *sum += b * differences[start][axis];
+                        }
+                    }
+                }
+            }
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::parallel::Workers;
+
+    #[test]
+    fn a_multiple_of_the_beam_and_a_cubic_cost_nothing() {
+        let shape = Shape::new(9, 11);
+        let cells = || (0..9).flat_map(|r| (0..11).map(move |c| (f64::from(r), f64::from(c))));
+        let beam: Vec<f64> =
+            cells().map(|(r, c)| 2.0 + (r * 1.3).sin() + (c * 0.7).cos()).collect();
+        let cubic: Vec<f64> = cells().map(|(r, c)| 1.0 + r * r * c - c * c * c).collect();
+        let mut weights = vec![1.0; 99];
+        weights[0] = 0.0;
+        let workers = Workers::new(None).unwrap();
+        let penalty = Penalty::new(shape, &beam, &weights, 1.0);
+        let energy = |penalty: &Penalty, beam: &[f64], x: &[f64]| {
+            let relative = penalty.relative(beam, x, &workers);
+            penalty.add(beam, relative, 1.0, &mut vec![0.0; 99], &workers)
+        };
+        let twice: Vec<f64> = beam.iter().map(|a| 2.0 * a).collect();
+        // Values to 1000, differences of sums of 16 of them.
+        assert!(energy(&penalty, &beam, &twice) < 1e-25);
+        assert!(energy(&penalty, &beam, &cubic) > 1.0);
+        assert!(penalty.add(&beam, cubic, 1.0, &mut vec![0.0; 99], &workers) < 1e-15);
+        assert!(penalty.diagonal()[60] == 2.0 * 70.0);
+    }
+
+    #[test]
+    fn the_product_is_that_of_a_symmetric_matrix() {
+        let shape = Shape::new(8, 7);
+        let random = |seed: f64| (0..56).map(|i| (f64::from(i) * seed).sin() + 1.5).collect();
+        let (beam, x, y): (Vec<f64>, Vec<f64>, Vec<f64>) = (random(1.7), random(2.9), random(4.1));
+        let workers = Workers::new(None).unwrap();
+        let penalty = Penalty::new(shape, &beam, &vec![1.0; 56], 0.7);
+        let product = |x: &[f64]| {
+            let mut sums = vec![0.0; 56];
+            let relative = penalty.relative(&beam, x, &workers);
+            let energy = penalty.add(&beam, relative, 1.0, &mut sums, &workers);
+            (sums, energy)
+        };
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let ((ax, energy), (ay, _)) = (product(&x), product(&y));
+        // Sums of some 56 · 20 products of size 100.
+        assert!((dot(&ax, &y) - dot(&ay, &x)).abs() < 1e-10);
+        assert!((dot(&ax, &x) - energy).abs() < 1e-10);
+    }
+}

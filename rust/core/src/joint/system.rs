@@ -1,0 +1,659 @@
+//! The linear problem of one step, with the pixels eliminated.
+//!
+//! The unknowns are the beam's coefficients a, the fluxes and the shifts; M, and the offset O where
+//! one is sought, follow at their closed forms. With the light e = c L that an exposure shows at
+//! a pixel, its change u = c M (B·a′ + L·ln c′ + ∇L·d′) and Q = 1 − e(eᵀwe)⁻¹eᵀw, which takes out
+//! what M can follow (and O likewise),
+//!
+//! ```text
+//! S x = Jᵀ w Q J x + priors,   J x = u
+//! ```
+//!
+//! (Golub and Pereyra 1973, with the simplification of Kaufman 1975.) Two passes make a product: one
+//! along rows of pixels, which all exposures share, and one along rows of cells, which collects.
+
+use super::flux::Fluxes;
+use super::grid::{Grid, TAPS, Taps, Window};
+use super::kernel::{Add, Follow, Interpolate, Row, Solve, Spread};
+use super::penalty::Penalty;
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::geometry::View;
+use crate::model::{Model, Stretch};
+use crate::parallel::Workers;
+
+/// Rows that a thread takes at a time.
+const BAND: usize = 8;
+/// A determinant that is rounding alone, of two columns that a pixel cannot tell from each other.
+const SINGULAR: f64 = 1e-12;
+
+/// What is sought.
+#[derive(Clone)]
+pub(super) struct State {
+    /// The coefficients of the beam, cell by cell.
+    pub(super) beam: Vec<f64>,
+    /// θ of the fluxes.
+    pub(super) theta: Vec<f64>,
+    pub(super) shifts: Vec<[f64; 2]>,
+}
+
+/// Where shifts were measured, and the weights of their squared deviations where noise is known.
+pub(super) struct ShiftPrior {
+    pub(super) measured: Vec<[f64; 2]>,
+    pub(super) precisions: Vec<[f64; 2]>,
+}
+
+/// The problem at a state.
+pub(super) struct System<'m, 'a, T> {
+    pub(super) model: &'m Model<'a, T>,
+    pub(super) workers: &'m Workers,
+    pub(super) grid: Grid,
+    pub(super) fluxes: Fluxes,
+    pub(super) shift_prior: Option<ShiftPrior>,
+    pub(super) with_offset: bool,
+    /// The variance of a measurement of weight 1.
+    pub(super) unit: f64,
+    pub(super) state: State,
+    /// c of each exposure.
+    pub(super) flux: Vec<f64>,
+    windows: Vec<Window>,
+    /// [`Row`] by row.
+    rows: Vec<f64>,
+    /// What the pixels pull, along columns of the views: by row and exposure.
+    pulls: Vec<f64>,
+    /// Σ w c² M² of the pixels that see a cell, by their factors.
+    pub(super) weights: Vec<f64>,
+    pub(super) penalty: Option<Penalty>,
+}
+
+/// Room of one thread for a row of pixels.
+struct Room {
+    weights: Vec<f64>,
+    values: Vec<f64>,
+    /// A row of coefficients, or one of pixels with zeros around.
+    row: Vec<f64>,
+    sums: [Vec<f64>; 2],
+    slope: Vec<f64>,
+}
+
+/// What one pass gathers besides the pulls: F, and the slopes of ln c and d of each exposure.
+#[derive(Clone, Default)]
+struct Sums {
+    objective: f64,
+    flux: Vec<f64>,
+    shifts: Vec<[f64; 2]>,
+}
+
+impl<'m, 'a, T: Real> System<'m, 'a, T> {
+    #[expect(clippy::too_many_arguments, reason = "all that a problem is made of")]
+    pub(super) fn new(
+        model: &'m Model<'a, T>,
+        grid: Grid,
+        fluxes: Fluxes,
+        shift_prior: Option<ShiftPrior>,
+        with_offset: bool,
+        state: State,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Self {
+        let (sensor, count) = (model.sensor(), model.count());
+        let wide = sensor.cols + grid.width - 1;
+        Self {
+            model,
+            workers,
+            fluxes,
+            shift_prior,
+            with_offset,
+            unit: 1.0,
+            flux: model.flux.clone(),
+            windows: grid.windows(&state.shifts),
+            rows: workers.filled(sensor.rows * Row::length(count, sensor.cols), 0.0, control),
+            pulls: workers.filled(sensor.rows * count * wide, 0.0, control),
+            weights: Vec::new(),
+            penalty: None,
+            state,
+            grid,
+        }
+    }
+
+    /// Values of a vector of unknowns: cells, θ, shifts.
+    pub(super) fn size(&self) -> usize {
+        let shifts = if self.shift_prior.is_some() { 2 * self.model.count() } else { 0 };
+        self.state.beam.len() + self.fluxes.columns.len() + shifts
+    }
+
+    /// Finds M at the state, F there, and half the slope of −F along the unknowns.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
+    pub(super) fn linearise(&mut self, tau: f64, control: &Control) -> Result<(f64, Vec<f64>)> {
+        self.windows = self.grid.windows(&self.state.shifts);
+        let logs = self.fluxes.spread(&self.state.theta, self.model.count());
+        self.flux = self.model.flux.iter().zip(&logs).map(|(c, log)| c * log.exp()).collect();
+        let views = self.views_of(&self.state.beam);
+        let sums = self.pass(control, |system, row_index, row, room| {
+            let cols = system.model.sensor().cols;
+            for (k, flux) in system.flux.iter().enumerate() {
+                let light = &mut row.light[k * cols..][..cols];
+                let window = &system.windows[k];
+                let taps = [&window.along_rows.values, &window.along_cols.values];
+                system.interpolate(&views, window, row_index, taps, &mut room.row, light);
+                light.iter_mut().for_each(|light| *light *= flux);
+                system.measure(k, row_index, room);
+            }
+            pulp::Arch::new().dispatch(Solve {
+                row,
+                fluxes: &system.flux,
+                weights: &room.weights,
+                values: &mut room.values,
+                with_offset: system.with_offset,
+                singular: SINGULAR,
+            })
+        })?;
+        let mut slope = self.collect(sums.clone(), false);
+        self.weigh(tau, control)?;
+        let mut objective = sums.objective;
+        if let Some(penalty) = &self.penalty {
+            let beam = &self.state.beam;
+            let cells = &mut slope[..beam.len()];
+            objective += penalty.add(beam, beam.clone(), -1.0, cells, self.workers);
+        }
+        objective += self.pull_by_priors(&mut slope);
+        Ok((objective, slope))
+    }
+
+    /// The pull of the priors, added to a slope; returns their share of F.
+    fn pull_by_priors(&self, slope: &mut [f64]) -> f64 {
+        let cells = self.state.beam.len();
+        let mut objective = 0.0;
+        let params = self.fluxes.columns.len();
+        let of_flux = slope[cells..].iter_mut().zip(&self.state.theta).zip(&self.fluxes.precisions);
+        for ((slope, theta), precision) in of_flux {
+            *slope -= self.unit * precision * theta;
+            objective += self.unit * precision * theta * theta;
+        }
+        if let Some(prior) = &self.shift_prior {
+            let known = prior.measured.as_flattened().iter().zip(prior.precisions.as_flattened());
+            let found = self.state.shifts.as_flattened();
+            let of_shifts = slope[cells + params..].iter_mut().zip(found).zip(known);
+            for ((slope, found), (measured, precision)) in of_shifts {
+                let deviation = found - measured;
+                *slope -= self.unit * precision * deviation;
+                objective += self.unit * precision * deviation * deviation;
+            }
+        }
+        objective
+    }
+
+    /// F of the measurements alone, at the state last linearised.
+    pub(super) fn misfit(&self, objective: f64) -> f64 {
+        let mut nothing = vec![0.0; self.size()];
+        let mut left = objective - self.pull_by_priors(&mut nothing);
+        if let Some(penalty) = &self.penalty {
+            let beam = &self.state.beam;
+            left -= penalty.add(beam, beam.clone(), 0.0, &mut nothing[..beam.len()], self.workers);
+        }
+        left
+    }
+
+    /// S x, and the change of M that goes with x in each [`Row`].
+    pub(super) fn multiply(&mut self, x: &[f64], control: &Control) -> Result<Vec<f64>> {
+        let cells = self.state.beam.len();
+        let params = self.fluxes.columns.len();
+        let logs = self.fluxes.spread(&x[cells..cells + params], self.model.count());
+        let moves = self.centred(&x[cells + params..]);
+        let (views, beams) = (self.views_of(&x[..cells]), self.beam_views());
+        let sums = self.pass(control, |system, row_index, row, room| {
+            let cols = system.model.sensor().cols;
+            for (k, (log, flux)) in logs.iter().zip(&system.flux).enumerate() {
+                let window = &system.windows[k];
+                system.weigh_row(k, row_index, room);
+                let values = &mut room.values[k * cols..][..cols];
+                let taps = [&window.along_rows.values, &window.along_cols.values];
+                system.interpolate(&views, window, row_index, taps, &mut room.row, values);
+                let share = log / flux;
+                for (value, light) in values.iter_mut().zip(&row.light[k * cols..]) {
+                    *value += share * light;
+                }
+                if let (Some(shift), Some(beams)) = (moves.get(k), &beams) {
+                    for (axis, step) in shift.iter().enumerate() {
+                        let taps = slopes(window, axis);
+                        let slope = &mut room.slope[..];
+                        system.interpolate(beams, window, row_index, taps, &mut room.row, slope);
+                        let values = &mut room.values[k * cols..][..cols];
+                        for (value, slope) in values.iter_mut().zip(slope) {
+                            *value += step * *slope;
+                        }
+                    }
+                }
+            }
+            let [first, second] = &mut room.sums;
+            pulp::Arch::new().dispatch(Follow {
+                row,
+                fluxes: &system.flux,
+                weights: &room.weights,
+                values: &mut room.values,
+                sums: [first, second],
+            });
+            0.0
+        })?;
+        let mut product = self.collect(sums, false);
+        if let Some(penalty) = &self.penalty {
+            let relative = penalty.relative(&self.state.beam, &x[..cells], self.workers);
+            penalty.add(&self.state.beam, relative, 1.0, &mut product[..cells], self.workers);
+        }
+        let found = x[cells..cells + params].iter().chain(moves.as_flattened());
+        let priors = product[cells..].iter_mut().zip(found).zip(self.precisions());
+        priors.for_each(|((product, x), precision)| *product += precision * x);
+        Ok(product)
+    }
+
+    /// Changes of shifts less their mean, by the weights of the prior: to move all exposures moves
+    /// but the beam, which no measurement tells.
+    pub(super) fn centred(&self, shifts: &[f64]) -> Vec<[f64; 2]> {
+        let mut shifts = shifts.as_chunks().0.to_vec();
+        if let Some(prior) = &self.shift_prior {
+            for axis in 0..2 {
+                let weights = || prior.precisions.iter().map(|p| p[axis]);
+                let sum: f64 =
+                    shifts.iter().zip(weights()).map(|(d, p): (&[f64; 2], _)| p * d[axis]).sum();
+                let mean = sum / weights().sum::<f64>();
+                shifts.iter_mut().for_each(|shift| shift[axis] -= mean);
+            }
+        }
+        shifts
+    }
+
+    /// What pulls at shifts pulls at them less their mean: the transpose of [`centred`](Self::centred).
+    fn centred_pulls(&self, mut pulls: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+        if let Some(prior) = &self.shift_prior {
+            for axis in 0..2 {
+                let sum: f64 = pulls.iter().map(|pull| pull[axis]).sum();
+                let weights: f64 = prior.precisions.iter().map(|p| p[axis]).sum();
+                for (pull, precision) in pulls.iter_mut().zip(&prior.precisions) {
+                    pull[axis] -= precision[axis] / weights * sum;
+                }
+            }
+        }
+        pulls
+    }
+
+    /// The priors' weights of the parameters.
+    pub(super) fn precisions(&self) -> Vec<f64> {
+        let shifts = self.shift_prior.iter().flat_map(|prior| prior.precisions.as_flattened());
+        self.fluxes.precisions.iter().chain(shifts).map(|precision| self.unit * precision).collect()
+    }
+
+    /// D, Σ w c² M² by the pixels' factors, and the penalty where it is seen.
+    fn weigh(&mut self, tau: f64, control: &Control) -> Result<()> {
+        self.weights = self.diagonal(false, control)?;
+        if self.grid.is_spline() {
+            let total: f64 = self.weights.iter().sum();
+            let typical = self.workers.dot(&self.weights, &self.weights) / total;
+            let (shape, beam) = (self.grid.geometry.beam, &self.state.beam);
+            self.penalty = Some(Penalty::new(shape, beam, &self.weights, tau * typical));
+        }
+        Ok(())
+    }
+
+    /// Σ w c² M² over the pixels that see a cell, by their factors or the squares of those: with the
+    /// penalty's, the diagonal of S but for what M takes out.
+    pub(super) fn diagonal(&mut self, squared: bool, control: &Control) -> Result<Vec<f64>> {
+        let windows = self.windows.clone();
+        if squared {
+            self.windows = windows.iter().map(|window| window.squared()).collect();
+        }
+        let passed = self.pass(control, |system, row_index, row, room| {
+            let cols = system.model.sensor().cols;
+            for (k, flux) in system.flux.iter().enumerate() {
+                system.weigh_row(k, row_index, room);
+                let values = &mut room.values[k * cols..][..cols];
+                let weights = &room.weights[k * cols..];
+                for ((value, weight), m) in values.iter_mut().zip(weights).zip(&*row.sensitivity) {
+                    *value = weight * (flux * m) * (flux * m);
+                }
+            }
+            0.0
+        });
+        let diagonal = passed.map(|sums| self.collect(sums, true));
+        self.windows = windows;
+        let mut diagonal = diagonal?;
+        diagonal.truncate(self.state.beam.len());
+        if let (true, Some(penalty)) = (squared, &self.penalty) {
+            self.workers.add_multiple(&mut diagonal, 1.0, &penalty.diagonal());
+        }
+        Ok(diagonal)
+    }
+
+    /// M and O at the state, row by row.
+    pub(super) fn pixels(&self) -> [Vec<f64>; 2] {
+        let mut found = [Vec::new(), Vec::new()];
+        self.for_rows(|row| {
+            found[0].extend_from_slice(row[0]);
+            found[1].extend_from_slice(row[1]);
+        });
+        found
+    }
+
+    /// The mean M of the pixels with measurements.
+    pub(super) fn mean_sensitivity(&self) -> f64 {
+        let (mut sum, mut count) = (0.0, 0);
+        self.for_rows(|[sensitivity, _, inverse, _]| {
+            for (m, inverse) in sensitivity.iter().zip(inverse) {
+                if *inverse > 0.0 {
+                    sum += m;
+                    count += 1;
+                }
+            }
+        });
+        sum / f64::from(count.max(1))
+    }
+
+    /// Calls `visit([M, O, 1/Σ w e², Σ w, change of M])` for each row of pixels.
+    pub(super) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 4])) {
+        let (cols, count) = (self.model.sensor().cols, self.model.count());
+        for row in self.rows.chunks_exact(Row::length(count, cols)) {
+            let part = |index: usize| &row[(count + index) * cols..][..cols];
+            visit([part(0), part(1), part(2), part(5)]);
+        }
+    }
+
+    /// The largest size of the last change of M, less `share` of what `earlier` holds, which it
+    /// replaces; pixels without weight do not count.
+    pub(super) fn largest_change(&self, share: f64, earlier: &mut Vec<f64>) -> f64 {
+        let cols = self.model.sensor().cols;
+        earlier.resize(self.model.sensor().len(), 0.0);
+        let mut largest = 0.0_f64;
+        let mut earlier = earlier.chunks_exact_mut(cols);
+        self.for_rows(|[_, _, _, change]| {
+            for (earlier, change) in earlier.next().unwrap_or_default().iter_mut().zip(change) {
+                largest = largest.max((change - share * *earlier).abs());
+                *earlier = *change;
+            }
+        });
+        largest
+    }
+
+    /// Ω = Σ w (c L M)² of each block of pixels and exposure, for blocks of `size`.
+    pub(super) fn block_weights(
+        &mut self,
+        size: [usize; 2],
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        let (sensor, count) = (self.model.sensor(), self.model.count());
+        let shape = [sensor.rows.div_ceil(size[0]), sensor.cols.div_ceil(size[1])];
+        let found = self.workers.map(shape[0], |block_row| {
+            let mut room = self.room();
+            let mut found = vec![0.0; shape[1] * count];
+            let rows = block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]);
+            for row_index in rows {
+                control.check()?;
+                let length = Row::length(count, sensor.cols);
+                let row = &self.rows[row_index * length..][..length];
+                let (light, rest) = row.split_at(count * sensor.cols);
+                for k in 0..count {
+                    self.weigh_row(k, row_index, &mut room);
+                    for col in 0..sensor.cols {
+                        let at = k * sensor.cols + col;
+                        let shown = light[at] * rest[col];
+                        found[col / size[1] * count + k] += room.weights[at] * shown * shown;
+                    }
+                }
+            }
+            Ok(found)
+        });
+        let found: Result<Vec<Vec<f64>>> = found.into_iter().collect();
+        Ok(found?.concat())
+    }
+
+    /// Σ w (c M ∂L/∂d)² of each exposure: what it tells of its shift, by itself.
+    pub(super) fn shift_diagonal(&self, control: &Control) -> Result<Vec<[f64; 2]>> {
+        let (sensor, count) = (self.model.sensor(), self.model.count());
+        let Some(beams) = self.beam_views() else { return Ok(Vec::new()) };
+        let length = Row::length(count, sensor.cols);
+        let found = self.workers.map(sensor.rows, |row_index| {
+            control.check()?;
+            let mut room = self.room();
+            let sensitivity = &self.rows[row_index * length + count * sensor.cols..][..sensor.cols];
+            let mut found = vec![[0.0; 2]; count];
+            for (k, found) in found.iter_mut().enumerate() {
+                self.weigh_row(k, row_index, &mut room);
+                for (axis, found) in found.iter_mut().enumerate() {
+                    let window = &self.windows[k];
+                    let (taps, slope) = (slopes(window, axis), &mut room.slope[..]);
+                    self.interpolate(&beams, window, row_index, taps, &mut room.row, slope);
+                    let weights = &room.weights[k * sensor.cols..];
+                    for ((slope, weight), m) in slope.iter().zip(weights).zip(sensitivity) {
+                        *found += weight * (self.flux[k] * m * slope).powi(2);
+                    }
+                }
+            }
+            Ok(found)
+        });
+        let mut total = vec![[0.0; 2]; count];
+        for found in found {
+            let found: Vec<[f64; 2]> = found?;
+            let pairs = total.as_flattened_mut().iter_mut().zip(found.as_flattened());
+            pairs.for_each(|(total, found)| *total += found);
+        }
+        Ok(total)
+    }
+
+    /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's
+    /// values, and spreads those along the columns of the views; returns the sums.
+    fn pass(
+        &mut self,
+        control: &Control,
+        work: impl Fn(&Self, usize, Row<'_>, &mut Room) -> f64 + Sync,
+    ) -> Result<Sums> {
+        let (sensor, count) = (self.model.sensor(), self.model.count());
+        let wide = sensor.cols + self.grid.width - 1;
+        let sizes = [Row::length(count, sensor.cols), count * wide];
+        let mut rows = std::mem::take(&mut self.rows);
+        let mut pulls = std::mem::take(&mut self.pulls);
+        let beams = self.beam_views();
+        let system = &*self;
+        let bands = system.workers.map_pairs(
+            &mut rows,
+            &mut pulls,
+            sizes.map(|size| BAND * size),
+            |band, rows, pulls| {
+                let mut room = system.room();
+                let mut sums = Sums {
+                    objective: 0.0,
+                    flux: vec![0.0; count],
+                    shifts: vec![[0.0; 2]; beams.as_ref().map_or(0, |_| count)],
+                };
+                let rows = rows.chunks_exact_mut(sizes[0]);
+                for (index, (row, pulls)) in rows.zip(pulls.chunks_exact_mut(sizes[1])).enumerate()
+                {
+                    if control.is_cancelled() {
+                        break;
+                    }
+                    let row_index = band * BAND + index;
+                    let parts = Row::of(row, count, sensor.cols);
+                    sums.objective += work(system, row_index, parts, &mut room);
+                    for k in 0..count {
+                        let pull = &room.values[k * sensor.cols..][..sensor.cols];
+                        let light = &row[k * sensor.cols..][..sensor.cols];
+                        let dot = |a: &[f64]| a.iter().zip(pull).map(|(a, b)| a * b).sum::<f64>();
+                        sums.flux[k] += dot(light) / system.flux[k];
+                        if let Some(beams) = &beams {
+                            let window = &system.windows[k];
+                            for axis in 0..2 {
+                                let (taps, slope) = (slopes(window, axis), &mut room.slope[..]);
+                                let room = &mut room.row;
+                                system.interpolate(beams, window, row_index, taps, room, slope);
+                                sums.shifts[k][axis] += dot(slope);
+                            }
+                        }
+                        system.spread(k, pull, &mut room.row, &mut pulls[k * wide..][..wide]);
+                    }
+                }
+                sums
+            },
+        );
+        (self.rows, self.pulls) = (rows, pulls);
+        control.check()?;
+        let mut total = Sums::default();
+        total.flux.resize(count, 0.0);
+        for sums in bands {
+            total.objective += sums.objective;
+            total.flux.iter_mut().zip(sums.flux).for_each(|(total, sum)| *total += sum);
+            total.shifts.resize(sums.shifts.len(), [0.0; 2]);
+            let pairs = total.shifts.as_flattened_mut().iter_mut();
+            pairs.zip(sums.shifts.as_flattened()).for_each(|(total, sum)| *total += sum);
+        }
+        Ok(total)
+    }
+
+    /// Spreads a row of pulls along the columns that its pixels see.
+    fn spread(&self, exposure: usize, pull: &[f64], room: &mut [f64], sums: &mut [f64]) {
+        if !self.grid.is_spline() {
+            return sums.copy_from_slice(pull);
+        }
+        let around = TAPS - 1;
+        let room = &mut room[..pull.len() + 2 * around];
+        room.fill(0.0);
+        room[around..][..pull.len()].copy_from_slice(pull);
+        let along_cols = &self.windows[exposure].along_cols.values;
+        pulp::Arch::new().dispatch(Spread { values: room, along_cols, sums });
+    }
+
+    /// Collects what the last pass spread, on cells, then θ and the shifts.
+    fn collect(&self, sums: Sums, cells_alone: bool) -> Vec<f64> {
+        let (sensor, count) = (self.model.sensor(), self.model.count());
+        let wide = sensor.cols + self.grid.width - 1;
+        let mut total = self.workers.filled(self.size(), 0.0, &Control::new());
+        let geometry = &self.grid.geometry;
+        let cells = self.state.beam.len();
+        for (index, view) in geometry.views.iter().enumerate() {
+            let mut found = vec![0.0; view.shape.len()];
+            self.workers.map_blocks(&mut found, BAND * view.shape.cols, |band, part| {
+                for (i, sums) in part.chunks_exact_mut(view.shape.cols).enumerate() {
+                    let row = band * BAND + i;
+                    let windows = self.windows.iter().enumerate();
+                    for (k, window) in windows.filter(|(_, window)| window.view == index) {
+                        for (j, &factor) in
+                            window.along_rows.values[..self.grid.width].iter().enumerate()
+                        {
+                            let pixel = row.checked_sub(window.row + j);
+                            let Some(pixel) = pixel.filter(|&row| row < sensor.rows) else {
+                                continue;
+                            };
+                            let values = &self.pulls[(pixel * count + k) * wide..][..wide];
+                            let sums = &mut sums[window.col..][..wide];
+                            pulp::Arch::new().dispatch(Add { factor, values, sums });
+                        }
+                    }
+                }
+            });
+            self.turn_back(view, &found, &mut total[..cells]);
+        }
+        if !cells_alone {
+            let theta = self.fluxes.gather(&sums.flux);
+            total[cells..].iter_mut().zip(theta).for_each(|(total, sum)| *total = sum);
+            let rest = &mut total[cells + self.fluxes.columns.len()..];
+            let pulls = self.centred_pulls(sums.shifts);
+            rest.iter_mut().zip(pulls.as_flattened()).for_each(|(total, sum)| *total = *sum);
+        }
+        total
+    }
+
+    /// Adds what was found in a view to the beam's grid.
+    fn turn_back(&self, view: &View, found: &[f64], cells: &mut [f64]) {
+        let cols = self.grid.geometry.beam.cols;
+        self.workers.map_blocks(cells, cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell += found[view.places.at(row, col)];
+            }
+        });
+    }
+
+    /// Values on cells in the order of each view.
+    fn views_of(&self, cells: &[f64]) -> Vec<Vec<f64>> {
+        let turned = |view: &View| {
+            let mut turned = vec![0.0; cells.len()];
+            self.workers.map_blocks(&mut turned, view.shape.cols, |row, values| {
+                for (col, value) in values.iter_mut().enumerate() {
+                    *value = cells[view.cells.at(row, col)];
+                }
+            });
+            turned
+        };
+        self.grid.geometry.views.iter().map(turned).collect()
+    }
+
+    /// The beam in the order of each view, if its slopes are asked for.
+    fn beam_views(&self) -> Option<Vec<Vec<f64>>> {
+        self.shift_prior.as_ref().map(|_| self.views_of(&self.state.beam))
+    }
+
+    /// What the pixels of one row of an exposure see of values on cells.
+    fn interpolate(
+        &self,
+        views: &[Vec<f64>],
+        window: &Window,
+        row: usize,
+        [along_rows, along_cols]: [&[f64; TAPS]; 2],
+        room: &mut [f64],
+        seen: &mut [f64],
+    ) {
+        let cols = self.grid.geometry.views[window.view].shape.cols;
+        let wide = seen.len() + self.grid.width - 1;
+        let line = |i| &views[window.view][(row + window.row + i) * cols + window.col..][..wide];
+        let lines: [&[f64]; TAPS] = std::array::from_fn(|i| line(i.min(self.grid.width - 1)));
+        let room = &mut room[..wide];
+        let rows = &lines[..self.grid.width];
+        pulp::Arch::new().dispatch(Interpolate { rows, along_rows, along_cols, room, seen });
+    }
+
+    /// The weights and values of one row of an exposure.
+    fn measure(&self, exposure: usize, row: usize, room: &mut Room) {
+        let cols = self.model.sensor().cols;
+        let weights = &mut room.weights[exposure * cols..][..cols];
+        let values = &mut room.values[exposure * cols..][..cols];
+        match self.model.stretch(exposure, row, 0..cols, weights) {
+            Stretch::Uniform(measured, weight) => {
+                values.iter_mut().zip(measured).for_each(|(value, y)| *value = y.to_f64());
+                weights.fill(weight);
+            }
+            Stretch::Weighted(measured, weights) => {
+                for ((value, y), weight) in values.iter_mut().zip(measured).zip(weights) {
+                    *value = if *weight > 0.0 { y.to_f64() } else { 0.0 };
+                }
+            }
+        }
+    }
+
+    /// The weights of one row of an exposure.
+    fn weigh_row(&self, exposure: usize, row: usize, room: &mut Room) {
+        let cols = self.model.sensor().cols;
+        let weights = &mut room.weights[exposure * cols..][..cols];
+        match self.model.uniform_weight(exposure) {
+            Some(weight) => weights.fill(weight),
+            None => {
+                let _ = self.model.stretch(exposure, row, 0..cols, weights);
+            }
+        }
+    }
+
+    fn room(&self) -> Room {
+        let (cols, count) = (self.model.sensor().cols, self.model.count());
+        Room {
+            weights: vec![0.0; count * cols],
+            values: vec![0.0; count * cols],
+            row: vec![0.0; cols + 2 * TAPS],
+            sums: [vec![0.0; cols], vec![0.0; cols]],
+            slope: vec![0.0; cols],
+        }
+    }
+}
+
+/// The factors of ∂L/∂d along one axis of the beam.
+fn slopes(window: &Window, axis: usize) -> [&[f64; TAPS]; 2] {
+    let (rows, cols): (&Taps, &Taps) = (&window.along_rows, &window.along_cols);
+    let along_rows = (axis == 0) != window.swaps_axes;
+    if along_rows { [&rows.slopes, &cols.values] } else { [&rows.values, &cols.slopes] }
+}
