@@ -45,6 +45,7 @@ LIBRARIES = {
 
 CHAIN = (
     {"calibrate"},
+    {"joint"},
     {"multiscale"},
     {"descent"},
     {"estimate"},
