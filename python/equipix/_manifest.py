@@ -28,7 +28,10 @@ _WANTED = {
     "aperture_before": "a file, a glob or a list of them",
     "aperture_after": "a file, a glob or a list of them",
     "shift": "[row, col] in pixels",
+    "shift_std": "[row, col] in pixels, not negative",
     "flux": "a positive number",
+    "flux_std": "a positive number, relative to the flux",
+    "time": "a number of seconds",
     "rotation": "0, 90, 180 or 270",
 }
 
@@ -71,7 +74,13 @@ class Exposure(_Table):
     aperture_before: Files | None = None
     aperture_after: Files | None = None
     shift: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    shift_std: (
+        Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
+        | None
+    ) = None
     flux: Positive | None = None
+    flux_std: Positive | None = None
+    time: FiniteFloat | None = None
     rotation: Literal[0, 90, 180, 270] = 0
 
     @model_validator(mode="after")
@@ -80,6 +89,10 @@ class Exposure(_Table):
             raise _problem("give both 'aperture_before' and 'aperture_after'")
         if self.aperture_before is not None and self.shift is not None:
             raise _problem("give aperture images or 'shift', not both")
+        if self.shift_std is not None and self.shift is None:
+            raise _problem("'shift_std' goes with 'shift'")
+        if self.flux_std is not None and self.flux is None:
+            raise _problem("'flux_std' goes with 'flux'")
         return self
 
 
@@ -107,9 +120,10 @@ class Manifest(_Table):
         names = [exposure.name for exposure in self.exposure]
         if repeated := [name for name in names if names.count(name) > 1]:
             raise _problem(f"two exposures have the name '{repeated[0]}'")
-        missing = [exposure.name for exposure in self.exposure if exposure.flux is None]
-        if missing and len(missing) < len(names):
-            raise _problem(f"'flux' is missing in exposure '{missing[0]}': give all or none")
+        for key in ("flux", "flux_std", "time"):
+            missing = [each.name for each in self.exposure if getattr(each, key) is None]
+            if missing and len(missing) < len(names):
+                raise _problem(f"'{key}' is missing in exposure '{missing[0]}': give all or none")
         return self
 
 

@@ -297,7 +297,8 @@ def calibrate(
         the beam's window; 0 unless given.
     shift_std : float or array_like, shape (n,) or (n, 2), optional
         Standard deviations of `shifts`, in pixels: the shifts are then refined, with this prior.
-        What moves all exposures alike stays as given.
+        What moves all exposures alike stays as given, and so do all where the beam has no
+        structure that tells them (``metadata["options"]["shifts"]`` says which).
     dark : {"subtracted", "fit"}
         Whether the dark is already subtracted, or to be found as an offset of each pixel: for
         exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.
@@ -418,9 +419,11 @@ def calibrate(
         workers=positive_workers(workers),
         progress=progress,
     )
-    options = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps, "dark": dark}
+    options: dict[str, Any] = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps, "dark": dark}
     if flux_model[0] != "known":
         options["flux"] = flux_model[0]
+    if result.shifts_told is not None:
+        options["shifts"] = "refined" if result.shifts_told else "as given: the beam tells none"
     calibration = _wrapped(result, values.dtype, positions)
     calibration.metadata.update(
         versions={"equipix": _native.__version__, "numpy": np.__version__},
@@ -437,9 +440,7 @@ def calibrate(
     return calibration
 
 
-def _wrapped(
-    result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any]
-) -> Calibration:
+def _wrapped(result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any]) -> Calibration:
     objective = result.misfit
     freedom = result.degrees_of_freedom
     return Calibration(

@@ -13,6 +13,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from equipix._measurements import FluxModel
 from equipix._native import __version__
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration, Method
@@ -88,6 +89,10 @@ def calibrate(
     method: Annotated[
         Method, typer.Option(help="How to solve: fast, or as the paper does.")
     ] = "multiscale",
+    flux: Annotated[
+        FluxModel | None,
+        typer.Option(help="Fluxes to find: one an exposure, or linear in the file's times."),
+    ] = None,
     tolerance: Tolerance = 1e-6,
     max_sweeps: MaxSweeps = None,
     workers: Workers = None,
@@ -100,6 +105,7 @@ def calibrate(
     refuse_inputs([output], [experiment, *loaded.files()])
     with progress_bars() as progress:
         calibration = loaded.run(
+            flux=flux,
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix._manifest import Exposure, Manifest
+    from equipix._measurements import FluxModel
     from equipix.calibration import Calibration, Method
     from equipix.results import FrameStatistics
     from equipix.shifts import ShiftMeasurement, Spot
@@ -126,7 +127,7 @@ class Experiment:
         shifts : ndarray, shape (n, 2)
             Absolute shifts (row, col) in pixels.
         std : ndarray, shape (n, 2)
-            Standard errors; 0 for shifts that the file gives. Those of successive moves add in
+            Standard errors; those that the file gives, or 0, for shifts that it gives. Those of successive moves add in
             quadrature, and so does what the unequal pixels under a spot do to its centroid.
 
         Raises
@@ -144,10 +145,11 @@ class Experiment:
         first, *others = self.manifest.exposure
         if first.shift is not None:
             shifts[0] = np.array(first.shift)
+            variances[0] = np.square(first.shift_std or [0.0, 0.0])
         for old, new in zip(self.manifest.exposure, others, strict=False):
             if new.shift is not None:
                 shifts.append(np.array(new.shift))
-                variances.append(np.zeros(2))
+                variances.append(np.square(new.shift_std or [0.0, 0.0]))
                 continue
             spots, shape = self._aperture(new)
             u_before, variance_before = _in_beam(spots.before, old.rotation, shape)
@@ -160,6 +162,7 @@ class Experiment:
     def run(
         self,
         *,
+        flux: FluxModel | None = None,
         method: Method = "multiscale",
         tolerance: float = 1e-6,
         max_sweeps: int | None = None,
@@ -170,6 +173,9 @@ class Experiment:
 
         Parameters
         ----------
+        flux : {"fit", "linear"}, optional
+            Fluxes to find: one for each exposure, or linear in the file's ``time``. Unless given
+            they are those of the file, as known or, with ``flux_std``, as a prior.
         method : {"multiscale", "coordinate-descent"}
             How to minimise the objective.
         tolerance : float
@@ -195,12 +201,18 @@ class Experiment:
             If an option is out of range, or the exposures do not make a calibration.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
+
+        Notes
+        -----
+        Shifts with a standard error are refined, with it as their prior: see `calibrate`.
         """
         started = datetime.now(UTC)
         _check_options(tolerance, max_sweeps, workers)
         self.check_formats()
         shifts, std = self.measure_shifts()
-        whole_shifts = round_shifts(shifts, std)
+        refined = method == "multiscale" and bool(std.any())
+        if method != "multiscale":
+            shifts = round_shifts(shifts, std).astype(np.float64)
         with naming_memory("averaging"):
             measured = self._average(workers, progress)
             noise = self._noise(measured)
@@ -212,10 +224,13 @@ class Experiment:
             )
         solved = calibrate(
             measured.signals,
-            whole_shifts,
+            shifts,
+            shift_std=std if refined else None,
             variance=variances,
             mask=flags != 0,
-            flux=self._flux(),
+            flux=self._column("flux") if flux is None else flux,
+            flux_std=self._column("flux_std") if flux is None else None,
+            time=self._column("time") if flux == "linear" else None,
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
             method=method,
             tolerance=tolerance,
@@ -292,9 +307,10 @@ class Experiment:
             return None
         return NoiseModel.fit(np.concatenate(measured.transfer), gain=gain)
 
-    def _flux(self) -> list[float] | None:
-        flux = [exposure.flux for exposure in self.manifest.exposure]
-        return [value for value in flux if value is not None] or None
+    def _column(self, key: str) -> list[float] | None:
+        """The values of a key that all exposures have, or none."""
+        values = [getattr(exposure, key) for exposure in self.manifest.exposure]
+        return [value for value in values if value is not None] or None
 
     def _metadata(
         self,

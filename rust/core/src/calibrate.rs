@@ -43,6 +43,8 @@ pub struct Solution {
     pub offset: Option<Vec<f64>>,
     /// F of the measurements at the end, without penalty and priors.
     pub objective: f64,
+    /// Whether the beam has structure that tells shifts; else they stay as given.
+    pub shifts_told: Option<bool>,
     /// Whether free fluxes leave a tilt of ln M undetermined: then its slope is 0.
     pub leaves_tilt: bool,
     /// The smallest Ritz value of a joint fit.
@@ -92,6 +94,7 @@ pub fn calibrate<T: Real>(
         flux: model.flux.clone(),
         shifts: None,
         offset: None,
+        shifts_told: None,
         leaves_tilt: false,
         smallest_ritz: None,
         objective: history.last().objective,
@@ -138,6 +141,7 @@ pub fn calibrate_jointly<T: Real>(
         flux: fit.flux,
         shifts: Some(fit.shifts),
         offset,
+        shifts_told: fit.shifts_told,
         leaves_tilt: fit.leaves_tilt,
         smallest_ritz: Some(fit.smallest_ritz),
         objective: fit.misfit,

@@ -45,6 +45,11 @@ const MOST_PRODUCTS: u64 = 20_000;
 const FIRST_SWEEPS: usize = 4;
 /// A shift that is known is one with this standard deviation, in pixels.
 const EXACT_SHIFT: f64 = 1e-6;
+/// The estimated error of M at which shifts begin to be refined.
+const BEFORE_SHIFTS: f64 = 1e-3;
+/// A beam whose structure is so much larger than noise tells shifts; by the slopes of noise steps
+/// would lead nowhere.
+const TOLD: f64 = 1.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
@@ -97,6 +102,8 @@ pub struct Fit {
     pub flux: Vec<f64>,
     /// The shift of each exposure.
     pub shifts: Vec<[f64; 2]>,
+    /// Whether the beam has structure that tells shifts; else they stay as given. None if not asked for.
+    pub shifts_told: Option<bool>,
     /// Whether the fluxes leave a tilt of ln M undetermined.
     pub leaves_tilt: bool,
     /// What the measurements can compare.
@@ -134,6 +141,9 @@ pub fn solve<T: Real>(
     let mut halvings = 0;
     let mut stuck = false;
     let mut preconditioner = None;
+    // Shifts are refined from a beam that is nearly found.
+    let mut shift_prior = shift_prior(unknowns);
+    let mut shifts_told = shift_prior.as_ref().map(|_| false);
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
         products += 1;
@@ -161,17 +171,27 @@ pub fn solve<T: Real>(
         } else {
             system.linearise(SMOOTHING, control)?
         };
-        if preconditioner.is_none() {
-            preconditioner = Some(Preconditioner::new(&mut system, control)?);
-        }
-        let Some(preconditioner) = &preconditioner else { continue };
-        search.begin(&system, preconditioner, slope);
+        let two_level = match preconditioner.take() {
+            Some(two_level) => two_level,
+            None => Preconditioner::new(&mut system, control)?,
+        };
+        search.begin(&system, &two_level, slope);
         let first = search.product(&mut system, control)?;
         products += 1;
         looks.push(Look { sweep: products, objective, error: first / search.smallest });
+        let near =
+            first / search.smallest <= BEFORE_SHIFTS && search.iterations >= FEWEST_ITERATIONS;
+        if let Some(prior) = shift_prior.take_if(|_| near)
+            && system.structure() >= TOLD
+        {
+            shifts_told = Some(true);
+            system.shift_prior = Some(prior);
+            (search, taken, looks) = (Search::default(), None, Vec::new());
+            continue;
+        }
         if let Some(ended) = ended(&looks, &search, &stop, limit, stuck) {
             let history = History { looks, ended };
-            let mut fit = finish(&system, &search, objective, history, control)?;
+            let mut fit = finish(&system, &search, objective, history, shifts_told, control)?;
             if unknowns.flux != Flux::Known && !matches!(unknowns.flux, Flux::Prior(_)) {
                 gauge::fix(&mut fit, rotations[0], model.sensor());
             }
@@ -180,7 +200,7 @@ pub fn solve<T: Real>(
         let reachable = first * first.clamp(CURVED[0], CURVED[1]);
         while products + 1 < limit {
             control.report("calibrate", products, TYPICAL.max(products).min(limit));
-            if !search.step(&system, preconditioner) {
+            if !search.step(&system, &two_level) {
                 break;
             }
             let size = search.product(&mut system, control)?;
@@ -192,6 +212,7 @@ pub fn solve<T: Real>(
         }
         advance(&mut system, &search.x, 1.0);
         taken = Some(search.x.clone());
+        preconditioner = Some(two_level);
     }
 }
 
@@ -246,11 +267,15 @@ fn start<'m, 'a, T: Real>(
         theta: vec![0.0; fluxes.columns.len()],
         shifts: unknowns.shifts.clone(),
     };
-    let prior = unknowns.shift_std.as_ref().map(|std| ShiftPrior {
+    Ok(System::new(model, grid, fluxes, unknowns.offset, state, workers, control))
+}
+
+/// What is known of shifts that are to be refined.
+fn shift_prior(unknowns: &Unknowns) -> Option<ShiftPrior> {
+    unknowns.shift_std.as_ref().map(|std| ShiftPrior {
         measured: unknowns.shifts.clone(),
         precisions: std.iter().map(|std| std.map(|std| std.max(EXACT_SHIFT).powi(-2))).collect(),
-    });
-    Ok(System::new(model, grid, fluxes, prior, unknowns.offset, state, workers, control))
+    })
 }
 
 /// A beam known where pixels look at whole shifts, on the grid: cells around take what is beside them.
@@ -335,6 +360,7 @@ fn finish<T: Real>(
     search: &Search,
     objective: f64,
     history: History,
+    shifts_told: Option<bool>,
     control: &Control,
 ) -> Result<Fit> {
     let [sensitivity, offset] = system.pixels();
@@ -347,6 +373,7 @@ fn finish<T: Real>(
         origin: system.grid.geometry.origin,
         flux: system.flux.clone(),
         shifts: system.state.shifts.clone(),
+        shifts_told,
         leaves_tilt: system.fluxes.leaves_tilt,
         smallest_ritz: search.smallest,
         misfit: system.misfit(objective),

@@ -67,6 +67,7 @@ pub(crate) struct PySolution {
     shifts: Option<Vec<[f64; 2]>>,
     offset: Option<Py<PyArray2<f64>>>,
     leaves_tilt: bool,
+    shifts_told: Option<bool>,
     smallest_ritz: Option<f64>,
     misfit: f64,
 }
@@ -243,6 +244,7 @@ fn wrap(py: Python<'_>, solution: Solution, sensor: Shape) -> PyResult<PySolutio
         shifts: solution.shifts,
         offset: solution.offset.map(|offset| image(py, offset, sensor)).transpose()?,
         leaves_tilt: solution.leaves_tilt,
+        shifts_told: solution.shifts_told,
         smallest_ritz: solution.smallest_ritz,
         misfit: solution.objective,
     })

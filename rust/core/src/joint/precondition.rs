@@ -1,10 +1,10 @@
 //! The preconditioner of the joint problem: its diagonal, and hats on a coarse grid over the beam.
 //!
-//! As in [`precondition`](crate::precondition), with the columns of Φ hats times the beam. The fluxes
-//! stand beside the hats in the coarse problem, since what looks like a tilt of M they tell from one
-//! only through large scales.
+//! As in [`precondition`](crate::precondition), with the columns of Φ hats times the beam. Fluxes
+//! and shifts stand beside the hats in the coarse problem: a tilt or a bend of M that they could explain
+//! is told from theirs by large scales alone.
 
-use super::system::System;
+use super::system::{Block, System};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -24,7 +24,6 @@ pub(super) struct Preconditioner {
     /// 1/D of cells, θ and shifts; 0 for what no measurement tells.
     inverse: Vec<f64>,
     coarse: Coarse,
-    params: usize,
 }
 
 impl Preconditioner {
@@ -34,12 +33,12 @@ impl Preconditioner {
         let (beam, origin) = (system.grid.geometry.beam, system.grid.geometry.origin);
         let hats = Hats::new(beam, spacing);
         let size = spacing.map(|spacing| (spacing / BLOCKS).max(1));
-        let weights = system.block_weights(size, control)?;
+        let blocks = system.blocks(size, control)?;
         let (sensor, count) = (system.model.sensor(), system.model.count());
         let params = system.fluxes.columns.len();
         let across = sensor.cols.div_ceil(size[1]);
-        let arm = |block: usize, k: usize, weight: f64| {
-            let corner = [block / across * size[0], block % across * size[1]];
+        let arm = |index: usize, k: usize, block: &Block| {
+            let corner = [index / across * size[0], index % across * size[1]];
             let centre = |axis: usize, side: usize| {
                 let end = (corner[axis] + size[axis]).min(side) - 1;
                 (corner[axis] + end) as f64 / 2.0
@@ -47,34 +46,41 @@ impl Preconditioner {
             let place = system.grid.place(k, [centre(0, sensor.rows), centre(1, sensor.cols)]);
             let [row, col] =
                 [0, 1].map(|axis| place[axis] + system.state.shifts[k][axis] + origin[axis] as f64);
-            let others = system.fluxes.columns.iter().enumerate();
-            let others = others.map(|(index, column)| (hats.count() + index, column[k])).collect();
-            Arm { weight, hats: hats.over(row, col), others }
+            let columns = system.fluxes.columns.iter().enumerate();
+            let mut others: Vec<_> =
+                columns.map(|(index, column)| (hats.count() + index, column[k])).collect();
+            if system.shift_prior.is_some() {
+                let first = hats.count() + params + 2 * k;
+                others.extend([0, 1].map(|axis| (first + axis, block.slope[axis] / block.weight)));
+            }
+            Arm { weight: block.weight, hats: hats.over(row, col), others }
         };
-        let stars = weights.chunks_exact(count).enumerate().map(|(block, weights)| {
-            let weights = weights.iter().enumerate().filter(|(_, weight)| **weight > 0.0);
-            weights.map(|(k, &weight)| arm(block, k, weight)).collect()
+        let stars = blocks.chunks_exact(count).enumerate().map(|(index, blocks)| {
+            let lit = blocks.iter().enumerate().filter(|(_, block)| block.weight > 0.0);
+            lit.map(|(k, block)| arm(index, k, block)).collect()
         });
-        let precisions = system.precisions();
-        let coarse = Coarse::of_stars(&hats, &precisions[..params], stars, control)?;
-        let mut totals = vec![0.0; count];
-        for (index, weight) in weights.iter().enumerate() {
-            totals[index % count] += weight;
+        // What a block's mean slope leaves of its mean square is the parameter's own.
+        let mut own = system.precisions();
+        let mut whole = own.clone();
+        for (index, block) in blocks.iter().enumerate().filter(|(_, block)| block.weight > 0.0) {
+            let k = index % count;
+            for (whole, column) in whole.iter_mut().zip(&system.fluxes.columns) {
+                *whole += block.weight * column[k] * column[k];
+            }
+            if system.shift_prior.is_some() {
+                for axis in 0..2 {
+                    let place = params + 2 * k + axis;
+                    whole[place] += block.square[axis];
+                    own[place] += block.square[axis] - block.slope[axis].powi(2) / block.weight;
+                }
+            }
         }
-        let of_theta = system.fluxes.columns.iter().zip(&precisions).map(|(column, precision)| {
-            precision + column.iter().zip(&totals).map(|(t, total)| t * t * total).sum::<f64>()
-        });
-        let of_theta: Vec<f64> = of_theta.collect();
+        let coarse = Coarse::of_stars(&hats, &own, stars, control)?;
         let mut diagonal = system.diagonal(true, control)?;
         let least = FAINTEST * diagonal.iter().sum::<f64>() / diagonal.len() as f64;
-        diagonal.extend(of_theta);
-        if system.shift_prior.is_some() {
-            let told = system.shift_diagonal(control)?;
-            let told = told.as_flattened().iter().zip(&precisions[params..]);
-            diagonal.extend(told.map(|(told, precision)| told + precision));
-        }
+        diagonal.extend(whole);
         let inverse = diagonal.iter().map(|&d| if d > least { 1.0 / d } else { 0.0 }).collect();
-        Ok(Self { hats, inverse, coarse, params })
+        Ok(Self { hats, inverse, coarse })
     }
 
     /// P⁻¹ r.
@@ -112,7 +118,7 @@ impl Preconditioner {
         for (node, sums) in bands.into_iter().flatten() {
             heights[node * nodes..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
         }
-        heights.extend_from_slice(&r[beam.len()..beam.len() + self.params]);
+        heights.extend_from_slice(&r[beam.len()..]);
         self.coarse.solve(&mut heights, DAMPING);
         let mut z = vec![0.0; r.len()];
         workers.map_blocks(&mut z, cols, |row, part| {
@@ -135,6 +141,10 @@ impl Preconditioner {
         });
         let coarse = &heights[self.hats.count()..];
         z[beam.len()..].iter_mut().zip(coarse).for_each(|(z, height)| *z += height);
+        // What moves all exposures alike is no error, and what rounding leaves of it must not grow.
+        let shifts = &mut z[beam.len() + system.fluxes.columns.len()..];
+        let moves = system.centred(shifts);
+        shifts.copy_from_slice(moves.as_flattened());
         z
     }
 }

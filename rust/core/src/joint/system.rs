@@ -18,11 +18,15 @@ use super::kernel::{Add, Follow, Interpolate, Row, Solve, Spread};
 use super::penalty::Penalty;
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
 use crate::geometry::{Rotation, View};
 use crate::model::{Model, Stretch};
 use crate::parallel::{Workers, dot};
 
+/// Cells between slopes that are compared.
+const APART: usize = 8;
+/// Binomial factors of standard deviation 1.
+const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
 /// Rows that a thread takes at a time.
 const BAND: usize = 8;
 /// A determinant that is rounding alone, of two columns that a pixel cannot tell from each other.
@@ -67,6 +71,15 @@ pub(super) struct System<'m, 'a, T> {
     pub(super) penalty: Option<Penalty>,
 }
 
+/// What one exposure shows in a block of pixels, with the light e = c L: Σ w (M e)², and with its
+/// slopes along the shift Σ w M² e ∂e and Σ w M² (∂e)².
+#[derive(Clone, Copy, Default)]
+pub(super) struct Block {
+    pub(super) weight: f64,
+    pub(super) slope: [f64; 2],
+    pub(super) square: [f64; 2],
+}
+
 /// Room of one thread for a row of pixels.
 struct Room {
     weights: Vec<f64>,
@@ -86,12 +99,10 @@ struct Sums {
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
-    #[expect(clippy::too_many_arguments, reason = "all that a problem is made of")]
     pub(super) fn new(
         model: &'m Model<'a, T>,
         grid: Grid,
         fluxes: Fluxes,
-        shift_prior: Option<ShiftPrior>,
         with_offset: bool,
         state: State,
         workers: &'m Workers,
@@ -103,7 +114,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             model,
             workers,
             fluxes,
-            shift_prior,
+            shift_prior: None,
             with_offset,
             unit: 1.0,
             flux: model.flux.clone(),
@@ -379,69 +390,80 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         rows.into_iter().fold(0.0, f64::max)
     }
 
-    /// Ω = Σ w (c L M)² of each block of pixels and exposure, for blocks of `size`.
-    pub(super) fn block_weights(
-        &mut self,
-        size: [usize; 2],
-        control: &Control,
-    ) -> Result<Vec<f64>> {
+    /// Sums of each block of pixels and exposure, for blocks of `size`.
+    pub(super) fn blocks(&self, size: [usize; 2], control: &Control) -> Result<Vec<Block>> {
         let (sensor, count) = (self.model.sensor(), self.model.count());
-        let shape = [sensor.rows.div_ceil(size[0]), sensor.cols.div_ceil(size[1])];
-        let found = self.workers.map(shape[0], |block_row| {
+        let (down, across) = (sensor.rows.div_ceil(size[0]), sensor.cols.div_ceil(size[1]));
+        let (beams, length) = (self.beam_views(), Row::length(count, sensor.cols));
+        let found = self.workers.map(down, |block_row| {
             let mut room = self.room();
-            let mut found = vec![0.0; shape[1] * count];
-            let rows = block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]);
-            for row_index in rows {
+            let mut found = vec![Block::default(); across * count];
+            for row_index in block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]) {
                 control.check()?;
-                let length = Row::length(count, sensor.cols);
                 let row = &self.rows[row_index * length..][..length];
                 let (light, rest) = row.split_at(count * sensor.cols);
                 for k in 0..count {
                     self.weigh_row(k, row_index, &mut room);
-                    for col in 0..sensor.cols {
+                    let measured = |col: usize| {
                         let at = k * sensor.cols + col;
-                        let shown = light[at] * rest[col];
-                        found[col / size[1] * count + k] += room.weights[at] * shown * shown;
+                        (col / size[1] * count + k, room.weights[at] * rest[col].powi(2), light[at])
+                    };
+                    for col in 0..sensor.cols {
+                        let (block, weight, light) = measured(col);
+                        found[block].weight += weight * light * light;
+                    }
+                    let Some(beams) = &beams else { continue };
+                    for axis in 0..2 {
+                        let window = &self.windows[k];
+                        let (taps, slope) = (slopes(window, axis), &mut room.slope[..]);
+                        self.interpolate(beams, window, row_index, taps, &mut room.row, slope);
+                        for (col, slope) in slope.iter().enumerate() {
+                            let (block, weight, light) = measured(col);
+                            let slope = self.flux[k] * slope;
+                            found[block].slope[axis] += weight * light * slope;
+                            found[block].square[axis] += weight * slope * slope;
+                        }
                     }
                 }
             }
             Ok(found)
         });
-        let found: Result<Vec<Vec<f64>>> = found.into_iter().collect();
+        let found: Result<Vec<Vec<Block>>> = found.into_iter().collect();
         Ok(found?.concat())
     }
 
-    /// Σ w (c M ∂L/∂d)² of each exposure: what it tells of its shift, by itself.
-    pub(super) fn shift_diagonal(&self, control: &Control) -> Result<Vec<[f64; 2]>> {
-        let (sensor, count) = (self.model.sensor(), self.model.count());
-        let Some(beams) = self.beam_views() else { return Ok(Vec::new()) };
-        let length = Row::length(count, sensor.cols);
-        let found = self.workers.map(sensor.rows, |row_index| {
-            control.check()?;
-            let mut room = self.room();
-            let sensitivity = &self.rows[row_index * length + count * sensor.cols..][..sensor.cols];
-            let mut found = vec![[0.0; 2]; count];
-            for (k, found) in found.iter_mut().enumerate() {
-                self.weigh_row(k, row_index, &mut room);
-                for (axis, found) in found.iter_mut().enumerate() {
-                    let window = &self.windows[k];
-                    let (taps, slope) = (slopes(window, axis), &mut room.slope[..]);
-                    self.interpolate(&beams, window, row_index, taps, &mut room.row, slope);
-                    let weights = &room.weights[k * sensor.cols..];
-                    for ((slope, weight), m) in slope.iter().zip(weights).zip(sensitivity) {
-                        *found += weight * (self.flux[k] * m * slope).powi(2);
-                    }
+    /// How much the beam's slopes change from place to place, over those of noise: the mean square of
+    /// the smoothed slopes' second differences over [`APART`] cells, by that of what smoothing took
+    /// away. A beam without structure, such as a Gaussian, has slopes of its own too, but by those
+    /// shifts are hardly told from a bend of M.
+    pub(super) fn structure(&self) -> f64 {
+        let Shape { rows, cols } = self.grid.geometry.beam;
+        let beam = &self.state.beam;
+        let seen = |cell: usize| self.weights.get(cell).is_some_and(|&weight| weight > 0.0);
+        let [mut kept, mut lost] = [0.0, 0.0];
+        for (step, length) in [(1, cols), (cols, rows)] {
+            let slope = |cell: usize| beam[cell + step] - beam[cell - step];
+            let smooth = |cell: usize| {
+                let terms = SMOOTH.iter().enumerate();
+                terms.map(|(i, t)| t * slope(cell + i * step - 2 * step)).sum::<f64>()
+            };
+            for cell in 0..beam.len() {
+                let place = cell / step % length;
+                let ends = 3..length.saturating_sub(3 + 2 * APART);
+                if !ends.contains(&place) {
+                    continue;
+                }
+                let places = [cell, cell + APART * step, cell + 2 * APART * step];
+                let known =
+                    |cell: usize| seen(cell - 3 * step) && seen(cell) && seen(cell + 3 * step);
+                if places.into_iter().all(known) {
+                    let [first, middle, last] = places.map(smooth);
+                    kept += (first - 2.0 * middle + last).powi(2) / 6.0;
+                    lost += (slope(cell) - first).powi(2);
                 }
             }
-            Ok(found)
-        });
-        let mut total = vec![[0.0; 2]; count];
-        for found in found {
-            let found: Vec<[f64; 2]> = found?;
-            let pairs = total.as_flattened_mut().iter_mut().zip(found.as_flattened());
-            pairs.for_each(|(total, found)| *total += found);
         }
-        Ok(total)
+        kept / lost
     }
 
     /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's
