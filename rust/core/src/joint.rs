@@ -49,7 +49,7 @@ const EXACT_SHIFT: f64 = 1e-6;
 const BEFORE_SHIFTS: f64 = 1e-3;
 /// A beam whose structure is so much larger than noise tells shifts; by the slopes of noise steps
 /// would lead nowhere.
-const TOLD: f64 = 1.0;
+const TOLD: f64 = 10.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
