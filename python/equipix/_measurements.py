@@ -102,7 +102,9 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> NDArray[np.float64]:
     if array.ndim == 1:
         array = array[:, np.newaxis]
     if array.ndim and array.shape not in ((count, 1), (count, 2)):
-        raise InputError(f"'shift_std' has shape {array.shape}, expected ({count},) or ({count}, 2)")
+        raise InputError(
+            f"'shift_std' has shape {array.shape}, expected ({count},) or ({count}, 2)"
+        )
     std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
