@@ -90,7 +90,10 @@ def as_flux(
     values = per_exposure("flux", flux, count, default=1)
     if flux_std is None:
         return values, ("known", [])
-    std = np.broadcast_to(as_array("flux_std", flux_std, ndim=(0, 1)), count).astype(np.float64)
+    array = as_array("flux_std", flux_std, ndim=(0, 1))
+    if array.size > 1:
+        check_count("flux_std", len(array), count)
+    std = np.broadcast_to(array.ravel(), count).astype(np.float64)
     if not (np.isfinite(std).all() and (std > 0).all()):
         raise InputError(f"'flux_std' is {std.tolist()}, expected positive numbers")
     return values, ("prior", std.tolist())
@@ -101,10 +104,8 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> NDArray[np.float64]:
     array = as_array("shift_std", shift_std, ndim=(0, 1, 2))
     if array.ndim == 1:
         array = array[:, np.newaxis]
-    if array.ndim and array.shape not in ((count, 1), (count, 2)):
-        raise InputError(
-            f"'shift_std' has shape {array.shape}, expected ({count},) or ({count}, 2)"
-        )
+    if array.size > 1 and array.shape not in ((count, 1), (count, 2)):
+        raise InputError(f"'shift_std' has shape {array.shape}, expected ({count},) or ({count}, 2)")
     std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")

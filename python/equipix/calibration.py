@@ -437,7 +437,9 @@ def calibrate(
     return calibration
 
 
-def _wrapped(result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any]) -> Calibration:
+def _wrapped(
+    result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any]
+) -> Calibration:
     objective = result.misfit
     freedom = result.degrees_of_freedom
     return Calibration(

@@ -1,6 +1,6 @@
 """Beam between pixels, fluxes, shifts and offsets in one dense fit, for tiny sensors.
 
-    F = Σ w·(y − c·L(u)·M − O)² + τ‖G a‖² + Σ (ln c − ln c₀)²/σ_c² + Σ (d − d₀)²/σ_d²
+    F = Σ w·(y − c·L(u)·M − O)² + τ‖G a‖² + Σ (ln c − ln c₀)²/s_c² + Σ (d − d₀)²/s_d²
 
 with L(u) = Σ_j a_j·B(u − j), B the cubic B-spline along rows and columns (de Boor, A Practical
 Guide to Splines, 1978), or a_u itself where all shifts are whole and known, and G the fourth
@@ -206,7 +206,7 @@ def _flux_columns(
 ) -> tuple[Array, bool]:
     """T of ln c = ln c₀ + T·θ, and whether a tilt of ln M hides what is missing in it.
 
-    M → M·exp(α·p), L → L·exp(−α·u) and ln c → ln c + α·d changes no measurement, unless exposures
+    M → M·exp(b·p), L → L·exp(−b·u) and ln c → ln c + b·d changes no measurement, unless exposures
     are turned against each other: then only a factor between L and c is not told.
     """
     count = len(shifts)
@@ -215,10 +215,10 @@ def _flux_columns(
     constant = np.ones((count, 1))
     turned = bool(np.any(turns != turns[0]))
     hidden = constant if turned else np.hstack([constant, shifts])
-    if flux == "fit":
+    if isinstance(flux, str) and flux == "fit":
         left, sizes, _ = np.linalg.svd(hidden)
         return left[:, np.sum(sizes > 1e-9 * sizes[0]) :], not turned
-    if flux == "linear":
+    if isinstance(flux, str):
         times = np.asarray(time, float)
         told = times - hidden @ np.linalg.lstsq(hidden, times)[0]
         if np.linalg.norm(told) > 1e-9 * np.linalg.norm(times):
@@ -228,9 +228,9 @@ def _flux_columns(
 
 
 def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Array]:
-    """Z of d = d₀ + Z·ζ, by exposure and axis, and the prior's (d − d₀)/σ_d by ζ.
+    """Z of d = d₀ + Z·ζ, by exposure and axis, and the prior's (d − d₀)/s_d by ζ.
 
-    To move all exposures alike moves but the beam: the mean of d − d₀, weighted by 1/σ_d², is 0.
+    To move all exposures alike moves but the beam: the mean of d − d₀, weighted by 1/s_d², is 0.
     """
     if shift_std is None:
         return np.empty((2 * count, 0)), np.empty((0, 0))
@@ -243,8 +243,8 @@ def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Arra
     for axis in (0, 1):
         centred = np.eye(count) - precision[:, axis]
         columns[:, axis, :, axis] = centred * std[:, axis]
-    columns = columns.reshape(2 * count, 2 * count)
-    return columns, columns / std.reshape(-1, 1)
+    by_zeta = columns.reshape(2 * count, 2 * count)
+    return by_zeta, by_zeta / std.reshape(-1, 1)
 
 
 def _diagonal_blocks(first: Array, second: Array) -> Array:
@@ -255,7 +255,7 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
 
 
 def _cubic(x: Array) -> tuple[Array, Array]:
-    """B(x) and B′(x), the cubic B-spline with knots at whole numbers and its slope."""
+    """B(x) and dB/dx, the cubic B-spline with knots at whole numbers and its slope."""
     t = np.abs(x)
     near, far = t < 1, (t >= 1) & (t < 2)
     value = np.where(near, 2 / 3 - t**2 + t**3 / 2, 0) + np.where(far, (2 - t) ** 3 / 6, 0)

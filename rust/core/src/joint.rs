@@ -12,6 +12,7 @@
 //! weight of a cell.
 
 mod flux;
+mod freedom;
 mod gauge;
 mod grid;
 mod kernel;
@@ -104,7 +105,7 @@ pub struct Fit {
     pub smallest_ritz: f64,
     /// F of the measurements alone.
     pub misfit: f64,
-    /// Numbers of coefficients and parameters sought.
+    /// How many numbers were found besides M and O; of a spline, those that measurements tell.
     pub unknowns: usize,
     /// The way here.
     pub history: History,
@@ -304,7 +305,7 @@ fn advance<T: Real>(system: &mut System<'_, '_, T>, x: &[f64], share: f64) {
     shifts.zip(moves.as_flattened()).for_each(|(shift, step)| *shift += share * step);
 }
 
-/// Measurements less unknowns; a coefficient that is seen counts whole.
+/// Measurements less unknowns.
 fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
     let pixels = system.model.sensor().len() * (1 + usize::from(system.with_offset));
     system.model.used().saturating_sub(pixels + unknowns(system)).max(1) as f64
@@ -312,7 +313,15 @@ fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
 
 fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     let seen = system.weights.iter().filter(|&&weight| weight > 0.0).count();
-    seen + system.size() - system.state.beam.len()
+    let params = system.size() - system.state.beam.len();
+    if !system.grid.is_spline() {
+        return seen + params;
+    }
+    let weights = system.model.exposure_weights();
+    let total: f64 = weights.iter().sum();
+    let shares: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
+    let windows = system.grid.windows(&system.state.shifts);
+    (freedom::told(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
 }
 
 /// What F may rise by through rounding, of residuals that are rounding alone.

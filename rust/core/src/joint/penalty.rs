@@ -5,8 +5,9 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
+use super::kernel::Add;
 use crate::frames::Shape;
-use crate::parallel::Workers;
+use crate::parallel::{Workers, dot};
 
 const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
@@ -15,8 +16,8 @@ const BAND: usize = 16;
 pub(super) struct Penalty {
     shape: Shape,
     pub(super) tau: f64,
-    /// Whether the five cells from here on count, down a column and along a row.
-    counted: Vec<[bool; 2]>,
+    /// 1 where the five cells from here on count, down a column and along a row; else 0.
+    counted: [Vec<f64>; 2],
     /// D a and aᵀ D a.
     pull: Vec<f64>,
     norm: f64,
@@ -24,31 +25,40 @@ pub(super) struct Penalty {
 
 impl Penalty {
     /// The penalty at a beam of weights D, seen where they are above 0.
-    pub(super) fn new(shape: Shape, beam: &[f64], weights: &[f64], tau: f64) -> Self {
+    pub(super) fn new(
+        shape: Shape,
+        beam: &[f64],
+        weights: &[f64],
+        tau: f64,
+        workers: &Workers,
+    ) -> Self {
         let Shape { rows, cols } = shape;
-        let seen = |row, col| weights[row * cols + col] > 0.0;
-        let cells = (0..rows).flat_map(|row| (0..cols).map(move |col| (row, col)));
-        let counted = cells.map(|(row, col)| {
-            let down = row + 4 < rows && (0..5).all(|i| seen(row + i, col));
-            let along = col + 4 < cols && (0..5).all(|j| seen(row, col + j));
-            [down, along]
-        });
-        let counted = counted.collect();
+        let count = |axis: usize, step: usize| {
+            let mut counted = vec![0.0; shape.len()];
+            workers.map_blocks(&mut counted, cols, |row, counted| {
+                for (col, counted) in counted.iter_mut().enumerate() {
+                    let inside = if axis == 0 { row + 4 < rows } else { col + 4 < cols };
+                    let cell = row * cols + col;
+                    let seen = inside && (0..5).all(|i| weights[cell + i * step] > 0.0);
+                    *counted = f64::from(u8::from(seen));
+                }
+            });
+            counted
+        };
+        let counted = [count(0, cols), count(1, 1)];
         let pull: Vec<f64> = weights.iter().zip(beam).map(|(d, a)| d * a).collect();
-        let norm = pull.iter().zip(beam).map(|(da, a)| da * a).sum();
+        let norm = workers.dot(&pull, beam);
         Self { shape, tau, counted, pull, norm }
     }
 
     /// The diagonal of τ GᵀG.
     pub(super) fn diagonal(&self) -> Vec<f64> {
-        let cols = self.shape.cols;
-        let mut diagonal = vec![0.0; self.counted.len()];
-        for (cell, counted) in self.counted.iter().enumerate() {
-            for (step, counted) in [cols, 1].into_iter().zip(counted) {
-                if *counted {
-                    for (i, factor) in FOURTH.iter().enumerate() {
-                        diagonal[cell + i * step] += self.tau * factor * factor;
-                    }
+        let mut diagonal = vec![0.0; self.pull.len()];
+        for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
+            for (cell, counted) in counted.iter().enumerate().filter(|(_, counted)| **counted > 0.0)
+            {
+                for (i, factor) in FOURTH.iter().enumerate() {
+                    diagonal[cell + i * step] += self.tau * counted * factor * factor;
                 }
             }
         }
@@ -81,22 +91,18 @@ impl Penalty {
     }
 
     /// G x, down and along, and ‖G x‖².
-    fn differences(&self, x: &[f64], workers: &Workers) -> (Vec<[f64; 2]>, f64) {
+    fn differences(&self, x: &[f64], workers: &Workers) -> ([Vec<f64>; 2], f64) {
         let cols = self.shape.cols;
-        let mut differences = vec![[0.0; 2]; x.len()];
-        let energies = workers.map_blocks(&mut differences, BAND * cols, |band, part| {
-            let first = band * BAND * cols;
+        let size = BAND * cols;
+        let mut differences = [0, 1].map(|_| vec![0.0; x.len()]);
+        let [down, along] = &mut differences;
+        let energies = workers.map_pairs(down, along, [size; 2], |band, down, along| {
+            let first = band * size;
             let mut energy = 0.0;
-            for (index, difference) in part.iter_mut().enumerate() {
-                let cell = first + index;
-                for (axis, step) in [cols, 1].into_iter().enumerate() {
-                    if self.counted[cell][axis] {
-                        let terms = FOURTH.iter().enumerate();
-                        let sum: f64 = terms.map(|(i, b)| b * x[cell + i * step]).sum();
-                        difference[axis] = sum;
-                        energy += sum * sum;
-                    }
-                }
+            for (axis, part, step) in [(0, down, cols), (1, along, 1)] {
+                let counted = &self.counted[axis][first..][..part.len()];
+                pulp::Arch::new().dispatch(Differ { x, first, step, counted, sums: &mut *part });
+                energy += dot(part, part);
             }
             energy
         });
@@ -104,29 +110,53 @@ impl Penalty {
     }
 
     /// Gᵀ of differences, which are 0 where they do not count.
-    fn adjoint(&self, differences: &[[f64; 2]], sums: &mut [f64], workers: &Workers) {
+    fn adjoint(&self, [down, along]: &[Vec<f64>; 2], sums: &mut [f64], workers: &Workers) {
         let cols = self.shape.cols;
         workers.map_blocks(sums, BAND * cols, |band, part| {
-            let first = band * BAND * cols;
-            for (index, sum) in part.iter_mut().enumerate() {
-                let cell = first + index;
-                *sum = 0.0;
-                for (axis, step) in [cols, 1].into_iter().enumerate() {
-                    for (i, b) in FOURTH.iter().enumerate() {
-                        if let Some(start) = cell.checked_sub(i * step) {
-                            *sum += b * differences[start][axis];
-                        }
-                    }
+            part.fill(0.0);
+            for (values, step) in [(down, cols), (along, 1)] {
+                for (i, factor) in FOURTH.iter().enumerate() {
+                    // Values from so many cells further back; before the first there are none.
+                    let first = band * BAND * cols;
+                    let missing = (i * step).saturating_sub(first).min(part.len());
+                    let values = &values[first + missing - i * step..];
+                    let (factor, sums) = (*factor, &mut part[missing..]);
+                    pulp::Arch::new().dispatch(Add { factor, values, sums });
                 }
             }
         });
     }
 }
 
+/// Fourth differences of x from a cell on, where they count.
+struct Differ<'s> {
+    x: &'s [f64],
+    first: usize,
+    step: usize,
+    counted: &'s [f64],
+    sums: &'s mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Differ<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        // Behind the last cell nothing counts.
+        let reach = 4 * self.step;
+        let whole = self.sums.len().min(self.x.len().saturating_sub(self.first + reach));
+        let [a, b, c, d, e] =
+            [0, 1, 2, 3, 4].map(|i| &self.x[(self.first + i * self.step).min(self.x.len())..]);
+        let inputs = a.iter().zip(b).zip(c).zip(d).zip(e).zip(self.counted);
+        for (sum, (((((a, b), c), d), e), counted)) in self.sums[..whole].iter_mut().zip(inputs) {
+            *sum = counted * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::parallel::Workers;
 
     #[test]
     fn a_multiple_of_the_beam_and_a_cubic_cost_nothing() {
@@ -138,7 +168,7 @@ mod tests {
         let mut weights = vec![1.0; 99];
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
-        let penalty = Penalty::new(shape, &beam, &weights, 1.0);
+        let penalty = Penalty::new(shape, &beam, &weights, 1.0, &workers);
         let energy = |penalty: &Penalty, beam: &[f64], x: &[f64]| {
             let relative = penalty.relative(beam, x, &workers);
             penalty.add(beam, relative, 1.0, &mut vec![0.0; 99], &workers)
@@ -148,7 +178,8 @@ mod tests {
         assert!(energy(&penalty, &beam, &twice) < 1e-25);
         assert!(energy(&penalty, &beam, &cubic) > 1.0);
         assert!(penalty.add(&beam, cubic, 1.0, &mut vec![0.0; 99], &workers) < 1e-15);
-        assert!(penalty.diagonal()[60] == 2.0 * 70.0);
+        // Row 5 of 9 is in four of five differences down, column 5 of 11 in all five along.
+        assert!(penalty.diagonal()[60] == 69.0 + 70.0);
     }
 
     #[test]
@@ -157,7 +188,7 @@ mod tests {
         let random = |seed: f64| (0..56).map(|i| (f64::from(i) * seed).sin() + 1.5).collect();
         let (beam, x, y): (Vec<f64>, Vec<f64>, Vec<f64>) = (random(1.7), random(2.9), random(4.1));
         let workers = Workers::new(None).unwrap();
-        let penalty = Penalty::new(shape, &beam, &vec![1.0; 56], 0.7);
+        let penalty = Penalty::new(shape, &beam, &[1.0; 56], 0.7, &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 56];
             let relative = penalty.relative(&beam, x, &workers);

@@ -19,9 +19,9 @@ use super::penalty::Penalty;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
-use crate::geometry::View;
+use crate::geometry::{Rotation, View};
 use crate::model::{Model, Stretch};
-use crate::parallel::Workers;
+use crate::parallel::{Workers, dot};
 
 /// Rows that a thread takes at a time.
 const BAND: usize = 8;
@@ -292,7 +292,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let total: f64 = self.weights.iter().sum();
             let typical = self.workers.dot(&self.weights, &self.weights) / total;
             let (shape, beam) = (self.grid.geometry.beam, &self.state.beam);
-            self.penalty = Some(Penalty::new(shape, beam, &self.weights, tau * typical));
+            let tau = tau * typical;
+            self.penalty = Some(Penalty::new(shape, beam, &self.weights, tau, self.workers));
         }
         Ok(())
     }
@@ -362,17 +363,20 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// The largest size of the last change of M, less `share` of what `earlier` holds, which it
     /// replaces; pixels without weight do not count.
     pub(super) fn largest_change(&self, share: f64, earlier: &mut Vec<f64>) -> f64 {
-        let cols = self.model.sensor().cols;
+        let (cols, count) = (self.model.sensor().cols, self.model.count());
         earlier.resize(self.model.sensor().len(), 0.0);
-        let mut largest = 0.0_f64;
-        let mut earlier = earlier.chunks_exact_mut(cols);
-        self.for_rows(|[_, _, _, change]| {
-            for (earlier, change) in earlier.next().unwrap_or_default().iter_mut().zip(change) {
-                largest = largest.max((change - share * *earlier).abs());
+        let length = Row::length(count, cols);
+        let rows = self.workers.map_blocks(earlier, cols, |row, earlier| {
+            let change = &self.rows[(row + 1) * length - cols..][..cols];
+            let mut largest = [0.0_f64; 2];
+            for (index, (earlier, change)) in earlier.iter_mut().zip(change).enumerate() {
+                let size = (change - share * *earlier).abs();
+                largest[index % 2] = largest[index % 2].max(size);
                 *earlier = *change;
             }
+            largest[0].max(largest[1])
         });
-        largest
+        rows.into_iter().fold(0.0, f64::max)
     }
 
     /// Ω = Σ w (c L M)² of each block of pixels and exposure, for blocks of `size`.
@@ -477,15 +481,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                     for k in 0..count {
                         let pull = &room.values[k * sensor.cols..][..sensor.cols];
                         let light = &row[k * sensor.cols..][..sensor.cols];
-                        let dot = |a: &[f64]| a.iter().zip(pull).map(|(a, b)| a * b).sum::<f64>();
-                        sums.flux[k] += dot(light) / system.flux[k];
+                        if !system.fluxes.columns.is_empty() {
+                            sums.flux[k] += dot(light, pull) / system.flux[k];
+                        }
                         if let Some(beams) = &beams {
                             let window = &system.windows[k];
                             for axis in 0..2 {
                                 let (taps, slope) = (slopes(window, axis), &mut room.slope[..]);
                                 let room = &mut room.row;
                                 system.interpolate(beams, window, row_index, taps, room, slope);
-                                sums.shifts[k][axis] += dot(slope);
+                                sums.shifts[k][axis] += dot(slope, pull);
                             }
                         }
                         system.spread(k, pull, &mut room.row, &mut pulls[k * wide..][..wide]);
@@ -563,6 +568,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// Adds what was found in a view to the beam's grid.
     fn turn_back(&self, view: &View, found: &[f64], cells: &mut [f64]) {
+        if view.rotation == Rotation::None {
+            return self.workers.add_multiple(cells, 1.0, found);
+        }
         let cols = self.grid.geometry.beam.cols;
         self.workers.map_blocks(cells, cols, |row, cells| {
             for (col, cell) in cells.iter_mut().enumerate() {
@@ -574,6 +582,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// Values on cells in the order of each view.
     fn views_of(&self, cells: &[f64]) -> Vec<Vec<f64>> {
         let turned = |view: &View| {
+            if view.rotation == Rotation::None {
+                return cells.to_vec();
+            }
             let mut turned = vec![0.0; cells.len()];
             self.workers.map_blocks(&mut turned, view.shape.cols, |row, values| {
                 for (col, value) in values.iter_mut().enumerate() {
