@@ -134,12 +134,14 @@ pub fn solve<T: Real>(
     let mut halvings = 0;
     let mut stuck = false;
     let mut preconditioner = None;
+    // What F may rise by because τ follows M, whose weights a step changes by twice its size.
+    let mut slack = 0.0;
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
         products += 1;
         let highest = looks.last().map_or(f64::INFINITY, |last| last.objective * (1.0 + 1e-12));
         // A number that is none is no fall either.
-        let fell = objective <= highest + rounding(model);
+        let fell = objective <= highest + slack + rounding(model);
         if let Some(x) = &taken
             && !fell
             && halvings <= MOST_HALVINGS
@@ -169,6 +171,7 @@ pub fn solve<T: Real>(
         let first = search.product(&mut system, control)?;
         products += 1;
         looks.push(Look { sweep: products, objective, error: first / search.smallest });
+        slack = 2.0 * (objective - system.misfit(objective)) * first / search.smallest;
         if let Some(ended) = ended(&looks, &search, &stop, limit, stuck) {
             let history = History { looks, ended };
             let mut fit = finish(&system, &search, objective, history, control)?;

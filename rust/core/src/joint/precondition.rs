@@ -18,6 +18,9 @@ const BLOCKS: usize = 3;
 const SUMMED: usize = 32;
 /// Cells with less than this share of the mean diagonal are as good as unseen.
 const FAINTEST: f64 = 1e-12;
+/// The share of its curvature that a flux has left where hats make up for it: hats times the
+/// coefficients are only nearly hats times the beam, so that a tilt of it is no exact one.
+const BLUR: f64 = 1e-3;
 
 pub(super) struct Preconditioner {
     hats: Hats,
@@ -56,7 +59,6 @@ impl Preconditioner {
             weights.map(|(k, &weight)| arm(block, k, weight)).collect()
         });
         let precisions = system.precisions();
-        let coarse = Coarse::of_stars(&hats, &precisions[..params], stars, control)?;
         let mut totals = vec![0.0; count];
         for (index, weight) in weights.iter().enumerate() {
             totals[index % count] += weight;
@@ -65,6 +67,10 @@ impl Preconditioner {
             precision + column.iter().zip(&totals).map(|(t, total)| t * t * total).sum::<f64>()
         });
         let of_theta: Vec<f64> = of_theta.collect();
+        let blur = if system.grid.is_spline() { BLUR } else { 0.0 };
+        let held = precisions.iter().zip(&of_theta).map(|(precision, all)| precision + blur * all);
+        let held: Vec<f64> = held.collect();
+        let coarse = Coarse::of_stars(&hats, &held, stars, control)?;
         let mut diagonal = system.diagonal(true, control)?;
         let least = FAINTEST * diagonal.iter().sum::<f64>() / diagonal.len() as f64;
         diagonal.extend(of_theta);
@@ -135,6 +141,10 @@ impl Preconditioner {
         });
         let coarse = &heights[self.hats.count()..];
         z[beam.len()..].iter_mut().zip(coarse).for_each(|(z, height)| *z += height);
+        // What moves all exposures alike no product tells: rounding would let it grow.
+        let moves = beam.len() + self.params;
+        let centred = system.centred(&z[moves..]);
+        z[moves..].copy_from_slice(centred.as_flattened());
         z
     }
 }
