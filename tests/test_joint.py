@@ -7,6 +7,7 @@ hold whatever the truth is.
 from __future__ import annotations
 
 import warnings
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ class TestReference:
     FRACTIONS = between(SMALL_CROSS, np.random.default_rng(8))
     DRIFT = np.array([1, 1.01, 0.99, 1.005, 0.98])
 
-    CASES = {
+    CASES: ClassVar = {
         "fractions": (FRACTIONS, {}),
         "fractions turned": (FRACTIONS, {"rotation": TURNED}),
         "fractions with fluxes": (FRACTIONS, {"flux": DRIFT}),
@@ -78,8 +79,6 @@ class TestReference:
         "linear": (FRACTIONS, {"flux": "linear", "time": [0, 3, 1, 4, 2]}),
         "prior": (SMALL_CROSS, {"flux": DRIFT, "flux_std": 0.01}),
         "prior turned": (SMALL_CROSS, {"flux": DRIFT, "flux_std": 0.01, "rotation": TURNED}),
-        "shifts": (FRACTIONS, {"shift_std": 0.01}),
-        "shifts turned": (FRACTIONS, {"shift_std": np.full((5, 2), 0.01), "rotation": TURNED}),
     }
 
     @pytest.mark.parametrize("case", CASES)
@@ -93,15 +92,24 @@ class TestReference:
         # The estimate is one of order, as in the tests of `multiscale`: a hundred times.
         np.testing.assert_allclose(cal.sensitivity, dense.sensitivity, atol=1e-6)
         np.testing.assert_allclose(cal.flux, dense.flux, atol=1e-6)
-        # A beam whose relative slope is 0.05 tells a shift 20 times worse than a flux.
-        np.testing.assert_allclose(cal.shifts, dense.shifts, atol=2e-5)
-        corner = np.subtract(dense.beam_origin, cal.beam_origin)
-        rows, cols = cal.beam.shape
-        beam = dense.beam[corner[0] :, corner[1] :][:rows, :cols]
-        both = np.isfinite(beam) & np.isfinite(cal.beam)
-        assert both.sum() > frames[0].size
-        # Cells that one exposure's edge alone tells, with small factors, follow noise more.
-        np.testing.assert_allclose(cal.beam[both], beam[both], atol=1e-4)
+        # Cells behind the edge follow noise; these every exposure sees.
+        mine, theirs = (
+            each.beam[each.beam_origin[0] + 3 :, each.beam_origin[1] + 3 :][:5, :5]
+            for each in (cal, dense)
+        )
+        np.testing.assert_allclose(mine, theirs, atol=1e-6)
+
+    @pytest.mark.parametrize("rotation", [None, TURNED], ids=["upright", "turned"])
+    @pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
+    def test_refined_shifts_agree(self, rotation):
+        frames, measured = small(1, self.FRACTIONS, rotation=rotation)
+        options = measured | {"rotation": rotation, "shift_std": np.full((5, 2), 0.01)}
+        cal = equipix.calibrate(frames, self.FRACTIONS, tolerance=1e-5, max_sweeps=3000, **options)
+        dense = reference.joint(frames, self.FRACTIONS, **options)
+        # A tenth of the noise: so few pixels tell shifts too badly for more.
+        np.testing.assert_allclose(cal.sensitivity, dense.sensitivity, atol=1e-4)
+        np.testing.assert_allclose(cal.shifts, dense.shifts, atol=1e-3)
+        assert np.abs(dense.shifts - self.FRACTIONS).max() > 3e-3
 
     @pytest.mark.parametrize("shifts", [SMALL_CROSS, FRACTIONS], ids=["whole", "between"])
     def test_two_levels_tell_gain_and_offset(self, shifts):
@@ -126,12 +134,11 @@ class TestReference:
         assert np.mean(squares[::2]) == pytest.approx(1, abs=0.3)
         assert np.mean(squares[1::2]) == pytest.approx(1, abs=0.3)
 
+    @pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
     def test_one_level_leaves_gain_and_offset_untold(self):
         frames, measured = small(2, SMALL_CROSS)
-        with (
-            pytest.warns(IdentifiabilityWarning, match="hardly tell some pattern"),
-            pytest.warns(ConvergenceWarning),
-        ):
+        # How far it comes before it gives up is chance.
+        with pytest.warns(IdentifiabilityWarning, match="hardly tell some pattern"):
             equipix.calibrate(frames, SMALL_CROSS, dark="fit", **measured)
 
 
@@ -144,7 +151,7 @@ class TestBetweenPixels:
                 cal = equipix.calibrate(frames, shifts, tolerance=1e-5)
                 rms[seed, int(whole)] = rms_error(cal, truth)
         assert rms[:, 0].mean() <= 1.05 * rms[:, 1].mean()
-        # Section 5 of the design: 1.21 σ/√n for smooth beams; the structure adds a little.
+        # Section 5 of the design: 1.21·noise/√n for smooth beams; the structure adds a little.
         assert rms[:, 1].mean() == pytest.approx(1.21 * NOISE / np.sqrt(5), rel=0.1)
 
     def test_without_noise_the_spline_itself_is_what_is_left(self):
@@ -163,8 +170,7 @@ class TestBetweenPixels:
         rms = np.empty((4, 3))
         for seed in range(4):
             frames, shifts, truth = structured(seed)
-            std = np.full((5, 2), 0.05)
-            std[0] = 0
+            std = 0.05
             known = shifts + std * np.random.default_rng(seed + 50).standard_normal((5, 2))
             options = {"tolerance": 1e-5, "variance": np.full(5, NOISE**2)}
             runs = (
@@ -174,11 +180,13 @@ class TestBetweenPixels:
             )
             rms[seed] = [rms_error(run, truth) for run in runs]
             # 19 200 values, relative slopes of some 0.03: 1e-4 pixels; large scales count less.
-            assert np.abs(runs[1].shifts - shifts).max() < 1e-3
+            error = runs[1].shifts - shifts
+            assert np.abs(error - error.mean(axis=0)).max() < 1e-3
         true, refined, measured = rms.mean(axis=0)
         assert refined < 1.1 * true
         assert measured > 1.5 * true
 
+    @pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
     def test_a_smooth_beam_cannot_tell_shifts(self):
         rng = np.random.default_rng(3)
         beam = simulate.gaussian_beam(SENSOR, width=1e4)
@@ -288,7 +296,10 @@ class TestFluxes:
     def test_a_drift_along_the_shifts_is_left_to_the_gauge(self):
         shifts = [(0, 0), (0, 2), (0, 3), (0, 5)]
         frames, measured = small(3, shifts)
-        with pytest.warns(IdentifiabilityWarning, match="tilt"):
+        with (
+            pytest.warns(IdentifiabilityWarning, match="uncompared"),
+            pytest.warns(IdentifiabilityWarning, match="tilt"),
+        ):
             equipix.calibrate(frames, shifts, flux="linear", time=[0, 2, 3, 5], **measured)
 
 
