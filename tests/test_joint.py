@@ -101,6 +101,7 @@ class TestReference:
 
     @pytest.mark.parametrize("rotation", [None, TURNED], ids=["upright", "turned"])
     @pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_refined_shifts_agree(self, rotation):
         frames, measured = small(1, self.FRACTIONS, rotation=rotation)
         options = measured | {"rotation": rotation, "shift_std": np.full((5, 2), 0.01)}
@@ -187,22 +188,19 @@ class TestBetweenPixels:
         assert measured > 1.5 * true
 
     @pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
-    def test_a_smooth_beam_cannot_tell_shifts(self):
+    def test_shifts_that_a_smooth_beam_cannot_tell_do_no_harm(self):
         rng = np.random.default_rng(3)
         beam = simulate.gaussian_beam(SENSOR, width=1e4)
         truth = simulate.paper_sensitivity(SENSOR, rng=rng)
-        shifts, std = between(CROSS, rng), 0.05
+        shifts, std = between(CROSS, rng), 0.01
         frames = simulate.exposures(truth, beam, shifts)
         frames += NOISE * rng.standard_normal(frames.shape)
         known = shifts + std * rng.standard_normal(shifts.shape)
-        options = {"shift_std": std, "variance": np.full(5, NOISE**2), "tolerance": 1e-5}
-        cal = equipix.calibrate(frames, known, **options)
-        # One standard deviation of a shift changes all values together by so many of theirs,
-        # and that is how far noise can pull a shift, in standard deviations.
-        steepest = 2 * np.hypot(*SENSOR) / 1e4**2
-        told = std * steepest * np.sqrt(frames[0].size) / NOISE
-        assert told < 0.1
-        assert np.abs(cal.shifts - known).max() < 6 * told * std
+        options = {"variance": np.full(5, NOISE**2), "tolerance": 1e-4}
+        given = equipix.calibrate(frames, known, **options)
+        refined = equipix.calibrate(frames, known, shift_std=std, **options)
+        # Ten more unknowns than 19 200, of whose noise they may take their share.
+        assert rms_error(refined, truth) < 1.01 * rms_error(given, truth)
 
 
 def drifting(seed, shape, cross, *, turn, noise=1e-3, drift=0.01, sixth=True):

@@ -171,7 +171,9 @@ pub fn solve<T: Real>(
         let first = search.product(&mut system, control)?;
         products += 1;
         looks.push(Look { sweep: products, objective, error: first / search.smallest });
-        slack = 2.0 * (objective - system.misfit(objective)) * first / search.smallest;
+        let change = first / search.smallest;
+        let small = if change < CURVED[1] { change } else { 0.0 };
+        slack = 2.0 * (objective - system.misfit(objective)) * small;
         if let Some(ended) = ended(&looks, &search, &stop, limit, stuck) {
             let history = History { looks, ended };
             let mut fit = finish(&system, &search, objective, history, control)?;
