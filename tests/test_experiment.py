@@ -149,14 +149,14 @@ def test_given_shifts_and_fluxes_are_used(edited, manifest):
     np.testing.assert_allclose(calibration.flux, [1, 1.1, 1.2, 1.3, 1.4])
 
 
-def test_a_fraction_of_a_pixel_is_rounded_with_a_warning(edited):
+def test_coordinate_descent_rounds_a_fraction_of_a_pixel_with_a_warning(edited):
     path = edited('aperture_before = "aperture/p1-before.tif"', "shift = [0.0, 5.3]")
     path.write_text(re.sub(r"aperture_after = .*p1-after.*\n", "", path.read_text()))
     with (
         pytest.warns(errors.ShiftRoundingWarning, match=r"rounded to whole pixels"),
         pytest.warns(errors.ConvergenceWarning),
     ):
-        Experiment.load(path).run(max_sweeps=2)
+        Experiment.load(path).run(method="coordinate-descent", max_sweeps=2)
 
 
 def test_progress_names_the_stages(manifest):
@@ -179,7 +179,8 @@ def test_real_input(data_dir):
     error = simulate.relative_error(calibration.sensitivity, truth["sensitivity"])
     assert rms(error) < 1.30e-3
     assert rms(simulate.block_means(error)) < 1.8e-4
-    np.testing.assert_array_equal(calibration.shifts, truth["shifts"])
+    # Unequal pixels move a centroid by 0.008 pixel, a shift after two moves by 0.016.
+    np.testing.assert_allclose(calibration.shifts, truth["shifts"], atol=4 * 0.016)
 
 
 # What is refused
@@ -191,8 +192,12 @@ def test_real_input(data_dir):
         ("[sensor]", "[sensro]", r"unknown key 'sensro'"),
         ("bit_depth", "bits", r"unknown key 'bits' in \[sensor\]"),
         ('name = "p1"', 'name = "p1"\nshift_std = 1', r"'shift_std' in exposure 1 \('p1'\)"),
-        ('name = "p1"', 'name = "p1"\nflux_std = 1', r"unknown key 'flux_std'"),
-        ('name = "p1"', 'name = "p1"\ntime = 1', r"unknown key 'time'"),
+        ('name = "p1"', 'name = "p1"\nflux_std = 1', r"'flux_std' goes with 'flux' in exposure 1"),
+        (
+            'name = "p1"',
+            'name = "p1"\ntime = 1',
+            r"'time' is missing in exposure 'p0': give all or none",
+        ),
         ('name = "p2"', "", r"key 'name' is missing in exposure 2"),
         ("bit_depth = 12", "bit_depth = 17", r"holds 17, expected a whole number from 1 to 16"),
         ("bit_depth = 12", "saturation = -1", r"'saturation' in \[sensor\] holds -1"),

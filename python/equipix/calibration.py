@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 Method = Literal["multiscale", "coordinate-descent"]
 
 UNTOLD = 1e-4
-"""A Ritz value this small stands for a pattern that no measurement tells: 300 products would be needed
-to find it, and noise in it is 100 times what it is elsewhere."""
+"""A Ritz value this small stands for a pattern that no measurement tells: noise in it is 100 times
+what it is elsewhere."""
 
 FORMAT = 1
 """Number of the file format; a file with a higher one is refused."""
@@ -419,7 +419,12 @@ def calibrate(
         workers=positive_workers(workers),
         progress=progress,
     )
-    options: dict[str, Any] = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps, "dark": dark}
+    options: dict[str, Any] = {
+        "method": method,
+        "tolerance": tolerance,
+        "max_sweeps": max_sweeps,
+        "dark": dark,
+    }
     if flux_model[0] != "known":
         options["flux"] = flux_model[0]
     if result.shifts_told is not None:

@@ -127,8 +127,9 @@ class Experiment:
         shifts : ndarray, shape (n, 2)
             Absolute shifts (row, col) in pixels.
         std : ndarray, shape (n, 2)
-            Standard errors; those that the file gives, or 0, for shifts that it gives. Those of successive moves add in
-            quadrature, and so does what the unequal pixels under a spot do to its centroid.
+            Standard errors; for shifts that the file gives those that it gives, or 0. Those of
+            successive moves add in quadrature, and so does what the unequal pixels under a spot do
+            to its centroid.
 
         Raises
         ------

@@ -7,11 +7,13 @@ checked against, so it shares no line with it.
 from equipix.reference.average import average
 from equipix.reference.connectivity import components
 from equipix.reference.descent import Solution, coordinate_descent
+from equipix.reference.joint import JointSolution, joint
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
 
 __all__ = [
+    "JointSolution",
     "MultiscaleSolution",
     "Solution",
     "average",
@@ -19,6 +21,7 @@ __all__ = [
     "coordinate_descent",
     "exposures",
     "grid_cells",
+    "joint",
     "multiscale",
     "objective",
     "solve_dense",

@@ -58,7 +58,8 @@ const CURVED: [f64; 2] = [1e-8, 0.03];
 const MOST_HALVINGS: u32 = 10;
 /// Steps that may fail to lower the estimate before it counts as stalled.
 const PATIENCE: usize = 3;
-/// Steps after which the variance of a measurement, where it is not known, counts as found.
+/// Steps after which the weight of the penalty, which M has a part in, and the variance of a
+/// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
 /// Products that an ordinary fit takes: what progress is measured against at first.
 const TYPICAL: u64 = 120;
@@ -162,14 +163,14 @@ pub fn solve<T: Real>(
             continue;
         }
         halvings = 0;
-        let before = system.unit;
-        if looks.len() < SETTLING && !model.variance_is_known() {
-            system.unit = system.misfit(objective) / freedom(&system);
-        }
-        let (objective, slope) = if system.unit == before {
-            (objective, slope)
-        } else {
+        let (objective, slope) = if looks.len() < SETTLING {
+            if !model.variance_is_known() {
+                system.unit = system.misfit(objective) / freedom(&system);
+            }
+            system.penalty = None;
             system.linearise(SMOOTHING, control)?
+        } else {
+            (objective, slope)
         };
         let two_level = match preconditioner.take() {
             Some(two_level) => two_level,
@@ -210,8 +211,15 @@ pub fn solve<T: Real>(
                 break;
             }
         }
-        advance(&mut system, &search.x, 1.0);
-        taken = Some(search.x.clone());
+        let mut step = std::mem::take(&mut search.x);
+        if let Some(penalty) = &system.penalty {
+            // A multiple of the beam is no step, but the penalty would see one.
+            let cells = system.state.beam.len();
+            let relative = penalty.relative(&system.state.beam, &step[..cells], workers);
+            step[..cells].copy_from_slice(&relative);
+        }
+        advance(&mut system, &step, 1.0);
+        taken = Some(step);
         preconditioner = Some(two_level);
     }
 }

@@ -3,7 +3,8 @@
 //! Two tilts of ln M cannot be told from fluxes: with M → M·exp(α·p), L → L·exp(−α·u) and
 //! ln c_k → ln c_k + α·d_k nothing that is measured changes, unless exposures are turned against each
 //! other. So free fluxes are sought where ln c has no part that is affine in the shifts, and what
-//! remains undetermined is left to the gauge.
+//! remains undetermined is left to the gauge. With a prior of weights π the same is done with
+//! Σ π a b in place of Σ a b: then the best of the parts that no measurement tells is the given one.
 
 use crate::geometry::Rotation;
 
@@ -48,17 +49,20 @@ impl Fluxes {
         let (columns, precisions, leaves_tilt) = match flux {
             Flux::Known => (Vec::new(), Vec::new(), false),
             Flux::Free => {
-                let free = complement(&hidden(turned), (0..count).map(unit));
+                let free = complement(&hidden(turned), (0..count).map(unit), &vec![1.0; count]);
                 (free, Vec::new(), !turned)
             }
             Flux::Linear(times) => {
-                let told = complement(&hidden(turned), std::iter::once(times.clone()));
-                let centred = complement(&hidden(true), std::iter::once(times.clone()));
+                let (even, times) = (vec![1.0; count], || std::iter::once(times.clone()));
+                let told = complement(&hidden(turned), times(), &even);
+                let centred = complement(&hidden(true), times(), &even);
                 (if told.is_empty() { Vec::new() } else { centred }, Vec::new(), told.is_empty())
             }
             Flux::Prior(std) => {
-                let precisions = std.iter().map(|std| 1.0 / (std * std)).collect();
-                ((0..count).map(unit).collect(), precisions, false)
+                let weights: Vec<f64> = std.iter().map(|std| 1.0 / (std * std)).collect();
+                let free = complement(&hidden(turned), (0..count).map(unit), &weights);
+                let precisions = vec![1.0; free.len()];
+                (free, precisions, false)
             }
         };
         let precisions = if precisions.is_empty() { vec![0.0; columns.len()] } else { precisions };
@@ -81,15 +85,24 @@ impl Fluxes {
     }
 }
 
-/// An orthonormal basis of what `vectors` add to the span of `hidden` (Gram and Schmidt, twice).
-fn complement(hidden: &[Vec<f64>], vectors: impl Iterator<Item = Vec<f64>>) -> Vec<Vec<f64>> {
+/// An orthonormal basis, by Σ w a b, of what `vectors` add to the span of `hidden` (Gram and Schmidt,
+/// twice).
+fn complement(
+    hidden: &[Vec<f64>],
+    vectors: impl Iterator<Item = Vec<f64>>,
+    weights: &[f64],
+) -> Vec<Vec<f64>> {
+    let dot = |a: &[f64], b: &[f64]| -> f64 {
+        a.iter().zip(b).zip(weights).map(|((a, b), w)| w * a * b).sum()
+    };
+    let norm = |vector: &[f64]| dot(vector, vector).sqrt();
     let mut basis: Vec<Vec<f64>> = Vec::new();
     let mut found = Vec::new();
     let tagged = hidden.iter().cloned().map(|v| (v, true)).chain(vectors.map(|v| (v, false)));
     for (mut vector, is_hidden) in tagged {
         let before = norm(&vector);
         for other in basis.iter().chain(&basis) {
-            let share: f64 = vector.iter().zip(other).map(|(a, b)| a * b).sum();
+            let share = dot(&vector, other);
             vector.iter_mut().zip(other).for_each(|(a, b)| *a -= share * b);
         }
         let size = norm(&vector);
@@ -102,10 +115,6 @@ fn complement(hidden: &[Vec<f64>], vectors: impl Iterator<Item = Vec<f64>>) -> V
         }
     }
     found
-}
-
-fn norm(vector: &[f64]) -> f64 {
-    vector.iter().map(|value| value * value).sum::<f64>().sqrt()
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ use crate::geometry::Rotation;
 pub(super) fn fix(fit: &mut Fit, rotation: Rotation, sensor: Shape) {
     if fit.leaves_tilt {
         let slope = slope(&fit.sensitivity, &fit.components.pixels, sensor);
-        untilt(fit, slope, rotation, sensor.cols);
+        untilt(fit, slope, rotation, sensor);
     }
     let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
     fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
@@ -23,23 +23,24 @@ pub(super) fn fix(fit: &mut Fit, rotation: Rotation, sensor: Shape) {
 }
 
 /// M → M·exp(−slope·p) and all that goes with it.
-fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, cols: usize) {
+fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
     for (pixel, m) in fit.sensitivity.iter_mut().enumerate() {
-        let (row, col) = ((pixel / cols) as f64, (pixel % cols) as f64);
+        let (row, col) = ((pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64);
         *m *= (-slope[0] * row - slope[1] * col).exp();
     }
     let [row, col] = slope;
-    let along_beam = match rotation {
-        Rotation::None => [row, col],
-        Rotation::Quarter => [col, -row],
-        Rotation::Half => [-row, -col],
-        Rotation::ThreeQuarters => [-col, row],
+    // β·u = α·p less what lies between the first pixel and the corner of its turned window.
+    let (last_row, last_col) = (sensor.rows as f64 - 1.0, sensor.cols as f64 - 1.0);
+    let ([down, along], corner) = match rotation {
+        Rotation::None => ([row, col], 0.0),
+        Rotation::Quarter => ([col, -row], row * last_row),
+        Rotation::Half => ([-row, -col], row * last_row + col * last_col),
+        Rotation::ThreeQuarters => ([-col, row], col * last_col),
     };
-    let [down, along] = along_beam;
     for (cell, value) in fit.beam.iter_mut().enumerate() {
         let (row, col) = (cell / fit.beam_shape.cols, cell % fit.beam_shape.cols);
         let u = [row as f64 - fit.origin[0] as f64, col as f64 - fit.origin[1] as f64];
-        *value *= (down * u[0] + along * u[1]).exp();
+        *value *= (down * u[0] + along * u[1] + corner).exp();
     }
     for (c, d) in fit.flux.iter_mut().zip(&fit.shifts) {
         *c *= (-down * d[0] - along * d[1]).exp();

@@ -3,11 +3,16 @@
 //! As in [`precondition`](crate::precondition), with the columns of Φ hats times the beam. Fluxes
 //! and shifts stand beside the hats in the coarse problem: a tilt or a bend of M that they could explain
 //! is told from theirs by large scales alone.
+//!
+//! A spline of coefficients h a is not h times the spline of coefficients a: with the factors 1/6, 4/6,
+//! 1/6 of B it has ∇h·∇a/3 more, to first order. The columns of Φ have that much less, so that a tilt
+//! of the beam is one.
 
 use super::system::{Block, System};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::parallel::Workers;
 use crate::precondition::coarse::{Arm, Coarse};
 use crate::precondition::hats::Hats;
 use crate::precondition::{DAMPING, spacing};
@@ -18,12 +23,14 @@ const BLOCKS: usize = 3;
 const SUMMED: usize = 32;
 /// Cells with less than this share of the mean diagonal are as good as unseen.
 const FAINTEST: f64 = 1e-12;
-
 pub(super) struct Preconditioner {
     hats: Hats,
     /// 1/D of cells, θ and shifts; 0 for what no measurement tells.
     inverse: Vec<f64>,
     coarse: Coarse,
+    /// a, and ∂a/3 along rows and columns where the beam is a spline.
+    beam: Vec<f64>,
+    slopes: [Vec<f64>; 2],
 }
 
 impl Preconditioner {
@@ -80,44 +87,18 @@ impl Preconditioner {
         let least = FAINTEST * diagonal.iter().sum::<f64>() / diagonal.len() as f64;
         diagonal.extend(whole);
         let inverse = diagonal.iter().map(|&d| if d > least { 1.0 / d } else { 0.0 }).collect();
-        Ok(Self { hats, inverse, coarse })
+        let beam = system.state.beam.clone();
+        let slopes = slopes(system);
+        Ok(Self { hats, inverse, coarse, beam, slopes })
     }
 
     /// P⁻¹ r.
     pub(super) fn apply<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64]) -> Vec<f64> {
-        let (beam, workers) = (&system.state.beam, system.workers);
+        let (beam, workers, hats) = (&self.beam, system.workers, &self.hats);
         let cols = system.grid.geometry.beam.cols;
-        let nodes = self.hats.cols.nodes;
+        let nodes = hats.cols.nodes;
         let rows = beam.len() / cols;
-        let bands = workers.map(rows.div_ceil(SUMMED), |band| {
-            let mut sums: Vec<(usize, Vec<f64>)> = Vec::new();
-            for row in band * SUMMED..rows.min((band + 1) * SUMMED) {
-                let mut along = vec![0.0; nodes];
-                let cells = row * cols..(row + 1) * cols;
-                let values = beam[cells.clone()].iter().zip(&r[cells]);
-                for ((a, r), &(node, height)) in values.zip(&self.hats.columns) {
-                    let (node, part) = (node as usize, f64::from(height) * a * r);
-                    along[node] += a * r - part;
-                    along[node + 1] += part;
-                }
-                let (node, height) = self.hats.rows.at(row as f64);
-                for (node, share) in [(node, 1.0 - height), (node + 1, height)] {
-                    if sums.iter().all(|(known, _)| *known != node) {
-                        sums.push((node, vec![0.0; nodes]));
-                    }
-                    for (known, sums) in &mut sums {
-                        if *known == node {
-                            sums.iter_mut().zip(&along).for_each(|(sum, a)| *sum += share * a);
-                        }
-                    }
-                }
-            }
-            sums
-        });
-        let mut heights = vec![0.0; self.hats.count()];
-        for (node, sums) in bands.into_iter().flatten() {
-            heights[node * nodes..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
-        }
+        let mut heights = self.gather(r, cols, system.workers);
         heights.extend_from_slice(&r[beam.len()..]);
         self.coarse.solve(&mut heights, DAMPING);
         let mut z = vec![0.0; r.len()];
@@ -128,14 +109,20 @@ impl Preconditioner {
             if row >= rows {
                 return;
             }
-            let (node, height) = self.hats.rows.at(row as f64);
+            let (node, height) = hats.rows.at(row as f64);
             let [above, below] = [node, node + 1].map(|node| &heights[node * nodes..][..nodes]);
-            let smooth = |node: usize| above[node] + height * (below[node] - above[node]);
-            let cells = part.iter_mut().zip(&beam[first..]).zip(&self.inverse[first..]);
-            for (((z, a), inverse), &(node, share)) in cells.zip(&self.hats.columns) {
-                let (left, right) = (smooth(node as usize), smooth(node as usize + 1));
-                if *inverse > 0.0 {
-                    *z += a * (left + f64::from(share) * (right - left));
+            let [down, along] = &self.slopes;
+            for (col, z) in part.iter_mut().enumerate() {
+                let (cell, (node, share)) = (first + col, hats.columns[col]);
+                let (node, share) = (node as usize, f64::from(share));
+                let at = |node: usize| above[node] + height * (below[node] - above[node]);
+                let fall = |node: usize| (below[node] - above[node]) / hats.rows.spacing;
+                let (left, right) = (at(node), at(node + 1));
+                let smooth = left + share * (right - left);
+                let sloping = (right - left) / hats.cols.spacing;
+                let falling = fall(node) + share * (fall(node + 1) - fall(node));
+                if self.inverse[cell] > 0.0 {
+                    *z += beam[cell] * smooth - down[cell] * falling - along[cell] * sloping;
                 }
             }
         });
@@ -147,4 +134,62 @@ impl Preconditioner {
         shifts.copy_from_slice(moves.as_flattened());
         z
     }
+
+    /// Φᵀ r.
+    fn gather(&self, r: &[f64], cols: usize, workers: &Workers) -> Vec<f64> {
+        let (beam, [down, along], hats) = (&self.beam, &self.slopes, &self.hats);
+        let (rows, nodes) = (beam.len() / cols, hats.cols.nodes);
+        let bands = workers.map(rows.div_ceil(SUMMED), |band| {
+            let mut sums: Vec<(usize, Vec<f64>)> = Vec::new();
+            for row in band * SUMMED..rows.min((band + 1) * SUMMED) {
+                let [mut level, mut falling] = [vec![0.0; nodes], vec![0.0; nodes]];
+                for (col, &(node, share)) in hats.columns.iter().enumerate() {
+                    let (cell, node, share) = (row * cols + col, node as usize, f64::from(share));
+                    let (value, sloping) = (r[cell] * beam[cell], r[cell] * along[cell]);
+                    let (part, turn) = (share * value, sloping / hats.cols.spacing);
+                    level[node] += value - part + turn;
+                    level[node + 1] += part - turn;
+                    let (fall, part) = (r[cell] * down[cell], share * r[cell] * down[cell]);
+                    falling[node] += fall - part;
+                    falling[node + 1] += part;
+                }
+                let (node, height) = hats.rows.at(row as f64);
+                let fall = 1.0 / hats.rows.spacing;
+                for (node, share, turn) in [(node, 1.0 - height, fall), (node + 1, height, -fall)] {
+                    if sums.iter().all(|(known, _)| *known != node) {
+                        sums.push((node, vec![0.0; nodes]));
+                    }
+                    for (_, sums) in sums.iter_mut().filter(|(known, _)| *known == node) {
+                        let both = level.iter().zip(&falling);
+                        sums.iter_mut()
+                            .zip(both)
+                            .for_each(|(s, (a, b))| *s += share * a + turn * b);
+                    }
+                }
+            }
+            sums
+        });
+        let mut heights = vec![0.0; hats.count()];
+        for (node, sums) in bands.into_iter().flatten() {
+            heights[node * nodes..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
+        }
+        heights
+    }
+}
+
+/// A third of the slopes of a, a cell, down and along; 0 beside cells that are not seen.
+fn slopes<T: Real>(system: &System<'_, '_, T>) -> [Vec<f64>; 2] {
+    let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
+    let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
+    [cols, 1].map(|step| {
+        let mut slopes = vec![0.0; beam.len()];
+        if system.grid.is_spline() {
+            for cell in step..beam.len() - step {
+                if seen(cell - step) && seen(cell + step) {
+                    slopes[cell] = (beam[cell + step] - beam[cell - step]) / 6.0;
+                }
+            }
+        }
+        slopes
+    })
 }

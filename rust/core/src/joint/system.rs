@@ -303,7 +303,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let total: f64 = self.weights.iter().sum();
             let typical = self.workers.dot(&self.weights, &self.weights) / total;
             let (shape, beam) = (self.grid.geometry.beam, &self.state.beam);
-            let tau = tau * typical;
+            // τ stays until it is asked for anew, or F would not be one function.
+            let tau = self.penalty.as_ref().map_or(tau * typical, |penalty| penalty.tau);
             self.penalty = Some(Penalty::new(shape, beam, &self.weights, tau, self.workers));
         }
         Ok(())
