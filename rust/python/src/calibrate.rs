@@ -151,7 +151,7 @@ fn method_named(name: &str) -> Result<Method> {
     }
 }
 
-fn rotation(degrees: i64) -> Result<Rotation> {
+pub(crate) fn rotation(degrees: i64) -> Result<Rotation> {
     Rotation::from_degrees(degrees).ok_or_else(|| Error::Value {
         argument: "rotation",
         problem: format!("holds {degrees}: expected 0, 90, 180 or 270 degrees"),
@@ -176,7 +176,7 @@ fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance
     }
 }
 
-fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
+pub(crate) fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
     Ok(match mask {
         PyMask::Pixels(mask) => Mask::Pixels(mask.as_slice()?),
         PyMask::Measurements(mask) => Mask::Measurements(mask.as_slice()?),
@@ -207,6 +207,10 @@ fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PyS
     })
 }
 
-fn image<T: Element>(py: Python<'_>, values: Vec<T>, shape: Shape) -> PyResult<Py<PyArray2<T>>> {
+pub(crate) fn image<T: Element>(
+    py: Python<'_>,
+    values: Vec<T>,
+    shape: Shape,
+) -> PyResult<Py<PyArray2<T>>> {
     Ok(values.into_pyarray(py).reshape([shape.rows, shape.cols])?.unbind())
 }

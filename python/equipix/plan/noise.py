@@ -1,0 +1,102 @@
+"""How far random noise alone will put the sensitivity from the truth, pixel by pixel."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.calibration import calibrate
+from equipix.errors import IdentifiabilityWarning
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_BLOCK = 64
+"""Rows at a time."""
+
+_SMALLEST, _SPANS = 256, 4
+"""The part of a large sensor that is drawn: so many pixels, or spans of the shifts, wide."""
+
+_DRAWS, _PIXELS = 4, 40_000
+"""Draws of noise: so many, or more on a small sensor, to have so many pixels in all."""
+
+_NOISE, _TOLERANCE = 1e-3, 1e-5
+"""Of the draws: small enough to be linear, and solved to a hundredth of it."""
+
+
+def local_variance(
+    shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats, width: float | None
+) -> Iterator[Floats]:
+    """Variance of M for noise of variance 1, but for a factor near 1 over the whole sensor.
+
+    With M = 1 and unit weights the least-squares problem S g = b has S = D_M − B·D_L⁻¹·Bᵀ, and
+    noise of variance 1 leaves g of covariance S⁻¹. With S = D_M − K D_M, the chance that a walk
+    from pixel p to a cell and on to a pixel that sees it comes straight back is the diagonal
+
+        K_p = Σ_k c_k⁴ L(u_k)² / C(u_k) / D_M(p),   D_M(p) = Σ_k c_k² L(u_k)²,
+
+    C(u) being the sum of c² of the exposures that see cell u: fewer of them near the edges. So
+    (S⁻¹)_pp ≈ 1 / (D_M (1 − K)); what longer ways back add is left to `factor`.
+    """
+    rows, cols = shape
+    inside = [_overlaps(size, positions[:, axis]) for axis, size in enumerate(shape)]
+    light = [_light(size, positions[:, axis], width) for axis, size in enumerate(shape)]
+    powers2 = powers**2
+    for start in range(0, rows, _BLOCK):
+        part = slice(start, start + _BLOCK)
+        weights: Floats = np.zeros((min(_BLOCK, rows - start), cols))
+        returning = np.zeros_like(weights)
+        for k, power2 in enumerate(powers2):
+            weight = power2 * np.outer(light[0][k, part], light[1][k])
+            seen = (inside[0][k, part] * powers2) @ inside[1][k].T
+            weights += weight
+            returning += power2 * weight / seen
+        # Alone in all its cells, a pixel is compared with nothing.
+        rest = weights - returning
+        yield np.divide(1, rest, where=rest > 1e-9 * weights, out=np.full_like(rest, np.inf))
+
+
+def _overlaps(size: int, positions: NDArray[np.int64]) -> Floats:
+    """Whether the cell that row (or column) i sees in exposure k is in the window of l: (k, i, l)."""
+    places = np.arange(size)[:, None] + positions[:, None, None] - positions
+    return ((places >= 0) & (places < size)).astype(np.float64)
+
+
+def _light(size: int, positions: NDArray[np.int64], width: float | None) -> Floats:
+    """Square of a Gaussian beam's factor along one axis, at each row (or column): (k, i)."""
+    places = np.arange(size) + positions[:, None] - (size - 1) / 2
+    return np.ones(places.shape) if width is None else np.exp(-2 * (places / width) ** 2)
+
+
+def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats) -> float:
+    """What `local_variance` must be multiplied by, from draws of noise.
+
+    It counts the longer ways, and nearly periodic waves with them. It depends on the size of the
+    sensor only weakly, so of a large one a part is solved, under an even beam.
+    """
+    spans = np.ptp(positions, axis=0).tolist()
+    rows, cols = (
+        min(size, max(_SMALLEST, _SPANS * span)) for size, span in zip(shape, spans, strict=True)
+    )
+    draws = max(_DRAWS, -(-_PIXELS // (rows * cols)))
+    rng = np.random.default_rng(0)
+    found, expected = [], []
+    local = np.concatenate(list(local_variance((rows, cols), positions, powers, None)))
+    light = powers[:, None, None] * np.ones((1, rows, cols))
+    for _ in range(draws):
+        frames = light + _NOISE * rng.standard_normal(light.shape)
+        with warnings.catch_warnings():
+            # Said of the whole sensor already; and what a part leaves undetermined is not counted.
+            warnings.simplefilter("ignore", IdentifiabilityWarning)
+            solved = calibrate(frames, positions, flux=powers, tolerance=_TOLERANCE)
+        error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
+        valid = np.isfinite(error) & np.isfinite(local)
+        found.append(np.sum(error**2, where=valid))
+        expected.append(np.sum(local, where=valid))
+    return float(np.sum(found) / np.sum(expected))
