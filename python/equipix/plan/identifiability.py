@@ -104,8 +104,8 @@ def identify(
     """
     sizes = check_shape(shape)
     exact = as_shifts(shifts)
-    if len(exact) == 0:
-        raise InputError("'shifts' is empty, expected one (row, col) an exposure")
+    if len(exact) < 2:
+        raise InputError(f"'shifts' holds {len(exact)} exposures, expected at least two")
     # A part of a pixel that all shifts have in common moves the grid of the beam along.
     whole = round_shifts(exact - (exact[0] - np.rint(exact[0])))
     masked = None if mask is None else as_mask(mask, (len(whole), *sizes))

@@ -161,7 +161,7 @@ def suggest(
 def _travel(max_shift: ArrayLike, shape: tuple[int, int]) -> Points:
     """Largest shift along each axis: that of the stage, and less than the sensor."""
     values = as_array("max_shift", max_shift, ndim=(0, 1)).astype(np.float64)
-    if values.shape not in ((), (2,)) or not (values >= 0).all():
+    if values.size not in (1, 2) or not (values >= 0).all():
         raise InputError(f"'max_shift' is {max_shift!r}, expected pixels from 0 on, or (row, col)")
     return np.minimum(np.broadcast_to(values, 2), np.array(shape) - 1).astype(np.int64)
 
