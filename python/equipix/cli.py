@@ -375,7 +375,8 @@ def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
 def _show_plans(plans: list[dict[str, Any]]) -> None:
     """Print the patterns' figures side by side."""
     table = Table(
-        "rms error of the sensitivity", *(f"pattern {k + 1}" for k in range(len(plans))),
+        "rms error of the sensitivity",
+        *(f"pattern {k + 1}" for k in range(len(plans))),
         box=SIMPLE_HEAD,
     )
     rows = {

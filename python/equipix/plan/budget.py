@@ -216,7 +216,9 @@ def _positive(name: str, value: float, *, zero: bool = False) -> float:
 def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
     """Count the components, and warn of more than one."""
     fits = np.all(np.abs(positions) < shape)
-    components = 1 if fits and is_connected(shape, positions) else identify(shape, positions).components
+    components = (
+        1 if fits and is_connected(shape, positions) else identify(shape, positions).components
+    )
     if components > 1:
         warnings.warn(
             f"the shifts leave {components} parts of the sensor that nothing compares: the errors "

@@ -23,11 +23,14 @@ _BLOCK = 64
 _SMALLEST, _SPANS = 256, 4
 """The part of a large sensor that is drawn: so many pixels, or spans of the shifts, wide."""
 
-_DRAWS, _PIXELS = 4, 40_000
-"""Draws of noise: so many, or more on a small sensor, to have so many pixels in all."""
+_FEWEST, _MOST = 4, 64
+"""Draws of noise; between them, until the mean square is known to `_KNOWN`."""
+
+_KNOWN = 0.02
+"""Relative standard error of the mean square; so 1 % of the root mean square."""
 
 _NOISE, _TOLERANCE = 1e-3, 1e-4
-"""Of the draws: small enough to be linear; 1e-5 changes the rms by 0.1 %, and takes half as long again."""
+"""Of the draws: small enough to be linear. A tolerance of 1e-5 changes the rms by 0.1 %."""
 
 
 def local_variance(
@@ -84,12 +87,11 @@ def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats)
     rows, cols = (
         min(size, max(_SMALLEST, _SPANS * span)) for size, span in zip(shape, spans, strict=True)
     )
-    draws = max(_DRAWS, -(-_PIXELS // (rows * cols)))
     rng = np.random.default_rng(0)
-    found, expected = [], []
     local = np.concatenate(list(local_variance((rows, cols), positions, powers, None)))
     light = powers[:, None, None] * np.ones((1, rows, cols))
-    for _ in range(draws):
+    ratios: list[float] = []
+    while len(ratios) < _FEWEST or (len(ratios) < _MOST and _uncertain(ratios)):
         frames = light + _NOISE * rng.standard_normal(light.shape)
         with warnings.catch_warnings():
             # Said of the whole sensor already; and what a part leaves undetermined is not counted.
@@ -98,6 +100,10 @@ def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats)
             solved = calibrate(frames, positions, flux=powers, tolerance=_TOLERANCE, workers=1)
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
-        found.append(np.sum(error**2, where=valid))
-        expected.append(np.sum(local, where=valid))
-    return float(np.sum(found) / np.sum(expected))
+        ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))
+    return float(np.mean(ratios))
+
+
+def _uncertain(ratios: list[float]) -> bool:
+    """Whether the mean of the draws is not known well enough: few waves may dominate them."""
+    return bool(np.std(ratios, ddof=1) > _KNOWN * np.sqrt(len(ratios)) * np.mean(ratios))

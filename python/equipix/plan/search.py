@@ -179,9 +179,7 @@ class _Score:
         As for `error_budget`.
     """
 
-    def __init__(
-        self, shape: tuple[int, int], travel: Points, noise: float, drift: float
-    ) -> None:
+    def __init__(self, shape: tuple[int, int], travel: Points, noise: float, drift: float) -> None:
         self._shape, self._noise, self._drift = shape, noise, drift
         # Points of a Kronecker sequence cover the half plane of waves evenly.
         steps = np.arange(1, _WAVES + 1)[:, None] * np.array([0.7548776662, 0.5698402910])
