@@ -15,7 +15,7 @@ from equipix.errors import DriftWarning
 
 SENSOR = (96, 128)
 CAUSES = {"noise": 1e-3, "drift": 2e-5, "shift_error": 0.02, "beam_width": 200}
-"""Noise of an exposure's mean; unknown drift of the lamp; errors of the stage; width of the beam."""
+"""Noise of an exposure's mean, drift of the lamp, errors of the stage, width of the beam."""
 
 
 def main() -> None:

@@ -319,7 +319,7 @@ def plan(
     if output is not None:
         check_picture(output)
         check_output(output, force=force)
-    causes = {
+    causes: dict[str, Any] = {
         "noise": noise,
         "drift": drift,
         "shift_error": shift_error,

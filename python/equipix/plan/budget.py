@@ -18,6 +18,8 @@ from equipix.plan.smooth import drift_tilt, shift_error_effect, tilt_rms
 from equipix.plan.spectrum import Spectrum, spectrum
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import ArrayLike, NDArray
 
     from equipix.plan.noise import Floats
@@ -70,7 +72,7 @@ class ErrorBudget:
     @cached_property
     def noise_map(self) -> NDArray[np.float64]:
         """Standard deviation of M from noise, shape (rows, cols); inf where not determined."""
-        return np.sqrt(np.concatenate(list(self._noise.variances())))
+        return np.asarray(np.sqrt(np.concatenate(list(self._noise.variances()))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ class _Noise:
     width: float | None
     scale: float
 
-    def variances(self):
+    def variances(self) -> Iterator[Floats]:
         """Blocks of rows of the map of variances."""
         for block in local_variance(self.shape, self.positions, self.powers, self.width):
             yield self.scale * block
@@ -234,8 +236,8 @@ def warn_of_drift(causes: dict[str, float]) -> None:
     if causes["drift"] > causes["noise"]:
         warnings.warn(
             f"lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
-            f"{causes['drift'] / causes['noise']:.1f} times what noise leaves, and no residual will "
-            "show it: measure the flux, turn one exposure, or use larger shifts "
+            f"{causes['drift'] / causes['noise']:.1f} times what noise leaves, and no residual "
+            "will show it: measure the flux, turn one exposure, or use larger shifts "
             "(equipix.plan.suggest)",
             DriftWarning,
             stacklevel=3,

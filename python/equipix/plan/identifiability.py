@@ -97,8 +97,9 @@ def identify(
     Examples
     --------
     >>> from equipix import cross_pattern, plan
-    >>> plan.identify((48, 64), cross_pattern(5, 7))
-    <Identifiability: 1 component, the largest of 3072 of 3072 pixels; 15360 equations for 6713 unknowns>
+    >>> found = plan.identify((48, 64), cross_pattern(5, 7))
+    >>> found.components, found.equations, found.unknowns
+    (1, 15360, 6928)
     >>> plan.identify((48, 64), cross_pattern(4, 6)).components
     4
     """

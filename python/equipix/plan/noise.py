@@ -66,7 +66,7 @@ def local_variance(
 
 
 def _overlaps(size: int, positions: NDArray[np.int64]) -> Floats:
-    """Whether the cell that row (or column) i sees in exposure k is in the window of l: (k, i, l)."""
+    """Whether exposure l has the cell that row (or column) i sees in exposure k: (k, i, l)."""
     places = np.arange(size)[:, None] + positions[:, None, None] - positions
     return ((places >= 0) & (places < size)).astype(np.float64)
 

@@ -101,7 +101,7 @@ def _hidden(positions: NDArray[np.float64]) -> NDArray[np.float64]:
 def _times(count: int) -> NDArray[np.float64]:
     """Equally spaced times of mean 0 and norm 1."""
     times = np.arange(count) - (count - 1) / 2
-    return times / max(np.linalg.norm(times), 1e-300)
+    return np.asarray(times / max(float(np.linalg.norm(times)), 1e-300))
 
 
 def _exchanged(

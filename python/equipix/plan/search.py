@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -163,7 +163,8 @@ def _travel(max_shift: ArrayLike, shape: tuple[int, int]) -> Points:
     values = as_array("max_shift", max_shift, ndim=(0, 1)).astype(np.float64)
     if values.size not in (1, 2) or not (values >= 0).all():
         raise InputError(f"'max_shift' is {max_shift!r}, expected pixels from 0 on, or (row, col)")
-    return np.minimum(np.broadcast_to(values, 2), np.array(shape) - 1).astype(np.int64)
+    travel = np.minimum(np.broadcast_to(values, 2), np.array(shape) - 1)
+    return np.asarray(travel.astype(np.int64))
 
 
 class _Score:
@@ -197,19 +198,19 @@ class _Score:
         spans = np.ptp(patterns, axis=1)
         rest = count / (count - self._cells(spans, count))
         noise = self._noise**2 * self._mean_of_inverse(others, places) * (1 - 1 / count) * rest
-        return np.sqrt(noise + self._drift**2 * self._tilt(patterns))
+        return np.asarray(np.sqrt(noise + self._drift**2 * self._tilt(patterns)))
 
     def _cells(self, spans: Points, count: int) -> Floats:
         """Beam cells over pixels: the trace of K of `local_variance`, times n."""
         cells = np.prod((np.array(self._shape) + spans) / self._shape, axis=1)
-        return np.minimum(cells, count * (1 - 1e-3))
+        return np.asarray(np.minimum(cells, count * (1 - 1e-3)))
 
     def _mean_of_inverse(self, others: Points, places: Points) -> Floats:
         """Mean of 1/λ over the waves."""
         count = len(others) + 1
         sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
         visible = count - (sums.real**2 + sums.imag**2) / count
-        return np.mean(1 / np.maximum(visible, 1e-3), axis=0, dtype=np.float64)
+        return np.asarray(np.mean(1 / np.maximum(visible, 1e-3), axis=0, dtype=np.float64))
 
     def _waves(self, places: Points) -> NDArray[np.complex64]:
         down, right = self._phases
@@ -279,7 +280,7 @@ def _places(place: Points, travel: Points, rng: np.random.Generator) -> Points:
     distances = rng.choice([1.0, 3.0, 10.0], (_NEAR, 1))
     near = np.rint(place + distances * rng.standard_normal((_NEAR, 2))).astype(np.int64)
     far = rng.integers(0, travel, (_FAR, 2), endpoint=True)
-    return np.clip(np.concatenate([near, far]), 0, travel)
+    return np.asarray(np.clip(np.concatenate([near, far]), 0, travel))
 
 
 def _whole_score(points: Points, score: _Score) -> float:
@@ -288,7 +289,7 @@ def _whole_score(points: Points, score: _Score) -> float:
 
 def _distinct(found: list[Points], score: _Score) -> list[Points]:
     """Put patterns in the order of their scores, and what is only a move of another aside."""
-    patterns = {}
+    patterns: dict[tuple[Any, ...], Points] = {}
     for points in found:
         moved = points - points.min(axis=0)
         patterns.setdefault(tuple(sorted(map(tuple, moved.tolist()))), points)

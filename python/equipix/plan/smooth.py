@@ -32,7 +32,8 @@ def drift_tilt(shape: tuple[int, int], shifts: Floats, drift: float) -> tuple[fl
     determined = determinant > 1e-12 * covariance[0, 0] * covariance[1, 1]
     tilts = []
     for size, own, other in zip(shape, np.diag(covariance), np.diag(covariance)[::-1], strict=True):
-        # Along an axis that nothing moves along across the other, ρ is not defined.
+        # Where nothing moves along the other axis ρ does not count; along a slanting line the
+        # tilts of the two axes cannot be told apart.
         rest = determinant / other if determined else own if other == 0 else 0.0
         slope = np.inf if rest <= 0 else drift / np.sqrt(len(shifts) * rest)
         tilts.append(0.0 if size == 1 or drift == 0 else float(size * slope))
