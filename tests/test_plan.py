@@ -69,10 +69,6 @@ def slopes(error):
     return np.array(tilts)
 
 
-def count_of(shifts):
-    return len(np.asarray(shifts))
-
-
 def compare(predicted, errors, within=WITHIN):
     """A predicted rms against that of independent draws, whose own standard error comes on top."""
     squares = [np.mean(error**2) for error in errors]
@@ -177,22 +173,22 @@ class TestNoise:
             for _ in range(draws)
         ]
         compare(budget.rms_by_cause["noise"], errors)
-        # Where the map says that errors are small or large, they are; but for three exposures one
-        # pixel apart, where it is too flat, by up to a fifth.
+        # Where the map says that errors are small or large, they are; less exactly so where few
+        # waves make up most of the error.
         predicted = budget.noise_map
         assert np.sqrt(np.mean(predicted**2)) == pytest.approx(budget.rms_by_cause["noise"])
+        few = len(shifts) == 3 or budget.spectrum.smallest < 1e-2
         edge = np.quantile(predicted, 0.75) * (1 + 1e-9)
         for part in (predicted <= edge, predicted > edge):
-            within = WITHIN if count_of(shifts) > 3 else 0.2
             wanted = np.sqrt(np.mean(predicted[part] ** 2))
-            compare(wanted, [error[part] for error in errors], within)
+            compare(wanted, [error[part] for error in errors], 0.25 if few else WITHIN)
 
     def test_of_the_cross(self):
         # What a solver at the optimum leaves: 1.21/√n at 782×582, 1.23/√n at 320×240.
         for shape, wanted in ((CCD, 1.21), ((240, 320), 1.23)):
             budget = budget_of(shape, CROSS, noise=1.0)
-            # The third figure of the wanted one, and 4 draws of 65 536 pixels.
-            tolerance = 0.005 + 3 * wanted / np.sqrt(2 * 4 * 65_536)
+            # The third figure of the wanted one, and 3 draws of 65 536 pixels.
+            tolerance = 0.005 + 3 * wanted / np.sqrt(2 * 3 * 65_536)
             assert budget.rms * np.sqrt(5) == pytest.approx(wanted, abs=tolerance)
 
     def test_scales_with_noise_and_falls_with_flux(self):
@@ -226,7 +222,7 @@ class TestDrift:
         for draw in orthogonal_draws(count, seed):
             beam = beam_of(shape, width)
             frames = simulate.exposures(np.ones(shape), beam, shifts, flux=1 + drift * draw)
-            errors.append(solved(frames, shifts, 1e-3 * drift))
+            errors.append(solved(frames, shifts, 1e-2 * drift))
         tilt = np.sqrt(np.mean([slopes(error) ** 2 for error in errors], axis=0))
         assert budget.tilt_by_cause["drift"] == pytest.approx(tilt, rel=WITHIN)
         rms = np.sqrt(np.mean(np.square(errors)))
@@ -261,13 +257,13 @@ class TestShiftErrors:
     )
     @pytest.mark.parametrize("seed", [1, 2])
     def test_error_agrees_with_simulation(self, shape, shifts, width, seed):
-        delta, count = 1e-3, len(shifts)
+        delta, count = 1e-2, len(shifts)
         budget = budget_of(shape, shifts, noise=1, shift_error=delta, beam_width=width)
         errors = []
         for draw in orthogonal_draws(2 * count, seed):
             moved = np.asarray(shifts) + delta * draw.reshape(count, 2)
             frames = simulate.exposures(np.ones(shape), beam_of(shape, width), moved)
-            errors.append(solved(frames, shifts, 1e-9))
+            errors.append(solved(frames, shifts, 1e-7))
         rms = np.sqrt(np.mean(np.square(errors)))
         assert budget.rms_by_cause["shift_error"] == pytest.approx(rms, rel=WITHIN)
         tilt = np.sqrt(np.mean([slopes(error) ** 2 for error in errors], axis=0))
@@ -324,7 +320,7 @@ class TestOrder:
         for shifts in (CROSS, CROSS[plan.advise_order(CROSS)]):
             beam = simulate.gaussian_beam(shape)
             frames = simulate.exposures(np.ones(shape), beam, shifts, flux=1 + trend)
-            tilts.append(np.linalg.norm(slopes(solved(frames, shifts, 1e-8))))
+            tilts.append(np.linalg.norm(slopes(solved(frames, shifts, 1e-7))))
         hidden = 1 - plan.trend_told(CROSS[plan.advise_order(CROSS)])
         # The tilt goes with the root of what is hidden, in a metric as lopsided as cov(d): its
         # eigenvalues are 96 and 24.
@@ -403,8 +399,8 @@ class TestBudget:
             budget = budget_of((80, 100), equipix.cross_pattern(4, 6), noise=1)
         # Each part is a sensor of half the pitch with a cross of (2, 3).
         alone = budget_of((40, 50), equipix.cross_pattern(2, 3), noise=1)
-        # Each is known to a standard error of 1 %, by its draws.
-        assert budget.rms == pytest.approx(alone.rms, rel=3 * np.sqrt(2) * 0.01)
+        # Draws of 2000 pixels scatter by some 4 %, as those of test_rms_and_map do; 24 were made.
+        assert budget.rms == pytest.approx(alone.rms, rel=3 * 0.04 * np.sqrt(2 / 24))
 
     def test_a_large_sensor_takes_no_longer_to_solve(self):
         small, large = (budget_of((size, size), CROSS, noise=1).rms for size in (256, 2000))
