@@ -354,3 +354,42 @@ def interrupted(command):
         ended = time.monotonic()
         assert "Traceback" not in process.stderr.read()
     return ended - started
+
+
+class TestPlan:
+    CROSS = "0,0 0,5 0,7 5,0 7,0"
+
+    def test_judges_a_pattern(self, run, tmp_path):
+        picture = tmp_path / "plan.png"
+        status, out, err = run("plan", "--shape", 64, 80, "--shifts", self.CROSS, "-o", picture)
+        assert status == 0
+        assert "tilt from lamp drift" in out
+        assert "in the order advised: " in out
+        assert err.startswith("equipix: warning: lamp drift will tilt")
+        assert picture.stat().st_size > 0
+
+    def test_as_json(self, run):
+        status, out, _ = run("plan", "--shape", 64, 80, "--shifts", "0,0 0,4 0,6 4,0 6,0", "--json")
+        assert status == 0
+        (found,) = json.loads(out)["patterns"]
+        assert found["components"] == 4
+        assert found["equations"] == 5 * 64 * 80
+        assert sorted(found["order"]) == [0, 1, 2, 3, 4]
+
+    def test_finds_patterns(self, run):
+        status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
+        assert status == 0
+        found = json.loads(out)["patterns"]
+        assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(3, 1)}
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ((), "give either --shifts"),
+            (("--shifts", CROSS, "--max-shift", 9, 9), "give either --shifts"),
+            (("--shifts", "0,0 5"), "'--shifts' is '0,0 5'"),
+            (("--shifts", CROSS, "-o", "plan.doc"), "plan.doc"),
+        ],
+    )
+    def test_refuses(self, run, arguments, words):
+        refused(run("plan", "--shape", 64, 80, *arguments), words)

@@ -25,7 +25,7 @@ LAYERS = (
     {"demo"},
     {"experiment"},
     {"load"},
-    {"calibration", "correct_files", "frames", "shifts", "simulate"},
+    {"calibration", "correct_files", "frames", "plan", "shifts", "simulate"},
     {"_manifest", "_measurements", "_terminal", "correction", "defects", "noise"},
     {"results"},
     {"io"},

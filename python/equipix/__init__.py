@@ -1,6 +1,6 @@
 """Pixel sensitivity of image sensors, measured without a uniform light source."""
 
-from equipix import errors, simulate
+from equipix import errors, plan, simulate
 from equipix._native import __version__
 from equipix.calibration import Calibration, History, calibrate
 from equipix.experiment import Experiment
@@ -25,5 +25,6 @@ __all__ = [
     "errors",
     "load",
     "measure_shift",
+    "plan",
     "simulate",
 ]

@@ -81,6 +81,14 @@ def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
+def check_shape(shape: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of a sensor, checked."""
+    sizes = np.asarray(shape)
+    if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or not np.all(sizes > 0):
+        raise InputError(f"'shape' is {shape!r}, expected (rows, cols), each 1 or more")
+    return int(sizes[0]), int(sizes[1])
+
+
 def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:

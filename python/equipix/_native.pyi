@@ -14,6 +14,7 @@ __all__ = [
     "calibrate_frames",
     "file_format",
     "locate_spots",
+    "planned_components",
     "read_file",
 ]
 
@@ -104,3 +105,10 @@ def locate_spots(
     after: NDArray[Any],
     saturations: tuple[float | None, float | None],
 ) -> tuple[_Spot, _Spot]: ...
+def planned_components(
+    shape: tuple[int, int],
+    shifts: NDArray[Any],
+    *,
+    rotation: list[int],
+    mask: NDArray[Any] | None,
+) -> tuple[NDArray[Any], list[int], int]: ...

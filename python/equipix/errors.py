@@ -43,3 +43,7 @@ class ShiftRoundingWarning(EquipixWarning):
 
 class ShiftSignWarning(EquipixWarning):
     """The data contradict the sign of the shifts."""
+
+
+class DriftWarning(EquipixWarning):
+    """Lamp drift will tilt the sensitivity by more than noise leaves."""

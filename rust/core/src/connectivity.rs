@@ -7,7 +7,9 @@
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
-use crate::model::Model;
+use crate::geometry::Geometry;
+use crate::memory;
+use crate::model::{Mask, Model};
 
 /// Pixels or cells between two looks at whether to stop.
 const CHECK_EVERY: usize = 1 << 20;
@@ -88,32 +90,76 @@ impl Components {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
     pub fn of<T: Real>(model: &Model<'_, T>, control: &Control) -> Result<Self> {
-        let sizes = [model.geometry.sensor.len(), model.geometry.beam.len()];
-        Self::linked(sizes, control, |link| model.for_each_used(control, link))
+        let mut edges = Edges::new(model.geometry.sensor.len(), model.geometry.beam.len());
+        model.for_each_used(control, |pixel, cell| edges.add(pixel, cell))?;
+        edges.components(control)
     }
 
-    /// Finds the components of so many pixels and cells, of which `for_each_link` names those that
-    /// a measurement links.
+    /// Finds the components of all measurements that `mask` leaves, before any is made.
     ///
     /// # Errors
+    /// [`Error::Shape`](crate::Error::Shape) if the mask does not fit;
+    /// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had;
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
-    pub(crate) fn linked(
-        [pixels, cells]: [usize; 2],
-        control: &Control,
-        for_each_link: impl FnOnce(&mut dyn FnMut(usize, usize)) -> Result<()>,
-    ) -> Result<Self> {
-        let mut sets = DisjointSets::new(pixels + cells);
-        let mut used = vec![false; pixels + cells];
-        for_each_link(&mut |pixel, cell| {
-            sets.union(pixel, pixels + cell);
-            used[pixel] = true;
-            used[pixels + cell] = true;
+    pub fn planned(geometry: &Geometry, mask: Mask<'_>, control: &Control) -> Result<Self> {
+        mask.check(geometry.exposures.len(), geometry.sensor)?;
+        memory::check(bytes_needed(geometry), || {
+            format!("comparing the pixels of {}", geometry.sensor)
         })?;
+        let mut edges = Edges::new(geometry.sensor.len(), geometry.beam.len());
+        let cols = geometry.sensor.cols;
+        for (exposure, place) in geometry.exposures.iter().enumerate() {
+            let cells = geometry.views[place.view].cells;
+            for row in 0..geometry.sensor.rows {
+                control.check()?;
+                let masked = mask.row(exposure, row, geometry.sensor);
+                for col in 0..cols {
+                    if masked.is_none_or(|masked| !masked[col]) {
+                        edges.add(row * cols + col, cells.at(row + place.row, col + place.col));
+                    }
+                }
+            }
+        }
+        edges.components(control)
+    }
+}
+
+/// What finding components holds at its fullest: sets and labels of 4 bytes and a byte of use for
+/// each pixel and cell, sizes and the labels of roots of 4 bytes each for each pixel.
+fn bytes_needed(geometry: &Geometry) -> u64 {
+    let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
+    9 * (pixels + cells) + 8 * pixels
+}
+
+/// The measurements seen so far, as edges between pixels and cells.
+pub(crate) struct Edges {
+    pixels: usize,
+    sets: DisjointSets,
+    used: Vec<bool>,
+}
+
+impl Edges {
+    /// None yet between so many pixels and cells.
+    pub(crate) fn new(pixels: usize, cells: usize) -> Self {
+        let sets = DisjointSets::new(pixels + cells);
+        Self { pixels, sets, used: vec![false; pixels + cells] }
+    }
+
+    /// One that a measurement makes.
+    pub(crate) fn add(&mut self, pixel: usize, cell: usize) {
+        self.sets.union(pixel, self.pixels + cell);
+        self.used[pixel] = true;
+        self.used[self.pixels + cell] = true;
+    }
+
+    /// The components that they make.
+    pub(crate) fn components(self, control: &Control) -> Result<Components> {
+        let Self { pixels, sets, used } = self;
         let roots = sets.into_roots(control)?;
         // Each component has a pixel, and pixels come before cells: so roots are pixels.
-        let mut sizes = vec![0_usize; pixels];
+        let mut sizes = vec![0_u32; pixels];
         in_parts(pixels, control, |pixel| {
-            sizes[roots[pixel] as usize] += usize::from(used[pixel]);
+            sizes[roots[pixel] as usize] += u32::from(used[pixel]);
         })?;
         let mut order = Vec::new();
         in_parts(pixels, control, |pixel| order.extend((sizes[pixel] > 0).then_some(pixel)))?;
@@ -127,8 +173,8 @@ impl Components {
             labels.push(if used[node] { label_of[roots[node] as usize] } else { NONE });
         })?;
         let cells = labels.split_off(pixels);
-        let sizes = order.iter().map(|&root| sizes[root]).collect();
-        Ok(Self { pixels: labels, cells, sizes })
+        let sizes = order.iter().map(|&root| sizes[root] as usize).collect();
+        Ok(Components { pixels: labels, cells, sizes })
     }
 }
 

@@ -23,7 +23,7 @@ mod system;
 pub use flux::Flux;
 
 use crate::conjugate::Ritz;
-use crate::connectivity::Components;
+use crate::connectivity::{Components, Edges};
 use crate::control::Control;
 use crate::descent::Descent;
 use crate::error::Result;
@@ -404,17 +404,16 @@ fn components<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<
         (true, false) => &[[1, 1], [1, 2], [2, 1], [2, 2]],
     };
     let windows = system.grid.windows(shifts);
-    let sizes = [sensor.len(), geometry.beam.len()];
-    Components::linked(sizes, control, |link| {
-        system.model.for_each_measurement(control, |exposure, row, col| {
-            let window = &windows[exposure];
-            let cells = geometry.views[window.view].cells;
-            for [i, j] in around {
-                let cell = cells.at(row + window.row + i, col + window.col + j);
-                link(row * sensor.cols + col, cell);
-            }
-        })
-    })
+    let mut edges = Edges::new(sensor.len(), geometry.beam.len());
+    system.model.for_each_measurement(control, |exposure, row, col| {
+        let window = &windows[exposure];
+        let cells = geometry.views[window.view].cells;
+        for [i, j] in around {
+            let cell = cells.at(row + window.row + i, col + window.col + j);
+            edges.add(row * sensor.cols + col, cell);
+        }
+    })?;
+    edges.components(control)
 }
 
 /// L at the cells: Σ_j a_j B(u − j) with B = 1/6, 4/6, 1/6 at whole numbers; 0 where a coefficient

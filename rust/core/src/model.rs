@@ -37,6 +37,32 @@ pub enum Mask<'a> {
     Measurements(&'a [bool]),
 }
 
+impl<'a> Mask<'a> {
+    /// Checks that it fits so many exposures of that shape.
+    pub(crate) fn check(&self, count: usize, shape: Shape) -> Result<()> {
+        let (length, size) = match self {
+            Self::None => return Ok(()),
+            Self::Pixels(mask) => (mask.len(), shape.len()),
+            Self::Measurements(mask) => (mask.len(), shape.len() * count),
+        };
+        if length == size {
+            return Ok(());
+        }
+        let wanted = format!("{shape} or ({count}, {}, {})", shape.rows, shape.cols);
+        Err(Error::Shape { argument: "mask", got: format!("({length},)"), wanted })
+    }
+
+    /// The part for a row of an exposure of that shape; `None` if nothing is masked.
+    pub(crate) fn row(&self, exposure: usize, row: usize, shape: Shape) -> Option<&'a [bool]> {
+        let Shape { rows, cols } = shape;
+        match self {
+            Self::None => None,
+            Self::Pixels(mask) => Some(&mask[row * cols..][..cols]),
+            Self::Measurements(mask) => Some(&mask[(exposure * rows + row) * cols..][..cols]),
+        }
+    }
+}
+
 /// The model of an experiment: its measurements, their weights and places.
 #[derive(Clone, Debug)]
 pub struct Model<'a, T> {
@@ -298,12 +324,7 @@ impl<'a, T: Real> Model<'a, T> {
     }
 
     fn mask_row(&self, exposure: usize, row: usize) -> Option<&'a [bool]> {
-        let Shape { rows, cols } = self.sensor();
-        match self.mask {
-            Mask::None => None,
-            Mask::Pixels(mask) => Some(&mask[row * cols..][..cols]),
-            Mask::Measurements(mask) => Some(&mask[(exposure * rows + row) * cols..][..cols]),
-        }
+        self.mask.row(exposure, row, self.sensor())
     }
 
     fn check_shapes(&self) -> Result<()> {
@@ -328,12 +349,7 @@ impl<'a, T: Real> Model<'a, T> {
                 check("variance", good, format!("({}, {rows}, {cols})", v.count()), &wanted)?;
             }
         }
-        let (length, size) = match self.mask {
-            Mask::None => (0, 0),
-            Mask::Pixels(mask) => (mask.len(), shape.len()),
-            Mask::Measurements(mask) => (mask.len(), shape.len() * count),
-        };
-        check("mask", length == size, format!("({length},)"), &format!("{shape} or {wanted}"))
+        self.mask.check(count, shape)
     }
 
     fn check_flux(&self) -> Result<()> {

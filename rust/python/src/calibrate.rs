@@ -187,7 +187,7 @@ fn flux_named((kind, values): (String, Vec<f64>)) -> Result<Flux> {
     }
 }
 
-fn rotation(degrees: i64) -> Result<Rotation> {
+pub(crate) fn rotation(degrees: i64) -> Result<Rotation> {
     Rotation::from_degrees(degrees).ok_or_else(|| Error::Value {
         argument: "rotation",
         problem: format!("holds {degrees}: expected 0, 90, 180 or 270 degrees"),
@@ -212,7 +212,7 @@ fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance
     }
 }
 
-fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
+pub(crate) fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
     Ok(match mask {
         PyMask::Pixels(mask) => Mask::Pixels(mask.as_slice()?),
         PyMask::Measurements(mask) => Mask::Measurements(mask.as_slice()?),
@@ -250,6 +250,10 @@ fn wrap(py: Python<'_>, solution: Solution, sensor: Shape) -> PyResult<PySolutio
     })
 }
 
-fn image<T: Element>(py: Python<'_>, values: Vec<T>, shape: Shape) -> PyResult<Py<PyArray2<T>>> {
+pub(crate) fn image<T: Element>(
+    py: Python<'_>,
+    values: Vec<T>,
+    shape: Shape,
+) -> PyResult<Py<PyArray2<T>>> {
     Ok(values.into_pyarray(py).reshape([shape.rows, shape.cols])?.unbind())
 }

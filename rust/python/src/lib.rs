@@ -10,6 +10,7 @@ mod average;
 mod calibrate;
 mod centroid;
 mod errors;
+mod plan;
 mod run;
 
 use pyo3::prelude::*;
@@ -26,6 +27,8 @@ mod _native {
     use crate::calibrate::{PySolution, calibrate_frames};
     #[pymodule_export]
     use crate::centroid::locate_spots;
+    #[pymodule_export]
+    use crate::plan::planned_components;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

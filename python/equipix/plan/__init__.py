@@ -1,0 +1,19 @@
+"""The experiment planned before it is done: what shifts can compare, what errors will be left."""
+
+from equipix.plan.budget import ErrorBudget, error_budget
+from equipix.plan.identifiability import Identifiability, identify
+from equipix.plan.order import advise_order, trend_told
+from equipix.plan.search import Suggestion, suggest
+from equipix.plan.spectrum import Spectrum
+
+__all__ = [
+    "ErrorBudget",
+    "Identifiability",
+    "Spectrum",
+    "Suggestion",
+    "advise_order",
+    "error_budget",
+    "identify",
+    "suggest",
+    "trend_told",
+]

@@ -1,0 +1,148 @@
+"""Which pixels an experiment compares: the connected components of its measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix import _native
+from equipix._arrays import as_shifts, check_shape, naming_memory, per_exposure
+from equipix._measurements import as_mask
+from equipix.errors import InputError
+from equipix.shifts import round_shifts
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identifiability:
+    """What the measurements of an experiment determine: the result of `identify`.
+
+    Attributes
+    ----------
+    components : int
+        Number of connected components: within one, sensitivity and beam are determined up to one
+        factor; between two nothing is compared. 1 is wanted.
+    labels : ndarray, shape (rows, cols), int32
+        The component of each pixel, the largest being 0; −1 for a pixel without measurement.
+    largest : int
+        Number of pixels of the largest component.
+    equations : int
+        Number of measurements used.
+    unknowns : int
+        Number of pixels and beam cells that are measured. One in each component is the gauge.
+    """
+
+    components: int
+    labels: NDArray[Any]
+    largest: int
+    equations: int
+    unknowns: int
+
+    def __repr__(self) -> str:
+        """Short form: how many pixels are compared."""
+        parts = "1 component" if self.components == 1 else f"{self.components} components"
+        return (
+            f"<Identifiability: {parts}, the largest of {self.largest} of {self.labels.size} "
+            f"pixels; {self.equations} equations for {self.unknowns} unknowns>"
+        )
+
+
+def identify(
+    shape: tuple[int, int],
+    shifts: ArrayLike,
+    mask: ArrayLike | None = None,
+    *,
+    rotation: ArrayLike | None = None,
+) -> Identifiability:
+    """Find which pixels an experiment can compare, before it is made.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    shifts : array_like, shape (n, 2)
+        Position (row, col) of the sensor in the beam in each exposure, in pixels.
+    mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+        True = will not be used, in all exposures or in one.
+    rotation : array_like of int, shape (n,), optional
+        How far each exposure is turned, in degrees: 0, 90, 180 or 270; 0 unless given.
+
+    Returns
+    -------
+    Identifiability
+        The components, the label of each pixel, equations and unknowns.
+
+    Raises
+    ------
+    InputError
+        If an argument has a wrong shape or value, or a shift is as large as the sensor.
+    InsufficientMemoryError
+        If the memory that it takes, 17 bytes a pixel and 9 a beam cell, cannot be had.
+
+    Warns
+    -----
+    ShiftRoundingWarning
+        If a shift differs from the first one by no whole number of pixels.
+
+    Notes
+    -----
+    ln y_k(p) = ln L(u_k(p)) + ln M(p) is a graph of pixels and beam cells with an edge for each
+    measurement. Union-find over all of them is exact for shifts that differ by whole pixels. The
+    index of the lattice that the differences generate is only a lower bound: corners come apart.
+
+    Examples
+    --------
+    >>> from equipix import cross_pattern, plan
+    >>> found = plan.identify((48, 64), cross_pattern(5, 7))
+    >>> found.components, found.equations, found.unknowns
+    (1, 15360, 6928)
+    >>> plan.identify((48, 64), cross_pattern(4, 6)).components
+    4
+    """
+    sizes = check_shape(shape)
+    exact = as_shifts(shifts)
+    if len(exact) < 2:
+        raise InputError(f"'shifts' holds {len(exact)} exposures, expected at least two")
+    # A part of a pixel that all shifts have in common moves the grid of the beam along.
+    whole = round_shifts(exact - (exact[0] - np.rint(exact[0])))
+    masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
+    turns = per_exposure("rotation", rotation, len(whole), default=0)
+    if not np.all(np.isin(turns, (0, 90, 180, 270))):
+        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+    with naming_memory("identifying"):
+        labels, counts, seen = _native.planned_components(
+            sizes, whole, rotation=turns.astype(int).tolist(), mask=masked
+        )
+    return Identifiability(
+        components=len(counts),
+        labels=labels,
+        largest=max(counts, default=0),
+        equations=_equations(sizes, len(whole), masked),
+        unknowns=sum(counts) + seen,
+    )
+
+
+def _equations(shape: tuple[int, int], count: int, mask: NDArray[np.bool_] | None) -> int:
+    """Count the measurements that the mask leaves."""
+    if mask is None:
+        return count * shape[0] * shape[1]
+    used = mask.size - int(np.count_nonzero(mask))
+    return used if mask.ndim == 3 else count * used
+
+
+def is_connected(shape: tuple[int, int], positions: NDArray[np.int64]) -> bool:
+    """Whether whole shifts compare all pixels of a sensor, by a part of it three spans wide.
+
+    A part that is connected by itself proves it: such parts cover the sensor, overlap, and stay
+    connected. One that is not rejects patterns that only detours through a large sensor connect.
+    """
+    spans = np.ptp(positions, axis=0).tolist()
+    rows, cols = (min(size, 3 * span + 8) for size, span in zip(shape, spans, strict=True))
+    corners = positions - positions.min(axis=0)
+    turns = [0] * len(corners)
+    counts = _native.planned_components((rows, cols), corners, rotation=turns, mask=None)[1]
+    return counts == [rows * cols]

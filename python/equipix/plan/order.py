@@ -1,0 +1,120 @@
+"""In which order to take exposures, so that a lamp's steady drift does not look like a tilt."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix._arrays import as_shifts
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+_ALL = 8
+"""Up to so many exposures all orders are tried: 40 320."""
+_STARTS = 64
+
+
+def trend_told(shifts: ArrayLike) -> float:
+    """Share of the variance of a linear trend of the lamp that can be told from a tilt.
+
+    Parameters
+    ----------
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col) in pixels, in the order of the exposures, equally spaced in time.
+
+    Returns
+    -------
+    float
+        From 0, where a trend looks just like a tilt of the sensitivity, to 1, where none of it
+        does. The tilt that it causes falls with the square root of the rest.
+
+    Notes
+    -----
+    Only the part of ln c that is affine in d hides: the share is 1 − R² of the regression of the
+    exposures' numbers on (1, d). Three exposures off one line hide every trend.
+
+    Examples
+    --------
+    >>> from equipix import cross_pattern, plan
+    >>> print(f"{plan.trend_told(cross_pattern(11, 19)):.3f}")
+    0.035
+    """
+    basis, times = _hidden(as_shifts(shifts)), _times(len(as_shifts(shifts)))
+    return float(1 - np.sum((times @ basis) ** 2))
+
+
+def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
+    """Order of exposures in which a linear drift of the lamp looks least like a tilt.
+
+    Parameters
+    ----------
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col) in pixels.
+
+    Returns
+    -------
+    ndarray, shape (n,), int64
+        ``shifts[order]`` are the shifts in the order advised. Of up to 8 exposures it is the
+        best, of more the best that exchanges of two lead to from 64 starts.
+
+    Raises
+    ------
+    InputError
+        If there is no shift, or one is not a finite number.
+
+    Examples
+    --------
+    >>> from equipix import cross_pattern, plan
+    >>> cross = cross_pattern(11, 19)
+    >>> order = plan.advise_order(cross)
+    >>> cross[order].tolist()
+    [[0, 11], [19, 0], [0, 0], [0, 19], [11, 0]]
+    >>> print(f"{plan.trend_told(cross[order]):.3f}")
+    0.996
+    """
+    positions = as_shifts(shifts)
+    count = len(positions)
+    if count == 0:
+        raise InputError("'shifts' is empty, expected one (row, col) an exposure")
+    basis, times = _hidden(positions), _times(count)
+    if count <= _ALL:
+        ranks = np.array(list(permutations(range(count))))
+    else:
+        rng = np.random.default_rng(0)
+        starts = [np.arange(count)] + [rng.permutation(count) for _ in range(_STARTS)]
+        ranks = np.array([_exchanged(start, basis, times) for start in starts])
+    # Exposure k is taken as number ranks[k]. What differs by rounding only is a tie.
+    hidden = np.round(np.sum((times[ranks] @ basis) ** 2, axis=1), 12)
+    return np.argsort(ranks[hidden.argmin()]).astype(np.int64)
+
+
+def _hidden(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal basis of what is linear in the shifts, their mean removed."""
+    axes, lengths, _ = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[:, lengths > 1e-9 * max(lengths.max(initial=0), 1e-300)])
+
+
+def _times(count: int) -> NDArray[np.float64]:
+    """Equally spaced times of mean 0 and norm 1."""
+    times = np.arange(count) - (count - 1) / 2
+    return np.asarray(times / max(float(np.linalg.norm(times)), 1e-300))
+
+
+def _exchanged(
+    ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Exchange the pair of exposures that helps most until none does."""
+    first, second = np.triu_indices(len(ranks), 1)
+    pairs = np.arange(len(first))
+    best = np.inf
+    while True:
+        tried = np.tile(ranks, (len(pairs), 1))
+        tried[pairs, first], tried[pairs, second] = ranks[second], ranks[first]
+        hidden = np.sum((times[tried] @ basis) ** 2, axis=1)
+        if not hidden.min() < best * (1 - 1e-9):
+            return ranks
+        best, ranks = hidden.min(), tried[hidden.argmin()]

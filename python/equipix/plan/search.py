@@ -1,0 +1,296 @@
+"""Patterns of shifts that leave little error, sought by exchanging one position at a time."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._arrays import as_array, check_shape, positive_count
+from equipix.errors import DriftWarning, InputError
+from equipix.plan.budget import ErrorBudget, error_budget, warn_of_drift
+from equipix.plan.identifiability import is_connected
+from equipix.plan.order import advise_order
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Points = NDArray[np.int64]
+    Floats = NDArray[np.float64]
+
+_STARTS, _FINALISTS = 10, 6
+"""Searches from different patterns, and how many of their ends get a full error budget."""
+
+_WAVES = 2048
+"""Waves that a pattern is judged by while searching."""
+
+_NEAR, _FAR, _TRIED = 32, 16, 4
+"""Places that a position might move to, nearby and anywhere; of those how many are checked."""
+
+_GAIN = 1e-3
+"""Relative gain below which a move is not worth while."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Suggestion:
+    """A pattern of shifts that compares every pixel.
+
+    Attributes
+    ----------
+    shifts : ndarray, shape (n, 2), int64
+        The shifts (row, col) in pixels, the smallest 0, in the order in which a linear drift of
+        the lamp looks least like a tilt (`advise_order`).
+    budget : ErrorBudget
+        Its errors.
+    """
+
+    shifts: Points
+    budget: ErrorBudget
+
+    def __repr__(self) -> str:
+        """Short form: the shifts and the error."""
+        return f"<Suggestion {self.shifts.tolist()}: {self.budget.rms:.1e} rms>"
+
+
+def suggest(
+    shape: tuple[int, int],
+    exposures: int | None,
+    max_shift: ArrayLike,
+    *,
+    noise: float = 1e-3,
+    drift: float = 1e-4,
+    shift_error: float = 0,
+    beam_width: float | None = None,
+    patterns: int = 3,
+    rng: int | np.random.Generator = 0,
+) -> list[Suggestion]:
+    """Find patterns of shifts within the stage's travel, best first.
+
+    Every one compares all pixels, by the exact test of `identify`.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    exposures : int or None
+        How many exposures; None: as few as determine every pixel.
+    max_shift : int or array_like of two
+        Travel of the stage, in pixels, along both axes or (row, col): shifts are 0 to that. It is
+        cut where the sensor is smaller.
+    noise, drift, shift_error, beam_width : float
+        As for `error_budget`, whose `rms` is what makes a pattern good. By default drift is a
+        tenth of the noise; for the order of the patterns only such ratios matter.
+    patterns : int
+        How many patterns to return, at most.
+    rng : numpy.random.Generator or int
+        Source of the random numbers of the search, or its seed: the same one finds the same.
+
+    Returns
+    -------
+    list of Suggestion
+        The patterns, by rising error.
+
+    Raises
+    ------
+    InputError
+        If an argument has a wrong value, or no pattern of so many exposures is found.
+
+    Warns
+    -----
+    DriftWarning
+        If even with the best pattern the tilt from drift exceeds the error from noise.
+
+    Notes
+    -----
+    The variance from noise falls with the mean of 1/λ(q) and rises with the number of beam cells;
+    the tilt from drift falls with the spread of the shifts: so good patterns have their positions
+    near the corners of the travel, but not so regularly that waves are nearly periodic in them.
+    From several starts, positions are moved one by one to where the predicted error is least.
+
+    Examples
+    --------
+    >>> from equipix import cross_pattern, plan
+    >>> cross = plan.error_budget((96, 128), cross_pattern(11, 19), noise=1e-3, drift=1e-5)
+    >>> best, *others = plan.suggest((96, 128), 5, 19, noise=1e-3, drift=1e-5)
+    >>> best.budget.rms < cross.rms
+    True
+    """
+    sizes = check_shape(shape)
+    travel = _travel(max_shift, sizes)
+    wanted = positive_count("patterns", patterns)
+    random = np.random.default_rng(rng)
+    score = _Score(sizes, travel, noise, drift)
+    if exposures is None:
+        counts = range(2, 6)
+    else:
+        counts = range(positive_count("exposures", exposures), exposures + 1)
+    found: list[Points] = []
+    for count in counts:
+        starts = _starts(count, travel, random)
+        ends = [_improved(start, sizes, travel, score, random) for start in starts]
+        found = _distinct([end for end in ends if end is not None], score)
+        if found:
+            break
+    if not found:
+        raise InputError(
+            f"'exposures' is {exposures}: no pattern of so many within 'max_shift' "
+            f"{travel.tolist()} was found that compares every pixel; allow more of either"
+        )
+    suggestions = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DriftWarning)
+        for points in found[: max(wanted, _FINALISTS)]:
+            shifts = points - points.min(axis=0)
+            shifts = shifts[advise_order(shifts)]
+            budget = error_budget(
+                sizes,
+                shifts,
+                noise=noise,
+                drift=drift,
+                shift_error=shift_error,
+                beam_width=beam_width,
+            )
+            suggestions.append(Suggestion(shifts, budget))
+    suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
+    warn_of_drift(suggestions[0].budget.rms_by_cause)
+    return suggestions[:wanted]
+
+
+def _travel(max_shift: ArrayLike, shape: tuple[int, int]) -> Points:
+    """Largest shift along each axis: that of the stage, and less than the sensor."""
+    values = as_array("max_shift", max_shift, ndim=(0, 1)).astype(np.float64)
+    if values.size not in (1, 2) or not (values >= 0).all():
+        raise InputError(f"'max_shift' is {max_shift!r}, expected pixels from 0 on, or (row, col)")
+    travel = np.minimum(np.broadcast_to(values, 2), np.array(shape) - 1)
+    return np.asarray(travel.astype(np.int64))
+
+
+class _Score:
+    """Predicts the error of patterns quickly: all places that one position might move to.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    travel : ndarray of int, shape (2,)
+        Largest shift along each axis.
+    noise, drift : float
+        As for `error_budget`.
+    """
+
+    def __init__(self, shape: tuple[int, int], travel: Points, noise: float, drift: float) -> None:
+        self._shape, self._noise, self._drift = shape, noise, drift
+        # Points of a Kronecker sequence cover the half plane of waves evenly.
+        steps = np.arange(1, _WAVES + 1)[:, None] * np.array([0.7548776662, 0.5698402910])
+        waves = (steps % 1 - [0, 0.5]) * [np.pi, 2 * np.pi]
+        self._phases = [
+            np.exp(1j * np.outer(q, np.arange(most + 1))).astype(np.complex64)
+            for q, most in zip(waves.T, travel, strict=True)
+        ]
+
+    def __call__(self, others: Points, places: Points) -> Floats:
+        """Evaluate the error of the patterns of `others` and one of `places` each."""
+        count = len(others) + 1
+        kept = np.broadcast_to(others, (len(places), *others.shape))
+        patterns = np.concatenate([kept, places[:, None]], axis=1)
+        spans = np.ptp(patterns, axis=1)
+        rest = count / (count - self._cells(spans, count))
+        noise = self._noise**2 * self._mean_of_inverse(others, places) * (1 - 1 / count) * rest
+        return np.asarray(np.sqrt(noise + self._drift**2 * self._tilt(patterns)))
+
+    def _cells(self, spans: Points, count: int) -> Floats:
+        """Beam cells over pixels: the trace of K of `local_variance`, times n."""
+        cells = np.prod((np.array(self._shape) + spans) / self._shape, axis=1)
+        return np.asarray(np.minimum(cells, count * (1 - 1e-3)))
+
+    def _mean_of_inverse(self, others: Points, places: Points) -> Floats:
+        """Mean of 1/λ over the waves."""
+        count = len(others) + 1
+        sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
+        visible = count - (sums.real**2 + sums.imag**2) / count
+        return np.asarray(np.mean(1 / np.maximum(visible, 1e-3), axis=0, dtype=np.float64))
+
+    def _waves(self, places: Points) -> NDArray[np.complex64]:
+        down, right = self._phases
+        return np.asarray(down[:, places[:, 0]] * right[:, places[:, 1]])
+
+    def _tilt(self, patterns: Points) -> Floats:
+        """Mean square tilt for drift 1: `drift_tilt` and `tilt_rms` of many patterns."""
+        away = patterns - patterns.mean(axis=1, keepdims=True)
+        variances = np.mean(away**2, axis=1)
+        determinant = np.prod(variances, axis=1) - np.mean(np.prod(away, axis=2), axis=1) ** 2
+        sides = np.where(np.array(self._shape) > 1, self._shape, 0)
+        if 0 in sides:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                slopes = np.where(sides > 0, sides**2 / variances, 0).sum(axis=1)
+        else:
+            slopes = np.divide(
+                (sides**2 * variances[:, ::-1]).sum(axis=1),
+                determinant,
+                where=determinant > 1e-9,
+                out=np.full(len(patterns), np.inf),
+            )
+        return np.asarray(slopes / (12 * patterns.shape[1]))
+
+
+def _starts(count: int, travel: Points, rng: np.random.Generator) -> list[Points]:
+    """Patterns to begin with: near the corners of the travel, and one that is surely connected."""
+    nearest = np.array([(0, 0), (0, 1), (1, 0)])[:count]
+    far = rng.integers(0, travel, (max(count - 3, 0), 2), endpoint=True)
+    starts = [np.minimum(np.concatenate([nearest, far]), travel)]
+    for _ in range(_STARTS - 1):
+        corners = rng.permutation(count)[:, None] >> np.array([0, 1]) & 1
+        inwards = np.abs(rng.normal(0, 0.08, (count, 2)))
+        places = np.where(corners, 1 - inwards, inwards) * travel
+        starts.append(np.clip(np.rint(places), 0, travel).astype(np.int64))
+    return starts
+
+
+def _improved(
+    points: Points,
+    shape: tuple[int, int],
+    travel: Points,
+    score: _Score,
+    rng: np.random.Generator,
+) -> Points | None:
+    """Move positions one by one while that helps; None if nothing connected was met."""
+    best = _whole_score(points, score) if is_connected(shape, points) else np.inf
+    unmoved, k = 0, 0
+    while unmoved < 2 * len(points):
+        others = np.delete(points, k, axis=0)
+        places = _places(points[k], travel, rng)
+        scores = score(others, places)
+        unmoved += 1
+        for place in np.argsort(scores, kind="stable")[:_TRIED]:
+            if not scores[place] < best * (1 - _GAIN):
+                break
+            moved = points.copy()
+            moved[k] = places[place]
+            if is_connected(shape, moved):
+                points, best, unmoved = moved, scores[place], 0
+                break
+        k = (k + 1) % len(points)
+    return points if np.isfinite(best) else None
+
+
+def _places(place: Points, travel: Points, rng: np.random.Generator) -> Points:
+    """Places that a position might move to: around it at several distances, and anywhere."""
+    distances = rng.choice([1.0, 3.0, 10.0], (_NEAR, 1))
+    near = np.rint(place + distances * rng.standard_normal((_NEAR, 2))).astype(np.int64)
+    far = rng.integers(0, travel, (_FAR, 2), endpoint=True)
+    return np.asarray(np.clip(np.concatenate([near, far]), 0, travel))
+
+
+def _whole_score(points: Points, score: _Score) -> float:
+    return float(score(points[:-1], points[-1:])[0])
+
+
+def _distinct(found: list[Points], score: _Score) -> list[Points]:
+    """Put patterns in the order of their scores, and what is only a move of another aside."""
+    patterns: dict[tuple[Any, ...], Points] = {}
+    for points in found:
+        moved = points - points.min(axis=0)
+        patterns.setdefault(tuple(sorted(map(tuple, moved.tolist()))), points)
+    return sorted(patterns.values(), key=lambda points: _whole_score(points, score))

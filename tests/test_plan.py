@@ -1,0 +1,424 @@
+"""The plan of an experiment: what it can compare, and errors as simulated experiments have them."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import equipix
+from equipix import plan, reference, simulate
+from equipix.errors import (
+    DriftWarning,
+    IdentifiabilityWarning,
+    InputError,
+    ShiftRoundingWarning,
+)
+from equipix.plan.smooth import drift_tilt, tilt_rms
+
+WITHIN = 0.1
+"""The claim: predictions agree with simulation within 10 %."""
+
+CROSS = equipix.cross_pattern(11, 19)
+CCD = (582, 782)
+
+PATTERNS = {
+    "cross": ((72, 96), equipix.cross_pattern(5, 7), 150.0),
+    "long arms": ((96, 128), CROSS, 200.0),
+    "corners": ((96, 128), [(0, 0), (0, 23), (25, 2), (24, 25), (11, 14)], 250.0),
+    "nine": (
+        (60, 96),
+        [(0, 0), (17, 3), (4, 19), (12, 12), (19, 18), (1, 9), (9, 1), (15, 7), (6, 14)],
+        120.0,
+    ),
+    "three": ((48, 40), [(0, 0), (0, 1), (1, 0)], 100.0),
+    "nearly periodic": ((96, 128), [(0, 0), (0, 20), (21, 0), (21, 20), (10, 7)], None),
+}
+patterns = pytest.mark.parametrize(
+    ("shape", "shifts", "width"), PATTERNS.values(), ids=PATTERNS.keys()
+)
+
+
+def budget_of(*arguments, **options):
+    """An error budget whose warnings do not matter here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DriftWarning)
+        return plan.error_budget(*arguments, **options)
+
+
+def beam_of(shape, width):
+    return simulate.gaussian_beam(shape, width=width or 1e9)
+
+
+def solved(frames, shifts, tolerance):
+    """The relative error of M, the truth being 1."""
+    found = equipix.calibrate(frames, shifts, tolerance=tolerance, workers=1).sensitivity
+    return simulate.relative_error(found, np.ones(found.shape))
+
+
+def slopes(error):
+    """Least-squares tilt of an error, edge to edge (row, col)."""
+    tilts = []
+    for axis, size in enumerate(error.shape):
+        lever = np.arange(size) - (size - 1) / 2
+        profile = error.mean(axis=1 - axis)
+        tilts.append(size * (lever @ profile) / (lever @ lever))
+    return np.array(tilts)
+
+
+def compare(predicted, errors, within=WITHIN):
+    """A predicted rms against that of independent draws, whose own standard error comes on top."""
+    squares = [np.mean(error**2) for error in errors]
+    rms = np.sqrt(np.mean(squares))
+    scatter = np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2 * rms)
+    assert predicted == pytest.approx(rms, abs=within * rms + 3 * scatter)
+
+
+def orthogonal_draws(count, seed):
+    """As many draws of `count` numbers of variance 1 as there are numbers, in random directions.
+
+    Their mean square through any linear response is what it is for independent normal numbers,
+    without the scatter of draws: the sum over an orthonormal basis does not depend on it.
+    """
+    normal = np.random.default_rng(seed).standard_normal((count, count))
+    return np.sqrt(count) * np.linalg.qr(normal)[0]
+
+
+class TestIdentify:
+    @settings(max_examples=60, deadline=None)
+    @given(st.data())
+    def test_agrees_with_the_reference(self, data):
+        shape = data.draw(st.tuples(st.integers(1, 9), st.integers(1, 9)), "shape")
+        n = data.draw(st.integers(2, 4), "n")
+        turns = data.draw(st.lists(st.sampled_from([0, 90, 180, 270]), min_size=n, max_size=n))
+        most = min(shape) - 1
+        shift = st.tuples(st.integers(-most, most), st.integers(-most, most))
+        shifts = data.draw(st.lists(shift, min_size=n, max_size=n), "shifts")
+        rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+        each = data.draw(st.booleans())
+        mask = rng.random((n, *shape) if each else shape) < data.draw(st.sampled_from([0, 0.3, 1]))
+        found = plan.identify(shape, shifts, mask, rotation=turns)
+        cells, grid, _ = reference.grid_cells(shape, shifts, turns)
+        used = ~np.broadcast_to(mask, cells.shape)
+        pixels, beam = reference.components(cells, used, grid)
+        np.testing.assert_array_equal(found.labels, pixels)
+        assert found.components == pixels.max() + 1
+        assert found.largest == np.count_nonzero(pixels == 0)
+        assert found.equations == used.sum()
+        assert found.unknowns == (pixels >= 0).sum() + (beam >= 0).sum()
+
+    @pytest.mark.parametrize(
+        ("shifts", "components"),
+        [
+            (equipix.cross_pattern(5, 7), 1),
+            (equipix.cross_pattern(4, 6), 4),
+            ([(0, 0), (5, 0), (0, 7)], 35),
+            # Index 1 of the lattice, but corners come apart.
+            ([(0, 0), (11, 13), (19, 17), (30, 41)], 89),
+        ],
+    )
+    def test_known_patterns(self, shifts, components):
+        assert plan.identify((150, 170), shifts).components == components
+
+    def test_what_calibrate_finds(self):
+        mask = np.random.default_rng(3).random((5, 30, 40)) < 0.4
+        shifts = equipix.cross_pattern(4, 7)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", IdentifiabilityWarning)
+            cal = equipix.calibrate(np.ones((5, 30, 40)), shifts, mask=mask)
+        found = plan.identify((30, 40), shifts, mask)
+        np.testing.assert_array_equal(found.labels, cal.component_labels)
+
+    def test_a_part_of_a_pixel_common_to_all_shifts_does_not_count(self):
+        assert plan.identify((48, 64), equipix.cross_pattern(4, 6) + 0.3).components == 4
+
+    def test_other_parts_of_pixels_are_rounded_with_a_warning(self):
+        with pytest.warns(ShiftRoundingWarning):
+            found = plan.identify((48, 64), equipix.cross_pattern(4, 6) * 1.1)
+        assert found.components == plan.identify((48, 64), equipix.cross_pattern(4, 7)).components
+
+    def test_says_what_it_found(self):
+        words = repr(plan.identify((20, 30), equipix.cross_pattern(4, 6)))
+        assert words.startswith("<Identifiability: 4 components, the largest of 150 of 600 pixels")
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (((0, 5), [(0, 0), (0, 1)]), "'shape' is (0, 5)"),
+            (((4.5, 5), [(0, 0), (0, 1)]), "'shape' is (4.5, 5)"),
+            (((4, 5), np.empty((0, 2))), "'shifts' holds 0 exposures"),
+            (((4, 5), [(0, 0), (0, 5)]), "must be smaller than the sensor"),
+            (((4, 5), [(0, 0), (0, 1)], np.zeros((5, 4), bool)), "'mask' has shape (5, 4)"),
+        ],
+    )
+    def test_refuses(self, arguments, words):
+        with pytest.raises(InputError) as error:
+            plan.identify(*arguments)
+        assert words in str(error.value)
+
+
+class TestNoise:
+    @patterns
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_rms_and_map_agree_with_simulation(self, shape, shifts, width, seed):
+        sigma, draws = 1e-3, 8
+        budget = budget_of(shape, shifts, noise=sigma, beam_width=width)
+        frames = simulate.exposures(np.ones(shape), beam_of(shape, width), shifts)
+        rng = np.random.default_rng(seed)
+        errors = [
+            solved(frames + sigma * rng.standard_normal(frames.shape), shifts, sigma / 100)
+            for _ in range(draws)
+        ]
+        compare(budget.rms_by_cause["noise"], errors)
+        # Where the map says that errors are small or large, they are; less exactly so where few
+        # waves make up most of the error.
+        predicted = budget.noise_map
+        assert np.sqrt(np.mean(predicted**2)) == pytest.approx(budget.rms_by_cause["noise"])
+        few = len(shifts) == 3 or budget.spectrum.smallest < 1e-2
+        edge = np.quantile(predicted, 0.75) * (1 + 1e-9)
+        for part in (predicted <= edge, predicted > edge):
+            wanted = np.sqrt(np.mean(predicted[part] ** 2))
+            compare(wanted, [error[part] for error in errors], 0.25 if few else WITHIN)
+
+    def test_of_the_cross(self):
+        # What a solver at the optimum leaves: 1.21/√n at 782×582, 1.23/√n at 320×240.
+        for shape, wanted in ((CCD, 1.21), ((240, 320), 1.23)):
+            budget = budget_of(shape, CROSS, noise=1.0)
+            # The third figure of the wanted one, and 3 draws of 65 536 pixels.
+            tolerance = 0.005 + 3 * wanted / np.sqrt(2 * 3 * 65_536)
+            assert budget.rms * np.sqrt(5) == pytest.approx(wanted, abs=tolerance)
+
+    def test_scales_with_noise_and_falls_with_flux(self):
+        shape = (48, 64)
+        once = budget_of(shape, CROSS, noise=1e-3).rms
+        assert budget_of(shape, CROSS, noise=2e-3).rms == pytest.approx(2 * once, rel=1e-9)
+        # Twice the light in all exposures: linear but for noise², 1e-6, in a step.
+        bright = budget_of(shape, CROSS, noise=1e-3, flux=[2] * 5).rms
+        assert bright == pytest.approx(once / 2, rel=1e-2)
+
+    def test_known_fluxes_weigh(self):
+        shape, sigma, flux = (64, 80), 1e-3, np.array([1, 2, 0.5, 1.5, 0.7])
+        shifts = equipix.cross_pattern(5, 7)
+        budget = budget_of(shape, shifts, noise=sigma, flux=flux)
+        frames = simulate.exposures(np.ones(shape), beam_of(shape, None), shifts, flux=flux)
+        rng, squares = np.random.default_rng(1), []
+        for _ in range(8):
+            noise = sigma * rng.standard_normal(frames.shape)
+            cal = equipix.calibrate(frames + noise, shifts, flux=flux, tolerance=1e-5, workers=1)
+            squares.append(np.var(cal.sensitivity))
+        assert budget.rms == pytest.approx(np.sqrt(np.mean(squares)), rel=WITHIN)
+
+
+class TestDrift:
+    @patterns
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_tilt_agrees_with_simulation(self, shape, shifts, width, seed):
+        drift, count = 1e-5, len(shifts)
+        budget = budget_of(shape, shifts, noise=1, drift=drift, beam_width=width)
+        errors = []
+        for draw in orthogonal_draws(count, seed):
+            beam = beam_of(shape, width)
+            frames = simulate.exposures(np.ones(shape), beam, shifts, flux=1 + drift * draw)
+            errors.append(solved(frames, shifts, 1e-2 * drift))
+        tilt = np.sqrt(np.mean([slopes(error) ** 2 for error in errors], axis=0))
+        assert budget.tilt_by_cause["drift"] == pytest.approx(tilt, rel=WITHIN)
+        rms = np.sqrt(np.mean(np.square(errors)))
+        assert budget.rms_by_cause["drift"] == pytest.approx(rms, rel=WITHIN)
+
+    @pytest.mark.parametrize(("arms", "wanted"), [((11, 19), 2.0e-3), ((97, 160), 2.4e-4)])
+    def test_of_the_cross(self, arms, wanted):
+        # Measured at 782×582, in two figures.
+        tilt = drift_tilt(CCD, equipix.cross_pattern(*arms).astype(float), 1e-4)
+        assert tilt_rms(tilt) == pytest.approx(wanted, abs=0.05 * 10 ** np.floor(np.log10(wanted)))
+
+    def test_is_loud_when_it_exceeds_the_noise(self):
+        with pytest.warns(DriftWarning, match="times what noise leaves"):
+            plan.error_budget((64, 80), CROSS, noise=1e-4, drift=1e-4)
+        plan.error_budget((64, 80), CROSS, noise=1e-2, drift=1e-4)  # warnings are errors here
+
+    def test_along_one_line_the_other_tilt_is_free(self):
+        with pytest.warns(IdentifiabilityWarning, match="30 parts"):
+            budget = budget_of((30, 40), [(0, 0), (0, 2), (0, 5)], noise=1, drift=1e-9)
+        assert np.isinf(budget.tilt_by_cause["drift"][0])
+        line = budget_of((1, 40), [(0, 0), (0, 2), (0, 5)], noise=1, drift=1e-9)
+        # ε·N/(√n·std): three shifts of variance 38/9.
+        wanted = 1e-9 * 40 / np.sqrt(3 * 38 / 9)
+        assert line.tilt_by_cause["drift"] == pytest.approx((0, wanted))
+
+
+class TestShiftErrors:
+    @pytest.mark.parametrize(
+        ("shape", "shifts", "width"),
+        [case for case in PATTERNS.values() if case[2]],
+        ids=[name for name, case in PATTERNS.items() if case[2]],
+    )
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_error_agrees_with_simulation(self, shape, shifts, width, seed):
+        delta, count = 1e-2, len(shifts)
+        budget = budget_of(shape, shifts, noise=1, shift_error=delta, beam_width=width)
+        errors = []
+        for draw in orthogonal_draws(2 * count, seed):
+            moved = np.asarray(shifts) + delta * draw.reshape(count, 2)
+            frames = simulate.exposures(np.ones(shape), beam_of(shape, width), moved)
+            errors.append(solved(frames, shifts, 1e-7))
+        rms = np.sqrt(np.mean(np.square(errors)))
+        assert budget.rms_by_cause["shift_error"] == pytest.approx(rms, rel=WITHIN)
+        tilt = np.sqrt(np.mean([slopes(error) ** 2 for error in errors], axis=0))
+        # A tilt is a small part of it: as exact as the whole.
+        whole = np.sqrt(12) * rms
+        assert budget.tilt_by_cause["shift_error"] == pytest.approx(tilt, abs=WITHIN * whole)
+
+    def test_of_the_cross(self):
+        # Section 5 of the design, in one figure: 0.01 pixel → 4e-5 rms; here 5.3e-5 with random
+        # errors of all exposures.
+        budget = budget_of(CCD, CROSS, noise=1, shift_error=0.01, beam_width=1000)
+        assert 3e-5 < budget.rms_by_cause["shift_error"] < 6e-5
+
+    def test_an_even_beam_forgives_them(self):
+        assert budget_of((64, 80), CROSS, noise=1, shift_error=1).rms_by_cause["shift_error"] == 0
+
+
+class TestSpectrum:
+    def test_is_the_symbol(self):
+        shifts = np.random.default_rng(2).integers(0, 30, (6, 2))
+        found = budget_of((64, 80), shifts, noise=1).spectrum
+        for row, col in ((0, 512), (100, 3), (512, 1024), (7, 700)):
+            q = 2 * np.pi * np.array([found.rows[row], found.cols[col]])
+            wanted = 6 - abs(np.exp(1j * shifts @ q).sum()) ** 2 / 6
+            # Rounding of a sum of 6 unit numbers, squared.
+            assert found.values[row, col] == pytest.approx(wanted, abs=100 * np.finfo(float).eps)
+
+    def test_names_the_nearly_periodic_wave(self):
+        shape, shifts, _ = PATTERNS["nearly periodic"]
+        worst = budget_of(shape, shifts, noise=1).spectrum.worst
+        phases = np.array(shifts) @ worst
+        assert np.abs(phases - np.rint(phases)).max() < 0.1
+        assert np.hypot(*worst) > 1 / 21
+
+
+class TestOrder:
+    def test_of_the_cross_hides_a_trend(self):
+        # Section 5 of the design: 3.5 % of the variance.
+        assert plan.trend_told(CROSS) == pytest.approx(0.035, abs=5e-4)
+
+    @pytest.mark.parametrize("count", [4, 6, 11])
+    def test_advised_hides_less(self, count):
+        shifts = np.random.default_rng(count).integers(0, 40, (count, 2))
+        order = plan.advise_order(shifts)
+        assert sorted(order) == list(range(count))
+        told = plan.trend_told(shifts[order])
+        rng = np.random.default_rng(0)
+        others = [plan.trend_told(rng.permutation(shifts)) for _ in range(500)]
+        assert told >= max(others) - 1e-9
+
+    def test_a_trend_in_the_advised_order_does_not_tilt(self):
+        shape, trend = (64, 80), 1e-4 * np.arange(5)
+        tilts = []
+        for shifts in (CROSS, CROSS[plan.advise_order(CROSS)]):
+            beam = simulate.gaussian_beam(shape)
+            frames = simulate.exposures(np.ones(shape), beam, shifts, flux=1 + trend)
+            tilts.append(np.linalg.norm(slopes(solved(frames, shifts, 1e-7))))
+        hidden = 1 - plan.trend_told(CROSS[plan.advise_order(CROSS)])
+        # The tilt goes with the root of what is hidden, in a metric as lopsided as cov(d): its
+        # eigenvalues are 96 and 24.
+        assert tilts[1] < 2 * np.sqrt(hidden / 0.965) * tilts[0]
+
+    def test_three_exposures_hide_every_trend(self):
+        assert plan.trend_told([(0, 0), (0, 3), (5, 0)]) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.fixture(scope="module")
+def cross():
+    return budget_of(CCD, CROSS, noise=1e-3, drift=1e-4)
+
+
+class TestSuggest:
+    @pytest.mark.parametrize(
+        ("exposures", "tilt", "noise", "seed"),
+        [(5, 5, 1.1, 0), (5, 5, 1.1, 1), (9, 6, 0.75, 0), (9, 6, 0.75, 1)],
+    )
+    def test_beats_the_cross(self, cross, exposures, tilt, noise, seed):
+        found = plan.suggest(CCD, exposures, 80, patterns=2, rng=seed)
+        for suggestion in found:
+            budget = suggestion.budget
+            assert budget.rms_by_cause["drift"] < cross.rms_by_cause["drift"] / tilt
+            assert budget.rms_by_cause["noise"] < cross.rms_by_cause["noise"] * noise
+            assert plan.identify(CCD, suggestion.shifts).components == 1
+            assert suggestion.shifts.min() >= 0
+            assert suggestion.shifts.max() <= 80
+        rms = [suggestion.budget.rms for suggestion in found]
+        assert rms == sorted(rms)
+
+    def test_the_same_seed_finds_the_same(self):
+        first, second = (
+            plan.suggest((64, 80), 5, (10, 20), drift=1e-6, rng=4)[0].shifts for _ in range(2)
+        )
+        np.testing.assert_array_equal(first, second)
+        assert (first.max(axis=0) <= (10, 20)).all()
+        # In the order advised, which is one of its own.
+        told = plan.trend_told(first)
+        assert told == pytest.approx(plan.trend_told(first[plan.advise_order(first)]), abs=1e-9)
+
+    def test_the_fewest(self):
+        # Two exposures compare pixels along one line only; three may have a lattice of index 1.
+        found = plan.suggest((40, 50), None, 12, drift=1e-6)[0].shifts
+        assert len(found) == 3
+        assert plan.identify((40, 50), found).components == 1
+        assert len(plan.suggest((1, 50), None, 12, drift=1e-6)[0].shifts) == 2
+
+    def test_says_that_drift_will_tilt(self):
+        with pytest.warns(DriftWarning):
+            plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (((64, 80), 2, 10), "no pattern of so many"),
+            (((64, 80), 5, -1), "'max_shift' is -1"),
+            (((64, 80), 5, (0, 10)), "no pattern of so many"),
+            (((64, 80), 0, 10), "'exposures' is 0"),
+        ],
+    )
+    def test_refuses(self, arguments, words):
+        with pytest.raises(InputError) as error:
+            plan.suggest(*arguments)
+        assert words in str(error.value)
+
+
+class TestBudget:
+    def test_adds_causes_in_quadrature(self):
+        budget = budget_of((64, 80), CROSS, noise=1e-3, drift=1e-5, shift_error=0.1, beam_width=99)
+        assert budget.rms == pytest.approx(np.linalg.norm([*budget.rms_by_cause.values()]))
+        assert all(value > 0 for value in budget.rms_by_cause.values())
+
+    def test_of_parts_that_nothing_compares(self):
+        with pytest.warns(IdentifiabilityWarning, match="4 parts"):
+            budget = budget_of((80, 100), equipix.cross_pattern(4, 6), noise=1)
+        # Each part is a sensor of half the pitch with a cross of (2, 3).
+        alone = budget_of((40, 50), equipix.cross_pattern(2, 3), noise=1)
+        # Draws of 2000 pixels scatter by some 4 %, as those of test_rms_and_map do; 24 were made.
+        assert budget.rms == pytest.approx(alone.rms, rel=3 * 0.04 * np.sqrt(2 / 24))
+
+    def test_a_large_sensor_takes_no_longer_to_solve(self):
+        small, large = (budget_of((size, size), CROSS, noise=1).rms for size in (256, 2000))
+        # Edges matter less: their share falls from 19/256 to nothing.
+        assert small * (1 - 0.05) < large < small
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"noise": 0}, "'noise' is 0"),
+            ({"noise": np.nan}, "'noise' is nan"),
+            ({"noise": 1, "drift": -1}, "'drift' is -1"),
+            ({"noise": 1, "beam_width": 0}, "'beam_width' is 0"),
+            ({"noise": 1, "flux": [1, 1]}, "'flux' has 2 entries, expected 5"),
+            ({"noise": 1, "flux": [1, 1, 0, 1, 1]}, "'flux' is"),
+        ],
+    )
+    def test_refuses(self, options, words):
+        with pytest.raises(InputError) as error:
+            plan.error_budget((64, 80), CROSS, **options)
+        assert words in str(error.value)
