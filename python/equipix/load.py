@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+_OPTIONAL = {"dark": np.floating, "sensitivity_std": np.floating}
 _MAPS = {"sensitivity": np.floating, "flags": np.uint32, "component_labels": np.integer}
 
 
@@ -38,7 +39,8 @@ def load(path: str | PathLike[str]) -> Calibration:
     """
     pages, content = load_pages(path)
     check_format(path, content, "calibration", FORMAT)
-    check_pages(path, pages, _MAPS | {"dark": np.floating} if "dark" in pages else _MAPS)
+    optional = {name: kind for name, kind in _OPTIONAL.items() if name in pages}
+    check_pages(path, pages, _MAPS | optional)
     check_pages(path, pages, {"beam": np.floating})
     try:
         return _calibration(pages, content)
@@ -50,7 +52,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
     numbers = content["calibration"]
     history = numbers["history"]
     row, col = numbers["beam_origin"]
-    chi2 = numbers["reduced_chi2"]
+    chi2, tilt_std = numbers["reduced_chi2"], numbers.get("tilt_std")
     return Calibration(
         sensitivity=pages["sensitivity"],
         beam=pages["beam"],
@@ -72,4 +74,6 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         ),
         dark=pages.get("dark"),
         metadata=content["metadata"],
+        sensitivity_std=pages.get("sensitivity_std"),
+        tilt_std=None if tilt_std is None else np.array(tilt_std, dtype=np.float64),
     )

@@ -24,6 +24,7 @@
 //!
 //! ```text
 //! calibrate       from measurements to a Solution: method, gauge, flags
+//! uncertainty     how far noise may have moved M
 //! multiscale      the fast solver: Gauss-Newton steps on all scales at once
 //! descent         coordinate descent, the method of the paper
 //! estimate        how far M still is from the minimum, large scales included; when to stop
@@ -131,5 +132,6 @@ pub mod parts;
 mod precondition;
 mod reduced;
 pub mod statistics;
+pub mod uncertainty;
 
 pub use error::{Error, Result};

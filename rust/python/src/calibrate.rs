@@ -151,14 +151,14 @@ fn method_named(name: &str) -> Result<Method> {
     }
 }
 
-fn rotation(degrees: i64) -> Result<Rotation> {
+pub(crate) fn rotation(degrees: i64) -> Result<Rotation> {
     Rotation::from_degrees(degrees).ok_or_else(|| Error::Value {
         argument: "rotation",
         problem: format!("holds {degrees}: expected 0, 90, 180 or 270 degrees"),
     })
 }
 
-fn stack<'a, T: Element + Real>(
+pub(crate) fn stack<'a, T: Element + Real>(
     argument: &'static str,
     array: &'a PyReadonlyArray3<'_, T>,
 ) -> PyResult<Stack<'a, T>> {
@@ -168,7 +168,9 @@ fn stack<'a, T: Element + Real>(
     stack.map_err(|error| errors::exception(array.py(), &error))
 }
 
-fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance<'a, T>> {
+pub(crate) fn by_exposure<'a, T>(
+    variance: Option<&'a PyVariance<'_>>,
+) -> PyResult<Variance<'a, T>> {
     match variance {
         Some(PyVariance::Exposures(values)) => Ok(Variance::Exposures(values.as_slice()?)),
         Some(_) => Err(pyo3::exceptions::PyTypeError::new_err("variance: not the frames' dtype")),
@@ -176,7 +178,7 @@ fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance
     }
 }
 
-fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
+pub(crate) fn view_mask<'a>(mask: &'a PyMask<'_>) -> PyResult<Mask<'a>> {
     Ok(match mask {
         PyMask::Pixels(mask) => Mask::Pixels(mask.as_slice()?),
         PyMask::Measurements(mask) => Mask::Measurements(mask.as_slice()?),
@@ -207,6 +209,10 @@ fn wrap(py: Python<'_>, solution: Solution, geometry: &Geometry) -> PyResult<PyS
     })
 }
 
-fn image<T: Element>(py: Python<'_>, values: Vec<T>, shape: Shape) -> PyResult<Py<PyArray2<T>>> {
+pub(crate) fn image<T: Element>(
+    py: Python<'_>,
+    values: Vec<T>,
+    shape: Shape,
+) -> PyResult<Py<PyArray2<T>>> {
     Ok(values.into_pyarray(py).reshape([shape.rows, shape.cols])?.unbind())
 }

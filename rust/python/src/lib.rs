@@ -11,6 +11,7 @@ mod calibrate;
 mod centroid;
 mod errors;
 mod run;
+mod uncertainty;
 
 use pyo3::prelude::*;
 
@@ -26,6 +27,8 @@ mod _native {
     use crate::calibrate::{PySolution, calibrate_frames};
     #[pymodule_export]
     use crate::centroid::locate_spots;
+    #[pymodule_export]
+    use crate::uncertainty::{error_map, functional_variances};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
