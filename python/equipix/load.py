@@ -15,8 +15,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_OPTIONAL = {"dark": np.floating, "sensitivity_std": np.floating}
-_MAPS = {"sensitivity": np.floating, "flags": np.uint32, "component_labels": np.integer}
+_MAPS: dict[str, type] = {
+    "sensitivity": np.floating,
+    "flags": np.uint32,
+    "component_labels": np.integer,
+}
+_OPTIONAL = {"dark", "sensitivity_std"}
 
 
 def load(path: str | PathLike[str]) -> Calibration:
@@ -39,8 +43,7 @@ def load(path: str | PathLike[str]) -> Calibration:
     """
     pages, content = load_pages(path)
     check_format(path, content, "calibration", FORMAT)
-    optional = {name: kind for name, kind in _OPTIONAL.items() if name in pages}
-    check_pages(path, pages, _MAPS | optional)
+    check_pages(path, pages, _MAPS | {name: np.floating for name in _OPTIONAL & pages.keys()})
     check_pages(path, pages, {"beam": np.floating})
     try:
         return _calibration(pages, content)

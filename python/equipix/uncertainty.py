@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import as_array, check_progress, per_exposure, positive_workers
+from equipix._arrays import as_array, per_exposure, positive_workers
 from equipix.errors import InputError
 from equipix.results import Flag
 

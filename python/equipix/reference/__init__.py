@@ -10,6 +10,7 @@ from equipix.reference.descent import Solution, coordinate_descent
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
+from equipix.reference.uncertainty import covariance
 
 __all__ = [
     "MultiscaleSolution",
@@ -17,6 +18,7 @@ __all__ = [
     "average",
     "components",
     "coordinate_descent",
+    "covariance",
     "exposures",
     "grid_cells",
     "multiscale",
