@@ -43,7 +43,7 @@ def load(path: str | PathLike[str]) -> Calibration:
     """
     pages, content = load_pages(path)
     check_format(path, content, "calibration", FORMAT)
-    check_pages(path, pages, _MAPS | {name: np.floating for name in _OPTIONAL & pages.keys()})
+    check_pages(path, pages, _MAPS | dict.fromkeys(_OPTIONAL & pages.keys(), np.floating))
     check_pages(path, pages, {"beam": np.floating})
     try:
         return _calibration(pages, content)

@@ -318,8 +318,8 @@ def tilt_std(
 
 def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """Standard deviations, one for all or one for each."""
-    array = as_array(name, values, ndim=(0, len(shape))).astype(np.float64)
-    if array.ndim and array.shape != shape:
+    array = as_array(name, values, ndim=(0, 1, len(shape))).astype(np.float64)
+    if array.shape not in ((1,), shape):
         raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
     if not (np.isfinite(array) & (array >= 0)).all():
         raise InputError(f"'{name}' holds values that are not 0 or above")

@@ -43,8 +43,8 @@ def covariance(
     Notes
     -----
     With J the derivatives of √w·c·L·M with respect to (M, L), those of the other components left
-    out, (JᵀJ)⁺ is the covariance in the gauge of least norm. That of mean 1 follows by the projection
-    P = 1 − M·1ᵀ/N onto changes of mean 0.
+    out, (JᵀJ)⁺ is the covariance in the gauge of least norm. That of mean 1 follows by the
+    projection P = 1 − M·1ᵀ/N onto changes of mean 0.
     """
     data = problem(frames, shifts, variance=variance, mask=mask, flux=flux, rotation=rotation)
     known = np.isfinite(sensitivity).ravel()

@@ -40,8 +40,8 @@ const MOST_DRAWS: u64 = 400;
 const LACK_OF_DRAW: f64 = 1e-5;
 /// That of a functional, which is the share of its variance itself.
 const LACK_OF_FUNCTIONAL: f64 = 1e-4;
-/// Iterations that a linear problem may take.
-const MOST_ITERATIONS: u64 = 10_000;
+/// A search that finds no more than this share of what it may lack in ten iterations is at its end.
+const NOTHING: f64 = 1e-2;
 
 /// The standard deviation of M, by pixel.
 #[derive(Clone, Debug)]
@@ -256,12 +256,19 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     fn solve(&mut self, lack: f64, control: &Control) -> Result<()> {
         let Self { search, smallest, .. } = self;
         search.begin(control)?;
-        for iterations in 1..=MOST_ITERATIONS {
-            if !smallest.iterate(search, control)? {
-                break;
-            }
+        let (mut iterations, mut earlier) = (0, 0.0);
+        while smallest.iterate(search, control)? {
+            iterations += 1;
             if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
                 break;
+            }
+            // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
+            // iterations brought tells.
+            if iterations % FEWEST_ITERATIONS == 0 {
+                if search.energy - earlier <= NOTHING * lack * search.energy {
+                    break;
+                }
+                earlier = search.energy;
             }
         }
         Ok(())
