@@ -142,10 +142,20 @@ def functional_std(
 
     Parameters
     ----------
-    measurements, sensitivity, beam, reduced_chi2, workers, progress
-        As for `error_map`.
+    measurements : Measurements
+        What the calibration was made from.
+    sensitivity : ndarray, shape (rows, cols)
+        The solution M, of mean 1.
+    beam : ndarray, shape of the padded grid
+        The solution L.
+    reduced_chi2 : float
+        Of the fit: the variance of a value where none was given.
     weights : ndarray, shape (m, rows, cols)
         Weights of the pixels; 0 where ln M is undetermined.
+    workers : int, optional
+        Number of threads.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then.
 
     Returns
     -------

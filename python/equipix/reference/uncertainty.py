@@ -28,12 +28,14 @@ def covariance(
 
     Parameters
     ----------
-    frames, shifts, variance, mask, flux, rotation : array_like
+    frames, shifts : array_like
         As for `equipix.reference.model.problem`; of the frames only their NaN count.
     sensitivity : ndarray, shape (rows, cols)
         M, of mean 1 over the pixels that are not NaN, which are one component.
     beam : ndarray, shape of the padded grid
         L.
+    variance, mask, flux, rotation : array_like, optional
+        As for `equipix.reference.model.problem`.
 
     Returns
     -------

@@ -3,7 +3,7 @@
 //! At the minimum of F the solution for noise alone is a draw from the covariance of the estimate,
 //! (JᵀWJ)⁻¹, large scales included. To count how far draws of M scatter would take thousands of
 //! them. But given L the pixels are independent, and given M the cells of L are, so that with the
-//! sweep T = D⁻¹ B D_L⁻¹ Bᵀ, of which D⁻¹S = 1 − T (see [`reduced`](crate::reduced)),
+//! sweep T = D⁻¹ B D_L⁻¹ Bᵀ, of which D⁻¹S = 1 − T (see `reduced.rs`),
 //!
 //! ```text
 //! Cov M = D⁻¹ + D⁻¹ B D_L⁻¹ Bᵀ D⁻¹ + T Cov(M) Tᵀ
