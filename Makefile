@@ -23,6 +23,7 @@ figures: $(BIN)/.built-release
 	$(BIN)/python docs/estimate.py
 	$(BIN)/python docs/plan.py
 	$(BIN)/python docs/section3.py
+	$(BIN)/python docs/uncertainty.py
 
 docs:
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps -p equipix-core

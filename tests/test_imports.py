@@ -26,7 +26,7 @@ LAYERS = (
     {"experiment"},
     {"load"},
     {"calibration", "correct_files", "frames", "plan", "shifts", "simulate"},
-    {"_manifest", "_measurements", "_terminal", "correction", "defects", "noise"},
+    {"_manifest", "_measurements", "_terminal", "correction", "defects", "noise", "uncertainty"},
     {"results"},
     {"io"},
     {"_arrays", "_native", "errors"},
@@ -45,6 +45,7 @@ LIBRARIES = {
 
 CHAIN = (
     {"calibrate"},
+    {"uncertainty"},
     {"joint"},
     {"multiscale"},
     {"descent"},
@@ -75,6 +76,7 @@ CRATES = {
     "image": {"io"},
     "numpy": set[str](),
     "pyo3": set[str](),
+    "rand_xoshiro": {"reduced"},
     "rayon": {"parallel"},
     "tiff": {"io"},
 }

@@ -12,7 +12,9 @@ __all__ = [
     "__version__",
     "average_files",
     "calibrate_frames",
+    "error_map",
     "file_format",
+    "functional_variances",
     "locate_spots",
     "planned_components",
     "read_file",
@@ -100,6 +102,33 @@ def calibrate_frames(
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
 ) -> Solution: ...
+def error_map(
+    frames: NDArray[Any],
+    shifts: NDArray[Any],
+    *,
+    rotation: list[int],
+    flux: list[float],
+    variance: NDArray[Any] | None,
+    mask: NDArray[Any] | None,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> tuple[NDArray[Any], int, float]: ...
+def functional_variances(
+    frames: NDArray[Any],
+    shifts: NDArray[Any],
+    *,
+    rotation: list[int],
+    flux: list[float],
+    variance: NDArray[Any] | None,
+    mask: NDArray[Any] | None,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    functionals: NDArray[Any],
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> NDArray[Any]: ...
 def locate_spots(
     before: NDArray[Any],
     after: NDArray[Any],

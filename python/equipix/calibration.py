@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
@@ -38,6 +38,15 @@ from equipix.io import save_pages
 from equipix.noise import smoothed_variances
 from equipix.results import Flag, FrameStatistics
 from equipix.shifts import as_positions, round_shifts
+from equipix.uncertainty import (
+    Measurements,
+    checked_weights,
+    determined,
+    error_map,
+    functional_std,
+    tilt,
+    tilt_weights,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -118,7 +127,15 @@ class Calibration:
     dark : ndarray, shape (rows, cols), or None
         The dark frame in DN, if it is part of the calibration.
     metadata : dict
-        Versions, options and origin, as JSON values.
+        Versions, options and origin, as JSON values; under ``uncertainty`` the draws that
+        `sensitivity_std` was made of, and its relative standard error.
+    sensitivity_std : ndarray, shape (rows, cols), or None
+        Standard deviation of `sensitivity` by noise, large scales included, in the gauge mean 1;
+        NaN where undetermined. In `sensitivity`'s dtype; None unless asked for.
+    tilt_std : ndarray, shape (2,), or None
+        Standard deviation of `tilt` by noise; None unless asked for.
+    measurements : Measurements or None
+        References to what the calibration was made from, for `std_of`; None if read from a file.
     """
 
     sensitivity: NDArray[Any]
@@ -137,6 +154,9 @@ class Calibration:
     history: History
     dark: NDArray[Any] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+    sensitivity_std: NDArray[Any] | None = None
+    tilt_std: NDArray[Any] | None = None
+    measurements: Measurements | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -147,10 +167,98 @@ class Calibration:
     def __repr__(self) -> str:
         """Short form: sizes and how far the solver came."""
         state = "converged" if self.converged else "not converged"
+        std = self.sensitivity_std
+        noise = "" if std is None else f", standard deviation {np.nanmedian(std):.1e}"
         return (
             f"<Calibration of {self.shape[0]} x {self.shape[1]} pixels from {len(self.shifts)} "
-            f"exposures: {state}, error estimate {self.error_estimate:.1e}>"
+            f"exposures: {state}, error estimate {self.error_estimate:.1e}{noise}>"
         )
+
+    @property
+    def tilt(self) -> NDArray[Any]:
+        """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
+
+        Valid are pixels without ``DO_NOT_USE``; NaN where they tell no slope.
+        """
+        return tilt(self.sensitivity, self._valid)
+
+    @property
+    def _valid(self) -> NDArray[np.bool_]:
+        usable = (self.flags & Flag.DO_NOT_USE) == 0
+        return np.asarray(usable & determined(self.sensitivity, self.flags))
+
+    def std_of(
+        self,
+        weights: ArrayLike,
+        *,
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> float | NDArray[Any]:
+        """Standard deviation of Σ weights · ln M by noise, large scales included.
+
+        Parameters
+        ----------
+        weights : array_like, shape (rows, cols) or (m, rows, cols)
+            The weight of each pixel, or a stack of them; 0 where M is undetermined or not above 0.
+        workers : int, optional
+            Number of threads; unless given, as many as processors may be used.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` now and then.
+
+        Returns
+        -------
+        float, or ndarray of shape (m,)
+            One for each image of weights, in the gauge mean(M) = 1.
+
+        Raises
+        ------
+        InputError
+            If this calibration was read from a file, which holds no measurements; if the weights
+            do not fit; or if no variance was given and no residual tells it.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
+
+        Notes
+        -----
+        Errors of pixels are correlated: the variance of a mean over many cannot be had from
+        `sensitivity_std`. With w the weights and g = w/M it is gᵀ S⁻¹ g, S being the reduced normal
+        matrix: one linear problem, about as much work as the calibration. Changes made since to the
+        arrays that were calibrated go unnoticed.
+
+        Examples
+        --------
+        The mean of ln M over the left half, less that over the right:
+
+        >>> import numpy as np
+        >>> import equipix
+        >>> shape = (48, 64)
+        >>> shifts = equipix.cross_pattern(5, 7)
+        >>> beam = equipix.simulate.gaussian_beam(shape)
+        >>> frames = equipix.simulate.exposures(np.ones(shape), beam, shifts)
+        >>> cal = equipix.calibrate(frames, shifts, variance=np.full(5, 1e-6))
+        >>> weights = np.where(np.arange(64) < 32, 1, -1) * np.ones(shape) / (48 * 32)
+        >>> print(f"{cal.std_of(weights):.1e}")
+        8.3e-05
+        """
+        measurements = self.measurements
+        if measurements is None:
+            raise InputError(
+                "this calibration was read from a file, which does not hold the measurements: "
+                "call std_of on the result of calibrate or Experiment.run"
+            )
+        check_progress(progress)
+        stack = checked_weights(weights, determined(self.sensitivity, self.flags))
+        with naming_memory("the standard deviation"):
+            std = functional_std(
+                measurements,
+                self.sensitivity,
+                self.beam,
+                self.reduced_chi2,
+                stack,
+                workers=workers,
+                progress=progress,
+            )
+        return float(std[0]) if np.ndim(weights) == 2 else std
 
     def correct(
         self,
@@ -224,6 +332,8 @@ class Calibration:
         }
         if self.dark is not None:
             pages["dark"] = self.dark
+        if self.sensitivity_std is not None:
+            pages["sensitivity_std"] = self.sensitivity_std
         numbers = {
             "beam_origin": list(self.beam_origin),
             "shifts": self.shifts.tolist(),
@@ -234,6 +344,9 @@ class Calibration:
             "sweeps": self.sweeps,
             "converged": self.converged,
             "error_estimate": self.error_estimate,
+            "tilt_std": None
+            if self.tilt_std is None
+            else [std if np.isfinite(std) else None for std in self.tilt_std.tolist()],
             "history": {
                 "sweep": self.history.sweep.tolist(),
                 "objective": self.history.objective.tolist(),
@@ -264,6 +377,7 @@ def calibrate(
     method: Method = "multiscale",
     tolerance: float = 1e-6,
     max_sweeps: int | None = None,
+    uncertainty: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -314,6 +428,11 @@ def calibrate(
         unless given, as many as it takes. It also ends where rounding keeps the error estimate
         from falling. Passes that only estimate the error
         of coordinate descent are not counted.
+    uncertainty : bool
+        Whether to find `Calibration.sensitivity_std` and `Calibration.tilt_std`, what noise leaves
+        uncertain; takes some ten times as long as the calibration. Without `variance` the scatter
+        of the residuals tells the noise. Between pixels the map is that of the nearest whole
+        shifts, a few per cent too large; errors of fluxes and shifts are not in it.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.
@@ -379,6 +498,11 @@ def calibrate(
     if method not in get_args(Method):
         raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
+    if uncertainty and (isinstance(flux, str) or flux_std is not None or dark == "fit"):
+        raise InputError(
+            "'uncertainty' knows given fluxes and a subtracted dark alone: leave it out where "
+            "'flux' is fitted or has a 'flux_std', or where 'dark' is 'fit'"
+        )
     statistics = as_statistics(frames)
     with naming_memory("calibrating"):
         values = as_values(cast("ArrayLike", frames), statistics)
@@ -429,7 +553,16 @@ def calibrate(
         options["flux"] = flux_model[0]
     if result.shifts_told is not None:
         options["shifts"] = "refined" if result.shifts_told else "as given: the beam tells none"
-    calibration = _wrapped(result, values.dtype, positions)
+    measurements = Measurements(
+        values,
+        np.rint(positions).astype(np.int64),
+        turns.astype(int).tolist(),
+        list(result.flux),
+        variances,
+        masked,
+        result.beam_origin,
+    )
+    calibration = _wrapped(result, values.dtype, positions, measurements)
     calibration.metadata.update(
         versions={"equipix": _native.__version__, "numpy": np.__version__},
         options=options | {"rotation": turns.astype(int).tolist()},
@@ -442,10 +575,44 @@ def calibrate(
     for each in statistics:
         calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
     _warn(calibration, tolerance, result)
+    if uncertainty:
+        calibration = _with_std(calibration, workers, progress)
     return calibration
 
 
-def _wrapped(result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any]) -> Calibration:
+def _with_std(
+    calibration: Calibration, workers: int | None, progress: Progress | None
+) -> Calibration:
+    measurements = calibration.measurements
+    assert measurements is not None
+    sensitivity = calibration.sensitivity
+    with naming_memory("the error map"):
+        std, exactness = error_map(
+            measurements,
+            sensitivity,
+            calibration.beam,
+            calibration.reduced_chi2,
+            workers=workers,
+            progress=progress,
+        )
+    weights = tilt_weights(calibration._valid)
+    tilt_std = np.full(2, np.nan)
+    if np.isfinite(weights).all():
+        tilt_std = np.asarray(calibration.std_of(weights, workers=workers))
+    return replace(
+        calibration,
+        sensitivity_std=std.astype(sensitivity.dtype, copy=False),
+        tilt_std=tilt_std,
+        metadata=calibration.metadata | {"uncertainty": exactness},
+    )
+
+
+def _wrapped(
+    result: _native.Solution,
+    dtype: np.dtype[Any],
+    shifts: NDArray[Any],
+    measurements: Measurements,
+) -> Calibration:
     objective = result.misfit
     freedom = result.degrees_of_freedom
     return Calibration(
@@ -464,6 +631,7 @@ def _wrapped(result: _native.Solution, dtype: np.dtype[Any], shifts: NDArray[Any
         error_estimate=float(result.error_estimate[-1]),
         history=History(result.sweeps, result.objective, result.error_estimate),
         dark=None if result.offset is None else result.offset.astype(dtype, copy=False),
+        measurements=measurements,
     )
 
 

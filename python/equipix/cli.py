@@ -45,6 +45,9 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
 Tolerance = Annotated[float, typer.Option(help="Largest relative error of the sensitivity.")]
 MaxSweeps = Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")]
+Uncertainty = Annotated[
+    bool, typer.Option("--uncertainty", help="Find the standard deviation of every pixel.")
+]
 Saturation = Annotated[
     float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
 ]
@@ -96,6 +99,7 @@ def calibrate(
     ] = None,
     tolerance: Tolerance = 1e-6,
     max_sweeps: MaxSweeps = None,
+    uncertainty: Uncertainty = False,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
@@ -110,6 +114,7 @@ def calibrate(
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,
+            uncertainty=uncertainty,
             workers=workers,
             progress=progress,
         )
@@ -142,12 +147,27 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         "shape": list(calibration.shape),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
         "spread": float(np.nanstd(sensitivity, dtype=np.float64)),
+        **_uncertainty(calibration),
         "converged": calibration.converged,
         "error_estimate": calibration.error_estimate,
         "sweeps": calibration.sweeps,
         "reduced_chi2": calibration.reduced_chi2,
         "components": calibration.components,
         "flagged_pixels": flagged,
+    }
+
+
+def _uncertainty(calibration: Calibration) -> dict[str, Any]:
+    """What noise leaves uncertain, if it was asked for, and how exact that is."""
+    std, tilt_std = calibration.sensitivity_std, calibration.tilt_std
+    if std is None or tilt_std is None:
+        return {}
+    exactness = calibration.metadata["uncertainty"]["relative_standard_error"]
+    return {
+        "sensitivity_std": float(np.nanmedian(std)),
+        "sensitivity_std_is_exact_to": exactness,
+        "tilt": dict(zip(("rows", "cols"), calibration.tilt.tolist(), strict=True)),
+        "tilt_std": dict(zip(("rows", "cols"), tilt_std.tolist(), strict=True)),
     }
 
 

@@ -167,6 +167,7 @@ class Experiment:
         method: Method = "multiscale",
         tolerance: float = 1e-6,
         max_sweeps: int | None = None,
+        uncertainty: bool = False,
         workers: int | None = None,
         progress: Progress | None = None,
     ) -> Calibration:
@@ -183,6 +184,8 @@ class Experiment:
             Largest relative error of the sensitivity at which the solver stops.
         max_sweeps : int, optional
             Most passes over the data.
+        uncertainty : bool
+            Whether to find the standard deviation of every pixel and of the tilt.
         workers : int, optional
             Number of threads; by default one for each processor.
         progress : callable, optional
@@ -236,6 +239,7 @@ class Experiment:
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,
+            uncertainty=uncertainty,
             workers=workers,
             progress=progress,
         )

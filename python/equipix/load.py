@@ -15,7 +15,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_MAPS = {"sensitivity": np.floating, "flags": np.uint32, "component_labels": np.integer}
+_MAPS: dict[str, type] = {
+    "sensitivity": np.floating,
+    "flags": np.uint32,
+    "component_labels": np.integer,
+}
+_OPTIONAL = {"dark", "sensitivity_std"}
 
 
 def load(path: str | PathLike[str]) -> Calibration:
@@ -38,7 +43,7 @@ def load(path: str | PathLike[str]) -> Calibration:
     """
     pages, content = load_pages(path)
     check_format(path, content, "calibration", FORMAT)
-    check_pages(path, pages, _MAPS | {"dark": np.floating} if "dark" in pages else _MAPS)
+    check_pages(path, pages, _MAPS | dict.fromkeys(_OPTIONAL & pages.keys(), np.floating))
     check_pages(path, pages, {"beam": np.floating})
     try:
         return _calibration(pages, content)
@@ -50,7 +55,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
     numbers = content["calibration"]
     history = numbers["history"]
     row, col = numbers["beam_origin"]
-    chi2 = numbers["reduced_chi2"]
+    chi2, tilt_std = numbers["reduced_chi2"], numbers.get("tilt_std")
     return Calibration(
         sensitivity=pages["sensitivity"],
         beam=pages["beam"],
@@ -72,4 +77,6 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         ),
         dark=pages.get("dark"),
         metadata=content["metadata"],
+        sensitivity_std=pages.get("sensitivity_std"),
+        tilt_std=None if tilt_std is None else np.array(tilt_std, dtype=np.float64),
     )

@@ -11,6 +11,7 @@ from equipix.reference.joint import JointSolution, joint
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
+from equipix.reference.uncertainty import covariance
 
 __all__ = [
     "JointSolution",
@@ -19,6 +20,7 @@ __all__ = [
     "average",
     "components",
     "coordinate_descent",
+    "covariance",
     "exposures",
     "grid_cells",
     "joint",

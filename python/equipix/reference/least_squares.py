@@ -58,13 +58,39 @@ def solve_dense(
 
 def _step(data: Problem, sensitivity: NDArray[Any], beam: NDArray[Any]) -> NDArray[Any]:
     """Solve √w·(c·L·δM + c·M·δL) = √w·(y − c·L·M) for (δM, δL), of least norm."""
+    rows, exposure, pixel = gradient(data, sensitivity, beam)
+    root = np.sqrt(data.weights.reshape(len(data.weights), -1)[exposure, pixel])
+    residual = data.values - exposures(sensitivity, beam, data.flux, data.cells)
+    wanted = root * residual.reshape(len(residual), -1)[exposure, pixel]
+    return np.asarray(np.linalg.lstsq(rows, wanted, rcond=1e-12)[0])
+
+
+def gradient(
+    data: Problem, sensitivity: NDArray[Any], beam: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Derivatives of √w·c·L·M with respect to all M, then all L, of each used measurement.
+
+    Parameters
+    ----------
+    data : Problem
+        The measurements.
+    sensitivity : ndarray, shape (rows, cols)
+        M.
+    beam : ndarray, shape of the padded grid
+        L.
+
+    Returns
+    -------
+    rows : ndarray, shape (measurements, pixels + cells)
+        The derivatives.
+    exposure, pixel : ndarray of int, shape (measurements,)
+        Which measurement a row belongs to.
+    """
     exposure, pixel = np.nonzero((data.weights > 0).reshape(len(data.weights), -1))
     root = np.sqrt(data.weights.reshape(len(data.weights), -1)[exposure, pixel])
     cell = data.cells.reshape(len(data.cells), -1)[exposure, pixel]
-    gradient = np.zeros((len(root), sensitivity.size + beam.size))
+    result = np.zeros((len(root), sensitivity.size + beam.size))
     rows = np.arange(len(root))
-    gradient[rows, pixel] = root * data.flux[exposure] * beam.flat[cell]
-    gradient[rows, sensitivity.size + cell] = root * data.flux[exposure] * sensitivity.flat[pixel]
-    residual = data.values - exposures(sensitivity, beam, data.flux, data.cells)
-    wanted = root * residual.reshape(len(residual), -1)[exposure, pixel]
-    return np.asarray(np.linalg.lstsq(gradient, wanted, rcond=1e-12)[0])
+    result[rows, pixel] = root * data.flux[exposure] * beam.flat[cell]
+    result[rows, sensitivity.size + cell] = root * data.flux[exposure] * sensitivity.flat[pixel]
+    return result, exposure, pixel

@@ -23,7 +23,7 @@ const ROUNDING: f64 = 4.0 * f64::EPSILON;
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
 pub(crate) struct Search<'m, 'a, T> {
     workers: &'m Workers,
-    reduced: Reduced<'m, 'a, T>,
+    pub(crate) reduced: Reduced<'m, 'a, T>,
     two_level: TwoLevel<'m>,
     /// b − S x.
     pub(crate) residual: Vec<f32>,
@@ -34,6 +34,8 @@ pub(crate) struct Search<'m, 'a, T> {
     square: f64,
     /// The largest size of P⁻¹ r, in the units of M.
     largest: f64,
+    /// x · b, which rises to b · S⁻¹ b: the sum of a r · P⁻¹ r over the steps.
+    pub(crate) energy: f64,
     pub(crate) ritz: Ritz,
 }
 
@@ -53,6 +55,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
             product,
             square: 0.0,
             largest: 0.0,
+            energy: 0.0,
             ritz: Ritz::default(),
         }
     }
@@ -68,12 +71,34 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         beams: &[Vec<f64>],
         control: &Control,
     ) -> Result<()> {
+        self.linearise(sensitivity, beams, control)?;
+        self.begin(control)
+    }
+
+    /// Takes S at M and L, and the preconditioner unless there is one.
+    ///
+    /// # Errors
+    /// As [`start`](Self::start).
+    pub(crate) fn linearise(
+        &mut self,
+        sensitivity: &[f64],
+        beams: &[Vec<f64>],
+        control: &Control,
+    ) -> Result<()> {
         self.reduced.linearise(sensitivity, beams, control)?;
-        self.two_level.prepare(&self.reduced, control)?;
+        self.two_level.prepare(&self.reduced, control)
+    }
+
+    /// Starts from x = 0, where the residual is b, with the S that there is.
+    ///
+    /// # Errors
+    /// As [`start`](Self::start).
+    pub(crate) fn begin(&mut self, control: &Control) -> Result<()> {
         self.workers.fill(&mut self.x, 0.0, control);
         self.workers.fill(&mut self.direction, 0.0, control);
         self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
+        self.energy = 0.0;
         self.square = self.descend(0.0);
         control.check()?;
         self.largest = self.turn(0.0, 0.0);
@@ -98,6 +123,7 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
         }
         let square = self.descend(step);
         control.check()?;
+        self.energy += step * self.square;
         let keep = square / self.square;
         self.square = square;
         self.largest = self.turn(step, keep);
@@ -119,6 +145,12 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
     /// The largest relative size of P⁻¹ r.
     pub(crate) fn largest(&self) -> f64 {
         self.relative(self.largest)
+    }
+
+    /// The error of x, squared in the norm of S, is at most this over the smallest eigenvalue of
+    /// P⁻¹S: r · P⁻¹ r.
+    pub(crate) fn square(&self) -> f64 {
+        self.square.max(0.0)
     }
 
     /// The largest relative size of the step found so far.

@@ -135,6 +135,13 @@ impl Smallest {
         search.found() + self.left(search)
     }
 
+    /// The share of b · S⁻¹ b that x · b lacks, at most: what is left is e · S e with e = S⁻¹ r, no more
+    /// than r · P⁻¹ r over the smallest eigenvalue of P⁻¹S.
+    pub(crate) fn lack<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+        let left = search.square() / self.value;
+        left / (search.energy + left)
+    }
+
     /// What is left of the error once the step that `search` has found is made.
     pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
         search.largest() / self.value

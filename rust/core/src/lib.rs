@@ -24,6 +24,7 @@
 //!
 //! ```text
 //! calibrate       from measurements to a Solution: method, gauge, flags
+//! uncertainty     how far noise may have moved M
 //! joint           the joint fit of beam, fluxes and shifts, with the pixels eliminated
 //! multiscale      the fast solver: Gauss-Newton steps on all scales at once
 //! descent         coordinate descent, the method of the paper
@@ -133,5 +134,6 @@ pub mod parts;
 mod precondition;
 mod reduced;
 pub mod statistics;
+pub mod uncertainty;
 
 pub use error::{Error, Result};

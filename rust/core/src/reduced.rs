@@ -18,6 +18,7 @@
 //! makes good what the one before left by rounding (iterative refinement).
 
 mod kernel;
+mod noise;
 
 use crate::control::Control;
 use crate::error::Result;
@@ -79,7 +80,7 @@ impl Padding {
     }
 
     /// Writes `values`, rows of `cols`, to an image.
-    fn copy(
+    pub(crate) fn copy(
         &self,
         values: &[f64],
         cols: usize,
@@ -95,6 +96,11 @@ impl Padding {
                 }
             }
         });
+    }
+
+    /// As [`body_mut`](Self::body_mut), to read.
+    pub(crate) fn body<'i>(&self, image: &'i [f32]) -> &'i [f32] {
+        &image[self.lead..image.len() - self.lead]
     }
 
     /// A row of `image`.
@@ -117,7 +123,7 @@ impl Padding {
 pub(crate) struct Reduced<'m, 'a, T> {
     model: &'m Model<'a, T>,
     workers: &'m Workers,
-    scale: Scale,
+    pub(crate) scale: Scale,
     pub(crate) padding: Padding,
     /// M.
     pub(crate) sensitivity: Vec<f32>,
@@ -175,6 +181,11 @@ impl Scale {
     pub(crate) fn slope(&self) -> f64 {
         1.0 / (self.weight * self.light * self.light)
     }
+
+    /// The standard deviation of an M where that of the linear problem is 1.
+    pub(crate) fn deviation(&self) -> f64 {
+        self.slope().sqrt()
+    }
 }
 
 impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
@@ -231,7 +242,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         product: &mut [f32],
         control: &Control,
     ) -> Result<f64> {
-        self.hide(x, control);
+        self.hide(Shown::Step(x), control);
         let (padding, rows) = (self.padding, self.model.sensor().rows);
         let bands = self.workers.map_blocks(
             padding.body_mut(product),
@@ -258,8 +269,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         Ok(bands.into_iter().sum())
     }
 
-    /// The first half of a product: h, in each view.
-    fn hide(&mut self, x: &[f32], control: &Control) {
+    /// The first half of a product: h, in each view, of what the pixels show.
+    fn hide(&mut self, shown: Shown<'_>, control: &Control) {
         let mut hidden = std::mem::take(&mut self.hidden);
         let padding = self.padding;
         if let [hidden] = &mut hidden[..] {
@@ -271,21 +282,24 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                     if control.is_cancelled() {
                         return;
                     }
-                    let lines = self.cell_lines(0, band * BAND + index, x, &mut scratch);
+                    let lines = self.cell_lines(0, band * BAND + index, shown, &mut scratch);
                     let arch = pulp::Arch::new();
                     arch.dispatch(Gather { lines: &lines, signal, weight: &mut weight });
+                    if let Shown::Weight = shown {
+                        signal.fill(1.0);
+                    }
                     arch.dispatch(Divide { signal, weight: &weight });
                 }
             });
         } else {
-            self.hide_turned(x, &mut hidden, control);
+            self.hide_turned(shown, &mut hidden, control);
         }
         self.hidden = hidden;
     }
 
     /// h where exposures are turned against each other: the sums of each view are brought together
     /// on the beam grid and turned into each view.
-    fn hide_turned(&self, x: &[f32], hidden: &mut [Vec<f32>], control: &Control) {
+    fn hide_turned(&self, shown: Shown<'_>, hidden: &mut [Vec<f32>], control: &Control) {
         let (padding, views) = (self.padding, &self.model.geometry.views);
         let gathered = |(index, view): (usize, &View)| {
             let mut signal = padding.zeros(view.shape.rows, self.workers, control);
@@ -300,7 +314,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                     if control.is_cancelled() {
                         return;
                     }
-                    let lines = self.cell_lines(index, band * BAND + row, x, &mut scratch);
+                    let lines = self.cell_lines(index, band * BAND + row, shown, &mut scratch);
                     pulp::Arch::new().dispatch(Gather { lines: &lines, signal, weight });
                 }
             });
@@ -319,6 +333,9 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                         let (row, col) = (place / view.shape.cols, place % view.shape.cols);
                         signal += padding.row(&sums.0, row)[col];
                         weight += padding.row(&sums.1, row)[col];
+                    }
+                    if let Shown::Weight = shown {
+                        signal = 1.0;
                     }
                     *cell = if weight > 0.0 { signal / weight } else { 0.0 };
                 }
@@ -387,6 +404,13 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         }
     }
 
+    /// The pixels that have left the system, each with its 1/D; 0 where that is none.
+    pub(crate) fn left_out_variances(&self) -> impl Iterator<Item = (usize, f64)> {
+        let (width, cols) = (self.padding.width, self.model.sensor().cols);
+        let pixel = move |place: usize| place / width * cols + place % width;
+        self.left_out.iter().map(move |out| (pixel(out.place), f64::from(out.inverse)))
+    }
+
     /// The pixels that have left the system, with the step to the closed form of their M.
     pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
         let (width, cols) = (self.padding.width, self.model.sensor().cols);
@@ -404,7 +428,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     ) {
         let place = &self.model.geometry.exposures[exposure];
         let Some(pixel_row) = self.row_seeing(place, row) else { return };
-        let weight = self.weight(exposure, pixel_row, &mut scratch.of_exposures[exposure]);
+        let scratch = &mut scratch.of_exposures[exposure].weight;
+        let weight = self.weight(exposure, pixel_row, scratch);
         let line = Line {
             weight: weight.before(&self.padding, place.col),
             first: self.padding.row_before(&self.sensitivity, pixel_row, place.col),
@@ -418,12 +443,12 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         row.checked_sub(place.row).filter(|&row| row < self.model.sensor().rows)
     }
 
-    /// The exposures that see a row of cells, with M and `x` of the pixels that do.
+    /// The exposures that see a row of cells, with M of the pixels that do and what they show.
     fn cell_lines<'s>(
         &'s self,
         view: usize,
         row: usize,
-        x: &'s [f32],
+        shown: Shown<'s>,
         scratch: &'s mut Scratch,
     ) -> Vec<Line<'s>> {
         let places = self.model.geometry.exposures.iter().enumerate();
@@ -432,12 +457,18 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             .filter(|((_, place), _)| place.view == view)
             .filter_map(|((exposure, place), scratch)| {
                 let pixel_row = self.row_seeing(place, row)?;
-                let weight = self.weight(exposure, pixel_row, scratch);
-                Some(Line {
-                    weight: weight.before(&self.padding, place.col),
-                    first: self.padding.row_before(&self.sensitivity, pixel_row, place.col),
-                    second: self.padding.row_before(x, pixel_row, place.col),
-                })
+                let ExposureScratch { weight, noise } = scratch;
+                let weight = self.weight(exposure, pixel_row, weight);
+                let first = self.padding.row_before(&self.sensitivity, pixel_row, place.col);
+                let second = match shown {
+                    Shown::Step(x) => self.padding.row_before(x, pixel_row, place.col),
+                    Shown::Noise(draw) => {
+                        let row = self.noise([draw, exposure as u64], pixel_row, weight, noise);
+                        &row[self.padding.lead - place.col..][..self.padding.width]
+                    }
+                    Shown::Weight => first,
+                };
+                Some(Line { weight: weight.before(&self.padding, place.col), first, second })
             })
             .collect()
     }
@@ -450,7 +481,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             .map(|((exposure, place), scratch)| {
                 let view_row = row + place.row;
                 Line {
-                    weight: self.weight(exposure, row, scratch).at(&self.padding),
+                    weight: self.weight(exposure, row, &mut scratch.weight).at(&self.padding),
                     first: self.padding.row_from(&self.light[place.view], view_row, place.col),
                     second: self.padding.row_from(&self.hidden[place.view], view_row, place.col),
                 }
@@ -463,7 +494,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         &self,
         exposure: usize,
         row: usize,
-        scratch: &'s mut ExposureScratch,
+        scratch: &'s mut WeightScratch,
     ) -> RowWeight<'s> {
         let factor = self.model.flux[exposure].powi(2) / self.scale.weight;
         if let Some(weight) = self.model.uniform_weight(exposure) {
@@ -492,11 +523,29 @@ pub(crate) struct Scratch {
 
 #[derive(Clone, Default)]
 struct ExposureScratch {
+    weight: WeightScratch,
+    noise: Vec<f32>,
+}
+
+#[derive(Clone, Default)]
+struct WeightScratch {
     double: Vec<f64>,
     padded: Vec<f32>,
 }
 
+/// What the pixels of each exposure show to the cells that they see.
+#[derive(Clone, Copy)]
+enum Shown<'x> {
+    /// The step x.
+    Step(&'x [f32]),
+    /// The noise of a draw, in place of M h.
+    Noise(u64),
+    /// Nothing: in place of h stands 1/Σ w c² M².
+    Weight,
+}
+
 /// Weights of a row of pixels.
+#[derive(Clone, Copy)]
 enum RowWeight<'s> {
     Same(f32),
     /// With zeros before and after.

@@ -194,7 +194,7 @@ pub(crate) fn rotation(degrees: i64) -> Result<Rotation> {
     })
 }
 
-fn stack<'a, T: Element + Real>(
+pub(crate) fn stack<'a, T: Element + Real>(
     argument: &'static str,
     array: &'a PyReadonlyArray3<'_, T>,
 ) -> PyResult<Stack<'a, T>> {
@@ -204,7 +204,9 @@ fn stack<'a, T: Element + Real>(
     stack.map_err(|error| errors::exception(array.py(), &error))
 }
 
-fn by_exposure<'a, T>(variance: Option<&'a PyVariance<'_>>) -> PyResult<Variance<'a, T>> {
+pub(crate) fn by_exposure<'a, T>(
+    variance: Option<&'a PyVariance<'_>>,
+) -> PyResult<Variance<'a, T>> {
     match variance {
         Some(PyVariance::Exposures(values)) => Ok(Variance::Exposures(values.as_slice()?)),
         Some(_) => Err(pyo3::exceptions::PyTypeError::new_err("variance: not the frames' dtype")),

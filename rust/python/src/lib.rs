@@ -12,6 +12,7 @@ mod centroid;
 mod errors;
 mod plan;
 mod run;
+mod uncertainty;
 
 use pyo3::prelude::*;
 
@@ -29,6 +30,8 @@ mod _native {
     use crate::centroid::locate_spots;
     #[pymodule_export]
     use crate::plan::planned_components;
+    #[pymodule_export]
+    use crate::uncertainty::{error_map, functional_variances};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

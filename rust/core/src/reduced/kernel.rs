@@ -157,3 +157,87 @@ impl pulp::NullaryFnOnce for Weigh<'_, '_> {
         }
     }
 }
+
+/// ±1/√w along a row, 0 where w is 0: noise of variance 1/w whose signs are given bit by bit.
+pub(super) struct Sign<'l, 's> {
+    pub(super) weight: Weight<'s>,
+    pub(super) signs: &'l [u32],
+    pub(super) noise: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Sign<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let chunks = self.noise.as_chunks_mut::<LANES>().0.iter_mut().zip(self.signs);
+        for (index, (noise, &signs)) in chunks.enumerate() {
+            let w = self.weight.chunk(index);
+            for i in 0..LANES {
+                let size = if w[i] > 0.0 { 1.0 / w[i].sqrt() } else { 0.0 };
+                let sign = (signs << i) & (1 << 31);
+                noise[i] = f32::from_bits(size.to_bits() | sign);
+            }
+        }
+    }
+}
+
+/// The right-hand side that noise e makes: b = Σ w c² L (e − M h), from lines of L² and h. The sign
+/// of L is lost: it turns all noise of one cell, which is as likely either way.
+pub(super) struct NoiseSlope<'l, 's> {
+    pub(super) lines: &'l [Line<'s>],
+    pub(super) noise: &'l [&'s [f32]],
+    pub(super) sensitivity: &'l [f32],
+    pub(super) slope: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for NoiseSlope<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (index, slope) in self.slope.as_chunks_mut().0.iter_mut().enumerate() {
+            let m = chunk(self.sensitivity, index);
+            let mut sum = [0.0; LANES];
+            for (line, noise) in self.lines.iter().zip(self.noise) {
+                let (w, light) = (line.weight.chunk(index), chunk(line.first, index));
+                let (h, e) = (chunk(line.second, index), chunk(noise, index));
+                for i in 0..LANES {
+                    sum[i] += w[i] * light[i].sqrt() * (e[i] - m[i] * h[i]);
+                }
+            }
+            *slope = sum;
+        }
+    }
+}
+
+/// 1/D + Σ (w c² L M / D)² v, from lines of L² and of the variance v of a cell's L.
+pub(super) struct TwoTerms<'l, 's> {
+    pub(super) lines: &'l [Line<'s>],
+    pub(super) sensitivity: &'l [f32],
+    pub(super) inverse_diagonal: &'l [f32],
+    pub(super) variance: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for TwoTerms<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (index, variance) in self.variance.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+            let (m, d) = (chunk(self.sensitivity, index), chunk(self.inverse_diagonal, index));
+            let mut sum = [0.0; LANES];
+            for line in self.lines {
+                let (w, light) = (line.weight.chunk(index), chunk(line.first, index));
+                let v = chunk(line.second, index);
+                for i in 0..LANES {
+                    let share = w[i] * m[i] * d[i];
+                    sum[i] += share * share * light[i] * v[i];
+                }
+            }
+            for i in 0..LANES {
+                variance[i] = d[i] + sum[i];
+            }
+        }
+    }
+}

@@ -1,0 +1,348 @@
+"""What noise, lamp drift and errors of the shifts leave uncertain in a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix import _native
+from equipix._arrays import as_array, per_exposure, positive_workers
+from equipix.errors import InputError
+from equipix.results import Flag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike, NDArray
+
+    Floats = NDArray[np.float64]
+    Progress = Callable[[int, int, str], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What a calibration was made from, in the compiled part's shapes.
+
+    Attributes
+    ----------
+    frames : ndarray, shape (n, rows, cols)
+        Values; what is not finite is not used.
+    shifts : ndarray, shape (n, 2), int64
+        Whole-pixel shifts (row, col).
+    rotation : list of int
+        Rotation of each exposure, in degrees.
+    flux : list of float
+        Relative flux of each exposure.
+    variance : ndarray, shape (n,) or (n, rows, cols), or None
+        Variance of the values; None: all weights are 1.
+    mask : ndarray of bool, shape (rows, cols) or (n, rows, cols), or None
+        True = do not use.
+    beam_origin : tuple of int
+        The cell of the beam's grid that the sensor's first pixel sees at shift 0.
+    """
+
+    frames: NDArray[Any]
+    shifts: NDArray[np.int64]
+    rotation: list[int]
+    flux: list[float]
+    variance: NDArray[Any] | None
+    mask: NDArray[np.bool_] | None
+    beam_origin: tuple[int, int]
+
+    def arguments(self, sensitivity: NDArray[Any], beam: NDArray[Any]) -> dict[str, Any]:
+        """The keywords of the compiled part at a solution M and L."""
+        return {
+            "frames": self.frames,
+            "shifts": self.shifts,
+            "rotation": self.rotation,
+            "flux": self.flux,
+            "variance": self.variance,
+            "mask": self.mask,
+            "sensitivity": np.ascontiguousarray(sensitivity, np.float64),
+            "beam": self._seen(beam),
+        }
+
+    def _seen(self, beam: NDArray[Any]) -> NDArray[Any]:
+        """The beam on the grid of whole shifts; that of a spline is somewhat wider."""
+        rows, cols = self.frames.shape[1:]
+        sizes = [(cols, rows) if turn in (90, 270) else (rows, cols) for turn in self.rotation]
+        low = np.minimum(self.shifts.min(axis=0), 0)
+        high = np.maximum((self.shifts + sizes).max(axis=0), (rows, cols))
+        (top, left), (bottom, right) = np.add([low, high], self.beam_origin)
+        return np.ascontiguousarray(beam[top:bottom, left:right])
+
+    def scale(self, reduced_chi2: float) -> float:
+        """What standard deviations of unit weights are multiplied by.
+
+        Raises
+        ------
+        InputError
+            If no variance was given and none can be told from the residuals.
+        """
+        if self.variance is not None:
+            return 1.0
+        if not np.isfinite(reduced_chi2):
+            raise InputError(
+                "'variance' is None and no residual tells the noise, since there are no more "
+                "measurements than unknowns: give the variance of the values"
+            )
+        return float(np.sqrt(reduced_chi2))
+
+
+def error_map(
+    measurements: Measurements,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    reduced_chi2: float,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[Floats, dict[str, Any]]:
+    """Standard deviation of M in every pixel, and how exact it is.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        What the calibration was made from.
+    sensitivity : ndarray, shape (rows, cols)
+        The solution M, of mean 1.
+    beam : ndarray, shape of the padded grid
+        The solution L.
+    reduced_chi2 : float
+        Of the fit: the variance of a value where none was given.
+    workers : int, optional
+        Number of threads.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then.
+
+    Returns
+    -------
+    std : ndarray, shape (rows, cols), float64
+        Standard deviation of M in the gauge mean 1; NaN where M is undetermined.
+    exactness : dict
+        ``draws``, and ``relative_standard_error`` of the map, root mean square over the pixels.
+
+    Notes
+    -----
+    Given L the pixels are independent, and given M the cells of L, so two terms of the variance
+    are exact; the third, a fifth of the whole with five exposures, is the mean square over draws:
+    solutions of the linearised problem for noise alone. There are as many draws as bring the
+    relative standard error to 2 %.
+    """
+    std, draws, exactness = _native.error_map(
+        **measurements.arguments(sensitivity, beam),
+        workers=positive_workers(workers),
+        progress=progress,
+    )
+    std *= measurements.scale(reduced_chi2)
+    return std, {"draws": draws, "relative_standard_error": exactness}
+
+
+def functional_std(
+    measurements: Measurements,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    reduced_chi2: float,
+    weights: NDArray[Any],
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Floats:
+    """Standard deviation of the sum of weights · ln M, for each of a stack of weights.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        What the calibration was made from.
+    sensitivity : ndarray, shape (rows, cols)
+        The solution M, of mean 1.
+    beam : ndarray, shape of the padded grid
+        The solution L.
+    reduced_chi2 : float
+        Of the fit: the variance of a value where none was given.
+    weights : ndarray, shape (m, rows, cols)
+        Weights of the pixels; 0 where ln M is undetermined.
+    workers : int, optional
+        Number of threads.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then.
+
+    Returns
+    -------
+    ndarray, shape (m,), float64
+        The standard deviations.
+
+    Notes
+    -----
+    With g = weights/M the variance is gᵀ S⁻¹ g, in the gauge mean(M) = 1: the solution of one
+    linear problem, to 1e-4 of the variance.
+    """
+    functionals = np.divide(weights, sensitivity, where=weights != 0, out=np.zeros(weights.shape))
+    variances = _native.functional_variances(
+        **measurements.arguments(sensitivity, beam),
+        functionals=functionals,
+        workers=positive_workers(workers),
+        progress=progress,
+    )
+    return np.asarray(np.sqrt(variances) * measurements.scale(reduced_chi2))
+
+
+def checked_weights(weights: ArrayLike, determined: NDArray[np.bool_]) -> Floats:
+    """Weights of a functional as (m, rows, cols), 0 wherever ln M is undetermined.
+
+    Parameters
+    ----------
+    weights : array_like, shape (rows, cols) or (m, rows, cols)
+        Weights of the pixels.
+    determined : ndarray of bool, shape (rows, cols)
+        Where ln M is known.
+
+    Returns
+    -------
+    ndarray, shape (m, rows, cols), float64
+        The weights.
+
+    Raises
+    ------
+    InputError
+        If they do not fit the sensor, or are not finite, or not 0 in such a pixel.
+    """
+    array = as_array("weights", weights, ndim=(2, 3)).astype(np.float64, copy=False)
+    if array.shape[-2:] != determined.shape:
+        raise InputError(f"'weights' has shape {array.shape}, the sensor {determined.shape}")
+    if not np.isfinite(array).all():
+        raise InputError("'weights' holds values that are not finite")
+    stack = array.reshape(-1, *determined.shape)
+    wrong = (stack != 0).any(axis=0) & ~determined
+    if wrong.any():
+        row, col = np.argwhere(wrong)[0].tolist()
+        raise InputError(
+            f"'weights' is not 0 in {np.count_nonzero(wrong)} pixels whose ln M is undetermined, "
+            f"the first at ({row}, {col}): set it to 0 there"
+        )
+    return stack
+
+
+def determined(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where ln M is known: M is above 0, and its measurements carry weight."""
+    weak = (flags & Flag.UNRELIABLE_FLAT) != 0
+    return np.asarray((sensitivity > 0) & ~weak)
+
+
+def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
+    """Weights whose sums with ln M are its least-squares slopes, edge to edge.
+
+    Parameters
+    ----------
+    valid : ndarray of bool, shape (rows, cols)
+        The pixels that count; at least three, not in one line.
+
+    Returns
+    -------
+    ndarray, shape (2, rows, cols), float64
+        For the slopes along rows and columns, each times the size of the sensor along it. NaN
+        where the valid pixels tell no slope.
+    """
+    count = max(int(np.count_nonzero(valid)), 1)
+    coordinates = np.indices(valid.shape) / np.reshape(valid.shape, (2, 1, 1))
+    means = np.sum(coordinates, axis=(1, 2), where=valid) / count
+    centred = np.where(valid, coordinates - means[:, None, None], 0)
+    normal = np.einsum("arc,brc->ab", centred, centred)
+    if np.linalg.matrix_rank(normal, tol=1e-12 * count) < 2:
+        return np.full((2, *valid.shape), np.nan)
+    return np.asarray(np.einsum("ab,brc->arc", np.linalg.inv(normal), centred))
+
+
+def tilt(sensitivity: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+    """Least-squares slope of ln M over valid pixels, edge to edge, (row, col).
+
+    Parameters
+    ----------
+    sensitivity : ndarray, shape (rows, cols)
+        M.
+    valid : ndarray of bool, shape (rows, cols)
+        The pixels that count.
+
+    Returns
+    -------
+    ndarray, shape (2,), float64
+        How much ln M grows from one edge of the sensor to the other.
+    """
+    logarithm = np.log(sensitivity, where=valid, out=np.zeros(valid.shape))
+    return np.asarray(np.einsum("arc,rc->a", tilt_weights(valid), logarithm))
+
+
+def tilt_std(
+    shifts: ArrayLike,
+    shape: tuple[int, int],
+    *,
+    flux_std: ArrayLike | None = None,
+    shift_std: ArrayLike | None = None,
+    beam_slope: ArrayLike = (0.0, 0.0),
+) -> Floats:
+    r"""Standard deviation of the tilt that errors of fluxes and shifts cause.
+
+    Parameters
+    ----------
+    shifts : array_like, shape (n, 2)
+        Shifts (row, col) in pixels, all exposures turned alike.
+    shape : tuple of int
+        Sizes of the sensor (rows, cols).
+    flux_std : array_like, shape () or (n,), optional
+        Relative standard deviation of the flux of each exposure.
+    shift_std : array_like, shape () or (n, 2), optional
+        Standard deviation of each shift, in pixels.
+    beam_slope : array_like, shape (2,)
+        Mean slope (row, col) of ln L over the sensor, per pixel: what makes an error of a shift
+        look like one of the flux.
+
+    Returns
+    -------
+    ndarray, shape (2,), float64
+        Standard deviation of the slope of ln M, edge to edge, (row, col); infinite along an axis
+        that the shifts leave open.
+
+    Notes
+    -----
+    An error of ln c that is affine in the shifts, a + s·d, leaves no residual: it becomes the tilt
+    s of ln M. Of independent errors ε_k that part is the least-squares one, with D the shifts less
+    their mean
+
+    .. math:: \mathrm{Cov}(s) = (D^T D)^{-1} D^T \mathrm{diag}(ε_k^2) D (D^T D)^{-1},
+
+    which is (ε²/n) times the inverse covariance of the shifts where all ε are equal. An error δ of
+    a shift counts as one of ln c by δ·∇ln L.
+
+    Examples
+    --------
+    >>> import equipix
+    >>> from equipix.uncertainty import tilt_std
+    >>> rows, cols = tilt_std(equipix.cross_pattern(11, 19), (582, 782), flux_std=1e-4)
+    >>> print(f"{rows:.1e} {cols:.1e}")
+    4.2e-03 5.6e-03
+    """
+    positions = as_array("shifts", shifts, ndim=2).astype(np.float64)
+    count = len(positions)
+    variance = np.zeros(count)
+    if flux_std is not None:
+        variance += np.square(_each("flux_std", flux_std, (count,)))
+    if shift_std is not None:
+        slope = per_exposure("beam_slope", beam_slope, 2, default=0)
+        variance += np.square(_each("shift_std", shift_std, (count, 2)) * slope).sum(axis=1)
+    centred = positions - positions.mean(axis=0)
+    if np.linalg.matrix_rank(centred) < 2:
+        return np.full(2, np.inf)
+    fit = np.linalg.pinv(centred)
+    return np.asarray(np.sqrt(np.square(fit) @ variance) * shape)
+
+
+def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Standard deviations, one for all or one for each."""
+    array = as_array(name, values, ndim=(0, 1, len(shape))).astype(np.float64)
+    if array.shape not in ((1,), shape):
+        raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
+    if not (np.isfinite(array) & (array >= 0)).all():
+        raise InputError(f"'{name}' holds values that are not 0 or above")
+    return np.broadcast_to(array, shape)
