@@ -399,8 +399,9 @@ class TestBudget:
             budget = budget_of((80, 100), equipix.cross_pattern(4, 6), noise=1)
         # Each part is a sensor of half the pitch with a cross of (2, 3).
         alone = budget_of((40, 50), equipix.cross_pattern(2, 3), noise=1)
-        # Draws of 2000 pixels scatter by some 4 %, as those of test_rms_and_map do; 24 were made.
-        assert budget.rms == pytest.approx(alone.rms, rel=3 * 0.04 * np.sqrt(2 / 24))
+        # Both from 24 draws, whose mean squares scatter by 16 %: with such short shifts long waves
+        # make up much of the error.
+        assert budget.rms == pytest.approx(alone.rms, rel=3 * 0.16 / 2 * np.sqrt(2 / 24))
 
     def test_a_large_sensor_takes_no_longer_to_solve(self):
         small, large = (budget_of((size, size), CROSS, noise=1).rms for size in (256, 2000))

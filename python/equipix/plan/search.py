@@ -198,7 +198,8 @@ class _Score:
         spans = np.ptp(patterns, axis=1)
         rest = count / (count - self._cells(spans, count))
         noise = self._noise**2 * self._mean_of_inverse(others, places) * (1 - 1 / count) * rest
-        return np.asarray(np.sqrt(noise + self._drift**2 * self._tilt(patterns)))
+        drift = self._drift**2 * self._tilt(patterns) if self._drift else 0.0
+        return np.asarray(np.sqrt(noise + drift))
 
     def _cells(self, spans: Points, count: int) -> Floats:
         """Beam cells over pixels: the trace of K of `local_variance`, times n."""
