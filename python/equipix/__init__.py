@@ -6,6 +6,7 @@ from equipix.calibration import Calibration, History, calibrate
 from equipix.experiment import Experiment
 from equipix.frames import average
 from equipix.load import load
+from equipix.noise import NoiseModel
 from equipix.results import Correction, Flag, FrameStatistics
 from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
 
@@ -16,6 +17,7 @@ __all__ = [
     "Flag",
     "FrameStatistics",
     "History",
+    "NoiseModel",
     "ShiftMeasurement",
     "Spot",
     "__version__",

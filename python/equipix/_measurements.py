@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array, as_floats, check_count
+from equipix._arrays import as_array, as_floats, check_count, number, per_exposure
 from equipix.errors import InputError
+from equipix.noise import NoiseModel, fit_frames, models_of_means
 from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
 
 
@@ -43,6 +47,58 @@ def as_values(frames: ArrayLike, statistics: list[FrameStatistics]) -> NDArray[A
     return values
 
 
+def as_rotation(rotation: ArrayLike | None, count: int) -> NDArray[np.int64]:
+    """Rotation of each exposure, in degrees; 0 unless given."""
+    turns = per_exposure("rotation", rotation, count, default=0)
+    if not np.all(np.isin(turns, (0, 90, 180, 270))):
+        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+    return turns.astype(np.int64)
+
+
+def as_models(
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
+    statistics: list[FrameStatistics],
+    count: int,
+) -> list[NoiseModel]:
+    """Noise model of each of the values given; none if variances are given as numbers, or not."""
+    if variance is None and statistics:
+        variance = fit_frames(statistics)
+    if isinstance(variance, NoiseModel):
+        return models_of_means(statistics, variance) if statistics else [variance] * count
+    if not isinstance(variance, list | tuple):
+        return []
+    models = [each for each in variance if isinstance(each, NoiseModel)]
+    if models:
+        if len(models) != len(variance):
+            raise InputError("'variance' mixes noise models and numbers, expected either")
+        check_count("variance", len(models), count)
+    return models
+
+
+def as_saturated(
+    saturation: float | None, values: NDArray[Any], statistics: list[FrameStatistics]
+) -> NDArray[np.bool_] | None:
+    """Which values reach the level `saturation`."""
+    if saturation is None:
+        return None
+    if statistics:
+        raise InputError(
+            "'saturation' is for arrays, but 'frames' are averages: their saturated samples are "
+            "counted where equipix.average is given the level"
+        )
+    level = number("saturation", saturation)
+    if not level > 0:
+        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")
+    saturated: NDArray[np.bool_] = values >= level
+    for k, each in enumerate(saturated):
+        if each.all():
+            raise InputError(
+                f"'frames': every pixel of exposure {k} reaches the 'saturation' level {level:g}: "
+                "expose less, or correct the level"
+            )
+    return saturated
+
+
 def as_variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
     """Variances in the shape and dtype that the solver takes."""
     variances = as_array("variance", variance, ndim=(1, 3))
@@ -53,6 +109,12 @@ def as_variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return variances.astype(values.dtype, copy=False)
+
+
+def union(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Mask of what any of several masks, of one exposure or of all, hides."""
+    given = [mask for mask in masks if mask is not None]
+    return functools.reduce(np.logical_or, given) if given else None
 
 
 def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -19,7 +19,17 @@ from equipix._arrays import (
     positive_count,
     positive_workers,
 )
-from equipix._measurements import as_mask, as_statistics, as_values, as_variances
+from equipix._measurements import (
+    as_mask,
+    as_models,
+    as_rotation,
+    as_saturated,
+    as_statistics,
+    as_values,
+    as_variances,
+    union,
+)
+from equipix._weights import Measurements, modelled, solve_robustly
 from equipix.correction import Flagged, apply_gain
 from equipix.errors import (
     ConvergenceWarning,
@@ -27,7 +37,9 @@ from equipix.errors import (
     InputError,
 )
 from equipix.io import save_pages
-from equipix.noise import smoothed_variances
+from equipix.defects import noisy_pixels, odd_responses
+from equipix.noise import fit_frames
+from equipix.prediction import light, positions, predictions
 from equipix.results import Flag, FrameStatistics
 from equipix.shifts import round_shifts
 
@@ -36,6 +48,8 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix.noise import NoiseModel
 
     Progress = Callable[[int, int, str], object]
 
@@ -107,6 +121,8 @@ class Calibration:
         The dark frame in DN, if it is part of the calibration.
     metadata : dict
         Versions, options and origin, as JSON values.
+    rejected : ndarray of bool, shape (n, rows, cols), or None
+        The measurements that a robust calibration left out; `metadata` counts them.
     """
 
     sensitivity: NDArray[Any]
@@ -125,6 +141,7 @@ class Calibration:
     history: History
     dark: NDArray[Any] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+    rejected: NDArray[np.bool_] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -187,6 +204,140 @@ class Calibration:
             frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
         )
 
+    def predict(
+        self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0
+    ) -> NDArray[Any]:
+        """Frame that the sensor would give at another position: c · L(u) · M(p).
+
+        Parameters
+        ----------
+        shift : array_like, shape (2,)
+            Position (row, col) of the sensor in the beam, in pixels, as for `calibrate`.
+        rotation : {0, 90, 180, 270}
+            How far the sensor is turned, in degrees.
+        flux : float
+            Relative flux c of the exposure.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols)
+            Noise-free signal in the units of the frames, the dark subtracted; NaN where the
+            sensitivity is undetermined, and where no exposure has observed the beam.
+
+        Raises
+        ------
+        InputError
+            If an argument has a wrong shape or value.
+
+        Warns
+        -----
+        ShiftRoundingWarning
+            If the shift is rounded by more than 0.02 pixel.
+
+        See Also
+        --------
+        residuals : How far frames are from it.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from equipix import calibrate, cross_pattern, simulate
+        >>> beam, truth = simulate.gaussian_beam((48, 64)), np.ones((48, 64))
+        >>> shifts = cross_pattern(5, 7)
+        >>> cal = calibrate(simulate.exposures(truth, beam, shifts), shifts)
+        >>> held_out = simulate.exposures(truth, beam, [(3, 4)])[0]
+        >>> bool(np.nanmax(np.abs(cal.predict((3, 4)) - held_out)) < 1e-6)
+        True
+        """
+        if np.shape(shift) != (2,):
+            raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
+        (frame,) = self._predictions([shift], [rotation], [flux])
+        return frame
+
+    def residuals(
+        self,
+        frames: ArrayLike | Sequence[FrameStatistics],
+        *,
+        variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+        shifts: ArrayLike | None = None,
+        rotation: ArrayLike | None = None,
+        flux: ArrayLike | None = None,
+    ) -> NDArray[Any]:
+        """How far frames are from what the calibration predicts: y − c · L(u) · M(p).
+
+        Parameters
+        ----------
+        frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
+            Exposures with the dark subtracted: those that the calibration was made from, or
+            others, whose `shifts` are given then.
+        variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
+            Variance of the values given, as for `calibrate`.
+        shifts, rotation, flux : array_like, optional
+            Where and how bright the exposures were taken, as for `calibrate`; by default those
+            of the calibration.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, cols)
+            Residuals in the units of the frames; where variances are known, in standard
+            deviations of a measurement. NaN where nothing is measured or predicted.
+
+        Raises
+        ------
+        InputError
+            If an argument has a wrong shape or value.
+
+        Notes
+        -----
+        Of the exposures that a calibration was made from M and L have followed some of the
+        noise: the mean square of residuals in standard deviations is `reduced_chi2` times the
+        degrees of freedom over the number of measurements. Of one held out it is above 1, by
+        the variance of the prediction.
+        """
+        statistics = as_statistics(frames)
+        values = as_values(cast("ArrayLike", frames), statistics)
+        if values.shape[1:] != self.shape:
+            raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
+        if shifts is None:
+            check_count("frames", len(values), len(self.shifts))
+        predicted = self._predictions(
+            self.shifts if shifts is None else shifts,
+            self._rotation if shifts is None and rotation is None else rotation,
+            self.flux if shifts is None and flux is None else flux,
+        )
+        check_count("shifts", len(predicted), len(values))
+        models = as_models(variance, statistics, len(values))
+        residuals = np.where(np.isfinite(values), values, np.nan) - predicted
+        if models:
+            scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
+        elif variance is not None:
+            given = as_variances(cast("ArrayLike", variance), values)
+            scales = list(given if given.ndim == 3 else given[:, None, None])
+        else:
+            return residuals
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for residual, scale in zip(residuals, scales, strict=True):
+                residual /= np.sqrt(scale)
+        return residuals
+
+    @property
+    def _rotation(self) -> list[int]:
+        rotation: list[int] = self.metadata["options"]["rotation"]
+        return rotation
+
+    def _predictions(
+        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
+    ) -> NDArray[Any]:
+        """Frames from these positions, shape (n, rows, cols)."""
+        whole = round_shifts(shifts)
+        turns = as_rotation(rotation, len(whole))
+        fluxes = per_exposure("flux", flux, len(whole), default=1)
+        places = positions(self.beam_origin, whole, turns, fluxes)
+        result = np.empty((len(whole), *self.shape), self.sensitivity.dtype)
+        for k, frame in enumerate(predictions(self.sensitivity, self.beam, places)):
+            result[k] = frame
+        return result
+
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.
 
@@ -212,6 +363,8 @@ class Calibration:
         }
         if self.dark is not None:
             pages["dark"] = self.dark
+        if self.rejected is not None:
+            pages["rejected"] = self.rejected.reshape(-1, self.shape[1]).astype(np.uint8)
         numbers = {
             "beam_origin": list(self.beam_origin),
             "shifts": self.shifts.tolist(),
@@ -241,10 +394,12 @@ def calibrate(
     frames: ArrayLike | Sequence[FrameStatistics],
     shifts: ArrayLike,
     *,
-    variance: ArrayLike | None = None,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
     mask: ArrayLike | None = None,
+    saturation: float | None = None,
     flux: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
+    robust: bool = False,
     method: Method = "multiscale",
     tolerance: float = 1e-6,
     max_sweeps: int | None = None,
@@ -259,20 +414,33 @@ def calibrate(
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
         `FrameStatistics` bring their variances along: a noise model fitted over all pixels, not
         each pixel's own sample variance, gives the weights. A mean with saturated samples counts
-        as masked, and its pixel is flagged.
+        as masked, and its pixel is flagged; a pixel that scatters more than chance explains in
+        every exposure is masked and flagged ``HOT``.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
         unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result without
         any residual to show it. Rounded to whole pixels.
-    variance : array_like, shape (n,) or (n, rows, cols), optional
-        Variance of the values given. Without it all weights are 1.
+    variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
+        Variance of the values given; without it all weights are 1. A noise model, or one for each
+        exposure, is evaluated at what a first fit expects, since with variances taken at the noisy
+        values themselves those that happen to be low would weigh more. (With `FrameStatistics` it
+        is the model of one frame.)
     mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
         True = do not use.
+    saturation : float, optional
+        Level, in the units of frames given as arrays: a value at or above it counts as masked, and
+        its pixel is flagged.
     flux : array_like, shape (n,), optional
         Known relative flux of each exposure; 1 unless given.
     rotation : array_like of int, shape (n,), optional
         How far each exposure is turned, in degrees: 0, 90, 180 or 270, as by ``numpy.rot90`` of
         the beam's window; 0 unless given.
+    robust : bool
+        Whether to leave out measurements that disagree with the others, such as of a particle or
+        a reflection that is there in one exposure only: those more than five standard deviations
+        from the fit, or whose 3×3 surroundings are, found in rounds of fitting. The scale is that
+        of the residuals, so variances need be right but for a factor. Needs three exposures. Give
+        variances as a noise model, not as computed from values that a grain has darkened.
     method : {"multiscale", "coordinate-descent"}
         How to minimise the objective: by Gauss-Newton steps on all scales at once, in a number of
         passes that does not depend on the size of the sensor; or by the paper's method, which
@@ -342,47 +510,97 @@ def calibrate(
         raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
     statistics = as_statistics(frames)
+    noise = fit_frames(statistics) if variance is None and statistics else None
+    noisy = noisy_pixels(statistics, noise) if noise is not None else None
     with naming_memory("calibrating"):
         values = as_values(cast("ArrayLike", frames), statistics)
-        if variance is None and statistics:
-            variance = smoothed_variances(statistics)
-        variances = None if variance is None else as_variances(variance, values)
-        masked = None if mask is None else as_mask(mask, values.shape)
-    count = len(values)
-    positions = round_shifts(shifts)
-    check_count("shifts", len(positions), count)
-    turns = per_exposure("rotation", rotation, count, default=0)
-    if not np.all(np.isin(turns, (0, 90, 180, 270))):
-        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+        count = len(values)
+        models = as_models(variance if noise is None else noise, statistics, count)
+        variances = None
+        if variance is not None and not models:
+            variances = as_variances(cast("ArrayLike", variance), values)
+        saturated = as_saturated(saturation, values, statistics)
+        given = None if mask is None else as_mask(mask, values.shape)
+        masked = union(given, saturated, noisy)
+    whole = round_shifts(shifts)
+    check_count("shifts", len(whole), count)
+    turns = as_rotation(rotation, count)
     fluxes = per_exposure("flux", flux, count, default=1)
-    result = _native.calibrate_frames(
-        values,
-        positions,
-        rotation=turns.astype(int).tolist(),
-        flux=fluxes.tolist(),
-        variance=variances,
-        mask=masked,
-        method=method,
-        tolerance=number("tolerance", tolerance),
-        max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
-        workers=positive_workers(workers),
-        progress=progress,
-    )
+
+    def solve(
+        variances: NDArray[Any] | None,
+        masked: NDArray[np.bool_] | None,
+        tolerance: float = number("tolerance", tolerance),
+    ) -> _native.Solution:
+        return _native.calibrate_frames(
+            values,
+            whole,
+            rotation=turns.tolist(),
+            flux=fluxes.tolist(),
+            variance=variances,
+            mask=masked,
+            method=method,
+            tolerance=tolerance,
+            max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
+            workers=positive_workers(workers),
+            progress=progress,
+        )
+
+    data = Measurements(values, masked, whole, turns, fluxes, solve)
+    rejected = None
+    with naming_memory("calibrating"):
+        if models:
+            variances = modelled(data, models, tolerance)
+        if robust:
+            result, rejected = solve_robustly(data, models, variances, tolerance)
+        else:
+            result = solve(variances, masked)
     options = {"method": method, "tolerance": tolerance, "max_sweeps": max_sweeps}
-    calibration = _wrapped(result, values.dtype, positions, fluxes)
+    calibration = _wrapped(result, values.dtype, whole, fluxes, rejected)
     calibration.metadata.update(
         versions={"equipix": _native.__version__, "numpy": np.__version__},
-        options=options | {"rotation": turns.astype(int).tolist()},
+        options=options | {"rotation": turns.tolist(), "robust": robust},
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    calibration.flags[calibration.sensitivity <= tolerance] |= np.uint32(
-        Flag.DEAD | Flag.DO_NOT_USE
-    )
-    for each in statistics:
-        calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
+    if rejected is not None:
+        calibration.metadata["rejected"] = rejected.sum(axis=(1, 2)).tolist()
+    _flag(calibration, data, variances)
+    flagged = [(each.saturated > 0, Flag.SATURATED) for each in statistics]
+    if saturated is not None:
+        flagged.append((saturated.any(axis=0), Flag.SATURATED))
+    if noisy is not None:
+        flagged.append((noisy, Flag.HOT | Flag.DO_NOT_USE))
+    for pixels, flag in flagged:
+        calibration.flags[pixels] |= np.uint32(flag)
     _warn(calibration, tolerance, result.ended)
     return calibration
+
+
+def _flag(calibration: Calibration, data: Measurements, variances: NDArray[Any] | None) -> None:
+    """Set the flags of pixels whose answer is odd, and of those whose measurements disagree."""
+    sensitivity, flags = calibration.sensitivity, calibration.flags
+    places = positions(calibration.beam_origin, data.shifts, data.rotation, data.flux)
+
+    def std(pixels: NDArray[Any]) -> NDArray[Any]:
+        """Standard deviation of M, that of the beam left out: 1/√(Σ w c²L²)."""
+        weight = np.zeros(len(pixels))
+        used = data.usable()
+        for k, place in enumerate(places):
+            seen = np.nan_to_num(light(calibration.beam, place, calibration.shape)).flat[pixels]
+            scale = calibration.reduced_chi2 if variances is None else variances[k]
+            scale = np.broadcast_to(scale, calibration.shape).flat[pixels]
+            weight += used[k].flat[pixels] * seen**2 / scale
+        with np.errstate(divide="ignore"):
+            return 1 / np.sqrt(weight)
+
+    dead, hot = odd_responses(sensitivity, std)
+    dead |= sensitivity <= calibration.metadata["options"]["tolerance"]
+    flags[dead] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
+    flags[hot] |= np.uint32(Flag.HOT | Flag.DO_NOT_USE)
+    if calibration.rejected is not None:
+        contradictory = 2 * calibration.rejected.sum(axis=0) > data.usable().sum(axis=0)
+        flags[contradictory] |= np.uint32(Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE)
 
 
 def _wrapped(
@@ -390,6 +608,7 @@ def _wrapped(
     dtype: np.dtype[Any],
     shifts: NDArray[np.int64],
     flux: NDArray[np.float64],
+    rejected: NDArray[np.bool_] | None,
 ) -> Calibration:
     objective = float(result.objective[-1])
     freedom = result.degrees_of_freedom
@@ -408,6 +627,7 @@ def _wrapped(
         converged=result.ended == "converged",
         error_estimate=float(result.error_estimate[-1]),
         history=History(result.sweeps, result.objective, result.error_estimate),
+        rejected=rejected,
     )
 
 

@@ -85,6 +85,9 @@ def _options(
 def calibrate(
     experiment: Annotated[Path, typer.Argument(help="The experiment.toml.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Calibration: .tif or .npz.")],
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Leave out measurements that disagree with the others.")
+    ] = False,
     method: Annotated[
         Method, typer.Option(help="How to solve: fast, or as the paper does.")
     ] = "multiscale",
@@ -100,6 +103,7 @@ def calibrate(
     refuse_inputs([output], [experiment, *loaded.files()])
     with progress_bars() as progress:
         calibration = loaded.run(
+            robust=robust,
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,

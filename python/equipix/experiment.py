@@ -160,6 +160,7 @@ class Experiment:
     def run(
         self,
         *,
+        robust: bool = False,
         method: Method = "multiscale",
         tolerance: float = 1e-6,
         max_sweeps: int | None = None,
@@ -170,6 +171,8 @@ class Experiment:
 
         Parameters
         ----------
+        robust : bool
+            Whether to leave out measurements that disagree with the others.
         method : {"multiscale", "coordinate-descent"}
             How to minimise the objective.
         tolerance : float
@@ -204,19 +207,20 @@ class Experiment:
         with naming_memory("averaging"):
             measured = self._average(workers, progress)
             noise = self._noise(measured)
-            variances = _variances(measured, noise)
+            models = _models(measured, noise)
             flags = pixel_flags(
-                dead_pixels(measured.signals, variances),
+                dead_pixels(measured.signals, models),
                 hot_pixels(measured.dark, noise),
                 measured.saturated,
             )
         solved = calibrate(
             measured.signals,
             whole_shifts,
-            variance=variances,
+            variance=models,
             mask=flags != 0,
             flux=self._flux(),
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
+            robust=robust,
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,
@@ -349,15 +353,12 @@ def _transfer(signal: NDArray[Any], frames: FrameStatistics) -> NDArray[Any]:
     return photon_transfer(signal, frames.variance, usable, int(frames.count.max()))
 
 
-def _variances(measured: _Measured, noise: NoiseModel | None) -> NDArray[Any] | None:
-    """Variance of each dark-subtracted mean by the noise model, in DN²."""
+def _models(measured: _Measured, noise: NoiseModel | None) -> list[NoiseModel] | None:
+    """Noise model of each dark-subtracted mean."""
     if noise is None:
         return None
-    variances = np.empty_like(measured.signals)
-    dark = noise.variance(0.0) / int(measured.dark.count.max())
-    for k, frames in enumerate(measured.frames):
-        variances[k] = noise.variance(measured.signals[k]) / frames + dark
-    return variances
+    dark = float(noise.variance(0.0)) / int(measured.dark.count.max())
+    return [noise.of_mean(frames, dark_variance=dark) for frames in measured.frames]
 
 
 def _in_beam(

@@ -51,6 +51,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
     history = numbers["history"]
     row, col = numbers["beam_origin"]
     chi2 = numbers["reduced_chi2"]
+    rejected = pages.get("rejected")
     return Calibration(
         sensitivity=pages["sensitivity"],
         beam=pages["beam"],
@@ -72,4 +73,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         ),
         dark=pages.get("dark"),
         metadata=content["metadata"],
+        rejected=None
+        if rejected is None
+        else rejected.reshape(-1, *pages["sensitivity"].shape).astype(bool),
     )

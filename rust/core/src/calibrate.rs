@@ -8,11 +8,20 @@ use crate::estimate::{History, Stop};
 use crate::frames::{Real, flag};
 use crate::geometry::Geometry;
 use crate::memory;
-use crate::model::Model;
+use crate::model::{Model, Stretch};
 use crate::multiscale;
 use crate::parallel::Workers;
 use crate::precondition;
 use crate::reduced::Padding;
+
+/// A response below this share of the typical one may be nil; above it none is.
+const WEAK_RESPONSE: f64 = 0.05;
+/// A response below this share is nil: its edges weigh 1e-6 of ordinary ones (M² in the Laplacian).
+const NIL_RESPONSE: f64 = 1e-3;
+/// Standard errors that a response must exceed 0 by.
+const SIGMAS: f64 = 6.0;
+/// Pixels, at most, that a median is taken over.
+const SAMPLE: usize = 4096;
 
 /// How to minimise F.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,7 +52,8 @@ pub struct Solution {
 /// Minimises F.
 ///
 /// M is given in the gauge mean(M) = 1 over the pixels of a component, each component for itself;
-/// pixels that their measurements leave almost no weight are flagged and not in the mean.
+/// pixels that their measurements leave almost no weight are flagged and not in the mean. They and
+/// pixels that do not respond tie no parts together.
 ///
 /// # Errors
 /// [`Error::Memory`](crate::Error::Memory) before anything else if the memory for it cannot be had;
@@ -63,9 +73,12 @@ pub fn calibrate<T: Real>(
         Method::CoordinateDescent => descent::solve(model, stop, workers, control)?,
     };
     // After the solver, whose vectors then make room for the sets.
-    let components = Components::of(model, control)?;
     let mut beam = descent.beam();
     let mut sensitivity = descent.sensitivity;
+    let dead = without_response(model, &sensitivity, &beam, &history);
+    let mut silent = vec![false; sensitivity.len()];
+    dead.iter().chain(&left_out).for_each(|&pixel| silent[pixel] = true);
+    let components = Components::of(model, &silent, control)?;
     let means = component_means(&sensitivity, &components, &left_out);
     rescale(&mut sensitivity, &components.pixels, workers, |value, label| {
         if label == 0 { value / means[0] } else { f64::NAN }
@@ -78,6 +91,9 @@ pub fn calibrate<T: Real>(
         components.pixels.iter().map(|&l| if l == 0 { 0 } else { undetermined }).collect();
     for &pixel in &left_out {
         flags[pixel] |= flag::UNRELIABLE_FLAT | flag::DO_NOT_USE;
+    }
+    for &pixel in &dead {
+        flags[pixel] |= flag::DEAD | flag::DO_NOT_USE;
     }
     Ok(Solution {
         sensitivity,
@@ -101,7 +117,7 @@ pub fn calibrate<T: Real>(
 /// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
-/// The components come after the solver, with less: M, L, 21 for each pixel and 13 for each cell.
+/// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell.
 fn bytes_needed(geometry: &Geometry) -> u64 {
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
@@ -111,6 +127,54 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
     let images = 24 * places(geometry.sensor.rows) + of_views;
     8 * pixels + images + 8 * views * cells + turned + precondition::bytes_needed(geometry)
+}
+
+/// The pixels that do not respond to light, as far as their measurements can tell: M is nil, or so
+/// small that it does not exceed 0 by its standard error, 1/√D with D = Σ w c² L² times F for each
+/// measurement.
+fn without_response<T: Real>(
+    model: &Model<'_, T>,
+    sensitivity: &[f64],
+    beam: &[f64],
+    history: &History,
+) -> Vec<usize> {
+    let typical = typical(sensitivity);
+    let objective = history.looks.last().map_or(0.0, |look| look.objective);
+    // F for each measurement is no more than the variance of one; for five exposures about half.
+    let noise = SIGMAS * SIGMAS * objective / model.used() as f64;
+    let weak = |&pixel: &usize| sensitivity[pixel].abs() <= WEAK_RESPONSE * typical;
+    let nil = |&pixel: &usize| {
+        let response = sensitivity[pixel].abs();
+        response <= NIL_RESPONSE * typical || response.powi(2) * weight(model, beam, pixel) <= noise
+    };
+    (0..sensitivity.len()).filter(weak).filter(nil).collect()
+}
+
+/// The median |M| of a sample, which a pixel stuck far above the others does not move.
+fn typical(sensitivity: &[f64]) -> f64 {
+    let every = sensitivity.len().div_ceil(SAMPLE);
+    let mut sample: Vec<f64> = sensitivity.iter().step_by(every).map(|m| m.abs()).collect();
+    let middle = sample.len() / 2;
+    *sample.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The weight Σ w c² L² of a pixel's sensitivity.
+fn weight<T: Real>(model: &Model<'_, T>, beam: &[f64], pixel: usize) -> f64 {
+    let cols = model.sensor().cols;
+    let (row, col) = (pixel / cols, pixel % cols);
+    let mut scratch = [0.0];
+    let exposures = model.geometry.exposures.iter().zip(&model.flux).enumerate();
+    let weights = exposures.map(|(exposure, (place, flux))| {
+        let weight = match model.stretch(exposure, row, col..col + 1, &mut scratch) {
+            Stretch::Uniform(_, weight) => weight,
+            Stretch::Weighted(_, weights) => weights[0],
+        };
+        let cells = model.geometry.views[place.view].cells;
+        let light = flux * beam[cells.at(row + place.row, col + place.col)];
+        // A cell that nothing lights has no number, and a measurement that is not used no weight.
+        if weight > 0.0 { weight * light * light } else { 0.0 }
+    });
+    weights.sum()
 }
 
 /// Replaces each value by `scaled(value, label)`.
@@ -146,9 +210,10 @@ fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usi
     chosen.map(|(sum, count)| sum / *count as f64).collect()
 }
 
-/// Measurements less unknowns; each component has one unknown less than values, by its gauge.
+/// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every
+/// pixel seen has its unknown; a cell that only silent pixels see has none that F depends on.
 fn degrees_of_freedom(used: usize, components: &Components) -> i64 {
-    let known = |labels: &[i32]| labels.iter().filter(|&&label| label != NONE).count();
-    let unknowns = known(&components.pixels) + known(&components.cells) - components.sizes.len();
+    let cells = components.cells.iter().filter(|&&label| label != NONE).count();
+    let unknowns = components.seen + cells - components.sizes.len();
     used as i64 - unknowns as i64
 }

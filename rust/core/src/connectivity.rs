@@ -2,7 +2,10 @@
 //!
 //! ln y_k(p) = ln L(u_k(p)) + ln M(p) is a bipartite graph of pixels and beam cells with an edge
 //! for each used measurement. Within a connected component M is determined up to one factor;
-//! between components nothing is.
+//! between components nothing is. A pixel that does not respond tells nothing of the beam that it
+//! sees, so it has no edge and joins nothing; nor has a pixel in the dark.
+
+use std::collections::BTreeMap;
 
 use crate::control::Control;
 use crate::error::Result;
@@ -78,27 +81,35 @@ pub struct Components {
     pub pixels: Vec<i32>,
     /// The component of each cell of the beam grid, or [`NONE`].
     pub cells: Vec<i32>,
-    /// How many pixels each component has, falling.
+    /// How many pixels that respond each component has, falling.
     pub sizes: Vec<usize>,
+    /// How many pixels have a used measurement, silent ones too.
+    pub seen: usize,
 }
 
 impl Components {
     /// Finds the components of the measurements that `model` uses.
     ///
+    /// `silent` tells of each pixel whether its measurements compare nothing. Such a pixel belongs
+    /// to the component of the cells that it sees, if they are all of one.
+    ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
-    pub fn of<T: Real>(model: &Model<'_, T>, control: &Control) -> Result<Self> {
+    pub fn of<T: Real>(model: &Model<'_, T>, silent: &[bool], control: &Control) -> Result<Self> {
         let geometry = &model.geometry;
         let pixels = geometry.sensor.len();
         let mut sets = DisjointSets::new(pixels + geometry.beam.len());
         let mut used = vec![false; pixels + geometry.beam.len()];
         model.for_each_used(control, |pixel, cell| {
-            sets.union(pixel, pixels + cell);
-            used[pixel] = true;
-            used[pixels + cell] = true;
+            if !silent[pixel] {
+                sets.union(pixel, pixels + cell);
+                used[pixel] = true;
+                used[pixels + cell] = true;
+            }
         })?;
         let roots = sets.into_roots(control)?;
-        // Each component has a pixel, and pixels come before cells: so roots are pixels.
+        // Each component has a pixel, and pixels come before cells: so roots are pixels. A silent
+        // pixel is its own root, and not used.
         let mut sizes = vec![0_usize; pixels];
         in_parts(pixels, control, |pixel| {
             sizes[roots[pixel] as usize] += usize::from(used[pixel]);
@@ -115,8 +126,39 @@ impl Components {
             labels.push(if used[node] { label_of[roots[node] as usize] } else { NONE });
         })?;
         let cells = labels.split_off(pixels);
-        let sizes = order.iter().map(|&root| sizes[root]).collect();
-        Ok(Self { pixels: labels, cells, sizes })
+        let sizes: Vec<usize> = order.iter().map(|&root| sizes[root]).collect();
+        let seen = sizes.iter().sum();
+        let mut components = Self { pixels: labels, cells, sizes, seen };
+        if silent.contains(&true) {
+            components.attach(model, silent, control)?;
+        }
+        Ok(components)
+    }
+
+    /// Gives silent pixels the label of the cells that they see, or [`NONE`] where these differ.
+    fn attach<T: Real>(
+        &mut self,
+        model: &Model<'_, T>,
+        silent: &[bool],
+        control: &Control,
+    ) -> Result<()> {
+        // The lowest and the highest label seen: only silent pixels are in it, so it is small.
+        let mut labels = BTreeMap::new();
+        model.for_each_used(control, |pixel, cell| {
+            if silent[pixel] {
+                let range = labels.entry(pixel).or_insert((i32::MAX, NONE));
+                if self.cells[cell] != NONE {
+                    *range = (range.0.min(self.cells[cell]), range.1.max(self.cells[cell]));
+                }
+            }
+        })?;
+        self.seen += labels.len();
+        for (pixel, (lowest, highest)) in labels {
+            if lowest == highest {
+                self.pixels[pixel] = lowest;
+            }
+        }
+        Ok(())
     }
 }
 
