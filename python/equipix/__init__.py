@@ -3,6 +3,7 @@
 from equipix import errors, simulate
 from equipix._native import __version__
 from equipix.calibration import Calibration, History, calibrate
+from equipix.comparison import Comparison, compare
 from equipix.experiment import Experiment
 from equipix.frames import average
 from equipix.load import load
@@ -12,6 +13,7 @@ from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
 
 __all__ = [
     "Calibration",
+    "Comparison",
     "Correction",
     "Experiment",
     "Flag",
@@ -23,6 +25,7 @@ __all__ = [
     "__version__",
     "average",
     "calibrate",
+    "compare",
     "cross_pattern",
     "errors",
     "load",

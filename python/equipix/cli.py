@@ -16,6 +16,7 @@ from rich.table import Table
 from equipix._native import __version__
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration, Method
+from equipix.comparison import compare as compare_calibrations
 from equipix.correct_files import correct_files, is_folder
 from equipix.correction import Flagged
 from equipix.demo import run_demo, virtual_experiment
@@ -25,7 +26,7 @@ from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
 from equipix.io import SUFFIXES, find_files, refuse_inputs
 from equipix.load import load
-from equipix.report import check_picture, draw_demo, save_figure
+from equipix.report import check_picture, draw_comparison, draw_demo, save_figure
 from equipix.results import Flag
 
 app = typer.Typer(
@@ -146,6 +147,52 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         "components": calibration.components,
         "flagged_pixels": flagged,
     }
+
+
+@app.command(epilog="Example: equipix compare first.tif second.tif -o agreement.png")
+def compare(
+    calibrations: Annotated[
+        list[Path], typer.Argument(help="Calibrations of one sensor: .tif or .npz.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Show how far calibrations of one sensor agree."""
+    if output is not None:
+        check_picture(output)
+        check_output(output, force=force)
+        refuse_inputs([output], calibrations)
+    result = compare_calibrations([load(file) for file in calibrations])
+    if output is not None:
+        names = [file.stem for file in calibrations]
+        save_figure(draw_comparison(result, names), output, force=force)
+    pairs = [
+        {
+            "files": [str(calibrations[i]) for i in pair],
+            "rms": float(result.rms[k]),
+            "block_rms": float(result.block_rms[k]),
+            "largest": float(result.largest[k]),
+        }
+        for k, pair in enumerate(result.pairs)
+    ]
+    pixels = int(np.isfinite(result.agreement).sum())
+    if as_json:
+        show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
+    else:
+        _show_pairs(pairs)
+        show_result({"pixels compared": pixels, "picture": str(output or "none")}, as_json=False)
+
+
+def _show_pairs(pairs: list[dict[str, Any]]) -> None:
+    """Print how far the calibrations of each pair differ."""
+    figures = ("rms", "block_rms", "largest")
+    table = Table("relative difference", "pixels, rms", "16×16 means, rms", "largest", box=SIMPLE_HEAD)
+    for pair in pairs:
+        table.add_row(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures))
+    Console(soft_wrap=True).print(table)
 
 
 @app.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")

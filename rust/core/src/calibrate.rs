@@ -16,8 +16,8 @@ use crate::reduced::Padding;
 
 /// A response below this share of the typical one may be nil; above it none is.
 const WEAK_RESPONSE: f64 = 0.05;
-/// A response below this share is nil: its edges weigh 1e-6 of ordinary ones (M² in the Laplacian).
-const NIL_RESPONSE: f64 = 1e-3;
+/// It is nil where its edges in the Laplacian, w c² L² M², weigh so little beside an ordinary one.
+const NIL_RESPONSE: f64 = 1e-6;
 /// Standard errors that a response must exceed 0 by.
 const SIGMAS: f64 = 6.0;
 /// Pixels, at most, that a median is taken over.
@@ -129,9 +129,8 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     8 * pixels + images + 8 * views * cells + turned + precondition::bytes_needed(geometry)
 }
 
-/// The pixels that do not respond to light, as far as their measurements can tell: M is nil, or so
-/// small that it does not exceed 0 by its standard error, 1/√D with D = Σ w c² L² times F for each
-/// measurement.
+/// The pixels that do not respond to light, as far as their measurements can tell: M is small,
+/// and so is M²D with D = Σ w c² L², whose square root is M over its standard error.
 fn without_response<T: Real>(
     model: &Model<'_, T>,
     sensitivity: &[f64],
@@ -142,10 +141,12 @@ fn without_response<T: Real>(
     let objective = history.looks.last().map_or(0.0, |look| look.objective);
     // F for each measurement is no more than the variance of one; for five exposures about half.
     let noise = SIGMAS * SIGMAS * objective / model.used() as f64;
+    let ordinary = model.typical_weight() * model.typical_light().powi(2);
     let weak = |&pixel: &usize| sensitivity[pixel].abs() <= WEAK_RESPONSE * typical;
+    // M²D is what a pixel shows of light: unlike M, the same in any gauge.
     let nil = |&pixel: &usize| {
-        let response = sensitivity[pixel].abs();
-        response <= NIL_RESPONSE * typical || response.powi(2) * weight(model, beam, pixel) <= noise
+        let shown = sensitivity[pixel].powi(2) * weight(model, beam, pixel);
+        shown <= noise.max(NIL_RESPONSE * ordinary)
     };
     (0..sensitivity.len()).filter(weak).filter(nil).collect()
 }
