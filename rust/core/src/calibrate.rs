@@ -1,6 +1,6 @@
 //! From the measurements of one experiment to the sensitivity of its sensor.
 
-use crate::connectivity::{Components, NONE};
+use crate::connectivity::{Components, NONE, Tie};
 use crate::control::Control;
 use crate::descent;
 use crate::error::Result;
@@ -76,9 +76,10 @@ pub fn calibrate<T: Real>(
     let mut beam = descent.beam();
     let mut sensitivity = descent.sensitivity;
     let dead = without_response(model, &sensitivity, &beam, &history);
-    let mut silent = vec![false; sensitivity.len()];
-    dead.iter().chain(&left_out).for_each(|&pixel| silent[pixel] = true);
-    let components = Components::of(model, &silent, control)?;
+    let mut ties = vec![Tie::Firm; sensitivity.len()];
+    left_out.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
+    dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
+    let components = Components::of(model, &ties, control)?;
     let means = component_means(&sensitivity, &components, &left_out);
     rescale(&mut sensitivity, &components.pixels, workers, |value, label| {
         if label == 0 { value / means[0] } else { f64::NAN }
@@ -212,7 +213,7 @@ fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usi
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every
-/// pixel seen has its unknown; a cell that only silent pixels see has none that F depends on.
+/// pixel seen has its unknown; a cell that only pixels without response see has none that F depends on.
 fn degrees_of_freedom(used: usize, components: &Components) -> i64 {
     let cells = components.cells.iter().filter(|&&label| label != NONE).count();
     let unknowns = components.seen + cells - components.sizes.len();

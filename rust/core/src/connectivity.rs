@@ -73,6 +73,18 @@ fn in_parts(count: usize, control: &Control, mut visit: impl FnMut(usize)) -> Re
 /// The label of what belongs to no component: it has no used measurement.
 pub const NONE: i32 = -1;
 
+/// What the measurements of a pixel do for others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tie {
+    /// They compare what it sees.
+    Firm,
+    /// They carry next to no weight: they join nothing, but cells that no other pixel sees follow
+    /// from it.
+    Loose,
+    /// It does not respond: they tell nothing of the beam.
+    None,
+}
+
 /// The connected components of an experiment.
 #[derive(Clone, Debug)]
 pub struct Components {
@@ -81,35 +93,35 @@ pub struct Components {
     pub pixels: Vec<i32>,
     /// The component of each cell of the beam grid, or [`NONE`].
     pub cells: Vec<i32>,
-    /// How many pixels that respond each component has, falling.
+    /// How many firmly tied pixels each component has, falling.
     pub sizes: Vec<usize>,
-    /// How many pixels have a used measurement, silent ones too.
+    /// How many pixels have a used measurement, however they are tied.
     pub seen: usize,
 }
 
 impl Components {
     /// Finds the components of the measurements that `model` uses.
     ///
-    /// `silent` tells of each pixel whether its measurements compare nothing. Such a pixel belongs
-    /// to the component of the cells that it sees, if they are all of one.
+    /// A pixel that is not tied firmly belongs to the component of the cells that it sees, if they
+    /// are all of one.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
-    pub fn of<T: Real>(model: &Model<'_, T>, silent: &[bool], control: &Control) -> Result<Self> {
+    pub fn of<T: Real>(model: &Model<'_, T>, ties: &[Tie], control: &Control) -> Result<Self> {
         let geometry = &model.geometry;
         let pixels = geometry.sensor.len();
         let mut sets = DisjointSets::new(pixels + geometry.beam.len());
         let mut used = vec![false; pixels + geometry.beam.len()];
         model.for_each_used(control, |pixel, cell| {
-            if !silent[pixel] {
+            if ties[pixel] == Tie::Firm {
                 sets.union(pixel, pixels + cell);
                 used[pixel] = true;
                 used[pixels + cell] = true;
             }
         })?;
         let roots = sets.into_roots(control)?;
-        // Each component has a pixel, and pixels come before cells: so roots are pixels. A silent
-        // pixel is its own root, and not used.
+        // Each component has a pixel, and pixels come before cells: so roots are pixels. One
+        // that is not tied is its own root, and not used.
         let mut sizes = vec![0_usize; pixels];
         in_parts(pixels, control, |pixel| {
             sizes[roots[pixel] as usize] += usize::from(used[pixel]);
@@ -129,23 +141,24 @@ impl Components {
         let sizes: Vec<usize> = order.iter().map(|&root| sizes[root]).collect();
         let seen = sizes.iter().sum();
         let mut components = Self { pixels: labels, cells, sizes, seen };
-        if silent.contains(&true) {
-            components.attach(model, silent, control)?;
+        if ties.iter().any(|&tie| tie != Tie::Firm) {
+            components.attach(model, ties, control)?;
         }
         Ok(components)
     }
 
-    /// Gives silent pixels the label of the cells that they see, or [`NONE`] where these differ.
+    /// Gives pixels that are not tied firmly the label of the cells that they see, or [`NONE`] where
+    /// these differ; and cells that only loose ones see the label of those.
     fn attach<T: Real>(
         &mut self,
         model: &Model<'_, T>,
-        silent: &[bool],
+        ties: &[Tie],
         control: &Control,
     ) -> Result<()> {
-        // The lowest and the highest label seen: only silent pixels are in it, so it is small.
+        // The lowest and the highest label seen: few pixels are in it, so it is small.
         let mut labels = BTreeMap::new();
         model.for_each_used(control, |pixel, cell| {
-            if silent[pixel] {
+            if ties[pixel] != Tie::Firm {
                 let range = labels.entry(pixel).or_insert((i32::MAX, NONE));
                 if self.cells[cell] != NONE {
                     *range = (range.0.min(self.cells[cell]), range.1.max(self.cells[cell]));
@@ -158,7 +171,11 @@ impl Components {
                 self.pixels[pixel] = lowest;
             }
         }
-        Ok(())
+        model.for_each_used(control, |pixel, cell| {
+            if ties[pixel] == Tie::Loose && self.cells[cell] == NONE {
+                self.cells[cell] = self.pixels[pixel];
+            }
+        })
     }
 }
 
