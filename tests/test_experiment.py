@@ -365,12 +365,12 @@ def test_scatter_limit_is_beyond_chance(frames):
 def test_faint_light_makes_no_dead_pixels():
     rng = np.random.default_rng(4)
     signals = 3 + 1.5 * rng.standard_normal((5, 100, 100))
-    variances = np.full_like(signals, 1.5**2)
+    models = [NoiseModel(1.5, 0.0)] * 5
     assert (signals < 1.5).any(axis=0).any()
-    assert not dead_pixels(signals, variances).any()
+    assert not dead_pixels(signals, models).any()
     signals = 100 + 1.5 * rng.standard_normal((5, 100, 100))
     signals[:, 7, 9] = 49 - 6 * 1.5 - 8
-    assert np.argwhere(dead_pixels(signals, variances)).tolist() == [[7, 9]]
+    assert np.argwhere(dead_pixels(signals, models)).tolist() == [[7, 9]]
 
 
 def test_noisy_pixels_are_hot():

@@ -98,21 +98,23 @@ def rejected(
     A hard redescending weight, 1 or 0, in rounds. A false value pulls M and L, and so makes its
     own residual smaller and those that share its pixel or its cell larger. So in each round only
     what deviates most in its pixel and in its cell goes; the next fit shows what remains. What no
-    longer deviates comes back.
+    longer deviates comes back, and so do those of a pixel that would be left without M.
     """
-    deviation = deviations(evidence, sensitivity, beam, before)
-    used = evidence.usable & ~before
-    leading = np.where(used, deviation, 0.0)
-    np.nan_to_num(leading, copy=False)
+    deviation, told = deviations(evidence, sensitivity, beam, before)
+    # One that nothing tells of counts as a rival: what lies around it may be what spreads.
+    leading = np.where(evidence.usable & ~before, deviation, 0.0)
     by_pixel = leading.max(axis=0)
     by_cell = np.zeros(beam.shape, leading.dtype)
     shape = by_pixel.shape
     for each, place in zip(leading, evidence.places, strict=True):
         np.maximum(window(by_cell, place, shape), each, out=window(by_cell, place, shape))
-    result = before & ~(deviation <= _NEAR)
+    result = before & ~(told & (deviation <= _NEAR))
+    # A pixel that has lost its ties by mistake, while larger deviations hid the true ones, gets
+    # its measurements back.
+    result[:, np.isnan(sensitivity)] = False
     for k, place in enumerate(evidence.places):
         rival = _LEADING * np.maximum(by_pixel, window(by_cell, place, shape))
-        suspect = (leading[k] > _NEAR) & (leading[k] >= rival)
+        suspect = told[k] & (leading[k] > _NEAR) & (leading[k] >= rival)
         result[k] |= suspect & (leading[k] > _BEYOND)
         result[k] |= suspect & (_box(result[k].astype(np.float32)) > 0)
     return result
@@ -123,7 +125,7 @@ def deviations(
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     left_out: NDArray[np.bool_],
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """How far each measurement, or the mean of the 3×3 pixels around it, is from the fit.
 
     Parameters
@@ -139,8 +141,11 @@ def deviations(
 
     Returns
     -------
-    ndarray, shape (n, rows, cols), float32
-        The larger of both absolute deviations, in standard deviations; NaN where nothing tells.
+    deviation : ndarray, shape (n, rows, cols), float32
+        The larger of both absolute deviations, in standard deviations; that of the surroundings
+        where nothing tells of the measurement itself.
+    told : ndarray of bool, shape (n, rows, cols)
+        Where something tells of it.
 
     Notes
     -----
@@ -160,7 +165,8 @@ def deviations(
         weight = np.where(left_out[k], 0, weights[k])
         on_pixels += weight * seen[k] ** 2
         window(on_cells, place, shape)[:] += weight * (place.flux * response) ** 2
-    result = np.full(evidence.values.shape, np.nan, np.float32)
+    result = np.empty(evidence.values.shape, np.float32)
+    told = np.empty(evidence.values.shape, bool)
     for k, place in enumerate(evidence.places):
         shares = (
             _share(weights[k] * seen[k] ** 2, on_pixels),
@@ -168,14 +174,14 @@ def deviations(
         )
         sign = np.where(left_out[k], 1, -1)
         spread = (1 + sign * shares[0]) * (1 + sign * shares[1])
-        known = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
+        known = told[k] = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
         root = np.sqrt(weights[k])
         expected = seen[k] * response
         residual = np.full(shape, np.nan)
         residual[known] = (root * (evidence.values[k] - expected))[known] / np.sqrt(spread[known])
         floor = evidence.floor * _median(root * expected, known)
         result[k] = _deviation(residual, known & ~left_out[k], floor)
-    return result
+    return result, told
 
 
 def _deviation(scaled: NDArray[Any], used: NDArray[np.bool_], floor: float) -> NDArray[Any]:
@@ -186,7 +192,8 @@ def _deviation(scaled: NDArray[Any], used: NDArray[np.bool_], floor: float) -> N
         np.abs(each) / max(_ROBUST * _median(each, used), floor, np.finfo(float).tiny)
         for each in (scaled, around)
     )
-    return np.where(known, np.maximum(own, mean), np.nan)
+    deviation: NDArray[Any] = np.fmax(own, mean)
+    return deviation
 
 
 def _weights(evidence: Evidence, exposure: int, expected: NDArray[np.bool_]) -> NDArray[Any]:
