@@ -100,23 +100,22 @@ def rejected(
     what deviates most in its pixel and in its cell goes; the next fit shows what remains. What no
     longer deviates comes back, and so do those of a pixel that would be left without M.
     """
-    deviation, told = deviations(evidence, sensitivity, beam, before)
-    # One that nothing tells of counts as a rival: what lies around it may be what spreads.
-    leading = np.where(evidence.usable & ~before, deviation, 0.0)
+    new, old = deviations(evidence, sensitivity, beam, before)
+    leading = np.where(before, 0, np.nan_to_num(new))
     by_pixel = leading.max(axis=0)
     by_cell = np.zeros(beam.shape, leading.dtype)
     shape = by_pixel.shape
     for each, place in zip(leading, evidence.places, strict=True):
         np.maximum(window(by_cell, place, shape), each, out=window(by_cell, place, shape))
-    result = before & ~(told & (deviation <= _NEAR))
+    result = before & ~(old <= _NEAR)
     # A pixel that has lost its ties by mistake, while larger deviations hid the true ones, gets
     # its measurements back.
     result[:, np.isnan(sensitivity)] = False
     for k, place in enumerate(evidence.places):
         rival = _LEADING * np.maximum(by_pixel, window(by_cell, place, shape))
-        suspect = told[k] & (leading[k] > _NEAR) & (leading[k] >= rival)
+        suspect = (leading[k] > _NEAR) & (leading[k] >= rival)
         result[k] |= suspect & (leading[k] > _BEYOND)
-        result[k] |= suspect & (_box(result[k].astype(np.float32)) > 0)
+        result[k] |= suspect & (_box(result[k]) > 0)
     return result
 
 
@@ -125,7 +124,7 @@ def deviations(
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     left_out: NDArray[np.bool_],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """How far each measurement, or the mean of the 3×3 pixels around it, is from the fit.
 
     Parameters
@@ -141,11 +140,11 @@ def deviations(
 
     Returns
     -------
-    deviation : ndarray, shape (n, rows, cols), float32
-        The larger of both absolute deviations, in standard deviations; that of the surroundings
-        where nothing tells of the measurement itself.
-    told : ndarray of bool, shape (n, rows, cols)
-        Where something tells of it.
+    new, old : ndarray, shape (n, rows, cols), float32
+        The larger of both absolute deviations, in standard deviations; NaN where nothing tells.
+        `new` is for what was not left out: the mean is over such only, and does not count beside
+        one that is conspicuous by itself, whose pull on others would show in it. `old` is for
+        what was left out: the mean is over both, each deviation cut off at five.
 
     Notes
     -----
@@ -165,8 +164,7 @@ def deviations(
         weight = np.where(left_out[k], 0, weights[k])
         on_pixels += weight * seen[k] ** 2
         window(on_cells, place, shape)[:] += weight * (place.flux * response) ** 2
-    result = np.empty(evidence.values.shape, np.float32)
-    told = np.empty(evidence.values.shape, bool)
+    new, old = (np.empty(evidence.values.shape, np.float32) for _ in range(2))
     for k, place in enumerate(evidence.places):
         shares = (
             _share(weights[k] * seen[k] ** 2, on_pixels),
@@ -174,26 +172,26 @@ def deviations(
         )
         sign = np.where(left_out[k], 1, -1)
         spread = (1 + sign * shares[0]) * (1 + sign * shares[1])
-        known = told[k] = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
+        known = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
         root = np.sqrt(weights[k])
         expected = seen[k] * response
         residual = np.full(shape, np.nan)
         residual[known] = (root * (evidence.values[k] - expected))[known] / np.sqrt(spread[known])
+        used = known & ~left_out[k]
         floor = evidence.floor * _median(root * expected, known)
-        result[k] = _deviation(residual, known & ~left_out[k], floor)
-    return result, told
+        residual /= max(_ROBUST * _median(residual, used), floor, np.finfo(float).tiny)
+        own = np.abs(residual)
+        quiet = _box(used & (own > _BEYOND)) == 0
+        new[k] = np.fmax(own, np.where(known & quiet, np.abs(_around(residual, used)), np.nan))
+        old[k] = np.fmax(own, np.abs(_around(np.clip(residual, -_BEYOND, _BEYOND), known)))
+        new[k][~known] = old[k][~known] = np.nan
+    return new, old
 
 
-def _deviation(scaled: NDArray[Any], used: NDArray[np.bool_], floor: float) -> NDArray[Any]:
-    """The larger of a pixel's own deviation and that of the 3×3 around it, in their own scale."""
-    known = np.isfinite(scaled)
-    around = _box(np.where(known, scaled, 0)) / np.sqrt(np.maximum(_box(known * 1.0), 1))
-    own, mean = (
-        np.abs(each) / max(_ROBUST * _median(each, used), floor, np.finfo(float).tiny)
-        for each in (scaled, around)
-    )
-    deviation: NDArray[Any] = np.fmax(own, mean)
-    return deviation
+def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
+    """Mean of the 3×3 residuals around each pixel in its standard deviations, by their own scale."""
+    mean = _box(np.where(where, residual, 0)) / np.sqrt(np.maximum(_box(where), 1))
+    return mean / max(1.0, _ROBUST * _median(mean, where))
 
 
 def _weights(evidence: Evidence, exposure: int, expected: NDArray[np.bool_]) -> NDArray[Any]:
@@ -217,7 +215,7 @@ def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
 
 def _box(image: NDArray[Any]) -> NDArray[Any]:
     """Sum of the 3×3 pixels around each, those beyond the border counting 0."""
-    padded = np.pad(image, 1)
+    padded = np.pad(image.astype(np.float32), 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     total: NDArray[Any] = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
     return total
