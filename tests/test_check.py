@@ -30,7 +30,12 @@ def noise_free():
     _, truth, beam = sensor(TestPredict.SHAPE, 1)
     options = {"rotation": TestPredict.ROTATION, "flux": TestPredict.FLUX}
     frames = simulate.exposures(truth, beam, TestPredict.SHIFTS, **options)
-    return truth, beam, frames, equipix.calibrate(frames, TestPredict.SHIFTS, tolerance=1e-9, **options)
+    return (
+        truth,
+        beam,
+        frames,
+        equipix.calibrate(frames, TestPredict.SHIFTS, tolerance=1e-9, **options),
+    )
 
 
 class TestPredict:
@@ -53,7 +58,7 @@ class TestPredict:
     def test_what_no_exposure_observed_is_nan(self, noise_free):
         cal = noise_free[3]
         assert np.isnan(cal.predict((500, -500))).all()
-        assert np.isnan(cal.predict((-10**6, 0), rotation=90)).all()
+        assert np.isnan(cal.predict((-(10**6), 0), rotation=90)).all()
         rows = np.isnan(cal.predict((-3, 0))).all(axis=1)
         assert rows.tolist() == [True] * 2 + [False] * 28  # the grid begins at row −1
 

@@ -17,7 +17,7 @@ NOISE = 1e-3
 
 @pytest.fixture(scope="module")
 def experiments():
-    """Three calibrations of one sensor by independent exposures, and what noise predicts of each."""
+    """Three calibrations of one sensor from independent exposures, and what noise predicts."""
     rng = np.random.default_rng(1)
     truth = simulate.cosine_sensitivity(SHAPE, rng=rng)
     truth /= truth.mean()

@@ -43,7 +43,11 @@ class TestSilentPixels:
         for seed in range(80):
             frames, _, silent, mask = bridged(seed, noise=noise)
             cal = equipix.calibrate(
-                frames, CROSS, mask=mask, variance=np.full(5, max(noise, 1e-6) ** 2), max_sweeps=2000
+                frames,
+                CROSS,
+                mask=mask,
+                variance=np.full(5, max(noise, 1e-6) ** 2),
+                max_sweeps=2000,
             )
             cells, grid, _ = reference.grid_cells(frames.shape[1:], CROSS)
             labels, _ = reference.components(cells, ~mask, grid, silent)

@@ -1,7 +1,8 @@
 """A robust calibration: what is there in one exposure only does not count.
 
 Simulated grains of dust have 20 pixels. What a run with those measurements masked by hand finds is
-the best that can be had: the rms error may be 1.1 times its over the grain, 1.02 times over the frame.
+the best that can be had: the rms error may be 1.1 times its own over the grain, 1.02 times over the
+frame.
 """
 
 from __future__ import annotations

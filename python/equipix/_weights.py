@@ -1,4 +1,4 @@
-"""Weights that depend on the fit: variances by a noise model, measurements that disagree left out."""
+"""Weights that depend on the fit: variances by a noise model, and none for what disagrees."""
 
 from __future__ import annotations
 
@@ -54,8 +54,10 @@ class Measurements:
 
     def usable(self) -> NDArray[np.bool_]:
         """Which measurements may be used, shape (n, rows, cols)."""
-        finite = np.isfinite(self.values)
-        return finite if self.masked is None else finite & ~self.masked
+        finite: NDArray[np.bool_] = np.isfinite(self.values)
+        if self.masked is not None:
+            finite &= ~self.masked
+        return finite
 
     def places(self, solution: Solution) -> list[Position]:
         """Where each exposure lies on the grid of the beam."""

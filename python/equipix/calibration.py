@@ -31,13 +31,13 @@ from equipix._measurements import (
 )
 from equipix._weights import Measurements, modelled, solve_robustly
 from equipix.correction import Flagged, apply_gain
+from equipix.defects import noisy_pixels, odd_responses
 from equipix.errors import (
     ConvergenceWarning,
     IdentifiabilityWarning,
     InputError,
 )
 from equipix.io import save_pages
-from equipix.defects import noisy_pixels, odd_responses
 from equipix.noise import fit_frames
 from equipix.prediction import light, positions, predictions
 from equipix.results import Flag, FrameStatistics
@@ -92,8 +92,12 @@ class Calibration:
     beam_origin : tuple of int
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0, or by no
-        more than the tolerance, is ``DEAD | DO_NOT_USE``.
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
+        neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
+        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. What the
+        measurements do not determine is ``NO_FLAT_FIELD | DO_NOT_USE``, what they contradict
+        each other about, so that a robust calibration left out most of them,
+        ``UNRELIABLE_FLAT | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     flux : ndarray, shape (n,), float64
@@ -105,6 +109,8 @@ class Calibration:
         variance of one value where none were given. NaN without any degree of freedom.
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
+        A pixel that does not respond ties none together; nor does one whose measurements carry
+        next to no weight.
     component_labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     sweeps : int
@@ -204,9 +210,7 @@ class Calibration:
             frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
         )
 
-    def predict(
-        self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0
-    ) -> NDArray[Any]:
+    def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).
 
         Parameters
@@ -251,8 +255,7 @@ class Calibration:
         """
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
-        (frame,) = self._predictions([shift], [rotation], [flux])
-        return frame
+        return self._predictions(np.reshape(shift, (1, 2)), [rotation], [flux])[0]
 
     def residuals(
         self,
@@ -307,7 +310,7 @@ class Calibration:
         )
         check_count("shifts", len(predicted), len(values))
         models = as_models(variance, statistics, len(values))
-        residuals = np.where(np.isfinite(values), values, np.nan) - predicted
+        residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
         if models:
             scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
         elif variance is not None:
@@ -327,16 +330,14 @@ class Calibration:
 
     def _predictions(
         self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
-    ) -> NDArray[Any]:
-        """Frames from these positions, shape (n, rows, cols)."""
+    ) -> list[NDArray[Any]]:
+        """Frames from these positions, each of shape (rows, cols)."""
         whole = round_shifts(shifts)
         turns = as_rotation(rotation, len(whole))
         fluxes = per_exposure("flux", flux, len(whole), default=1)
         places = positions(self.beam_origin, whole, turns, fluxes)
-        result = np.empty((len(whole), *self.shape), self.sensitivity.dtype)
-        for k, frame in enumerate(predictions(self.sensitivity, self.beam, places)):
-            result[k] = frame
-        return result
+        frames = predictions(self.sensitivity, self.beam, places)
+        return [frame.astype(self.sensitivity.dtype) for frame in frames]
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.
@@ -423,8 +424,8 @@ def calibrate(
     variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
         Variance of the values given; without it all weights are 1. A noise model, or one for each
         exposure, is evaluated at what a first fit expects, since with variances taken at the noisy
-        values themselves those that happen to be low would weigh more. (With `FrameStatistics` it
-        is the model of one frame.)
+        values themselves those that happen to be low would weigh more. With `FrameStatistics` it
+        is the model of one frame.
     mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
         True = do not use.
     saturation : float, optional
@@ -566,9 +567,10 @@ def calibrate(
     if rejected is not None:
         calibration.metadata["rejected"] = rejected.sum(axis=(1, 2)).tolist()
     _flag(calibration, data, variances)
+    flagged: list[tuple[NDArray[np.bool_], Flag]]
     flagged = [(each.saturated > 0, Flag.SATURATED) for each in statistics]
     if saturated is not None:
-        flagged.append((saturated.any(axis=0), Flag.SATURATED))
+        flagged.append((np.any(saturated, axis=0), Flag.SATURATED))
     if noisy is not None:
         flagged.append((noisy, Flag.HOT | Flag.DO_NOT_USE))
     for pixels, flag in flagged:

@@ -189,7 +189,9 @@ def compare(
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:
     """Print how far the calibrations of each pair differ."""
     figures = ("rms", "block_rms", "largest")
-    table = Table("relative difference", "pixels, rms", "16×16 means, rms", "largest", box=SIMPLE_HEAD)
+    table = Table(
+        "relative difference", "pixels, rms", "16×16 means, rms", "largest", box=SIMPLE_HEAD
+    )
     for pair in pairs:
         table.add_row(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures))
     Console(soft_wrap=True).print(table)

@@ -11,7 +11,7 @@ import numpy as np
 from equipix._arrays import as_array, check_count
 from equipix.errors import InputError
 from equipix.results import Flag
-from equipix.simulate.accuracy import BLOCK, block_means, relative_error
+from equipix.simulate.accuracy import block_means, relative_error
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,7 +118,7 @@ def compare(
     sensitivities = _in_one_gauge(calibrations)
     pairs = np.array(list(combinations(range(count), 2)))
     differences = [relative_error(*sensitivities[pair]) for pair in pairs]
-    comparison = Comparison(
+    return Comparison(
         sensitivities=sensitivities,
         agreement=sensitivities.std(axis=0, ddof=1),
         pairs=pairs,
@@ -127,7 +127,6 @@ def compare(
         largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
         **_predictions(predicted, pairs, count),
     )
-    return comparison
 
 
 def _in_one_gauge(calibrations: Sequence[Calibration]) -> NDArray[Any]:

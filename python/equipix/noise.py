@@ -44,9 +44,9 @@ class NoiseModel:
 
     `signal` should be an expectation, not a noisy value: with a model evaluated on the values
     themselves those that happen to be low weigh more, which at N electrons lowers a weighted mean
-    by 1/N of itself, and raises χ² with five exposures by some 2/(3N); and what a grain of dust has darkened would get the
-    largest weight of all. `equipix.calibrate` evaluates it on its own fit, whose residuals do not
-    correlate with it.
+    by 1/N of itself, and raises χ² with five exposures by some 2/(3N); and what a grain of dust
+    has darkened would get the largest weight of all. `equipix.calibrate` evaluates it on its own
+    fit, whose residuals do not correlate with it.
 
     Examples
     --------

@@ -184,8 +184,9 @@ def _densities(
 ) -> None:
     """Draw histograms with one set of edges, and what the uncertainties predict."""
     reach = max(float(np.nanmax(np.abs(each))) for each in values.values()) or 1.0
-    edges = reach * np.linspace(-1, 1, 62)
-    highest = 0.0
+    count = min(int(np.isfinite(each).sum()) for each in values.values())
+    edges = reach * np.linspace(-1, 1, min(62, 6 + round(count**0.5)))
+    highest, width = 0.0, 2 * reach / (len(edges) - 1)
     for label, each in values.items():
         density = np.histogram(each, edges)[0] / np.isfinite(each).sum() / np.diff(edges)
         highest = max(highest, float(density.max()))
@@ -200,7 +201,7 @@ def _densities(
         xlabel="difference, %",
         ylabel="density",
         yscale="log",
-        ylim=(highest / 1e5, 30 * highest),
+        ylim=(0.5 / count / width, 30 * highest),
     )
     axes.legend(loc="upper right", fontsize="small")
 

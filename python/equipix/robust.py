@@ -25,8 +25,8 @@ _NEAR = 3.0
 """The same beside a measurement that is rejected: grains have soft edges."""
 
 _LEADING = 0.7
-"""Share of the largest deviation in the same pixel and cell that is suspect. One false value among m
-spreads 1/(m − 1) of its own deviation over each of the others, which is at most a half from m = 3."""
+"""Share of the largest deviation in the same pixel and cell that is suspect. One false value among
+m spreads 1/(m − 1) of its own deviation over each of the others: at most a half from m = 3."""
 
 _TESTABLE = 1e-6
 """Least share of its variance that a residual must keep: less is rounding."""
@@ -152,7 +152,7 @@ def deviations(
     noise out of its residual, L the share h_L = w c²M² / Σ w c²M² (over those that see the cell):
     its variance is near (1 − h_M)(1 − h_L) σ², which is exact where every exposure sees all, as
     in a two-way analysis of variance. That of one that was left out is (1 + h_M)(1 + h_L) σ². The
-    scale of σ is the residuals' own, in each exposure, from their median absolute value; so it
+    scale of these is the residuals' own, in each exposure, from their median absolute value; so it
     matters little whether the variances given are right by a factor.
     """
     shape = evidence.values.shape[1:]
@@ -189,9 +189,10 @@ def deviations(
 
 
 def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
-    """Mean of the 3×3 residuals around each pixel in its standard deviations, by their own scale."""
+    """Mean of the 3×3 residuals around each pixel, in standard deviations by their own scale."""
     mean = _box(np.where(where, residual, 0)) / np.sqrt(np.maximum(_box(where), 1))
-    return mean / max(1.0, _ROBUST * _median(mean, where))
+    scaled: NDArray[Any] = mean / max(1.0, _ROBUST * _median(mean, where))
+    return scaled
 
 
 def _weights(evidence: Evidence, exposure: int, expected: NDArray[np.bool_]) -> NDArray[Any]:
@@ -205,7 +206,8 @@ def _weights(evidence: Evidence, exposure: int, expected: NDArray[np.bool_]) -> 
 
 def _share(own: NDArray[Any], total: NDArray[Any]) -> NDArray[Any]:
     """Share that a weight has in a sum; NaN where the sum is 0."""
-    return np.divide(own, total, where=total > 0, out=np.full(own.shape, np.nan))
+    share: NDArray[Any] = np.divide(own, total, where=total > 0, out=np.full(own.shape, np.nan))
+    return share
 
 
 def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:

@@ -61,9 +61,9 @@ def components(
         labels[roots == root] = label
     for pixel in np.flatnonzero(silent):
         exposures = [k for k, counts in enumerate(everything) if counts.flat[pixel]]
-        seen = {int(labels[pixels + cells[k].flat[pixel]]) for k in exposures} - {-1}
-        if len(seen) == 1:
-            labels[pixel] = seen.pop()
+        around = {int(labels[pixels + cells[k].flat[pixel]]) for k in exposures} - {-1}
+        if len(around) == 1:
+            labels[pixel] = around.pop()
     return labels[:pixels].reshape(cells[0].shape), labels[pixels:].reshape(grid_shape)
 
 
