@@ -106,11 +106,18 @@ class NoiseModel:
                 "repeated frames are all equal, which shows no scatter: give a single one of them"
             )
         weight = degrees / np.maximum(variance, floor) ** 2
+        given = gain
         if gain is None:
             x = signal - np.average(signal, weights=weight)
             spread = np.sum(weight * x**2)
             gain = max(0.0, float(np.sum(weight * x * variance) / spread)) if spread > 0 else 0.0
-        read_variance = max(floor, np.average(variance - gain * signal, weights=weight))
+        read_variance = np.average(variance - gain * signal, weights=weight)
+        if read_variance < floor:
+            read_variance = floor
+            # At its bound the other parameter must follow, or every variance would be too large.
+            energy = np.sum(weight * signal**2)
+            if given is None and energy > 0:
+                gain = max(0.0, float(np.sum(weight * signal * (variance - floor)) / energy))
         return cls(read_noise=float(np.sqrt(read_variance)), gain=gain)
 
 
