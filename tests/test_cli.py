@@ -67,7 +67,7 @@ def refused(result, *words):
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "simulate", "average", "calibrate", "correct", "inspect"]
+    "command", ["demo", "simulate", "average", "calibrate", "compare", "correct", "inspect"]
 )
 def test_help_has_an_example(run, command):
     status, out, _ = run(command, "--help")

@@ -10,7 +10,7 @@ import pytest
 
 from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
 from equipix.defects import dead_pixels, hot_pixels
-from equipix.noise import NoiseModel, photon_transfer, scatter_limit, smoothed_variances
+from equipix.noise import NoiseModel, fit_frames, models_of_means, photon_transfer, scatter_limit
 
 SHAPE = (64, 80)
 SHIFTS = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
@@ -343,8 +343,9 @@ def test_variances_are_a_smooth_function_of_the_mean():
     rng = np.random.default_rng(1)
     levels = np.tile(np.linspace(500, 3000, 100), (100, 1))
     exposures = [statistics(rng, levels, gain=0.3, read_noise=2.0, frames=8) for _ in range(3)]
-    variances = smoothed_variances(exposures)
-    expected = (0.3 * np.stack([e.mean for e in exposures]) + 4 + 1 / 12) / 8
+    models = models_of_means(exposures, fit_frames(exposures))
+    variances = np.stack([model.variance(levels) for model in models])
+    expected = np.broadcast_to((0.3 * levels + 4 + 1 / 12) / 8, variances.shape)
     # Standard errors as above, for 30 000 pixels and 7 degrees of freedom; twice for two
     # parameters, five of these.
     np.testing.assert_allclose(variances, expected, rtol=10 * np.sqrt(2 / 7 / 30_000))
@@ -354,7 +355,7 @@ def test_single_frames_have_no_variance():
     ones, none = np.ones((4, 4)), np.full((4, 4), np.nan)
     single = FrameStatistics(ones, none, none, ones.astype(np.uint32), np.zeros((4, 4), np.uint32))
     with pytest.raises(errors.InputError, match="single frames"):
-        smoothed_variances([single, single])
+        fit_frames([single, single])
 
 
 @pytest.mark.parametrize("frames", [2, 3, 10, 100])
@@ -369,12 +370,12 @@ def test_scatter_limit_is_beyond_chance(frames):
 def test_faint_light_makes_no_dead_pixels():
     rng = np.random.default_rng(4)
     signals = 3 + 1.5 * rng.standard_normal((5, 100, 100))
-    variances = np.full_like(signals, 1.5**2)
+    models = [NoiseModel(1.5, 0.0)] * 5
     assert (signals < 1.5).any(axis=0).any()
-    assert not dead_pixels(signals, variances).any()
+    assert not dead_pixels(signals, models).any()
     signals = 100 + 1.5 * rng.standard_normal((5, 100, 100))
     signals[:, 7, 9] = 49 - 6 * 1.5 - 8
-    assert np.argwhere(dead_pixels(signals, variances)).tolist() == [[7, 9]]
+    assert np.argwhere(dead_pixels(signals, models)).tolist() == [[7, 9]]
 
 
 def test_noisy_pixels_are_hot():

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix._arrays import as_array, as_floats, check_count, per_exposure
+from equipix._arrays import as_array, as_floats, check_count, number, per_exposure
 from equipix.errors import InputError
+from equipix.noise import NoiseModel, fit_frames, models_of_means
 from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
 
 FluxModel = Literal["fit", "linear"]
@@ -45,6 +50,58 @@ def as_values(frames: ArrayLike, statistics: list[FrameStatistics]) -> NDArray[A
     return values
 
 
+def as_rotation(rotation: ArrayLike | None, count: int) -> NDArray[np.int64]:
+    """Rotation of each exposure, in degrees; 0 unless given."""
+    turns = per_exposure("rotation", rotation, count, default=0)
+    if not np.all(np.isin(turns, (0, 90, 180, 270))):
+        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+    return turns.astype(np.int64)
+
+
+def as_models(
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
+    statistics: list[FrameStatistics],
+    count: int,
+) -> list[NoiseModel]:
+    """Noise model of each of the values given; none if variances are given as numbers, or not."""
+    if variance is None and statistics:
+        variance = fit_frames(statistics)
+    if isinstance(variance, NoiseModel):
+        return models_of_means(statistics, variance) if statistics else [variance] * count
+    if not isinstance(variance, list | tuple):
+        return []
+    models = [each for each in variance if isinstance(each, NoiseModel)]
+    if models:
+        if len(models) != len(variance):
+            raise InputError("'variance' mixes noise models and numbers, expected either")
+        check_count("variance", len(models), count)
+    return models
+
+
+def as_saturated(
+    saturation: float | None, values: NDArray[Any], statistics: list[FrameStatistics]
+) -> NDArray[np.bool_] | None:
+    """Which values reach the level `saturation`."""
+    if saturation is None:
+        return None
+    if statistics:
+        raise InputError(
+            "'saturation' is for arrays, but 'frames' are averages: their saturated samples are "
+            "counted where equipix.average is given the level"
+        )
+    level = number("saturation", saturation)
+    if not level > 0:
+        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")
+    saturated: NDArray[np.bool_] = values >= level
+    for k, each in enumerate(saturated):
+        if each.all():
+            raise InputError(
+                f"'frames': every pixel of exposure {k} reaches the 'saturation' level {level:g}: "
+                "expose less, or correct the level"
+            )
+    return saturated
+
+
 def as_variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
     """Variances in the shape and dtype that the solver takes."""
     variances = as_array("variance", variance, ndim=(1, 3))
@@ -55,6 +112,12 @@ def as_variances(variance: ArrayLike, values: NDArray[Any]) -> NDArray[Any]:
         raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return variances.astype(values.dtype, copy=False)
+
+
+def union(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Mask of what any of several masks, of one exposure or of all, hides."""
+    given = [mask for mask in masks if mask is not None]
+    return functools.reduce(np.logical_or, given) if given else None
 
 
 def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -112,3 +175,37 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> NDArray[np.float64]:
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
     return std
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What of a calibration was asked for, where not all goes with all."""
+
+    method: str
+    flux: str
+    shifts_refined: bool
+    dark: str
+    modelled: bool
+    robust: bool
+    uncertainty: bool
+
+    def check(self) -> None:
+        """Refuse what does not go together."""
+        if self.dark not in ("subtracted", "fit"):
+            raise InputError(f"'dark' is {self.dark!r}, expected 'subtracted' or 'fit'")
+        fitted = self.flux != "known" or self.dark == "fit"
+        if self.method != "multiscale" and (fitted or self.shifts_refined):
+            raise InputError(
+                "'method' is 'coordinate-descent', which knows whole shifts and given fluxes: to "
+                "fit fluxes, shifts or the dark take 'multiscale'"
+            )
+        if self.uncertainty and fitted:
+            raise InputError(
+                "'uncertainty' knows given fluxes and a subtracted dark alone: leave it out where "
+                "'flux' is fitted or has a 'flux_std', or where 'dark' is 'fit'"
+            )
+        if self.dark == "fit" and (self.robust or self.modelled):
+            raise InputError(
+                "'dark' is 'fit', but 'robust' and noise models expect the signal alone: subtract "
+                "a dark, or give variances as numbers and leave 'robust' out"
+            )

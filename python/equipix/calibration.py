@@ -20,22 +20,30 @@ from equipix._arrays import (
     positive_workers,
 )
 from equipix._measurements import (
+    Asked,
     FluxModel,
     as_flux,
     as_mask,
+    as_models,
+    as_rotation,
+    as_saturated,
     as_shift_std,
     as_statistics,
     as_values,
     as_variances,
+    union,
 )
+from equipix._weights import Problem, modelled, solve_robustly
 from equipix.correction import Flagged, apply_gain
+from equipix.defects import noisy_pixels, odd_responses
 from equipix.errors import (
     ConvergenceWarning,
     IdentifiabilityWarning,
     InputError,
 )
 from equipix.io import save_pages
-from equipix.noise import smoothed_variances
+from equipix.noise import fit_frames
+from equipix.prediction import light, positions, predictions
 from equipix.results import Flag, FrameStatistics
 from equipix.shifts import as_positions, round_shifts
 from equipix.uncertainty import (
@@ -53,6 +61,8 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix.noise import NoiseModel
 
     Progress = Callable[[int, int, str], object]
 
@@ -99,8 +109,12 @@ class Calibration:
     beam_origin : tuple of int
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is not above 0, or by no
-        more than the tolerance, is ``DEAD | DO_NOT_USE``.
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
+        neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
+        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. What the
+        measurements do not determine is ``NO_FLAT_FIELD | DO_NOT_USE``, what they contradict
+        each other about, so that a robust calibration left out most of them,
+        ``UNRELIABLE_FLAT | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     flux : ndarray, shape (n,), float64
@@ -112,6 +126,8 @@ class Calibration:
         variance of one value where none were given. NaN without any degree of freedom.
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
+        A pixel that does not respond ties none together; nor does one whose measurements carry
+        next to no weight.
     component_labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     sweeps : int
@@ -136,6 +152,8 @@ class Calibration:
         Standard deviation of `tilt` by noise; None unless asked for.
     measurements : Measurements or None
         References to what the calibration was made from, for `std_of`; None if read from a file.
+    rejected : ndarray of bool, shape (n, rows, cols), or None
+        The measurements that a robust calibration left out; `metadata` counts them.
     """
 
     sensitivity: NDArray[Any]
@@ -157,6 +175,7 @@ class Calibration:
     sensitivity_std: NDArray[Any] | None = None
     tilt_std: NDArray[Any] | None = None
     measurements: Measurements | None = None
+    rejected: NDArray[np.bool_] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -307,6 +326,130 @@ class Calibration:
             frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
         )
 
+    def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
+        """Frame that the sensor would give at another position: c · L(u) · M(p).
+
+        Parameters
+        ----------
+        shift : array_like, shape (2,)
+            Position (row, col) of the sensor in the beam, in pixels, as for `calibrate`.
+        rotation : {0, 90, 180, 270}
+            How far the sensor is turned, in degrees.
+        flux : float
+            Relative flux c of the exposure.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols)
+            Noise-free signal in the units of the frames, the dark subtracted; NaN where the
+            sensitivity is undetermined, and where no exposure has observed the beam.
+
+        Raises
+        ------
+        InputError
+            If an argument has a wrong shape or value.
+
+        See Also
+        --------
+        residuals : How far frames are from it.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from equipix import calibrate, cross_pattern, simulate
+        >>> beam, truth = simulate.gaussian_beam((48, 64)), np.ones((48, 64))
+        >>> shifts = cross_pattern(5, 7)
+        >>> cal = calibrate(simulate.exposures(truth, beam, shifts), shifts)
+        >>> held_out = simulate.exposures(truth, beam, [(3, 4)])[0]
+        >>> bool(np.nanmax(np.abs(cal.predict((3, 4)) - held_out)) < 1e-6)
+        True
+        """
+        if np.shape(shift) != (2,):
+            raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
+        return self._predictions(np.reshape(shift, (1, 2)), [rotation], [flux])[0]
+
+    def residuals(
+        self,
+        frames: ArrayLike | Sequence[FrameStatistics],
+        *,
+        variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+        shifts: ArrayLike | None = None,
+        rotation: ArrayLike | None = None,
+        flux: ArrayLike | None = None,
+    ) -> NDArray[Any]:
+        """How far frames are from what the calibration predicts: y − c · L(u) · M(p).
+
+        Parameters
+        ----------
+        frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
+            Exposures with the dark subtracted: those that the calibration was made from, or
+            others, whose `shifts` are given then.
+        variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
+            Variance of the values given, as for `calibrate`.
+        shifts, rotation, flux : array_like, optional
+            Where and how bright the exposures were taken, as for `calibrate`; by default those
+            of the calibration.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, cols)
+            Residuals in the units of the frames; where variances are known, in standard
+            deviations of a measurement. NaN where nothing is measured or predicted.
+
+        Raises
+        ------
+        InputError
+            If an argument has a wrong shape or value.
+
+        Notes
+        -----
+        Of the exposures that a calibration was made from M and L have followed some of the
+        noise: the mean square of residuals in standard deviations is `reduced_chi2` times the
+        degrees of freedom over the number of measurements. Of one held out it is above 1, by
+        the variance of the prediction.
+        """
+        statistics = as_statistics(frames)
+        values = as_values(cast("ArrayLike", frames), statistics)
+        if values.shape[1:] != self.shape:
+            raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
+        if shifts is None:
+            check_count("frames", len(values), len(self.shifts))
+        predicted = self._predictions(
+            self.shifts if shifts is None else shifts,
+            self._rotation if shifts is None and rotation is None else rotation,
+            self.flux if shifts is None and flux is None else flux,
+        )
+        check_count("shifts", len(predicted), len(values))
+        models = as_models(variance, statistics, len(values))
+        residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
+        if models:
+            scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
+        elif variance is not None:
+            given = as_variances(cast("ArrayLike", variance), values)
+            scales = list(given if given.ndim == 3 else given[:, None, None])
+        else:
+            return residuals
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for residual, scale in zip(residuals, scales, strict=True):
+                residual /= np.sqrt(scale)
+        return residuals
+
+    @property
+    def _rotation(self) -> list[int]:
+        rotation: list[int] = self.metadata["options"]["rotation"]
+        return rotation
+
+    def _predictions(
+        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
+    ) -> list[NDArray[Any]]:
+        """Frames from these positions, each of shape (rows, cols)."""
+        exact = as_positions(shifts)
+        turns = as_rotation(rotation, len(exact))
+        fluxes = per_exposure("flux", flux, len(exact), default=1)
+        places = positions(self.beam_origin, exact, turns, fluxes)
+        frames = predictions(self.sensitivity, self.beam, places)
+        return [frame.astype(self.sensitivity.dtype) for frame in frames]
+
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.
 
@@ -334,6 +477,8 @@ class Calibration:
             pages["dark"] = self.dark
         if self.sensitivity_std is not None:
             pages["sensitivity_std"] = self.sensitivity_std
+        if self.rejected is not None:
+            pages["rejected"] = self.rejected.reshape(-1, self.shape[1]).astype(np.uint8)
         numbers = {
             "beam_origin": list(self.beam_origin),
             "shifts": self.shifts.tolist(),
@@ -366,14 +511,16 @@ def calibrate(
     frames: ArrayLike | Sequence[FrameStatistics],
     shifts: ArrayLike,
     *,
-    variance: ArrayLike | None = None,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
     mask: ArrayLike | None = None,
+    saturation: float | None = None,
     flux: ArrayLike | FluxModel | None = None,
     flux_std: ArrayLike | None = None,
     time: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     dark: Literal["subtracted", "fit"] = "subtracted",
+    robust: bool = False,
     method: Method = "multiscale",
     tolerance: float = 1e-6,
     max_sweeps: int | None = None,
@@ -389,16 +536,23 @@ def calibrate(
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
         `FrameStatistics` bring their variances along: a noise model fitted over all pixels, not
         each pixel's own sample variance, gives the weights. A mean with saturated samples counts
-        as masked, and its pixel is flagged.
+        as masked, and its pixel is flagged; a pixel that scatters more than chance explains in
+        every exposure is masked and flagged ``HOT``.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
         unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result without
         any residual to show it. Where they are not whole numbers the beam is a cubic spline;
         coordinate descent rounds them.
-    variance : array_like, shape (n,) or (n, rows, cols), optional
-        Variance of the values given. Without it all weights are 1.
+    variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
+        Variance of the values given; without it all weights are 1. A noise model, or one for each
+        exposure, is evaluated at what a first fit expects, since with variances taken at the noisy
+        values themselves those that happen to be low would weigh more. With `FrameStatistics` it
+        is the model of one frame.
     mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
         True = do not use.
+    saturation : float, optional
+        Level, in the units of frames given as arrays: a value at or above it counts as masked, and
+        its pixel is flagged.
     flux : array_like, shape (n,), "fit" or "linear", optional
         Known relative flux of each exposure, 1 unless given; or what is to be found: a flux for
         each exposure, or ln c linear in `time`.
@@ -416,6 +570,12 @@ def calibrate(
     dark : {"subtracted", "fit"}
         Whether the dark is already subtracted, or to be found as an offset of each pixel: for
         exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.
+    robust : bool
+        Whether to leave out measurements that disagree with the others, such as of a particle or
+        a reflection that is there in one exposure only: those more than five standard deviations
+        from the fit, or whose 3×3 surroundings are, found in rounds of fitting. The scale is that
+        of the residuals, so variances need be right but for a factor. Needs three exposures. Give
+        variances as a noise model, not as computed from values that a grain has darkened.
     method : {"multiscale", "coordinate-descent"}
         How to minimise the objective: by Gauss-Newton steps on all scales at once, in a number of
         passes that does not depend on the size of the sensor; or by the paper's method, which
@@ -498,82 +658,87 @@ def calibrate(
     if method not in get_args(Method):
         raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
-    if uncertainty and (isinstance(flux, str) or flux_std is not None or dark == "fit"):
-        raise InputError(
-            "'uncertainty' knows given fluxes and a subtracted dark alone: leave it out where "
-            "'flux' is fitted or has a 'flux_std', or where 'dark' is 'fit'"
-        )
     statistics = as_statistics(frames)
+    noise = fit_frames(statistics) if variance is None and statistics else None
+    noisy = noisy_pixels(statistics, noise) if noise is not None else None
     with naming_memory("calibrating"):
         values = as_values(cast("ArrayLike", frames), statistics)
-        if variance is None and statistics:
-            variance = smoothed_variances(statistics)
-        variances = None if variance is None else as_variances(variance, values)
-        masked = None if mask is None else as_mask(mask, values.shape)
-    count = len(values)
-    positions = as_positions(shifts) if method == "multiscale" else round_shifts(shifts)
-    check_count("shifts", len(positions), count)
-    turns = per_exposure("rotation", rotation, count, default=0)
-    if not np.all(np.isin(turns, (0, 90, 180, 270))):
-        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+        count = len(values)
+        models = as_models(variance if noise is None else noise, statistics, count)
+        variances = None
+        if variance is not None and not models:
+            variances = as_variances(cast("ArrayLike", variance), values)
+        saturated = as_saturated(saturation, values, statistics)
+        given = None if mask is None else as_mask(mask, values.shape)
+        masked = union(given, saturated, noisy)
+    places = as_positions(shifts) if method == "multiscale" else round_shifts(shifts)
+    check_count("shifts", len(places), count)
+    turns = as_rotation(rotation, count)
     fluxes, flux_model = as_flux(flux, flux_std, time, count)
     shift_error = None if shift_std is None else as_shift_std(shift_std, count)
-    if dark not in ("subtracted", "fit"):
-        raise InputError(f"'dark' is {dark!r}, expected 'subtracted' or 'fit'")
-    if method != "multiscale" and (
-        flux_model[0] != "known" or shift_error is not None or dark == "fit"
-    ):
-        raise InputError(
-            "'method' is 'coordinate-descent', which knows whole shifts and given fluxes: to fit "
-            "fluxes, shifts or the dark take 'multiscale'"
-        )
-    result = _native.calibrate_frames(
-        values,
-        positions.astype(np.float64),
-        shift_std=shift_error,
-        rotation=turns.astype(int).tolist(),
-        flux=fluxes.tolist(),
-        flux_model=flux_model,
-        offset=dark == "fit",
-        variance=variances,
-        mask=masked,
-        method=method,
-        tolerance=number("tolerance", tolerance),
-        max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
-        workers=positive_workers(workers),
-        progress=progress,
+    asked = Asked(
+        method, flux_model[0], shift_error is not None, dark, bool(models), robust, uncertainty
     )
+    asked.check()
+
+    def solve(
+        variances: NDArray[Any] | None,
+        masked: NDArray[np.bool_] | None,
+        tolerance: float = number("tolerance", tolerance),
+    ) -> _native.Solution:
+        return _native.calibrate_frames(
+            values,
+            places.astype(np.float64),
+            shift_std=shift_error,
+            rotation=turns.tolist(),
+            flux=fluxes.tolist(),
+            flux_model=flux_model,
+            offset=dark == "fit",
+            variance=variances,
+            mask=masked,
+            method=method,
+            tolerance=tolerance,
+            max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
+            workers=positive_workers(workers),
+            progress=progress,
+        )
+
+    data = Problem(values, masked, places, turns, fluxes, solve)
+    rejected = None
+    with naming_memory("calibrating"):
+        if models:
+            variances = modelled(data, models, tolerance)
+        if robust:
+            result, rejected = solve_robustly(data, models, variances, tolerance)
+        else:
+            result = solve(variances, masked)
+    measurements = Measurements(
+        values,
+        np.rint(places).astype(np.int64),
+        turns.tolist(),
+        list(result.flux),
+        variances,
+        masked if rejected is None else ~data.usable() | rejected,
+        result.beam_origin,
+    )
+    calibration = _wrapped(result, values.dtype, places, measurements, rejected)
     options: dict[str, Any] = {
         "method": method,
         "tolerance": tolerance,
         "max_sweeps": max_sweeps,
         "dark": dark,
+        "flux": flux_model[0],
     }
-    if flux_model[0] != "known":
-        options["flux"] = flux_model[0]
     if result.shifts_told is not None:
         options["shifts"] = "refined" if result.shifts_told else "as given: the beam tells none"
-    measurements = Measurements(
-        values,
-        np.rint(positions).astype(np.int64),
-        turns.astype(int).tolist(),
-        list(result.flux),
-        variances,
-        masked,
-        result.beam_origin,
-    )
-    calibration = _wrapped(result, values.dtype, positions, measurements)
     calibration.metadata.update(
         versions={"equipix": _native.__version__, "numpy": np.__version__},
-        options=options | {"rotation": turns.astype(int).tolist()},
+        options=options | {"rotation": turns.tolist(), "robust": robust},
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    calibration.flags[calibration.sensitivity <= tolerance] |= np.uint32(
-        Flag.DEAD | Flag.DO_NOT_USE
-    )
-    for each in statistics:
-        calibration.flags[each.saturated > 0] |= np.uint32(Flag.SATURATED)
+    _flag(calibration, data, variances)
+    _flag_known(calibration, statistics, saturated, noisy)
     _warn(calibration, tolerance, result)
     if uncertainty:
         calibration = _with_std(calibration, workers, progress)
@@ -607,11 +772,56 @@ def _with_std(
     )
 
 
+def _flag_known(
+    calibration: Calibration,
+    statistics: list[FrameStatistics],
+    saturated: NDArray[np.bool_] | None,
+    noisy: NDArray[np.bool_] | None,
+) -> None:
+    """Set the flags of pixels that were odd before any fit."""
+    flagged: list[tuple[NDArray[np.bool_], Flag]]
+    flagged = [(each.saturated > 0, Flag.SATURATED) for each in statistics]
+    if saturated is not None:
+        flagged.append((np.any(saturated, axis=0), Flag.SATURATED))
+    if noisy is not None:
+        flagged.append((noisy, Flag.HOT | Flag.DO_NOT_USE))
+    for pixels, flag in flagged:
+        calibration.flags[pixels] |= np.uint32(flag)
+
+
+def _flag(calibration: Calibration, data: Problem, variances: NDArray[Any] | None) -> None:
+    """Set the flags of pixels whose answer is odd, and of those whose measurements disagree."""
+    sensitivity, flags = calibration.sensitivity, calibration.flags
+    places = positions(calibration.beam_origin, calibration.shifts, data.rotation, calibration.flux)
+
+    def std(pixels: NDArray[Any]) -> NDArray[Any]:
+        """Standard deviation of M, that of the beam left out: 1/√(Σ w c²L²)."""
+        weight = np.zeros(len(pixels))
+        used = data.usable()
+        for k, place in enumerate(places):
+            seen = np.nan_to_num(light(calibration.beam, place, calibration.shape)).flat[pixels]
+            scale = calibration.reduced_chi2 if variances is None else variances[k]
+            scale = np.broadcast_to(scale, calibration.shape).flat[pixels]
+            weight += used[k].flat[pixels] * seen**2 / scale
+        with np.errstate(divide="ignore"):
+            return 1 / np.sqrt(weight)
+
+    dead, hot = odd_responses(sensitivity, std)
+    dead |= sensitivity <= calibration.metadata["options"]["tolerance"]
+    flags[dead] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
+    flags[hot] |= np.uint32(Flag.HOT | Flag.DO_NOT_USE)
+    if calibration.rejected is not None:
+        contradictory = 2 * calibration.rejected.sum(axis=0) > data.usable().sum(axis=0)
+        flags[contradictory] |= np.uint32(Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE)
+        calibration.metadata["rejected"] = calibration.rejected.sum(axis=(1, 2)).tolist()
+
+
 def _wrapped(
     result: _native.Solution,
     dtype: np.dtype[Any],
     shifts: NDArray[Any],
     measurements: Measurements,
+    rejected: NDArray[np.bool_] | None,
 ) -> Calibration:
     objective = result.misfit
     freedom = result.degrees_of_freedom
@@ -632,6 +842,7 @@ def _wrapped(
         history=History(result.sweeps, result.objective, result.error_estimate),
         dark=None if result.offset is None else result.offset.astype(dtype, copy=False),
         measurements=measurements,
+        rejected=rejected,
     )
 
 

@@ -17,6 +17,7 @@ from equipix._measurements import FluxModel
 from equipix._native import __version__
 from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.calibration import Calibration, Method
+from equipix.comparison import compare as compare_calibrations
 from equipix.correct_files import correct_files, is_folder
 from equipix.correction import Flagged
 from equipix.demo import run_demo, virtual_experiment
@@ -27,7 +28,7 @@ from equipix.frames import save_statistics
 from equipix.io import SUFFIXES, find_files, refuse_inputs
 from equipix.load import load
 from equipix.plan import ErrorBudget, advise_order, error_budget, identify, suggest, trend_told
-from equipix.report import check_picture, draw_demo, draw_plans, save_figure
+from equipix.report import check_picture, draw_comparison, draw_demo, draw_plans, save_figure
 from equipix.results import Flag
 
 app = typer.Typer(
@@ -90,6 +91,9 @@ def _options(
 def calibrate(
     experiment: Annotated[Path, typer.Argument(help="The experiment.toml.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Calibration: .tif or .npz.")],
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Leave out measurements that disagree with the others.")
+    ] = False,
     method: Annotated[
         Method, typer.Option(help="How to solve: fast, or as the paper does.")
     ] = "multiscale",
@@ -111,6 +115,7 @@ def calibrate(
     with progress_bars() as progress:
         calibration = loaded.run(
             flux=flux,
+            robust=robust,
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,
@@ -169,6 +174,54 @@ def _uncertainty(calibration: Calibration) -> dict[str, Any]:
         "tilt": dict(zip(("rows", "cols"), calibration.tilt.tolist(), strict=True)),
         "tilt_std": dict(zip(("rows", "cols"), tilt_std.tolist(), strict=True)),
     }
+
+
+@app.command(epilog="Example: equipix compare first.tif second.tif -o agreement.png")
+def compare(
+    calibrations: Annotated[
+        list[Path], typer.Argument(help="Calibrations of one sensor: .tif or .npz.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Show how far calibrations of one sensor agree."""
+    if output is not None:
+        check_picture(output)
+        check_output(output, force=force)
+        refuse_inputs([output], calibrations)
+    result = compare_calibrations([load(file) for file in calibrations])
+    if output is not None:
+        names = [file.stem for file in calibrations]
+        save_figure(draw_comparison(result, names), output, force=force)
+    pairs = [
+        {
+            "files": [str(calibrations[i]) for i in pair],
+            "rms": float(result.rms[k]),
+            "block_rms": float(result.block_rms[k]),
+            "largest": float(result.largest[k]),
+        }
+        for k, pair in enumerate(result.pairs)
+    ]
+    pixels = int(np.isfinite(result.agreement).sum())
+    if as_json:
+        show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
+    else:
+        _show_pairs(pairs)
+        show_result({"pixels compared": pixels, "picture": str(output or "none")}, as_json=False)
+
+
+def _show_pairs(pairs: list[dict[str, Any]]) -> None:
+    """Print how far the calibrations of each pair differ."""
+    figures = ("rms", "block_rms", "largest")
+    table = Table(
+        "relative difference", "pixels, rms", "16×16 means, rms", "largest", box=SIMPLE_HEAD
+    )
+    for pair in pairs:
+        table.add_row(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures))
+    Console(soft_wrap=True).print(table)
 
 
 @app.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")

@@ -11,6 +11,8 @@ from equipix.noise import scatter_limit
 from equipix.results import Flag
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from numpy.typing import NDArray
 
     from equipix.noise import NoiseModel
@@ -28,15 +30,15 @@ DEAD_RESPONSE = 0.5
 _BLOCK = 16
 
 
-def dead_pixels(signals: NDArray[Any], variances: NDArray[Any] | None) -> NDArray[Any]:
+def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:
     """Find pixels that answer to light with less than half of what their neighbours do.
 
     Parameters
     ----------
     signals : ndarray, shape (n, rows, cols)
         Dark-subtracted means of the exposures, in DN.
-    variances : ndarray, shape (n, rows, cols), optional
-        Variances of `signals`, in DN²: a pixel must be below by more than chance explains.
+    models : sequence of NoiseModel, optional
+        Those of `signals`, one an exposure: a pixel must be below by more than chance explains.
 
     Returns
     -------
@@ -46,7 +48,7 @@ def dead_pixels(signals: NDArray[Any], variances: NDArray[Any] | None) -> NDArra
     """
     dead = np.ones(signals.shape[1:], dtype=bool)
     for k, signal in enumerate(signals):
-        margin = 0.0 if variances is None else SIGMAS * np.sqrt(variances[k])
+        margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
         # A comparison with NaN is false: no measurement does not make a pixel alive.
         dead &= ~(signal + margin >= DEAD_RESPONSE * _block_medians(signal))
     return dead
@@ -76,6 +78,64 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     if noise is not None and frames > 1:
         hot |= dark.variance > scatter_limit(frames, sigmas=SIGMAS) * noise.variance(0.0)
     return hot
+
+
+def noisy_pixels(frames: Sequence[FrameStatistics], noise: NoiseModel) -> NDArray[Any]:
+    """Find pixels that scatter from frame to frame by more than chance explains.
+
+    Parameters
+    ----------
+    frames : sequence of FrameStatistics
+        The exposures, dark subtracted.
+    noise : NoiseModel
+        That of one frame of a good pixel.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where this holds in every exposure that shows a scatter.
+    """
+    noisy = np.ones(frames[0].mean.shape, dtype=bool)
+    seen = np.zeros_like(noisy)
+    for each in frames:
+        count = int(each.count.max())
+        if count < 2:
+            continue
+        limit = scatter_limit(count, sigmas=SIGMAS) * noise.variance(each.mean)
+        noisy &= ~(each.variance <= limit)
+        seen |= np.isfinite(each.variance)
+    return noisy & seen
+
+
+def odd_responses(
+    sensitivity: NDArray[Any], std: Callable[[NDArray[Any]], NDArray[Any]]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.
+
+    Parameters
+    ----------
+    sensitivity : ndarray, shape (rows, cols)
+        Sensitivity M; NaN where undetermined.
+    std : callable
+        Standard deviations of M in pixels given by their flat indices: it must be beyond the limit
+        by more than chance explains.
+
+    Returns
+    -------
+    dead, hot : ndarray of bool, shape (rows, cols)
+        Of the two kinds; the neighbours' sensitivity is the median of a block of 16×16 pixels.
+    """
+    dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
+    with np.errstate(invalid="ignore"):
+        # Where no pixel is twice as sensitive as another, none is as its neighbours' median.
+        if not np.nanmin(sensitivity) < DEAD_RESPONSE * np.nanmax(sensitivity):
+            return dead, hot
+    usual = _block_medians(sensitivity)
+    for found, sign, limit in ((dead, -1, DEAD_RESPONSE), (hot, 1, 1 / DEAD_RESPONSE)):
+        beyond = sign * (sensitivity - limit * usual).ravel()
+        suspects = np.flatnonzero(beyond > 0)
+        found.flat[suspects] = beyond[suspects] > SIGMAS * std(suspects)
+    return dead, hot
 
 
 def pixel_flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) -> NDArray[Any]:

@@ -164,6 +164,7 @@ class Experiment:
         self,
         *,
         flux: FluxModel | None = None,
+        robust: bool = False,
         method: Method = "multiscale",
         tolerance: float = 1e-6,
         max_sweeps: int | None = None,
@@ -178,6 +179,8 @@ class Experiment:
         flux : {"fit", "linear"}, optional
             Fluxes to find: one for each exposure, or linear in the file's ``time``. Unless given
             they are those of the file, as known or, with ``flux_std``, as a prior.
+        robust : bool
+            Whether to leave out measurements that disagree with the others.
         method : {"multiscale", "coordinate-descent"}
             How to minimise the objective.
         tolerance : float
@@ -220,9 +223,9 @@ class Experiment:
         with naming_memory("averaging"):
             measured = self._average(workers, progress)
             noise = self._noise(measured)
-            variances = _variances(measured, noise)
+            models = _models(measured, noise)
             flags = pixel_flags(
-                dead_pixels(measured.signals, variances),
+                dead_pixels(measured.signals, models),
                 hot_pixels(measured.dark, noise),
                 measured.saturated,
             )
@@ -230,12 +233,13 @@ class Experiment:
             measured.signals,
             shifts,
             shift_std=std if refined else None,
-            variance=variances,
+            variance=models,
             mask=flags != 0,
             flux=self._column("flux") if flux is None else flux,
             flux_std=self._column("flux_std") if flux is None else None,
             time=self._column("time") if flux == "linear" else None,
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
+            robust=robust,
             method=method,
             tolerance=tolerance,
             max_sweeps=max_sweeps,
@@ -370,15 +374,12 @@ def _transfer(signal: NDArray[Any], frames: FrameStatistics) -> NDArray[Any]:
     return photon_transfer(signal, frames.variance, usable, int(frames.count.max()))
 
 
-def _variances(measured: _Measured, noise: NoiseModel | None) -> NDArray[Any] | None:
-    """Variance of each dark-subtracted mean by the noise model, in DN²."""
+def _models(measured: _Measured, noise: NoiseModel | None) -> list[NoiseModel] | None:
+    """Noise model of each dark-subtracted mean."""
     if noise is None:
         return None
-    variances = np.empty_like(measured.signals)
-    dark = noise.variance(0.0) / int(measured.dark.count.max())
-    for k, frames in enumerate(measured.frames):
-        variances[k] = noise.variance(measured.signals[k]) / frames + dark
-    return variances
+    dark = float(noise.variance(0.0)) / int(measured.dark.count.max())
+    return [noise.of_mean(frames, dark_variance=dark) for frames in measured.frames]
 
 
 def _in_beam(

@@ -56,6 +56,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
     history = numbers["history"]
     row, col = numbers["beam_origin"]
     chi2, tilt_std = numbers["reduced_chi2"], numbers.get("tilt_std")
+    rejected = pages.get("rejected")
     return Calibration(
         sensitivity=pages["sensitivity"],
         beam=pages["beam"],
@@ -79,4 +80,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         metadata=content["metadata"],
         sensitivity_std=pages.get("sensitivity_std"),
         tilt_std=None if tilt_std is None else np.array(tilt_std, dtype=np.float64),
+        rejected=None
+        if rejected is None
+        else rejected.reshape(-1, *pages["sensitivity"].shape).astype(bool),
     )

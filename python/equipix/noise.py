@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from equipix._arrays import number
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -40,14 +41,39 @@ class NoiseModel:
     other number has a unit, frames in any unit give the same weights. Two parameters fitted over
     all pixels weight a pixel better than its own sample variance, whose scatter would enter the
     weights.
+
+    `signal` should be an expectation, not a noisy value: with a model evaluated on the values
+    themselves those that happen to be low weigh more, which at N electrons lowers a weighted mean
+    by 1/N of itself, and raises χ² with five exposures by some 2/(3N); and what a grain of dust
+    has darkened would get the largest weight of all. `equipix.calibrate` evaluates it on its own
+    fit, whose residuals do not correlate with it.
+
+    Examples
+    --------
+    >>> import equipix
+    >>> float(equipix.NoiseModel(read_noise=2.0, gain=0.25).variance(1000.0))
+    254.0
     """
 
     read_noise: float
     gain: float
 
+    def __post_init__(self) -> None:
+        """Refuse what is no variance."""
+        for name, value in (("read_noise", self.read_noise), ("gain", self.gain)):
+            if not 0 <= number(name, value) < np.inf:
+                raise InputError(f"'{name}' is {value!r}, expected a number not below 0")
+        if self.read_noise == self.gain == 0:
+            raise InputError("'read_noise' and 'gain' are both 0, expected some noise")
+
     def variance(self, signal: ArrayLike) -> NDArray[Any]:
         """Variance of one frame, in DN², at the mean `signal`, in DN."""
         return self.read_noise**2 + self.gain * np.maximum(signal, 0)
+
+    def of_mean(self, frames: int, *, dark_variance: float = 0.0) -> Self:
+        """Model of the mean of so many frames, from which a dark of that variance was taken."""
+        variance = self.read_noise**2 / frames + dark_variance
+        return type(self)(read_noise=float(np.sqrt(variance)), gain=self.gain / frames)
 
     @classmethod
     def fit(cls, points: NDArray[Any], *, gain: float | None = None) -> Self:
@@ -80,11 +106,18 @@ class NoiseModel:
                 "repeated frames are all equal, which shows no scatter: give a single one of them"
             )
         weight = degrees / np.maximum(variance, floor) ** 2
+        given = gain
         if gain is None:
             x = signal - np.average(signal, weights=weight)
             spread = np.sum(weight * x**2)
             gain = max(0.0, float(np.sum(weight * x * variance) / spread)) if spread > 0 else 0.0
-        read_variance = max(floor, np.average(variance - gain * signal, weights=weight))
+        read_variance = np.average(variance - gain * signal, weights=weight)
+        if read_variance < floor:
+            read_variance = floor
+            # At its bound the other parameter must follow, or every variance would be too large.
+            energy = np.sum(weight * signal**2)
+            if given is None and energy > 0:
+                gain = max(0.0, float(np.sum(weight * signal * (variance - floor)) / energy))
         return cls(read_noise=float(np.sqrt(read_variance)), gain=gain)
 
 
@@ -125,41 +158,73 @@ def photon_transfer(
     return np.array(points).reshape(-1, 3)
 
 
-def smoothed_variances(frames: Sequence[FrameStatistics]) -> NDArray[Any]:
-    """Variance of each mean by a noise model fitted over all pixels of all exposures.
+def fit_frames(frames: Sequence[FrameStatistics]) -> NoiseModel:
+    """Noise model of one frame, fitted over all pixels of all exposures.
 
     Parameters
     ----------
     frames : sequence of FrameStatistics
-        The exposures, dark subtracted. What the dark adds to `variance_of_mean` is taken as the
-        same in all pixels of an exposure: its median.
+        The exposures, dark subtracted.
 
     Returns
     -------
-    ndarray, shape (n, rows, cols), float64
-        Variances in DN².
+    NoiseModel
+        That of a single frame.
 
     Raises
     ------
     InputError
         If no exposure has two frames, so that nothing shows the scatter.
     """
-    counts = [int(statistics.count.max()) for statistics in frames]
     points = [
-        photon_transfer(statistics.mean, statistics.variance, statistics.saturated == 0, count)
-        for statistics, count in zip(frames, counts, strict=True)
+        photon_transfer(each.mean, each.variance, each.saturated == 0, int(each.count.max()))
+        for each in frames
     ]
     if not any(map(len, points)):
         raise InputError(
             "'frames' are single frames, which show no scatter: give their 'variance', or the "
             "means alone for unit weights"
         )
-    model = NoiseModel.fit(np.concatenate(points))
-    variances = np.empty((len(frames), *frames[0].mean.shape))
-    for variance, statistics, count in zip(variances, frames, counts, strict=True):
-        added = statistics.variance_of_mean - statistics.variance / count
-        dark = np.nanmedian(added) if count > 1 else 0.0
-        variance[:] = model.variance(statistics.mean) / count + max(0.0, float(dark))
+    return NoiseModel.fit(np.concatenate(points))
+
+
+def models_of_means(frames: Sequence[FrameStatistics], model: NoiseModel) -> list[NoiseModel]:
+    """Noise model of each mean.
+
+    Parameters
+    ----------
+    frames : sequence of FrameStatistics
+        The exposures, dark subtracted. What the dark adds to `variance_of_mean` is taken as the
+        same in all pixels of an exposure: its median.
+    model : NoiseModel
+        That of a single frame.
+
+    Returns
+    -------
+    list of NoiseModel
+        One for each exposure.
+    """
+    models = []
+    for each in frames:
+        count = int(each.count.max())
+        added = each.variance_of_mean - each.variance / count
+        dark = float(np.nanmedian(added)) if count > 1 else 0.0
+        models.append(model.of_mean(count, dark_variance=max(0.0, dark)))
+    return models
+
+
+def modelled_variances(
+    models: Sequence[NoiseModel], expected: Iterable[NDArray[Any]], like: NDArray[Any]
+) -> NDArray[Any]:
+    """Variance of every value of `like`, shape (n, rows, cols), where its model expects `expected`.
+
+    Where no signal is expected the least variance is a millionth of the largest, so that a model
+    without read noise gives a number there.
+    """
+    variances = np.empty_like(like)
+    for variance, model, signal in zip(variances, models, expected, strict=True):
+        variance[:] = model.variance(np.nan_to_num(signal))
+        np.maximum(variance, _FLOOR * variance.max(), out=variance)
     return variances
 
 

@@ -1,7 +1,8 @@
 """Connected components: which pixels the measurements tie to which.
 
 ln y_k(p) = ln L(u_k(p)) + ln M(p) has an edge from pixel p to beam cell u_k(p) for each used
-measurement. Within a component the solution is unique up to one factor.
+measurement. Within a component the solution is unique up to one factor. A pixel that does not
+respond has no edge: y = 0 tells nothing of the light.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ if TYPE_CHECKING:
 
 
 def components(
-    cells: NDArray[Any], used: NDArray[Any], grid_shape: tuple[int, int]
+    cells: NDArray[Any],
+    used: NDArray[Any],
+    grid_shape: tuple[int, int],
+    silent: NDArray[Any] | None = None,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Label the connected components of pixels and beam cells.
 
@@ -27,16 +31,22 @@ def components(
         Whether the measurement counts.
     grid_shape : tuple of int
         Rows and columns of the beam grid.
+    silent : ndarray of bool, shape (rows, cols), optional
+        Pixels that do not respond, or are in the dark. They join nothing.
 
     Returns
     -------
     pixel_labels : ndarray of int32, shape (rows, cols)
-        Component of each pixel; −1 without a used measurement. Component 0 has the most pixels;
-        of equal ones, that with the lowest pixel index comes first.
+        Component of each pixel; −1 without a used measurement. Component 0 has the most pixels
+        that are not silent; of equal ones, that with the lowest pixel index comes first. A silent
+        pixel has the label of the cells that it sees, −1 if they are of several components.
     cell_labels : ndarray of int32, shape grid_shape
         Component of each beam cell, −1 likewise.
     """
     pixels = cells[0].size
+    if silent is None:
+        silent = np.zeros(cells[0].shape, bool)
+    everything, used = used, used & ~silent
     parent = list(range(pixels + grid_shape[0] * grid_shape[1]))
     for exposure, counts in zip(cells, used, strict=True):
         for pixel in np.flatnonzero(counts):
@@ -49,6 +59,11 @@ def components(
     labels = np.full(len(parent), -1, np.int32)
     for label, root in enumerate(order):
         labels[roots == root] = label
+    for pixel in np.flatnonzero(silent):
+        exposures = [k for k, counts in enumerate(everything) if counts.flat[pixel]]
+        around = {int(labels[pixels + cells[k].flat[pixel]]) for k in exposures} - {-1}
+        if len(around) == 1:
+            labels[pixel] = around.pop()
     return labels[:pixels].reshape(cells[0].shape), labels[pixels:].reshape(grid_shape)
 
 

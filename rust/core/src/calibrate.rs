@@ -1,6 +1,6 @@
 //! From the measurements of one experiment to the sensitivity of its sensor.
 
-use crate::connectivity::{Components, NONE};
+use crate::connectivity::{Components, NONE, Tie};
 use crate::control::Control;
 use crate::descent;
 use crate::error::Result;
@@ -9,11 +9,20 @@ use crate::frames::{Real, Shape, flag};
 use crate::geometry::{Geometry, Rotation};
 use crate::joint::{self, Unknowns};
 use crate::memory;
-use crate::model::Model;
+use crate::model::{Model, Stretch};
 use crate::multiscale;
 use crate::parallel::Workers;
 use crate::precondition;
 use crate::reduced::Padding;
+
+/// A response below this share of the typical one may be nil; above it none is.
+const WEAK_RESPONSE: f64 = 0.05;
+/// It is nil where its edges in the Laplacian, w c² L² M², weigh so little beside an ordinary one.
+const NIL_RESPONSE: f64 = 1e-6;
+/// Standard errors that a response must exceed 0 by.
+const SIGMAS: f64 = 6.0;
+/// Pixels, at most, that a median is taken over.
+const SAMPLE: usize = 4096;
 
 /// How to minimise F.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -62,7 +71,8 @@ pub struct Solution {
 /// Minimises F, with whole shifts and known fluxes.
 ///
 /// M is given in the gauge mean(M) = 1 over the pixels of a component, each component for itself;
-/// pixels that their measurements leave almost no weight are flagged and not in the mean.
+/// pixels that their measurements leave almost no weight are flagged and not in the mean. They and
+/// pixels that do not respond tie no parts together.
 ///
 /// # Errors
 /// [`Error::Memory`](crate::Error::Memory) before anything else if the memory for it cannot be had;
@@ -82,10 +92,16 @@ pub fn calibrate<T: Real>(
         Method::CoordinateDescent => descent::solve(model, stop, workers, control)?,
     };
     // After the solver, whose vectors then make room for the sets.
-    let components = Components::of(model, control)?;
-    let beam = descent.beam();
-    let (sensitivity, beam, flags) =
-        gauged(descent.sensitivity, beam, &components, &left_out, workers);
+    let (beam, sensitivity) = (descent.beam(), descent.sensitivity);
+    let dead = without_response(model, &sensitivity, &beam, &history);
+    let mut ties = vec![Tie::Firm; sensitivity.len()];
+    left_out.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
+    dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
+    let components = Components::of(model, &ties, control)?;
+    let (sensitivity, beam, mut flags) = gauged(sensitivity, beam, &components, &left_out, workers);
+    for &pixel in &dead {
+        flags[pixel] |= flag::DEAD | flag::DO_NOT_USE;
+    }
     Ok(Solution {
         sensitivity,
         beam,
@@ -188,7 +204,7 @@ fn gauged(
 /// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
-/// The components come after the solver, with less: M, L, 21 for each pixel and 13 for each cell.
+/// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell.
 fn bytes_needed(geometry: &Geometry) -> u64 {
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
@@ -198,6 +214,55 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
     let images = 24 * places(geometry.sensor.rows) + of_views;
     8 * pixels + images + 8 * views * cells + turned + precondition::bytes_needed(geometry)
+}
+
+/// The pixels that do not respond to light, as far as their measurements can tell: M is small,
+/// and so is M²D with D = Σ w c² L², whose square root is M over its standard error.
+fn without_response<T: Real>(
+    model: &Model<'_, T>,
+    sensitivity: &[f64],
+    beam: &[f64],
+    history: &History,
+) -> Vec<usize> {
+    let typical = typical(sensitivity);
+    let objective = history.looks.last().map_or(0.0, |look| look.objective);
+    // F for each measurement is no more than the variance of one; for five exposures about half.
+    let noise = SIGMAS * SIGMAS * objective / model.used() as f64;
+    let ordinary = model.typical_weight() * model.typical_light().powi(2);
+    let weak = |&pixel: &usize| sensitivity[pixel].abs() <= WEAK_RESPONSE * typical;
+    // M²D is what a pixel shows of light: unlike M, the same in any gauge.
+    let nil = |&pixel: &usize| {
+        let shown = sensitivity[pixel].powi(2) * weight(model, beam, pixel);
+        shown <= noise.max(NIL_RESPONSE * ordinary)
+    };
+    (0..sensitivity.len()).filter(weak).filter(nil).collect()
+}
+
+/// The median |M| of a sample, which a pixel stuck far above the others does not move.
+fn typical(sensitivity: &[f64]) -> f64 {
+    let every = sensitivity.len().div_ceil(SAMPLE);
+    let mut sample: Vec<f64> = sensitivity.iter().step_by(every).map(|m| m.abs()).collect();
+    let middle = sample.len() / 2;
+    *sample.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The weight Σ w c² L² of a pixel's sensitivity.
+fn weight<T: Real>(model: &Model<'_, T>, beam: &[f64], pixel: usize) -> f64 {
+    let cols = model.sensor().cols;
+    let (row, col) = (pixel / cols, pixel % cols);
+    let mut scratch = [0.0];
+    let exposures = model.geometry.exposures.iter().zip(&model.flux).enumerate();
+    let weights = exposures.map(|(exposure, (place, flux))| {
+        let weight = match model.stretch(exposure, row, col..col + 1, &mut scratch) {
+            Stretch::Uniform(_, weight) => weight,
+            Stretch::Weighted(_, weights) => weights[0],
+        };
+        let cells = model.geometry.views[place.view].cells;
+        let light = flux * beam[cells.at(row + place.row, col + place.col)];
+        // A cell that nothing lights has no number, and a measurement that is not used no weight.
+        if weight > 0.0 { weight * light * light } else { 0.0 }
+    });
+    weights.sum()
 }
 
 /// Replaces each value by `scaled(value, label)`.
@@ -233,9 +298,10 @@ fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usi
     chosen.map(|(sum, count)| sum / *count as f64).collect()
 }
 
-/// Measurements less unknowns; each component has one unknown less than values, by its gauge.
+/// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every
+/// pixel seen has its unknown; a cell that only pixels without response see has none that F depends on.
 fn degrees_of_freedom(used: usize, components: &Components) -> i64 {
-    let known = |labels: &[i32]| labels.iter().filter(|&&label| label != NONE).count();
-    let unknowns = known(&components.pixels) + known(&components.cells) - components.sizes.len();
+    let cells = components.cells.iter().filter(|&&label| label != NONE).count();
+    let unknowns = components.seen + cells - components.sizes.len();
     used as i64 - unknowns as i64
 }

@@ -2,7 +2,10 @@
 //!
 //! ln y_k(p) = ln L(u_k(p)) + ln M(p) is a bipartite graph of pixels and beam cells with an edge
 //! for each used measurement. Within a connected component M is determined up to one factor;
-//! between components nothing is.
+//! between components nothing is. A pixel that does not respond tells nothing of the beam that it
+//! sees, so it has no edge and joins nothing; nor has a pixel in the dark.
+
+use std::collections::BTreeMap;
 
 use crate::control::Control;
 use crate::error::Result;
@@ -72,6 +75,18 @@ fn in_parts(count: usize, control: &Control, mut visit: impl FnMut(usize)) -> Re
 /// The label of what belongs to no component: it has no used measurement.
 pub const NONE: i32 = -1;
 
+/// What the measurements of a pixel do for others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tie {
+    /// They compare what it sees.
+    Firm,
+    /// They carry next to no weight: they join nothing, but cells that no other pixel sees follow
+    /// from it.
+    Loose,
+    /// It does not respond: they tell nothing of the beam.
+    None,
+}
+
 /// The connected components of an experiment.
 #[derive(Clone, Debug)]
 pub struct Components {
@@ -80,19 +95,32 @@ pub struct Components {
     pub pixels: Vec<i32>,
     /// The component of each cell of the beam grid, or [`NONE`].
     pub cells: Vec<i32>,
-    /// How many pixels each component has, falling.
+    /// How many firmly tied pixels each component has, falling.
     pub sizes: Vec<usize>,
+    /// How many pixels have a used measurement, however they are tied.
+    pub seen: usize,
 }
 
 impl Components {
     /// Finds the components of the measurements that `model` uses.
     ///
+    /// A pixel that is not tied firmly belongs to the component of the cells that it sees, if they
+    /// are all of one.
+    ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
-    pub fn of<T: Real>(model: &Model<'_, T>, control: &Control) -> Result<Self> {
+    pub fn of<T: Real>(model: &Model<'_, T>, ties: &[Tie], control: &Control) -> Result<Self> {
         let mut edges = Edges::new(model.geometry.sensor.len(), model.geometry.beam.len());
-        model.for_each_used(control, |pixel, cell| edges.add(pixel, cell))?;
-        edges.components(control)
+        model.for_each_used(control, |pixel, cell| {
+            if ties[pixel] == Tie::Firm {
+                edges.add(pixel, cell);
+            }
+        })?;
+        let mut components = edges.components(control)?;
+        if ties.iter().any(|&tie| tie != Tie::Firm) {
+            components.attach(model, ties, control)?;
+        }
+        Ok(components)
     }
 
     /// Finds the components of all measurements that `mask` leaves, before any is made.
@@ -121,6 +149,37 @@ impl Components {
             }
         }
         edges.components(control)
+    }
+
+    /// Gives pixels that are not tied firmly the label of the cells that they see, or [`NONE`] where
+    /// these differ; and cells that only loose ones see the label of those.
+    fn attach<T: Real>(
+        &mut self,
+        model: &Model<'_, T>,
+        ties: &[Tie],
+        control: &Control,
+    ) -> Result<()> {
+        // The lowest and the highest label seen: few pixels are in it, so it is small.
+        let mut labels = BTreeMap::new();
+        model.for_each_used(control, |pixel, cell| {
+            if ties[pixel] != Tie::Firm {
+                let range = labels.entry(pixel).or_insert((i32::MAX, NONE));
+                if self.cells[cell] != NONE {
+                    *range = (range.0.min(self.cells[cell]), range.1.max(self.cells[cell]));
+                }
+            }
+        })?;
+        self.seen += labels.len();
+        for (pixel, (lowest, highest)) in labels {
+            if lowest == highest {
+                self.pixels[pixel] = lowest;
+            }
+        }
+        model.for_each_used(control, |pixel, cell| {
+            if ties[pixel] == Tie::Loose && self.cells[cell] == NONE {
+                self.cells[cell] = self.pixels[pixel];
+            }
+        })
     }
 }
 
@@ -156,7 +215,8 @@ impl Edges {
     pub(crate) fn components(self, control: &Control) -> Result<Components> {
         let Self { pixels, sets, used } = self;
         let roots = sets.into_roots(control)?;
-        // Each component has a pixel, and pixels come before cells: so roots are pixels.
+        // Each component has a pixel, and pixels come before cells: so roots are pixels. One
+        // that is not tied is its own root, and not used.
         let mut sizes = vec![0_u32; pixels];
         in_parts(pixels, control, |pixel| {
             sizes[roots[pixel] as usize] += u32::from(used[pixel]);
@@ -173,8 +233,9 @@ impl Edges {
             labels.push(if used[node] { label_of[roots[node] as usize] } else { NONE });
         })?;
         let cells = labels.split_off(pixels);
-        let sizes = order.iter().map(|&root| sizes[root] as usize).collect();
-        Ok(Components { pixels: labels, cells, sizes })
+        let sizes: Vec<usize> = order.iter().map(|&root| sizes[root] as usize).collect();
+        let seen = sizes.iter().sum();
+        Ok(Components { pixels: labels, cells, sizes, seen })
     }
 }
 

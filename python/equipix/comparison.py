@@ -1,0 +1,160 @@
+"""How far several calibrations of one sensor agree, and how far they should."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._arrays import as_array, check_count
+from equipix.errors import InputError
+from equipix.results import Flag
+from equipix.simulate.accuracy import block_means, relative_error
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from equipix.calibration import Calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Agreement of several calibrations of one sensor: the result of `compare`.
+
+    Attributes
+    ----------
+    sensitivities : ndarray, shape (n, rows, cols), float64
+        The sensitivities in one gauge, mean 1 over the pixels that are good in all; NaN elsewhere.
+    agreement : ndarray, shape (rows, cols), float64
+        Standard deviation of the sensitivity over the calibrations, of one of them.
+    pairs : ndarray, shape (pairs, 2), int64
+        Which two calibrations, from 0, are compared.
+    rms : ndarray, shape (pairs,), float64
+        Root mean square over the pixels of the relative difference of two sensitivities.
+    block_rms : ndarray, shape (pairs,), float64
+        The same of means over blocks of 16×16 pixels: what is left at large scales.
+    largest : ndarray, shape (pairs,), float64
+        Largest absolute relative difference of a pixel.
+    predicted_rms, predicted_block_rms : ndarray, shape (pairs,), float64, or None
+        What the uncertainties of two independent calibrations predict for `rms` and `block_rms`.
+    """
+
+    sensitivities: NDArray[Any]
+    agreement: NDArray[Any]
+    pairs: NDArray[np.int64]
+    rms: NDArray[Any]
+    block_rms: NDArray[Any]
+    largest: NDArray[Any]
+    predicted_rms: NDArray[Any] | None = None
+    predicted_block_rms: NDArray[Any] | None = None
+
+    def difference(self, pair: int) -> NDArray[Any]:
+        """Relative difference of the sensitivities of a pair, (M₁ − M₂)/M₂, shape (rows, cols)."""
+        first, second = self.sensitivities[self.pairs[pair]]
+        return relative_error(first, second)
+
+
+def compare(
+    calibrations: Sequence[Calibration], *, predicted: ArrayLike | None = None
+) -> Comparison:
+    """Compare calibrations of one sensor, from experiments independent of each other.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        Two or more, of sensors of one shape.
+    predicted : array_like, shape (n, 2), optional
+        Of each calibration the root mean square of its relative error that is expected in single
+        pixels and in means over blocks of 16×16, as `equipix.simulate.noise_prediction` gives.
+
+    Returns
+    -------
+    Comparison
+        Agreement map and, for each pair, how far the two are from each other.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two calibrations, of different shapes, without a common good
+        pixel, or smaller than a block of 16×16 pixels.
+
+    Notes
+    -----
+    What errors two calibrations have in common, such as a dark level that is off, does not show.
+    A shift error or lamp drift does: it differs between experiments, and tilts or bends M as a
+    whole, so it stands out in the block means.
+
+    References
+    ----------
+    .. [1] S. E. Stukachev, I. E. Kozhevatov, "Calibration method for spatial distribution of light
+       sensitivity of matrix photo receivers", Radiophysics and Quantum Electronics, 2011, figure 5.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from equipix import calibrate, compare, cross_pattern, simulate
+    >>> rng = np.random.default_rng(1)
+    >>> truth = simulate.paper_sensitivity((48, 64), rng=rng)
+    >>> beam = simulate.gaussian_beam(truth.shape)
+    >>> calibrations = []
+    >>> for arms in ((5, 7), (7, 11)):
+    ...     shifts = cross_pattern(*arms)
+    ...     frames = simulate.exposures(truth, beam, shifts)
+    ...     calibrations.append(calibrate(frames + rng.normal(0, 1e-3, frames.shape), shifts))
+    >>> result = compare(calibrations, predicted=[(5.5e-4, 5.3e-5), (5.7e-4, 5.6e-5)])
+    >>> bool(0.9 < result.rms[0] / result.predicted_rms[0] < 1.1)
+    True
+    """
+    count = len(calibrations)
+    if count < 2:
+        raise InputError(f"'calibrations' has {count} entries, expected two or more")
+    shapes = [calibration.shape for calibration in calibrations]
+    if len(set(shapes)) > 1:
+        raise InputError(f"'calibrations' are of sensors of shapes {shapes}, expected one shape")
+    sensitivities = _in_one_gauge(calibrations)
+    pairs = np.array(list(combinations(range(count), 2)))
+    differences = [relative_error(*sensitivities[pair]) for pair in pairs]
+    return Comparison(
+        sensitivities=sensitivities,
+        agreement=sensitivities.std(axis=0, ddof=1),
+        pairs=pairs,
+        rms=np.array([_rms(each) for each in differences]),
+        block_rms=np.array([_rms(block_means(each)) for each in differences]),
+        largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
+        **_predictions(predicted, pairs, count),
+    )
+
+
+def _in_one_gauge(calibrations: Sequence[Calibration]) -> NDArray[Any]:
+    """Sensitivities of mean 1 over the pixels that are good in all, NaN elsewhere."""
+    maps = np.stack([each.sensitivity.astype(np.float64) for each in calibrations])
+    good = np.isfinite(maps).all(axis=0)
+    for each in calibrations:
+        good &= (each.flags & Flag.DO_NOT_USE) == 0
+    if not good.any():
+        raise InputError("'calibrations' have no pixel that is good in all of them")
+    maps[:, ~good] = np.nan
+    gauged: NDArray[Any] = maps / np.nanmean(maps, axis=(1, 2), keepdims=True)
+    return gauged
+
+
+def _predictions(
+    predicted: ArrayLike | None, pairs: NDArray[np.int64], count: int
+) -> dict[str, NDArray[Any]]:
+    """Errors of two calibrations in quadrature, in pixels and in blocks."""
+    if predicted is None:
+        return {}
+    errors = as_array("predicted", predicted, ndim=2).astype(np.float64)
+    check_count("predicted", len(errors), count)
+    if errors.shape[1] != 2:
+        raise InputError(f"'predicted' has shape {errors.shape}, expected ({count}, 2)")
+    rms, block_rms = np.sqrt((errors[pairs] ** 2).sum(axis=1)).T
+    return {"predicted_rms": rms, "predicted_block_rms": block_rms}
+
+
+def _rms(values: NDArray[Any]) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))

@@ -1,0 +1,126 @@
+"""Several calibrations of one sensor against each other."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import cli, errors, simulate
+
+SHAPE = (96, 128)
+ARMS = ((5, 7), (7, 11), (11, 19))
+NOISE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def experiments():
+    """Three calibrations of one sensor from independent exposures, and what noise predicts."""
+    rng = np.random.default_rng(1)
+    truth = simulate.cosine_sensitivity(SHAPE, rng=rng)
+    truth /= truth.mean()
+    beam = simulate.gaussian_beam(SHAPE, width=400)
+    calibrations, predicted = [], []
+    for arms in ARMS:
+        shifts = equipix.cross_pattern(*arms)
+        frames = simulate.exposures(truth, beam, shifts)
+        frames += NOISE * rng.standard_normal(frames.shape)
+        calibrations.append(equipix.calibrate(frames, shifts))
+        draws = [
+            simulate.noise_prediction(truth, beam, shifts, NOISE**2, draws=1, rng=seed)
+            for seed in range(12)
+        ]
+        predicted.append(draws)
+    return truth, calibrations, np.array(predicted)
+
+
+def test_they_agree_as_their_uncertainties_predict(experiments):
+    _, calibrations, draws = experiments
+    mean, scatter = (f(draws**2, axis=1) for f in (np.mean, lambda x, axis: x.std(axis, ddof=1)))
+    result = equipix.compare(calibrations, predicted=np.sqrt(mean))
+    for k, (i, j) in enumerate(result.pairs):
+        # A mean square scatters as the draws show it to; so does their mean, by √12 less.
+        margin = 4 * np.hypot(scatter[i], scatter[j]) * np.sqrt(1 + 1 / 12)
+        got = np.array([result.rms[k], result.block_rms[k]]) ** 2
+        wanted = np.array([result.predicted_rms[k], result.predicted_block_rms[k]]) ** 2
+        np.testing.assert_allclose(wanted, mean[i] + mean[j], rtol=1e-12)
+        # Twice the margin: the difference of two has their covariance's scatter besides.
+        assert (np.abs(got - wanted) < 2 * margin).all()
+
+
+def test_the_agreement_map_is_the_scatter_of_one(experiments):
+    _, calibrations, draws = experiments
+    agreement = equipix.compare(calibrations).agreement
+    # Its mean square is the mean variance of the three, over 12 288 pixels with 2 degrees each.
+    expected = np.mean(draws[..., 0] ** 2)
+    assert np.mean(agreement**2) == pytest.approx(expected, rel=4 * np.sqrt(2 / (2 * 12_288)) * 2)
+
+
+def test_a_tilt_stands_out_at_large_scales(experiments):
+    """Lamp drift tilts one of them by 5e-4 rms: the blocks show it, the pixels hardly."""
+    _, calibrations, draws = experiments
+    first, second, _ = calibrations
+    tilt = 5e-4 * np.sqrt(12) * np.linspace(-0.5, 0.5, SHAPE[1])
+    tilted = type(second)(**(vars(second) | {"sensitivity": second.sensitivity * (1 + tilt)}))
+    predicted = np.sqrt(np.mean(draws[:2] ** 2, axis=1))
+    result = equipix.compare([first, tilted], predicted=predicted)
+    assert result.block_rms[0] > 2 * result.predicted_block_rms[0]
+    assert result.rms[0] < 1.5 * result.predicted_rms[0]
+
+
+def test_the_gauge_and_bad_pixels_play_no_part(experiments):
+    _, calibrations, _ = experiments
+    first, second, _ = calibrations
+    sensitivity = 3 * second.sensitivity
+    flags = second.flags.copy()
+    sensitivity[3, 4], flags[3, 4] = 100, equipix.Flag.HOT | equipix.Flag.DO_NOT_USE
+    sensitivity[5, 6] = np.nan
+    changed = type(second)(**(vars(second) | {"sensitivity": sensitivity, "flags": flags}))
+    plain, other = equipix.compare([first, second]), equipix.compare([first, changed])
+    assert np.argwhere(np.isnan(other.agreement)).tolist() == [[3, 4], [5, 6]]
+    valid = np.isfinite(other.agreement)
+    # The means, over 2 of 12 288 pixels fewer, shift all differences alike.
+    np.testing.assert_allclose(
+        other.difference(0)[valid], plain.difference(0)[valid], rtol=0, atol=4 * 0.1 / 12_288
+    )
+
+
+def test_bad_arguments_are_named(experiments):
+    _, calibrations, _ = experiments
+    with pytest.raises(errors.InputError, match="1 entries, expected two"):
+        equipix.compare(calibrations[:1])
+    with pytest.raises(errors.InputError, match="'predicted' has 2 entries"):
+        equipix.compare(calibrations, predicted=np.ones((2, 2)))
+    with pytest.raises(errors.InputError, match=r"'predicted' has shape \(3, 1\)"):
+        equipix.compare(calibrations, predicted=np.ones((3, 1)))
+    frames = np.ones((5, 40, 50))
+    small = equipix.calibrate(frames, equipix.cross_pattern(5, 7))
+    with pytest.raises(errors.InputError, match="expected one shape"):
+        equipix.compare([small, calibrations[0]])
+    no_good = type(small)(**(vars(small) | {"flags": small.flags | 1}))
+    with pytest.raises(errors.InputError, match="no pixel that is good"):
+        equipix.compare([small, no_good])
+
+
+def test_the_command_line_compares_files(experiments, tmp_path, capsys):
+    _, calibrations, _ = experiments
+    files = []
+    for number, calibration in enumerate(calibrations):
+        files.append(str(tmp_path / f"cal{number}.tif"))
+        calibration.save(files[-1])
+    picture = tmp_path / "agreement.png"
+    with pytest.raises(SystemExit) as done:
+        cli.main(["compare", *files, "-o", str(picture), "--json"])
+    assert not done.value.code
+    found = json.loads(capsys.readouterr().out)
+    result = equipix.compare(calibrations)
+    assert found["pixels"] == SHAPE[0] * SHAPE[1]
+    assert [pair["files"] for pair in found["pairs"]] == [files[:2], files[::2], files[1:]]
+    assert [pair["rms"] for pair in found["pairs"]] == result.rms.tolist()
+    assert [pair["block_rms"] for pair in found["pairs"]] == result.block_rms.tolist()
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SystemExit) as done:
+        cli.main(["compare", *files])
+    assert "16×16" in capsys.readouterr().out
