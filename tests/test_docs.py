@@ -125,6 +125,42 @@ def test_public_names_are_documented(name):
         assert thing.__doc__
 
 
+def figures(name, capsys):
+    """The numbers in each line that an example prints."""
+    runpy.run_path(str(ROOT / f"examples/{name}.py"), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    return [[float(each) for each in re.findall(r"[-+]?\d\.\d+(?:e-\d+)?", line)] for line in lines]
+
+
+def test_the_example_between_pixels(capsys):
+    rounded, measured, refined, true, left = (each[0] for each in figures("subpixel", capsys))
+    assert rounded > 5 * true
+    assert refined < 1.1 * true < measured
+    assert left < 0.01
+
+
+def test_the_example_of_a_monitor(capsys):
+    steady, monitor = figures("drift_monitor", capsys)
+    # 1 % against 0.02 % of error in the fluxes makes as much of a difference in the tilt.
+    assert monitor[1] < steady[1] / 5
+    assert monitor[0] < steady[0]
+
+
+def test_the_example_of_a_turned_exposure(capsys):
+    turned, alike, fluxes = figures("drift_rotated", capsys)
+    assert turned[1] == pytest.approx(0.04, abs=0.001)
+    assert alike[1] == 0
+    assert turned[0] < alike[0] / 5
+    assert fluxes[0] < 1e-4
+
+
+def test_the_example_of_two_levels(capsys):
+    (sensitivity, dark), (corrected,) = figures("two_levels", capsys)
+    # Ten exposures, but levels that differ by 0.6 tell the gain: some 1.2·5e-4/√10/0.4 each.
+    assert sensitivity < 1e-3 > dark
+    assert corrected < 3 * 5e-4
+
+
 def test_the_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["calibrate.py", str(tmp_path / "cal.tif")])
     runpy.run_path(str(ROOT / "examples/calibrate.py"), run_name="__main__")
