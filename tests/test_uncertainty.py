@@ -109,7 +109,7 @@ class TestAgainstSimulatedExperiments:
         squares = np.array([self.mean_squares(seed, masked) for seed in range(4)])
         pixels, means, modes = np.sqrt(squares.mean(axis=0))
         # The limits of the design. By chance: 4e-4 over 3.84e6 pixels, plus the map's own 2 %
-        # squared; over 200 × 12 modes 0.014, over blocks, which share slow errors, no more.
+        # squared; over 200 × 12 modes 0.014, over blocks, which share slow errors, as much.
         assert pixels == pytest.approx(1, abs=0.03)
         assert means == pytest.approx(1, abs=0.05)
         assert modes == pytest.approx(1, abs=0.05)
@@ -376,7 +376,7 @@ class TestOfAResult:
             with pytest.raises(SystemExit) as ended:
                 main(command)
             assert ended.value.code == 0
-        _, told, again = map(json.loads, capsys.readouterr().out.splitlines()[-3:])
+        told, again = map(json.loads, capsys.readouterr().out.splitlines()[-2:])
         cal = equipix.load(output)
         assert told["sensitivity_std"] == pytest.approx(np.nanmedian(cal.sensitivity_std))
         assert told["sensitivity_std_is_exact_to"] <= DRAWS_EXACT_TO

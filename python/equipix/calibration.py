@@ -257,7 +257,7 @@ class Calibration:
         >>> cal = equipix.calibrate(frames, shifts, variance=np.full(5, 1e-6))
         >>> weights = np.where(np.arange(64) < 32, 1, -1) * np.ones(shape) / (48 * 32)
         >>> print(f"{cal.std_of(weights):.1e}")
-        8.3e-05
+        1.3e-04
         """
         measurements = self.measurements
         if measurements is None:
