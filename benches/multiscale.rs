@@ -31,6 +31,8 @@ const SIZES: [Shape; 5] = [
 const SMALL: [Shape; 1] = [Shape::new(48, 64)];
 /// The size at which coordinate descent is waited for, and to what error.
 const AWAITED: (Shape, f64) = (SIZES[1], 1e-4);
+/// Five times what it takes.
+const MOST_SWEEPS: usize = 50_000;
 /// Sweeps between two looks at its true error.
 const CHECK_EVERY: usize = 100;
 
@@ -105,6 +107,7 @@ fn await_descent<T: Real>(
     let mut descent = Descent::new(model, workers, control);
     let (mut sweeps, mut taken) = (0, 0.0);
     while true_error(&descent.sensitivity, model.sensor(), workers) > AWAITED.1 {
+        assert!(sweeps < MOST_SWEEPS, "coordinate descent does not get there");
         let each = seconds(CHECK_EVERY, || descent.sweep(control).unwrap());
         sweeps += CHECK_EVERY;
         taken += CHECK_EVERY as f64 * each;

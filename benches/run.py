@@ -17,6 +17,7 @@ import cargo
 import large
 import multiscale
 import numpy as np
+import subpixel
 import uncertainty
 from peers import table as peers
 
@@ -36,6 +37,7 @@ def main(*, smoke: bool) -> None:
     rows.append(numpy_row(rates[0], repetitions=1 if smoke else 7))
     rows += multiscale.rows(smoke=smoke)
     rows += uncertainty.rows((48, 64), 1) if smoke else uncertainty.rows()
+    rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()

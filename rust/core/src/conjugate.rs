@@ -133,7 +133,10 @@ impl<'m, 'a, T: Real> Search<'m, 'a, T> {
 
     /// A size of M in units of its mean.
     fn relative(&self, size: f64) -> f64 {
-        let known = self.reduced.mean > 0.0 && self.square.is_finite() && size.is_finite();
+        let known = self.reduced.mean > 0.0
+            && self.square.is_finite()
+            && size.is_finite()
+            && self.two_level.sees_large_scales();
         if known { size / self.reduced.mean } else { f64::INFINITY }
     }
 

@@ -108,6 +108,14 @@
 //! - J. R. Kuhn, H. Lin, D. Loranz, "Gain calibrating nonuniform image-array data using only the
 //!   image data", Publications of the Astronomical Society of the Pacific 103 (1991) 1097–1108: the
 //!   same idea for telescopes.
+//! - M. R. Hestenes, E. Stiefel, "Methods of conjugate gradients for solving linear systems", Journal
+//!   of Research of the National Bureau of Standards 49 (1952) 409–436: the iteration; its Ritz values
+//!   after G. H. Golub, C. F. Van Loan, "Matrix Computations", 4th ed. (2013).
+//! - G. H. Golub, V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares
+//!   problems whose variables separate", SIAM Journal on Numerical Analysis 10 (1973) 413–432, and
+//!   L. Kaufman, "A variable projection method for solving separable nonlinear least squares
+//!   problems", BIT 15 (1975) 49–57: steps with the pixels eliminated.
+//! - C. de Boor, "A Practical Guide to Splines" (1978).
 //! - T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance", The
 //!   American Statistician 37 (1983) 242–247: merging of partial sums.
 

@@ -24,8 +24,9 @@ impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
         let control = Control::new();
         let reduced = Reduced::new(model, workers, &control);
-        let [x, product] =
+        let [mut x, product] =
             [(); 2].map(|()| reduced.padding.zeros(model.sensor().rows, workers, &control));
+        workers.fill(reduced.padding.body_mut(&mut x), 1.0, &control);
         Self { model, workers, reduced, x, product }
     }
 

@@ -96,6 +96,11 @@ impl<'m> TwoLevel<'m> {
         Ok(())
     }
 
+    /// Whether large scales are in it: without a factor of the coarse matrix nothing sees them.
+    pub(crate) fn sees_large_scales(&self) -> bool {
+        self.coarse.as_ref().is_some_and(Coarse::is_factorised)
+    }
+
     /// r ← r − a q, and finds P⁻¹ r, which [`turn`](Self::turn) makes use of; returns r · P⁻¹ r.
     pub(crate) fn descend<T: Real>(
         &mut self,

@@ -82,6 +82,11 @@ impl Coarse {
         Self::factorised(&matrix, hats, control)
     }
 
+    /// Whether the matrix has a factor; rounding may leave none of a nearly singular one.
+    pub(crate) const fn is_factorised(&self) -> bool {
+        self.factor.is_some()
+    }
+
     fn factorised(matrix: &Matrix, hats: &Hats, control: &Control) -> Result<Self> {
         let mut sets = DisjointSets::new(hats.count());
         matrix.for_each(|row, col, _| {
