@@ -15,6 +15,7 @@ import pytest
 import equipix
 from equipix import reference, simulate
 from equipix.errors import ConvergenceWarning, IdentifiabilityWarning, InputError
+from equipix.results import Flag
 
 SMALL = (9, 12)
 SMALL_CROSS = np.array([(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)], float)
@@ -122,12 +123,36 @@ class TestReference:
         assert np.mean(squares[::2]) == pytest.approx(1, abs=0.3)
         assert np.mean(squares[1::2]) == pytest.approx(1, abs=0.3)
 
-    @pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
-    def test_one_level_leaves_gain_and_offset_untold(self):
+    @pytest.mark.parametrize("flux", [None, np.full(5, 2.0)])
+    def test_one_level_cannot_tell_gain_from_offset(self, flux):
         frames, measured = small(2, SMALL_CROSS)
-        # How far it comes before it gives up is chance.
-        with pytest.warns(IdentifiabilityWarning, match="hardly tell some pattern"):
-            equipix.calibrate(frames, SMALL_CROSS, dark="fit", **measured)
+        with pytest.raises(InputError, match="offset and gain cannot be told apart"):
+            equipix.calibrate(frames, SMALL_CROSS, flux=flux, dark="fit", **measured)
+
+    def test_a_pixel_with_one_measurement_tells_no_offset(self):
+        twice, levels = np.tile(SMALL_CROSS, (2, 1)), np.repeat([1, 0.5], 5)
+        truth = simulate.paper_sensitivity(SMALL, rng=1)
+        frames = simulate.exposures(truth, simulate.gaussian_beam(SMALL), twice, flux=levels) + 0.1
+        mask = np.zeros(frames.shape, bool)
+        mask[1:, 5, 5] = True
+        cal = equipix.calibrate(frames, twice, flux=levels, dark="fit", mask=mask)
+        assert np.argwhere(np.isnan(cal.sensitivity)).tolist() == [[5, 5]]
+        assert np.isnan(cal.dark[5, 5])
+        assert cal.flags[5, 5] & Flag.NO_FLAT_FIELD
+        np.testing.assert_allclose(np.delete(cal.dark, 5 * SMALL[1] + 5), 0.1, atol=1e-4)
+
+    def test_residuals_know_the_fitted_dark(self):
+        twice, levels = np.tile(SMALL_CROSS, (2, 1)), np.repeat([1, 0.5], 5)
+        frames = simulate.exposures(
+            simulate.paper_sensitivity(SMALL, rng=1),
+            simulate.gaussian_beam(SMALL),
+            twice,
+            flux=levels,
+        )
+        cal = equipix.calibrate(frames + 0.1, twice, flux=levels, dark="fit")
+        np.testing.assert_allclose(cal.residuals(frames + 0.1), 0, atol=1e-5)
+        with pytest.raises(InputError, match="std_of"):
+            cal.std_of(np.ones(SMALL) / 108)
 
 
 class TestBetweenPixels:

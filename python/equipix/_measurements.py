@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from equipix._arrays import as_array, as_floats, check_count, number, per_exposure
-from equipix.errors import InputError
+from equipix.errors import IdentifiabilityWarning, InputError
 from equipix.noise import NoiseModel, fit_frames, models_of_means
 from equipix.results import FrameStatistics
 
@@ -19,6 +20,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 FluxModel = Literal["fit", "linear"]
+
+_HARDLY_TOLD = 0.1
+"""A share of a trend's variance that leaves its error three times larger."""
+
+_WIDEST = 0.3
+"""Standard deviation of a shift, in pixels: three are within the pixel that it may move."""
 
 
 def as_statistics(frames: object) -> list[FrameStatistics]:
@@ -154,7 +161,7 @@ def as_flux(
     if flux_std is None:
         return values, ("known", [])
     array = as_array("flux_std", flux_std, ndim=(0, 1))
-    if array.size > 1:
+    if array.size != 1:
         check_count("flux_std", len(array), count)
     std = np.broadcast_to(array.ravel(), count).astype(np.float64)
     if not (np.isfinite(std).all() and (std > 0).all()):
@@ -162,18 +169,37 @@ def as_flux(
     return values, ("prior", std.tolist())
 
 
+def warn_of_order(times: list[float], shifts: NDArray[Any]) -> None:
+    """Warn where a drift linear in time looks much like a tilt, whose error then is large."""
+    affine = np.column_stack([np.ones(len(shifts)), shifts])
+    left = np.array(times) - affine @ np.linalg.lstsq(affine, np.array(times))[0]
+    share = float(np.sum(left**2) / np.sum((np.array(times) - np.mean(times)) ** 2))
+    if share < _HARDLY_TOLD:
+        warnings.warn(
+            f"of a drift linear in time only {share:.1%} of the variance can be told from a tilt of "
+            "the sensitivity in this order of exposures: take another (equipix.plan.advise_order)",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
+
+
 def as_shift_std(shift_std: ArrayLike, count: int) -> NDArray[np.float64]:
     """Standard deviations of the shifts, (n, 2)."""
     array = as_array("shift_std", shift_std, ndim=(0, 1, 2))
     if array.ndim == 1:
         array = array[:, np.newaxis]
-    if array.size > 1 and array.shape not in ((count, 1), (count, 2)):
+    if array.size != 1 and array.shape not in ((count, 1), (count, 2)):
         raise InputError(
             f"'shift_std' has shape {array.shape}, expected ({count},) or ({count}, 2)"
         )
     std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
+    if std.max() > _WIDEST:
+        raise InputError(
+            f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined within "
+            "a pixel of where they were measured; measure them better"
+        )
     return std
 
 
@@ -185,6 +211,7 @@ class Asked:
     flux: str
     shifts_refined: bool
     dark: str
+    one_level: bool
     modelled: bool
     robust: bool
     uncertainty: bool
@@ -203,6 +230,11 @@ class Asked:
             raise InputError(
                 "'uncertainty' knows given fluxes and a subtracted dark alone: leave it out where "
                 "'flux' is fitted or has a 'flux_std', or where 'dark' is 'fit'"
+            )
+        if self.dark == "fit" and self.one_level:
+            raise InputError(
+                "'dark' is 'fit' with one flux for all: offset and gain cannot be told apart; "
+                "take exposures at two or more levels and give their 'flux', or subtract a dark"
             )
         if self.dark == "fit" and (self.robust or self.modelled):
             raise InputError(

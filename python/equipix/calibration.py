@@ -32,12 +32,14 @@ from equipix._measurements import (
     as_values,
     as_variances,
     union,
+    warn_of_order,
 )
 from equipix._weights import Problem, modelled, solve_robustly
 from equipix.correction import Flagged, apply_gain
 from equipix.defects import noisy_pixels, odd_responses
 from equipix.errors import (
     ConvergenceWarning,
+    EquipixWarning,
     IdentifiabilityWarning,
     InputError,
 )
@@ -68,6 +70,9 @@ if TYPE_CHECKING:
 
 Method = Literal["multiscale", "coordinate-descent"]
 
+_MISFIT = 4.0
+"""A reduced χ² this large has a cause other than variances that are a little off."""
+
 UNTOLD = 1e-4
 """A Ritz value this small stands for a pattern that no measurement tells: noise in it is 100 times
 what it is elsewhere."""
@@ -85,7 +90,8 @@ class History:
     sweep : ndarray, shape (looks,), uint64
         How many sweeps had been made.
     objective : ndarray, shape (looks,), float64
-        Objective F; it never rises but for rounding.
+        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
+        and while such a fit still finds their weights.
     error_estimate : ndarray, shape (looks,), float64
         The estimated largest relative error of the sensitivity.
     """
@@ -265,6 +271,12 @@ class Calibration:
                 "this calibration was read from a file, which does not hold the measurements: "
                 "call std_of on the result of calibrate or Experiment.run"
             )
+        options = self.metadata["options"]
+        if options["flux"] != "known" or options["dark"] == "fit":
+            raise InputError(
+                "this calibration has fitted fluxes, fluxes with a 'flux_std' or a fitted dark: "
+                "what those leave uncertain is not known to std_of"
+            )
         check_progress(progress)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
         with naming_memory("the standard deviation"):
@@ -382,8 +394,8 @@ class Calibration:
         Parameters
         ----------
         frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
-            Exposures with the dark subtracted: those that the calibration was made from, or
-            others, whose `shifts` are given then.
+            Exposures as they were calibrated, with the dark subtracted unless it was fitted: those
+            that the calibration was made from, or others, whose `shifts` are given then.
         variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
             Variance of the values given, as for `calibrate`.
         shifts, rotation, flux : array_like, optional
@@ -422,6 +434,8 @@ class Calibration:
         check_count("shifts", len(predicted), len(values))
         models = as_models(variance, statistics, len(values))
         residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
+        if self.metadata["options"]["dark"] == "fit":
+            residuals -= self.dark
         if models:
             scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
         elif variance is not None:
@@ -621,6 +635,8 @@ def calibrate(
         fluxes leave a tilt of the sensitivity undetermined.
     ConvergenceWarning
         If the tolerance was not reached.
+    EquipixWarning
+        If residuals are more than twice what the variances given say.
 
     Notes
     -----
@@ -655,6 +671,10 @@ def calibrate(
     True
     """
     started = datetime.now(UTC)
+    if not isinstance(dark, str):
+        raise InputError("'dark' holds values: subtract it from the frames, or average with dark=")
+    if not isinstance(uncertainty, bool) or not isinstance(robust, bool):
+        raise InputError(f"'uncertainty' is {uncertainty!r}, 'robust' {robust!r}: expected bool")
     if method not in get_args(Method):
         raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
@@ -675,9 +695,18 @@ def calibrate(
     check_count("shifts", len(places), count)
     turns = as_rotation(rotation, count)
     fluxes, flux_model = as_flux(flux, flux_std, time, count)
+    if flux_model[0] == "linear" and len(set(turns.tolist())) == 1:
+        warn_of_order(flux_model[1], places)
     shift_error = None if shift_std is None else as_shift_std(shift_std, count)
     asked = Asked(
-        method, flux_model[0], shift_error is not None, dark, bool(models), robust, uncertainty
+        method=method,
+        flux=flux_model[0],
+        shifts_refined=shift_error is not None,
+        dark=dark,
+        one_level=flux_model[0] in ("known", "prior") and len(set(fluxes.tolist())) == 1,
+        modelled=bool(models),
+        robust=robust,
+        uncertainty=uncertainty,
     )
     asked.check()
 
@@ -729,8 +758,8 @@ def calibrate(
         "dark": dark,
         "flux": flux_model[0],
     }
-    if result.shifts_told is not None:
-        options["shifts"] = "refined" if result.shifts_told else "as given: the beam tells none"
+    if result.refinement:
+        options["shifts"] = result.refinement
     calibration.metadata.update(
         versions={"equipix": _native.__version__, "numpy": np.__version__},
         options=options | {"rotation": turns.tolist(), "robust": robust},
@@ -867,6 +896,16 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
             "free fluxes leave a tilt of the sensitivity undetermined: its slope is set to 0; turn "
             "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp",
             IdentifiabilityWarning,
+            stacklevel=3,
+        )
+    measurements = calibration.measurements
+    weighted = measurements is not None and measurements.variance is not None
+    if weighted and calibration.reduced_chi2 > _MISFIT:
+        warnings.warn(
+            f"residuals are {calibration.reduced_chi2**0.5:.1f} times what the variances say: are "
+            "the shifts right, and their sign? does the lamp drift (flux='fit')? is there dust "
+            "(robust=True)?",
+            EquipixWarning,
             stacklevel=3,
         )
     if not calibration.converged:

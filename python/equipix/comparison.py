@@ -109,6 +109,9 @@ def compare(
     >>> bool(0.9 < result.rms[0] / result.predicted_rms[0] < 1.1)
     True
     """
+    several = isinstance(calibrations, list | tuple)
+    if not several or not all(hasattr(each, "sensitivity") for each in calibrations):
+        raise InputError("'calibrations' is no list of results of calibrate")
     count = len(calibrations)
     if count < 2:
         raise InputError(f"'calibrations' has {count} entries, expected two or more")

@@ -237,7 +237,7 @@ def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
 
 def warn_of_drift(causes: dict[str, float]) -> None:
     """Warn of a tilt from drift that exceeds the noise; shown where `error_budget` was called."""
-    if causes["drift"] > causes["noise"]:
+    if causes["drift"] > causes["noise"] > 0:
         warnings.warn(
             f"lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
             f"{causes['drift'] / causes['noise']:.1f} times what noise leaves, and no residual "

@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::estimate::{History, Stop};
 use crate::frames::{Real, Shape, flag};
 use crate::geometry::{Geometry, Rotation};
-use crate::joint::{self, Unknowns};
+use crate::joint::{self, Refinement, Unknowns};
 use crate::memory;
 use crate::model::{Model, Stretch};
 use crate::multiscale;
@@ -52,8 +52,8 @@ pub struct Solution {
     pub offset: Option<Vec<f64>>,
     /// F of the measurements at the end, without penalty and priors.
     pub objective: f64,
-    /// Whether the beam has structure that tells shifts; else they stay as given.
-    pub shifts_told: Option<bool>,
+    /// What became of shifts that were to be refined.
+    pub refinement: Refinement,
     /// Whether free fluxes leave a tilt of ln M undetermined: then its slope is 0.
     pub leaves_tilt: bool,
     /// The smallest Ritz value of a joint fit.
@@ -110,7 +110,7 @@ pub fn calibrate<T: Real>(
         flux: model.flux.clone(),
         shifts: None,
         offset: None,
-        shifts_told: None,
+        refinement: Refinement::None,
         leaves_tilt: false,
         smallest_ritz: None,
         objective: history.last().objective,
@@ -139,15 +139,21 @@ pub fn calibrate_jointly<T: Real>(
     })?;
     let fit = joint::solve(model, rotations, unknowns, stop, workers, control)?;
     let components = fit.components;
-    let (sensitivity, beam, flags) = gauged(fit.sensitivity, fit.beam, &components, &[], workers);
+    let (mut sensitivity, beam, mut flags) =
+        gauged(fit.sensitivity, fit.beam, &components, &fit.untold, workers);
+    for &pixel in &fit.untold {
+        sensitivity[pixel] = f64::NAN;
+        flags[pixel] |= flag::NO_FLAT_FIELD | flag::DO_NOT_USE;
+    }
     let offset = fit.offset.map(|mut offset| {
+        fit.untold.iter().for_each(|&pixel| offset[pixel] = f64::NAN);
         rescale(&mut offset, &components.pixels, workers, |value, label| {
             if label == 0 { value } else { f64::NAN }
         });
         offset
     });
     let pixels = components.pixels.iter().filter(|&&label| label != NONE).count();
-    let offsets = if offset.is_some() { pixels } else { 0 };
+    let offsets = if offset.is_some() { pixels - fit.untold.len() } else { 0 };
     let unknowns = fit.unknowns + pixels + offsets - components.sizes.len();
     Ok(Solution {
         sensitivity,
@@ -157,7 +163,7 @@ pub fn calibrate_jointly<T: Real>(
         flux: fit.flux,
         shifts: Some(fit.shifts),
         offset,
-        shifts_told: fit.shifts_told,
+        refinement: fit.refinement,
         leaves_tilt: fit.leaves_tilt,
         smallest_ritz: Some(fit.smallest_ritz),
         objective: fit.misfit,

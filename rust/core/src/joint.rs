@@ -40,7 +40,7 @@ use system::{ShiftPrior, State, System};
 /// The weight τ of the penalty, as a share of the mean weight of a cell.
 pub const SMOOTHING: f64 = 1e-5;
 /// Products that nobody waits for.
-const MOST_PRODUCTS: u64 = 20_000;
+const MOST_PRODUCTS: u64 = 5000;
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: usize = 4;
 /// A shift that is known is one with this standard deviation, in pixels.
@@ -50,6 +50,8 @@ const BEFORE_SHIFTS: f64 = 1e-3;
 /// A beam whose structure is so much larger than noise tells shifts; by the slopes of noise steps
 /// would lead nowhere.
 const TOLD: f64 = 10.0;
+/// How far a shift may come from where it was measured, in pixels: the grid reaches no further.
+const FURTHEST: f64 = 0.99;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
@@ -86,6 +88,19 @@ impl Unknowns {
     }
 }
 
+/// What became of shifts that were to be refined.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refinement {
+    /// They were not to be.
+    None,
+    /// The fit ended before: they are as given.
+    NotTried,
+    /// The beam has no structure that tells them: they are as given.
+    Untold,
+    /// They are refined.
+    Done,
+}
+
 /// What was found.
 #[derive(Clone, Debug)]
 pub struct Fit {
@@ -93,7 +108,7 @@ pub struct Fit {
     pub sensitivity: Vec<f64>,
     /// O, row by row, if it was sought.
     pub offset: Option<Vec<f64>>,
-    /// L at the cells of its grid, row by row; 0 where no measurement tells.
+    /// L at the cells of its grid, row by row; NaN where no measurement tells.
     pub beam: Vec<f64>,
     /// Sizes of the grid.
     pub beam_shape: Shape,
@@ -103,8 +118,10 @@ pub struct Fit {
     pub flux: Vec<f64>,
     /// The shift of each exposure.
     pub shifts: Vec<[f64; 2]>,
-    /// Whether the beam has structure that tells shifts; else they stay as given. None if not asked for.
-    pub shifts_told: Option<bool>,
+    /// What became of shifts that were to be refined.
+    pub refinement: Refinement,
+    /// Pixels whose measurements do not tell their offset, where one is sought, from their gain.
+    pub untold: Vec<usize>,
     /// Whether the fluxes leave a tilt of ln M undetermined.
     pub leaves_tilt: bool,
     /// What the measurements can compare.
@@ -144,7 +161,7 @@ pub fn solve<T: Real>(
     let mut preconditioner = None;
     // Shifts are refined from a beam that is nearly found.
     let mut shift_prior = shift_prior(unknowns);
-    let mut shifts_told = shift_prior.as_ref().map(|_| false);
+    let mut shifts = shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
         products += 1;
@@ -165,7 +182,7 @@ pub fn solve<T: Real>(
         halvings = 0;
         let (objective, slope) = if looks.len() < SETTLING {
             if !model.variance_is_known() {
-                system.unit = system.misfit(objective) / freedom(&system);
+                system.unit = system.misfit / freedom(&system);
             }
             system.penalty = None;
             system.linearise(SMOOTHING, control)?
@@ -180,21 +197,24 @@ pub fn solve<T: Real>(
         let first = search.product(&mut system, control)?;
         products += 1;
         looks.push(Look { sweep: products, objective, error: first / search.smallest });
-        let near =
-            first / search.smallest <= BEFORE_SHIFTS && search.iterations >= FEWEST_ITERATIONS;
-        if let Some(prior) = shift_prior.take_if(|_| near)
-            && system.structure() >= TOLD
-        {
-            shifts_told = Some(true);
-            system.shift_prior = Some(prior);
-            (search, taken, looks) = (Search::default(), None, Vec::new());
-            continue;
+        let near = first / search.smallest <= BEFORE_SHIFTS.max(stop.tolerance)
+            && search.iterations >= FEWEST_ITERATIONS;
+        if let Some(prior) = shift_prior.take_if(|_| near) {
+            if system.structure() >= TOLD {
+                shifts = Refinement::Done;
+                system.shift_prior = Some(prior);
+                (search, taken, looks) = (Search::default(), None, Vec::new());
+                continue;
+            }
+            shifts = Refinement::Untold;
         }
         if let Some(ended) = ended(&looks, &search, &stop, limit, stuck) {
             let history = History { looks, ended };
-            let mut fit = finish(&system, &search, objective, history, shifts_told, control)?;
-            if unknowns.flux != Flux::Known && !matches!(unknowns.flux, Flux::Prior(_)) {
-                gauge::fix(&mut fit, rotations[0], model.sensor());
+            let mut fit = finish(&system, &search, history, shifts, control)?;
+            if matches!(unknowns.flux, Flux::Free | Flux::Linear(_)) {
+                let theta = system.state.theta.first().copied().unwrap_or_default();
+                let drift = system.fluxes.slope.map(|slope| theta * slope);
+                gauge::fix(&mut fit, drift, rotations[0], model.sensor());
             }
             return Ok(fit);
         }
@@ -336,11 +356,17 @@ fn advance<T: Real>(system: &mut System<'_, '_, T>, x: &[f64], share: f64) {
     let moves = system.centred(&x[cells + params..]);
     let shifts = system.state.shifts.as_flattened_mut().iter_mut();
     shifts.zip(moves.as_flattened()).for_each(|(shift, step)| *shift += share * step);
+    if let Some(prior) = &system.shift_prior {
+        let measured = prior.measured.as_flattened();
+        for (shift, measured) in system.state.shifts.as_flattened_mut().iter_mut().zip(measured) {
+            *shift = shift.clamp(measured - FURTHEST, measured + FURTHEST);
+        }
+    }
 }
 
 /// Measurements less unknowns.
 fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
-    let pixels = system.model.sensor().len() * (1 + usize::from(system.with_offset));
+    let pixels = system.measured() * (1 + usize::from(system.with_offset));
     system.model.used().saturating_sub(pixels + unknowns(system)).max(1) as f64
 }
 
@@ -366,9 +392,8 @@ fn rounding<T: Real>(model: &Model<'_, T>) -> f64 {
 fn finish<T: Real>(
     system: &System<'_, '_, T>,
     search: &Search,
-    objective: f64,
     history: History,
-    shifts_told: Option<bool>,
+    refinement: Refinement,
     control: &Control,
 ) -> Result<Fit> {
     let [sensitivity, offset] = system.pixels();
@@ -381,52 +406,55 @@ fn finish<T: Real>(
         origin: system.grid.geometry.origin,
         flux: system.flux.clone(),
         shifts: system.state.shifts.clone(),
-        shifts_told,
+        refinement,
+        untold: system.untold(),
         leaves_tilt: system.fluxes.leaves_tilt,
         smallest_ritz: search.smallest,
-        misfit: system.misfit(objective),
+        misfit: system.misfit,
         unknowns: unknowns(system),
         history,
     })
 }
 
-/// The components of pixels and cells. Where all shifts differ by whole numbers of pixels, a pixel
-/// hangs on one value of the beam; else on the four cells around it, which is a necessary condition
+/// The components of pixels and cells. Along an axis where all shifts differ by whole numbers of pixels,
+/// a pixel hangs on one value of the beam; else on the two beside it, which is a necessary condition
 /// alone: then a Ritz value near 0 tells of patterns that nothing compares.
 fn components<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Components> {
     let Grid { geometry, sensor, .. } = &system.grid;
     let shifts = &system.state.shifts;
-    let whole =
-        shifts.iter().all(|d| (0..2).all(|axis| (d[axis] - shifts[0][axis]).fract() == 0.0));
-    let around: &[[usize; 2]] = match (system.grid.is_spline(), whole) {
-        (false, _) => &[[0, 0]],
-        (true, true) => &[[1, 1]],
-        (true, false) => &[[1, 1], [1, 2], [2, 1], [2, 2]],
-    };
+    let whole = [0, 1].map(|axis| {
+        let apart = |d: &[f64; 2]| d[axis] - shifts[0][axis];
+        shifts.iter().all(|d| apart(d).fract() == 0.0)
+    });
     let windows = system.grid.windows(shifts);
     let mut edges = Edges::new(sensor.len(), geometry.beam.len());
     system.model.for_each_measurement(control, |exposure, row, col| {
         let window = &windows[exposure];
         let cells = geometry.views[window.view].cells;
-        for [i, j] in around {
-            let cell = cells.at(row + window.row + i, col + window.col + j);
-            edges.add(row * sensor.cols + col, cell);
+        let [down, along] = if window.swaps_axes { [whole[1], whole[0]] } else { whole };
+        for i in window.along_rows.around(down) {
+            for j in window.along_cols.around(along) {
+                let cell = cells.at(row + window.row + i, col + window.col + j);
+                edges.add(row * sensor.cols + col, cell);
+            }
         }
     })?;
     edges.components(control)
 }
 
-/// L at the cells: Σ_j a_j B(u − j) with B = 1/6, 4/6, 1/6 at whole numbers; 0 where a coefficient
+/// L at the cells: Σ_j a_j B(u − j) with B = 1/6, 4/6, 1/6 at whole numbers; NaN where a coefficient
 /// that it takes is not seen.
 fn values_at_cells<T: Real>(system: &System<'_, '_, T>) -> Vec<f64> {
     let beam = &system.state.beam;
     let seen = |cell: usize| system.weights[cell] > 0.0;
     if !system.grid.is_spline() {
-        return (0..beam.len()).map(|cell| if seen(cell) { beam[cell] } else { 0.0 }).collect();
+        return (0..beam.len())
+            .map(|cell| if seen(cell) { beam[cell] } else { f64::NAN })
+            .collect();
     }
     const FACTORS: [f64; 3] = [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0];
     let Shape { rows, cols } = system.grid.geometry.beam;
-    let mut values = vec![0.0; beam.len()];
+    let mut values = vec![f64::NAN; beam.len()];
     system.workers.map_blocks(&mut values, cols, |row, values| {
         if row == 0 || row + 1 == rows {
             return;
@@ -456,6 +484,8 @@ struct Search {
     /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
     smallest: f64,
     iterations: u64,
+    /// Whether the preconditioner does.
+    sees_large_scales: bool,
 }
 
 impl Search {
@@ -468,6 +498,7 @@ impl Search {
         if self.iterations == 0 {
             self.smallest = crate::precondition::DAMPING;
         }
+        self.sees_large_scales = preconditioner.sees_large_scales();
         self.x = vec![0.0; slope.len()];
         self.direction = preconditioner.apply(system, &slope);
         self.square = system.workers.dot(&slope, &self.direction);
@@ -484,7 +515,9 @@ impl Search {
         control: &Control,
     ) -> Result<f64> {
         self.product = system.multiply(&self.direction, control)?;
-        Ok(system.largest_change(self.keep, &mut self.change) / system.mean_sensitivity())
+        let size = system.largest_change(self.keep, &mut self.change) / system.mean_sensitivity();
+        let known = size.is_finite() && self.square.is_finite() && self.sees_large_scales;
+        Ok(if known { size } else { f64::INFINITY })
     }
 
     /// A step along the direction, and a new direction; `false` if there was none to go.

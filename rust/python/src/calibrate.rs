@@ -16,7 +16,7 @@ use equipix_core::error::{Error, Result};
 use equipix_core::estimate::{Ended, History, Look, Stop};
 use equipix_core::frames::{Real, Shape, Stack};
 use equipix_core::geometry::{Geometry, Rotation};
-use equipix_core::joint::{Flux, Unknowns};
+use equipix_core::joint::{Flux, Refinement, Unknowns};
 use equipix_core::model::{Mask, Model, Variance};
 use equipix_core::parallel::Workers;
 use numpy::{
@@ -67,7 +67,7 @@ pub(crate) struct PySolution {
     shifts: Option<Vec<[f64; 2]>>,
     offset: Option<Py<PyArray2<f64>>>,
     leaves_tilt: bool,
-    shifts_told: Option<bool>,
+    refinement: &'static str,
     smallest_ritz: Option<f64>,
     misfit: f64,
 }
@@ -246,7 +246,12 @@ fn wrap(py: Python<'_>, solution: Solution, sensor: Shape) -> PyResult<PySolutio
         shifts: solution.shifts,
         offset: solution.offset.map(|offset| image(py, offset, sensor)).transpose()?,
         leaves_tilt: solution.leaves_tilt,
-        shifts_told: solution.shifts_told,
+        refinement: match solution.refinement {
+            Refinement::None => "",
+            Refinement::NotTried => "as given: the fit ended before",
+            Refinement::Untold => "as given: the beam tells none",
+            Refinement::Done => "refined",
+        },
         smallest_ritz: solution.smallest_ritz,
         misfit: solution.objective,
     })

@@ -27,6 +27,9 @@ pub(super) struct Fluxes {
     pub(super) columns: Vec<Vec<f64>>,
     /// The weight of θ² in F, for each column, where the noise is known.
     pub(super) precisions: Vec<f64>,
+    /// The slope of ln L, a cell, that stands for what a drift linear in time has affine in the shifts,
+    /// for θ = 1.
+    pub(super) slope: [f64; 2],
     /// Whether a tilt of ln M is left undetermined.
     pub(super) leaves_tilt: bool,
 }
@@ -46,6 +49,7 @@ impl Fluxes {
             }
             hidden
         };
+        let mut slope = [0.0; 2];
         let (columns, precisions, leaves_tilt) = match flux {
             Flux::Known => (Vec::new(), Vec::new(), false),
             Flux::Free => {
@@ -53,10 +57,15 @@ impl Fluxes {
                 (free, Vec::new(), !turned)
             }
             Flux::Linear(times) => {
-                let (even, times) = (vec![1.0; count], || std::iter::once(times.clone()));
-                let told = complement(&hidden(turned), times(), &even);
-                let centred = complement(&hidden(true), times(), &even);
-                (if told.is_empty() { Vec::new() } else { centred }, Vec::new(), told.is_empty())
+                // What of the times is affine in the shifts no measurement tells from a tilt: it
+                // follows from the rest.
+                let even = vec![1.0; count];
+                let told = complement(&hidden(turned), std::iter::once(times.clone()), &even);
+                if let (Some(told), false) = (told.first(), turned) {
+                    slope = affine_part(times, told, shifts).map(|part| -part);
+                }
+                let leaves_tilt = told.is_empty();
+                (told, Vec::new(), leaves_tilt)
             }
             Flux::Prior(std) => {
                 let weights: Vec<f64> = std.iter().map(|std| 1.0 / (std * std)).collect();
@@ -66,7 +75,7 @@ impl Fluxes {
             }
         };
         let precisions = if precisions.is_empty() { vec![0.0; columns.len()] } else { precisions };
-        Self { columns, precisions, leaves_tilt }
+        Self { columns, precisions, slope, leaves_tilt }
     }
 
     /// T θ.
@@ -83,6 +92,24 @@ impl Fluxes {
         let dot = |column: &Vec<f64>| column.iter().zip(slopes).map(|(t, b)| t * b).sum();
         self.columns.iter().map(dot).collect()
     }
+}
+
+/// γ of t/|t·told| = told + c + γ·d, for d along which the times change at all.
+fn affine_part(times: &[f64], told: &[f64], shifts: &[[f64; 2]]) -> [f64; 2] {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let scale = dot(times, told);
+    let basis = [0, 1].map(|axis| shifts.iter().map(|d| d[axis]).collect::<Vec<f64>>());
+    let constant = vec![1.0; times.len()];
+    // Against the constant, then the second axis against the first too.
+    let rows =
+        complement(std::slice::from_ref(&constant), std::iter::once(basis[0].clone()), &constant);
+    let hidden: Vec<_> = std::iter::once(constant.clone()).chain(rows.iter().cloned()).collect();
+    let cols = complement(&hidden, std::iter::once(basis[1].clone()), &constant);
+    let along = |column: &[f64], axis: usize| dot(column, &basis[axis]);
+    let col = cols.first().map_or(0.0, |c| dot(c, times) / scale / along(c, 1));
+    let row =
+        rows.first().map_or(0.0, |r| (dot(r, times) / scale - col * along(r, 1)) / along(r, 0));
+    [row, col]
 }
 
 /// An orthonormal basis, by Σ w a b, of what `vectors` add to the span of `hidden` (Gram and Schmidt,
@@ -154,5 +181,22 @@ mod tests {
         let fluxes =
             Fluxes::new(&Flux::Linear(vec![0.0, 3.0, 1.0, 2.0]), &line, &[Rotation::None; 4]);
         assert!(!fluxes.leaves_tilt && fluxes.columns.len() == 1);
+    }
+
+    #[test]
+    fn a_linear_drift_is_what_is_told_and_its_affine_part() {
+        let times = [3.0, 10.0, 21.0, 30.0, 47.0];
+        let flux = Flux::Linear(times.to_vec());
+        let fluxes = Fluxes::new(&flux, &CROSS, &[Rotation::None; 5]);
+        let told = &fluxes.columns[0];
+        let [row, col] = fluxes.slope;
+        let whole: Vec<f64> =
+            told.iter().zip(&CROSS).map(|(t, d)| t - row * d[0] - col * d[1]).collect();
+        // Linear in time: the same slope between all pairs, to rounding of sums of some ten terms.
+        let slope = (whole[1] - whole[0]) / (times[1] - times[0]);
+        for k in 2..5 {
+            let other = (whole[k] - whole[0]) / (times[k] - times[0]);
+            assert!((other / slope - 1.0).abs() < 1e-12);
+        }
     }
 }

@@ -10,9 +10,10 @@ use super::Fit;
 use crate::frames::Shape;
 use crate::geometry::Rotation;
 
-/// Brings the mean of ln c to 0, and the slope of ln M, least squares over the pixels of the largest
-/// component where M > 0, if the fluxes leave it undetermined.
-pub(super) fn fix(fit: &mut Fit, rotation: Rotation, sensor: Shape) {
+/// Gives L the slope `drift` that a lamp's drift has in the beam, brings the mean of ln c to 0, and the slope of ln M, least squares over the ordinary pixels of the largest
+/// component, if the fluxes leave it undetermined.
+pub(super) fn fix(fit: &mut Fit, drift: [f64; 2], rotation: Rotation, sensor: Shape) {
+    untilt(fit, in_sensor(drift, rotation), rotation, sensor);
     if fit.leaves_tilt {
         let slope = slope(&fit.sensitivity, &fit.components.pixels, sensor);
         untilt(fit, slope, rotation, sensor);
@@ -20,6 +21,16 @@ pub(super) fn fix(fit: &mut Fit, rotation: Rotation, sensor: Shape) {
     let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
     fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
     fit.beam.iter_mut().for_each(|value| *value *= mean.exp());
+}
+
+/// A slope of ln L in the beam as one of ln M on a sensor that is turned: −α = Aᵀ β.
+const fn in_sensor([down, along]: [f64; 2], rotation: Rotation) -> [f64; 2] {
+    match rotation {
+        Rotation::None => [down, along],
+        Rotation::Quarter => [-along, down],
+        Rotation::Half => [-down, -along],
+        Rotation::ThreeQuarters => [along, -down],
+    }
 }
 
 /// M → M·exp(−slope·p) and all that goes with it.
@@ -47,13 +58,17 @@ fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
     }
 }
 
-/// The least-squares slope of ln M along rows and columns, a pixel.
+/// The least-squares slope of ln M along rows and columns, a pixel, over pixels from half to twice the
+/// mean: the logarithm of a dead one would weigh more than all others of its row.
 fn slope(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [f64; 2] {
+    let counted = || sensitivity.iter().zip(labels).filter(|(_, label)| **label == 0);
+    let mean = counted().map(|(m, _)| m).sum::<f64>() / counted().count() as f64;
     let pixels = || {
         let known = sensitivity.iter().zip(labels).enumerate();
-        known.filter(|(_, (m, label))| **m > 0.0 && **label == 0).map(|(pixel, (m, _))| {
-            [(pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64, m.ln()]
-        })
+        let ordinary = 0.5 * mean..2.0 * mean;
+        known.filter(move |(_, (m, label))| **label == 0 && ordinary.contains(m)).map(
+            |(pixel, (m, _))| [(pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64, m.ln()],
+        )
     };
     let sum = pixels().fold([0.0; 4], |sum, [row, col, log]| {
         [sum[0] + row, sum[1] + col, sum[2] + log, sum[3] + 1.0]

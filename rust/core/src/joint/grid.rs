@@ -44,6 +44,14 @@ impl Taps {
         }
     }
 
+    /// The cells that count for what hangs together: the nearest one alone where exposures stand
+    /// `whole` numbers of cells apart, else those on either side.
+    pub(super) fn around(&self, whole: bool) -> std::ops::Range<usize> {
+        let largest = |a: &usize, b: &usize| self.values[*a].total_cmp(&self.values[*b]);
+        let nearest = (0..TAPS).max_by(largest).unwrap_or_default();
+        if whole || self.values[nearest] == 1.0 { nearest..nearest + 1 } else { 1..TAPS - 1 }
+    }
+
     fn reversed(mut self) -> Self {
         self.values.reverse();
         self.slopes.reverse();

@@ -85,11 +85,17 @@ impl Preconditioner {
         let coarse = Coarse::of_stars(&hats, &own, stars, control)?;
         let mut diagonal = system.diagonal(true, control)?;
         let least = FAINTEST * diagonal.iter().sum::<f64>() / diagonal.len() as f64;
+        diagonal.iter_mut().filter(|d| **d <= least).for_each(|d| *d = 0.0);
         diagonal.extend(whole);
-        let inverse = diagonal.iter().map(|&d| if d > least { 1.0 / d } else { 0.0 }).collect();
+        let inverse = diagonal.iter().map(|&d| if d > 0.0 { 1.0 / d } else { 0.0 }).collect();
         let beam = system.state.beam.clone();
         let slopes = slopes(system);
         Ok(Self { hats, inverse, coarse, beam, slopes })
+    }
+
+    /// Whether the coarse matrix has a factor.
+    pub(super) const fn sees_large_scales(&self) -> bool {
+        self.coarse.is_factorised()
     }
 
     /// P⁻¹ r.

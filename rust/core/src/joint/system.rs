@@ -56,6 +56,8 @@ pub(super) struct System<'m, 'a, T> {
     pub(super) fluxes: Fluxes,
     pub(super) shift_prior: Option<ShiftPrior>,
     pub(super) with_offset: bool,
+    /// F of the measurements alone, at the state last linearised.
+    pub(super) misfit: f64,
     /// The variance of a measurement of weight 1.
     pub(super) unit: f64,
     pub(super) state: State,
@@ -116,6 +118,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             fluxes,
             shift_prior: None,
             with_offset,
+            misfit: 0.0,
             unit: 1.0,
             flux: model.flux.clone(),
             windows: grid.windows(&state.shifts),
@@ -162,9 +165,10 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                 singular: SINGULAR,
             })
         })?;
-        let mut slope = self.collect(sums.clone(), false);
-        self.weigh(tau, control)?;
         let mut objective = sums.objective;
+        self.misfit = objective;
+        let mut slope = self.collect(sums, false);
+        self.weigh(tau, control)?;
         if let Some(penalty) = &self.penalty {
             let beam = &self.state.beam;
             let cells = &mut slope[..beam.len()];
@@ -197,15 +201,25 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         objective
     }
 
-    /// F of the measurements alone, at the state last linearised.
-    pub(super) fn misfit(&self, objective: f64) -> f64 {
-        let mut nothing = vec![0.0; self.size()];
-        let mut left = objective - self.pull_by_priors(&mut nothing);
-        if let Some(penalty) = &self.penalty {
-            let beam = &self.state.beam;
-            left -= penalty.add(beam, beam.clone(), 0.0, &mut nothing[..beam.len()], self.workers);
+    /// How many pixels have a measurement.
+    pub(super) fn measured(&self) -> usize {
+        let mut count = 0;
+        self.for_rows(|[_, _, inverse, _]| count += inverse.iter().filter(|i| **i > 0.0).count());
+        count
+    }
+
+    /// The pixels whose measurements do not tell an offset from a gain, where one is sought.
+    pub(super) fn untold(&self) -> Vec<usize> {
+        let (mut untold, mut first) = (Vec::new(), 0);
+        if self.with_offset {
+            self.for_rows(|[_, _, gain, offset]| {
+                let pixels = gain.iter().zip(offset).enumerate();
+                let told = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
+                untold.extend(told.map(|(col, _)| first + col));
+                first += gain.len();
+            });
         }
-        left
+        untold
     }
 
     /// S x, and the change of M that goes with x in each [`Row`].
@@ -363,12 +377,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         sum / f64::from(count.max(1))
     }
 
-    /// Calls `visit([M, O, 1/Σ w e², Σ w, change of M])` for each row of pixels.
+    /// Calls `visit([M, O, the inverse's first and last element])` for each row of pixels: that of M, and
+    /// that of O, which is 0 where no offset is told.
     pub(super) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 4])) {
         let (cols, count) = (self.model.sensor().cols, self.model.count());
         for row in self.rows.chunks_exact(Row::length(count, cols)) {
             let part = |index: usize| &row[(count + index) * cols..][..cols];
-            visit([part(0), part(1), part(2), part(5)]);
+            visit([part(0), part(1), part(2), part(4)]);
         }
     }
 
@@ -383,6 +398,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let mut largest = [0.0_f64; 2];
             for (index, (earlier, change)) in earlier.iter_mut().zip(change).enumerate() {
                 let size = (change - share * *earlier).abs();
+                // A maximum would lose what is no number.
+                let size = if size.is_finite() { size } else { f64::INFINITY };
                 largest[index % 2] = largest[index % 2].max(size);
                 *earlier = *change;
             }
