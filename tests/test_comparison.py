@@ -9,6 +9,7 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
+from equipix.report import draw_comparison
 
 SHAPE = (96, 128)
 ARMS = ((5, 7), (7, 11), (11, 19))
@@ -48,6 +49,36 @@ def test_they_agree_as_their_uncertainties_predict(experiments):
         np.testing.assert_allclose(wanted, mean[i] + mean[j], rtol=1e-12)
         # Twice the margin: the difference of two has their covariance's scatter besides.
         assert (np.abs(got - wanted) < 2 * margin).all()
+
+
+def test_uncertainties_predict_without_being_told(experiments, tmp_path):
+    """By the error maps, and by 16 blocks each, what the draws say: within their scatter."""
+    _, calibrations, draws = experiments
+    rng = np.random.default_rng(5)
+    known = []
+    for calibration, arms in zip(calibrations[:2], ARMS, strict=False):
+        shifts = equipix.cross_pattern(*arms)
+        frames = np.stack([calibration.predict(shift) for shift in shifts])
+        frames += NOISE * rng.standard_normal(frames.shape)
+        variance = np.full(5, NOISE**2)
+        known.append(equipix.calibrate(frames, shifts, variance=variance, uncertainty=True))
+    result = equipix.compare(known)
+    scatter = draws[:2].std(axis=1, ddof=1) / np.sqrt(draws.shape[1])
+    wanted = np.sqrt(np.sum(np.mean(draws[:2] ** 2, axis=1), axis=0))
+    # The map is exact to 2 % and the mean of the draws to their standard error, times four.
+    margin = 4 * np.hypot(0.02 * wanted[0], np.hypot(*scatter)[0])
+    assert result.predicted_rms[0] == pytest.approx(wanted[0], abs=margin)
+    # 16 of 48 blocks stand for all. The mean square of 16 variances that differ by up to eight
+    # times, those at corners being the largest, is the whole's to within half of it.
+    assert result.predicted_block_rms[0] ** 2 == pytest.approx(wanted[1] ** 2, rel=0.5)
+    assert equipix.compare(calibrations).predicted_rms is None
+    for number, each in enumerate(known):
+        each.save(tmp_path / f"{number}.npz")
+    files = [equipix.load(tmp_path / f"{number}.npz") for number in range(2)]
+    read = equipix.compare(files)
+    np.testing.assert_array_equal(read.predicted_rms, result.predicted_rms)
+    assert np.isnan(read.predicted_block_rms).all()  # a file holds no measurements
+    assert draw_comparison(read, ["one", "other"]).axes
 
 
 def test_the_agreement_map_is_the_scatter_of_one(experiments):

@@ -203,6 +203,9 @@ def compare(
             "rms": float(result.rms[k]),
             "block_rms": float(result.block_rms[k]),
             "largest": float(result.largest[k]),
+            "predicted_rms": None
+            if result.predicted_rms is None
+            else float(result.predicted_rms[k]),
         }
         for k, pair in enumerate(result.pairs)
     ]

@@ -11,7 +11,8 @@ import numpy as np
 from equipix._arrays import as_array, check_count
 from equipix.errors import InputError
 from equipix.results import Flag
-from equipix.simulate.accuracy import block_means, relative_error
+from equipix.simulate.accuracy import BLOCK, block_means, relative_error
+from equipix.uncertainty import determined
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from equipix.calibration import Calibration
+
+_MOST_BLOCKS = 16
+"""Blocks whose uncertainty stands for all: each takes about as long as a calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +74,8 @@ def compare(
     predicted : array_like, shape (n, 2), optional
         Of each calibration the root mean square of its relative error that is expected in single
         pixels and in means over blocks of 16×16, as `equipix.simulate.noise_prediction` gives.
+        Unless given it follows from `sensitivity_std` where all have one; that of the blocks, by
+        `Calibration.std_of` of 16 of them, where none was read from a file.
 
     Returns
     -------
@@ -128,7 +134,7 @@ def compare(
         rms=np.array([_rms(each) for each in differences]),
         block_rms=np.array([_rms(block_means(each)) for each in differences]),
         largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
-        **_predictions(predicted, pairs, count),
+        **_predictions(_expected(calibrations) if predicted is None else predicted, pairs, count),
     )
 
 
@@ -143,6 +149,39 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> NDArray[Any]:
     maps[:, ~good] = np.nan
     gauged: NDArray[Any] = maps / np.nanmean(maps, axis=(1, 2), keepdims=True)
     return gauged
+
+
+def _expected(calibrations: Sequence[Calibration]) -> NDArray[Any] | None:
+    """Rms of the relative error in pixels and in block means, by the uncertainties, if known."""
+    expected = []
+    for each in calibrations:
+        if each.sensitivity_std is None:
+            return None
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = each.sensitivity_std / each.sensitivity
+        pixels = _rms(relative[np.isfinite(relative) & ((each.flags & Flag.DO_NOT_USE) == 0)])
+        blocks = (
+            np.nan
+            if each.measurements is None
+            else _rms(np.asarray(each.std_of(_some_blocks(each))))
+        )
+        expected.append((pixels, blocks))
+    return np.array(expected)
+
+
+def _some_blocks(calibration: Calibration) -> NDArray[Any]:
+    """Weights of the means over some blocks, each less the mean over all: shape (m, rows, cols)."""
+    good = determined(calibration.sensitivity, calibration.flags)
+    rows, cols = (size // BLOCK for size in calibration.shape)
+    chosen = np.unique(np.linspace(0, rows * cols - 1, _MOST_BLOCKS).round().astype(int))
+    weights = []
+    for row, col in zip(*np.divmod(chosen, cols), strict=True):
+        block = np.zeros(calibration.shape, bool)
+        block[BLOCK * row : BLOCK * (row + 1), BLOCK * col : BLOCK * (col + 1)] = True
+        block &= good
+        if block.any():
+            weights.append(block / block.sum() - good / good.sum())
+    return np.array(weights)
 
 
 def _predictions(

@@ -238,7 +238,8 @@ def draw_comparison(comparison: Comparison, names: Sequence[str]) -> Figure:
         (rows[2, 0], "Differences of pixels", differences, comparison.predicted_rms),
         (rows[2, 1], "Differences of 16×16 means", blocks, comparison.predicted_block_rms),
     ):
-        expected = None if predicted is None else 100 * float(_rms(predicted))
+        known = predicted is not None and np.isfinite(predicted).all()
+        expected = 100 * float(_rms(np.asarray(predicted))) if known else None
         _densities(axes, title, dict(zip(labels, errors, strict=True)), expected)
     return figure
 
