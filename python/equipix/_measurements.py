@@ -169,15 +169,22 @@ def as_flux(
     return values, ("prior", std.tolist())
 
 
-def warn_of_order(times: list[float], shifts: NDArray[Any]) -> None:
+def warn_of_order(
+    flux_model: tuple[str, list[float]], shifts: NDArray[Any], rotation: NDArray[Any]
+) -> None:
     """Warn where a drift linear in time looks much like a tilt, whose error then is large."""
+    kind, values = flux_model
+    if kind != "linear" or len(set(rotation.tolist())) > 1:
+        return
+    times = np.array(values)
     affine = np.column_stack([np.ones(len(shifts)), shifts])
-    left = np.array(times) - affine @ np.linalg.lstsq(affine, np.array(times))[0]
-    share = float(np.sum(left**2) / np.sum((np.array(times) - np.mean(times)) ** 2))
+    left = times - affine @ np.linalg.lstsq(affine, times)[0]
+    share = float(np.sum(left**2) / np.sum((times - times.mean()) ** 2))
     if share < _HARDLY_TOLD:
         warnings.warn(
-            f"of a drift linear in time only {share:.1%} of the variance can be told from a tilt of "
-            "the sensitivity in this order of exposures: take another (equipix.plan.advise_order)",
+            f"of a drift linear in time only {share:.1%} of the variance can be told from a tilt "
+            "of the sensitivity in this order of exposures: take another "
+            "(equipix.plan.advise_order)",
             IdentifiabilityWarning,
             stacklevel=3,
         )
@@ -197,8 +204,8 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> NDArray[np.float64]:
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
     if std.max() > _WIDEST:
         raise InputError(
-            f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined within "
-            "a pixel of where they were measured; measure them better"
+            f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined "
+            "within a pixel of where they were measured; measure them better"
         )
     return std
 
@@ -218,6 +225,13 @@ class Asked:
 
     def check(self) -> None:
         """Refuse what does not go together."""
+        if not isinstance(self.dark, str):
+            raise InputError(
+                "'dark' holds values: subtract it from the frames, or give it to equipix.average"
+            )
+        for name in ("robust", "uncertainty"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected True or False")
         if self.dark not in ("subtracted", "fit"):
             raise InputError(f"'dark' is {self.dark!r}, expected 'subtracted' or 'fit'")
         fitted = self.flux != "known" or self.dark == "fit"

@@ -671,10 +671,6 @@ def calibrate(
     True
     """
     started = datetime.now(UTC)
-    if not isinstance(dark, str):
-        raise InputError("'dark' holds values: subtract it from the frames, or average with dark=")
-    if not isinstance(uncertainty, bool) or not isinstance(robust, bool):
-        raise InputError(f"'uncertainty' is {uncertainty!r}, 'robust' {robust!r}: expected bool")
     if method not in get_args(Method):
         raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
@@ -695,8 +691,7 @@ def calibrate(
     check_count("shifts", len(places), count)
     turns = as_rotation(rotation, count)
     fluxes, flux_model = as_flux(flux, flux_std, time, count)
-    if flux_model[0] == "linear" and len(set(turns.tolist())) == 1:
-        warn_of_order(flux_model[1], places)
+    warn_of_order(flux_model, places, turns)
     shift_error = None if shift_std is None else as_shift_std(shift_std, count)
     asked = Asked(
         method=method,
