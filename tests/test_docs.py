@@ -132,6 +132,7 @@ def figures(name, capsys):
     return [[float(each) for each in re.findall(r"[-+]?\d\.\d+(?:e-\d+)?", line)] for line in lines]
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 def test_the_example_between_pixels(capsys):
     rounded, measured, refined, true, left = (each[0] for each in figures("subpixel", capsys))
     assert rounded > 5 * true
@@ -139,6 +140,7 @@ def test_the_example_between_pixels(capsys):
     assert left < 0.01
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 def test_the_example_of_a_monitor(capsys):
     steady, monitor = figures("drift_monitor", capsys)
     # 1 % against 0.02 % of error in the fluxes makes as much of a difference in the tilt.

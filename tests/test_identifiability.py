@@ -36,6 +36,8 @@ def parts(labels):
     return [list(dict.fromkeys(labels.tolist())).index(label) for label in labels]
 
 
+# A sensor of a few pixels in parts may end in a minimum that is not the best.
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestSilentPixels:
     @pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2])
     def test_components_are_those_of_the_reference(self, noise):

@@ -14,7 +14,12 @@ import pytest
 
 import equipix
 from equipix import reference, simulate
-from equipix.errors import ConvergenceWarning, IdentifiabilityWarning, InputError
+from equipix.errors import (
+    ConvergenceWarning,
+    IdentifiabilityWarning,
+    InputError,
+    MisfitWarning,
+)
 from equipix.results import Flag
 
 SMALL = (9, 12)
@@ -64,6 +69,7 @@ def slope(image):
     return np.linalg.lstsq(plane, image.ravel())[0][1:]
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestReference:
     FRACTIONS = between(SMALL_CROSS, np.random.default_rng(8))
     DRIFT = np.array([1, 1.01, 0.99, 1.005, 0.98])
@@ -155,6 +161,7 @@ class TestReference:
             cal.std_of(np.ones(SMALL) / 108)
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestBetweenPixels:
     def test_noise_counts_as_with_whole_shifts(self):
         rms = np.empty((10, 2))
@@ -173,6 +180,11 @@ class TestBetweenPixels:
             cal = equipix.calibrate(frames, shifts)
             assert cal.converged
             assert rms_error(cal, truth) <= 1e-5
+
+    def test_a_terrible_fit_is_told(self):
+        frames, shifts, _ = structured(0)
+        with pytest.warns(MisfitWarning, match="times what the variances say"):
+            equipix.calibrate(frames, -shifts, tolerance=1e-4, variance=np.full(5, NOISE**2))
 
     def test_rounded_shifts_ruin_it(self):
         frames, shifts, truth = structured(0)

@@ -47,6 +47,7 @@ def compared(frames, truth, dusty, **options):
     return robust, rms(found[pixels]) / rms(best[pixels]), rms(found) / rms(best)
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 @pytest.mark.parametrize("contrast", [0.02, 0.05, 0.2, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_grain_of_dust(seed, contrast):

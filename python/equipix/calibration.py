@@ -39,9 +39,9 @@ from equipix.correction import Flagged, apply_gain
 from equipix.defects import noisy_pixels, odd_responses
 from equipix.errors import (
     ConvergenceWarning,
-    EquipixWarning,
     IdentifiabilityWarning,
     InputError,
+    MisfitWarning,
 )
 from equipix.io import save_pages
 from equipix.noise import fit_frames
@@ -635,7 +635,7 @@ def calibrate(
         fluxes leave a tilt of the sensitivity undetermined.
     ConvergenceWarning
         If the tolerance was not reached.
-    EquipixWarning
+    MisfitWarning
         If residuals are more than twice what the variances given say.
 
     Notes
@@ -895,12 +895,12 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
         )
     measurements = calibration.measurements
     weighted = measurements is not None and measurements.variance is not None
-    if weighted and calibration.reduced_chi2 > _MISFIT:
+    if weighted and calibration.converged and calibration.reduced_chi2 > _MISFIT:
         warnings.warn(
             f"residuals are {calibration.reduced_chi2**0.5:.1f} times what the variances say: are "
             "the shifts right, and their sign? does the lamp drift (flux='fit')? is there dust "
             "(robust=True)?",
-            EquipixWarning,
+            MisfitWarning,
             stacklevel=3,
         )
     if not calibration.converged:

@@ -47,3 +47,7 @@ class ShiftSignWarning(EquipixWarning):
 
 class DriftWarning(EquipixWarning):
     """Lamp drift will tilt the sensitivity by more than noise leaves."""
+
+
+class MisfitWarning(EquipixWarning):
+    """Residuals are larger than the variances given explain."""
