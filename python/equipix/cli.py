@@ -52,6 +52,9 @@ Uncertainty = Annotated[
 Saturation = Annotated[
     float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
 ]
+Picture = Annotated[
+    Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
+]
 Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
 Shape = Annotated[
     tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
@@ -182,9 +185,7 @@ def compare(
     calibrations: Annotated[
         list[Path], typer.Argument(help="Calibrations of one sensor: .tif or .npz.")
     ],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
-    ] = None,
+    output: Picture = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -390,9 +391,7 @@ def plan(
         float | None, typer.Option(help="Width of a Gaussian beam in pixels; even unless given.")
     ] = None,
     rng: Seed = 0,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
-    ] = None,
+    output: Picture = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:

@@ -1,5 +1,6 @@
 //! From the measurements of one experiment to the sensitivity of its sensor.
 
+use crate::conjugate;
 use crate::connectivity::{Components, NONE, Tie};
 use crate::control::Control;
 use crate::descent;
@@ -12,8 +13,6 @@ use crate::memory;
 use crate::model::{Model, Stretch};
 use crate::multiscale;
 use crate::parallel::Workers;
-use crate::precondition;
-use crate::reduced::Padding;
 
 /// A response below this share of the typical one may be nil; above it none is.
 const WEAK_RESPONSE: f64 = 0.05;
@@ -198,28 +197,21 @@ fn gauged(
     (sensitivity, beam, flags)
 }
 
-/// What a solver holds beside the measurements at its fullest, in bytes, where a *place* is a pixel
-/// of an image padded to the width of the beam:
+/// What a solver holds beside the measurements at its fullest, in bytes: a search
+/// ([`conjugate`]), and
 ///
 /// | array | in bytes |
 /// |---|---|
 /// | M | 8 for each pixel |
-/// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
-/// | L², h | 2 · 4 for each place of each view |
 /// | L | 8 for each cell of each view |
-/// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
 /// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell.
 fn bytes_needed(geometry: &Geometry) -> u64 {
-    let padding = Padding::of(geometry);
-    let places = |rows| padding.size(rows) as u64;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let views = geometry.views.len() as u64;
-    let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
-    let images = 24 * places(geometry.sensor.rows) + of_views;
-    8 * pixels + images + 8 * views * cells + turned + precondition::bytes_needed(geometry)
+    8 * pixels + 8 * views * cells + turned + conjugate::bytes_needed(geometry)
 }
 
 /// The pixels that do not respond to light, as far as their measurements can tell: M is small,

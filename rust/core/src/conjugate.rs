@@ -7,10 +7,11 @@
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::geometry::Geometry;
 use crate::model::Model;
 use crate::parallel::Workers;
-use crate::precondition::TwoLevel;
-use crate::reduced::Reduced;
+use crate::precondition::{self, TwoLevel};
+use crate::reduced::{Padding, Reduced};
 
 /// Values that a thread takes at a time.
 const BLOCK: usize = 1 << 16;
@@ -19,6 +20,20 @@ const LONGEST_STEP: f64 = 1e6;
 
 /// A relative error that is rounding alone.
 const ROUNDING: f64 = 4.0 * f64::EPSILON;
+
+/// What a search holds, in bytes, where a *place* is a pixel of an image padded to the width of the beam:
+///
+/// | array | in bytes |
+/// |---|---|
+/// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
+/// | L², h | 2 · 4 for each place of each view |
+/// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
+pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
+    let padding = Padding::of(geometry);
+    let places = |rows| padding.size(rows) as u64;
+    let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
+    24 * places(geometry.sensor.rows) + of_views + precondition::bytes_needed(geometry)
+}
 
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
 pub(crate) struct Search<'m, 'a, T> {

@@ -22,10 +22,16 @@ use crate::conjugate::Search;
 use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::frames::Real;
+use crate::model::Model;
 use crate::precondition::DAMPING;
 
 /// Iterations before the smallest Ritz value is worth its name.
 pub(crate) const FEWEST_ITERATIONS: u64 = 10;
+
+/// How often a step that raises F is halved; the last time, what is left of it is taken back.
+pub(crate) const MOST_HALVINGS: i32 = 10;
+/// Looks that may fail to lower the estimate before it counts as stalled.
+const PATIENCE: usize = 3;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug)]
@@ -92,6 +98,20 @@ impl History {
     pub fn last(&self) -> Look {
         self.looks.last().copied().unwrap_or(Look { sweep: 0, objective: 0.0, error: 0.0 })
     }
+}
+
+/// What F may rise by through rounding: that of a sum, and of residuals that are rounding alone.
+pub(crate) fn rounding<T: Real>(model: &Model<'_, T>, objective: f64) -> f64 {
+    let residual = 4.0 * f64::EPSILON * model.brightest();
+    let weights: f64 = model.exposure_weights().iter().sum();
+    1e-12 * objective + weights * residual * residual
+}
+
+/// The look since which the estimate has not fallen by half, once that is long ago.
+pub(crate) fn stalled_since(looks: &[Look]) -> Option<usize> {
+    let earlier = looks.len().checked_sub(PATIENCE + 1)?;
+    let best = |looks: &[Look]| looks.iter().map(|look| look.error).fold(f64::INFINITY, f64::min);
+    (2.0 * best(&looks[earlier + 1..]) > best(&looks[..=earlier])).then_some(earlier)
 }
 
 /// The smallest Ritz value found so far, and in how many iterations.

@@ -83,7 +83,7 @@ impl Rotation {
     }
 
     /// The rotation that undoes this one.
-    const fn inverse(self) -> Self {
+    pub(crate) const fn inverse(self) -> Self {
         match self {
             Self::Quarter => Self::ThreeQuarters,
             Self::ThreeQuarters => Self::Quarter,

@@ -27,7 +27,9 @@ use crate::connectivity::{Components, Edges};
 use crate::control::Control;
 use crate::descent::Descent;
 use crate::error::Result;
-use crate::estimate::{Ended, FEWEST_ITERATIONS, History, Look, Stop};
+use crate::estimate::{
+    Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, Stop, rounding, stalled_since,
+};
 use crate::frames::{Real, Shape};
 use crate::geometry::Rotation;
 use crate::model::Model;
@@ -56,10 +58,6 @@ const FURTHEST: f64 = 0.99;
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
 const CURVED: [f64; 2] = [1e-8, 0.03];
-/// How often a step is halved before it is taken back.
-const MOST_HALVINGS: u32 = 10;
-/// Steps that may fail to lower the estimate before it counts as stalled.
-const PATIENCE: usize = 3;
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
 /// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
@@ -165,9 +163,11 @@ pub fn solve<T: Real>(
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
         products += 1;
-        let highest = looks.last().map_or(f64::INFINITY, |last| last.objective * (1.0 + 1e-12));
+        let highest = looks
+            .last()
+            .map_or(f64::INFINITY, |last| last.objective + rounding(model, last.objective));
         // A number that is none is no fall either.
-        let fell = objective <= highest + rounding(model);
+        let fell = objective <= highest;
         if let Some(x) = &taken
             && !fell
             && halvings <= MOST_HALVINGS
@@ -175,7 +175,7 @@ pub fn solve<T: Real>(
             // The last time, what is left of the step is taken back.
             halvings += 1;
             stuck = halvings > MOST_HALVINGS;
-            let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS) as i32);
+            let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS));
             advance(&mut system, x, -share);
             continue;
         }
@@ -259,10 +259,7 @@ pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>) -> u64 {
 fn ended(looks: &[Look], search: &Search, stop: &Stop, limit: u64, stuck: bool) -> Option<Ended> {
     let last = looks.last()?;
     let settled = last.error == 0.0;
-    let best = |looks: &[Look]| looks.iter().map(|look| look.error).fold(f64::INFINITY, f64::min);
-    let stalled = looks.len().checked_sub(PATIENCE + 1).is_some_and(|earlier| {
-        earlier >= SETTLING && 2.0 * best(&looks[earlier + 1..]) > best(&looks[..=earlier])
-    });
+    let stalled = stalled_since(looks).is_some_and(|earlier| earlier >= SETTLING);
     if (search.iterations >= FEWEST_ITERATIONS || settled) && last.error <= stop.tolerance {
         Some(Ended::Converged)
     } else if last.sweep + 1 >= limit {
@@ -381,12 +378,6 @@ fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     let shares: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
     let windows = system.grid.windows(&system.state.shifts);
     (freedom::told(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
-}
-
-/// What F may rise by through rounding, of residuals that are rounding alone.
-fn rounding<T: Real>(model: &Model<'_, T>) -> f64 {
-    let residual = 4.0 * f64::EPSILON * model.brightest();
-    model.exposure_weights().iter().sum::<f64>() * residual * residual
 }
 
 fn finish<T: Real>(

@@ -12,7 +12,9 @@ use crate::conjugate::Search;
 use crate::control::Control;
 use crate::descent::Descent;
 use crate::error::Result;
-use crate::estimate::{Ended, FEWEST_ITERATIONS, History, Look, Smallest, Stop};
+use crate::estimate::{
+    Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, Smallest, Stop, rounding, stalled_since,
+};
 use crate::frames::Real;
 use crate::model::Model;
 use crate::parallel::Workers;
@@ -29,10 +31,6 @@ const RESCUE_SWEEPS: u64 = 32;
 const MOST_RESCUES: u32 = 8;
 /// What linearising adds at most counts as this share of a step, far from the minimum.
 const MOST_CURVED: f64 = 0.1;
-/// Steps that may fail to lower the estimate before it counts as stalled.
-const PATIENCE: usize = 3;
-/// How often a step is halved before it is taken as it is.
-const MOST_HALVINGS: i32 = 10;
 /// Products that an ordinary calibration takes: what progress is measured against at first.
 const TYPICAL: u64 = 60;
 
@@ -63,7 +61,7 @@ pub fn solve<'m, 'a, T: Real>(
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
-        let noise = looks.last().map_or(f64::INFINITY, |last| rounding(model, last));
+        let noise = looks.last().map_or(f64::INFINITY, |last| rounding(model, last.objective));
         let highest = looks.last().map_or(f64::INFINITY, |last| last.objective + noise);
         // A number that is none is no fall either.
         let fell = objective <= highest;
@@ -141,19 +139,11 @@ fn reachable<T: Real>(search: &Search<'_, '_, T>) -> f64 {
     search.largest() * search.size().clamp(PRECISION, MOST_CURVED)
 }
 
-/// What F may rise by through rounding: that of a sum, and of residuals that are rounding alone.
-fn rounding<T: Real>(model: &Model<'_, T>, last: &Look) -> f64 {
-    let residual = 4.0 * f64::EPSILON * model.brightest();
-    let weights: f64 = model.exposure_weights().iter().sum();
-    1e-12 * last.objective + weights * residual * residual
-}
-
 /// Whether neither the estimate has fallen by half for some steps, nor F by more than rounding.
 fn stalled(looks: &[Look], rounding: f64) -> bool {
-    let Some(earlier) = looks.len().checked_sub(PATIENCE + 1) else { return false };
-    let best = |looks: &[Look]| looks.iter().map(|look| look.error).fold(f64::INFINITY, f64::min);
-    let fell = looks[earlier].objective - looks[looks.len() - 1].objective;
-    2.0 * best(&looks[earlier + 1..]) > best(&looks[..=earlier]) && fell <= rounding
+    stalled_since(looks).is_some_and(|earlier| {
+        looks[earlier].objective - looks[looks.len() - 1].objective <= rounding
+    })
 }
 
 /// The number of products in all, if the error goes on to fall as it did from the first look on.

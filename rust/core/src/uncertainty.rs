@@ -16,7 +16,7 @@
 //!
 //! A linear functional gᵀM has the variance gᵀ S⁻¹ g: one linear problem, no draws.
 
-use crate::conjugate::Search;
+use crate::conjugate::{self, Search};
 use crate::control::Control;
 use crate::error::Result;
 use crate::estimate::{FEWEST_ITERATIONS, Smallest};
@@ -25,7 +25,6 @@ use crate::geometry::{Geometry, View};
 use crate::memory;
 use crate::model::Model;
 use crate::parallel::Workers;
-use crate::precondition;
 use crate::reduced::{BAND, Padding};
 
 /// The relative standard error of the map, root mean square over its pixels, that draws go on to.
@@ -124,8 +123,8 @@ fn exactness(share: f64, draws: u64) -> f64 {
     0.5 * share * (2.0 / draws as f64).sqrt()
 }
 
-/// What both take beside the measurements, in bytes: the images of a search and three more, a copy of
-/// L in each view, and the map.
+/// What both take beside the measurements, in bytes: a search and three images more, a copy of L in
+/// each view, and the map.
 fn bytes_needed(geometry: &Geometry) -> u64 {
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
@@ -133,8 +132,8 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let views = geometry.views.len() as u64;
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     let turned = if views > 1 { of_views } else { 0 };
-    let images = 36 * places(geometry.sensor.rows) + of_views + turned;
-    16 * pixels + images + 8 * views * cells + precondition::bytes_needed(geometry)
+    let more = 12 * places(geometry.sensor.rows) + turned;
+    16 * pixels + more + 8 * views * cells + conjugate::bytes_needed(geometry)
 }
 
 /// The linear problem at the solution.

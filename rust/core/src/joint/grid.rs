@@ -153,14 +153,9 @@ impl Grid {
     }
 
     /// A p + t: where a point of the sensor lies in the beam at shift 0, in exposure k.
-    pub(super) fn place(&self, exposure: usize, [row, col]: [f64; 2]) -> [f64; 2] {
-        let (last_row, last_col) = (self.sensor.rows as f64 - 1.0, self.sensor.cols as f64 - 1.0);
-        match self.rotations[exposure] {
-            Rotation::None => [row, col],
-            Rotation::Quarter => [col, last_row - row],
-            Rotation::Half => [last_row - row, last_col - col],
-            Rotation::ThreeQuarters => [last_col - col, row],
-        }
+    pub(super) fn place(&self, exposure: usize, pixel: [f64; 2]) -> [f64; 2] {
+        // The sensor sees a window of the beam turned by its rotation: back from there.
+        self.rotations[exposure].inverse().turned_point(pixel, self.sensor)
     }
 
     /// How many cells from the corner on the first one lies, and the factors, along one axis.

@@ -146,7 +146,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let logs = self.fluxes.spread(&self.state.theta, self.model.count());
         self.flux = self.model.flux.iter().zip(&logs).map(|(c, log)| c * log.exp()).collect();
         let views = self.views_of(&self.state.beam);
-        let sums = self.pass(control, |system, row_index, row, room| {
+        let slopes = self.shift_prior.is_some().then_some(&views[..]);
+        let sums = self.pass(slopes, control, |system, row_index, row, room| {
             let cols = system.model.sensor().cols;
             for (k, flux) in system.flux.iter().enumerate() {
                 let light = &mut row.light[k * cols..][..cols];
@@ -167,7 +168,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         })?;
         let mut objective = sums.objective;
         self.misfit = objective;
-        let mut slope = self.collect(sums, false);
+        let mut slope = self.collect(sums);
         self.weigh(tau, control)?;
         if let Some(penalty) = &self.penalty {
             let beam = &self.state.beam;
@@ -229,7 +230,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let logs = self.fluxes.spread(&x[cells..cells + params], self.model.count());
         let moves = self.centred(&x[cells + params..]);
         let (views, beams) = (self.views_of(&x[..cells]), self.beam_views());
-        let sums = self.pass(control, |system, row_index, row, room| {
+        let sums = self.pass(beams.as_deref(), control, |system, row_index, row, room| {
             let cols = system.model.sensor().cols;
             for (k, (log, flux)) in logs.iter().zip(&system.flux).enumerate() {
                 let window = &system.windows[k];
@@ -263,7 +264,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             });
             0.0
         })?;
-        let mut product = self.collect(sums, false);
+        let mut product = self.collect(sums);
         if let Some(penalty) = &self.penalty {
             let relative = penalty.relative(&self.state.beam, &x[..cells], self.workers);
             penalty.add(&self.state.beam, relative, 1.0, &mut product[..cells], self.workers);
@@ -331,7 +332,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         if squared {
             self.windows = windows.iter().map(|window| window.squared()).collect();
         }
-        let passed = self.pass(control, |system, row_index, row, room| {
+        let passed = self.pass(None, control, |system, row_index, row, room| {
             let cols = system.model.sensor().cols;
             for (k, flux) in system.flux.iter().enumerate() {
                 system.weigh_row(k, row_index, room);
@@ -343,10 +344,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
             0.0
         });
-        let diagonal = passed.map(|sums| self.collect(sums, true));
+        let diagonal = passed.map(|_| self.collect_cells());
         self.windows = windows;
         let mut diagonal = diagonal?;
-        diagonal.truncate(self.state.beam.len());
         if let (true, Some(penalty)) = (squared, &self.penalty) {
             self.workers.add_multiple(&mut diagonal, 1.0, &penalty.diagonal());
         }
@@ -485,9 +485,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's
-    /// values, and spreads those along the columns of the views; returns the sums.
+    /// values, and spreads those along the columns of the views; returns the sums, those of shifts by
+    /// the slopes of `beams`, the beam in each view.
     fn pass(
         &mut self,
+        beams: Option<&[Vec<f64>]>,
         control: &Control,
         work: impl Fn(&Self, usize, Row<'_>, &mut Room) -> f64 + Sync,
     ) -> Result<Sums> {
@@ -496,7 +498,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let sizes = [Row::length(count, sensor.cols), count * wide];
         let mut rows = std::mem::take(&mut self.rows);
         let mut pulls = std::mem::take(&mut self.pulls);
-        let beams = self.beam_views();
         let system = &*self;
         let bands = system.workers.map_pairs(
             &mut rows,
@@ -507,7 +508,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                 let mut sums = Sums {
                     objective: 0.0,
                     flux: vec![0.0; count],
-                    shifts: vec![[0.0; 2]; beams.as_ref().map_or(0, |_| count)],
+                    shifts: vec![[0.0; 2]; beams.map_or(0, |_| count)],
                 };
                 let rows = rows.chunks_exact_mut(sizes[0]);
                 for (index, (row, pulls)) in rows.zip(pulls.chunks_exact_mut(sizes[1])).enumerate()
@@ -524,7 +525,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                         if !system.fluxes.columns.is_empty() {
                             sums.flux[k] += dot(light, pull) / system.flux[k];
                         }
-                        if let Some(beams) = &beams {
+                        if let Some(beams) = beams {
                             let window = &system.windows[k];
                             for axis in 0..2 {
                                 let (taps, slope) = (slopes(window, axis), &mut room.slope[..]);
@@ -567,12 +568,20 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// Collects what the last pass spread, on cells, then θ and the shifts.
-    fn collect(&self, sums: Sums, cells_alone: bool) -> Vec<f64> {
+    fn collect(&self, sums: Sums) -> Vec<f64> {
+        let mut total = self.collect_cells();
+        total.extend(self.fluxes.gather(&sums.flux));
+        total.extend_from_slice(self.centred_pulls(sums.shifts).as_flattened());
+        total
+    }
+
+    /// Collects what the last pass spread on cells.
+    fn collect_cells(&self) -> Vec<f64> {
         let (sensor, count) = (self.model.sensor(), self.model.count());
         let wide = sensor.cols + self.grid.width - 1;
-        let mut total = self.workers.filled(self.size(), 0.0, &Control::new());
+        let mut total = Vec::with_capacity(self.size());
+        total.resize(self.state.beam.len(), 0.0);
         let geometry = &self.grid.geometry;
-        let cells = self.state.beam.len();
         for (index, view) in geometry.views.iter().enumerate() {
             let mut found = vec![0.0; view.shape.len()];
             self.workers.map_blocks(&mut found, BAND * view.shape.cols, |band, part| {
@@ -594,14 +603,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                     }
                 }
             });
-            self.turn_back(view, &found, &mut total[..cells]);
-        }
-        if !cells_alone {
-            let theta = self.fluxes.gather(&sums.flux);
-            total[cells..].iter_mut().zip(theta).for_each(|(total, sum)| *total = sum);
-            let rest = &mut total[cells + self.fluxes.columns.len()..];
-            let pulls = self.centred_pulls(sums.shifts);
-            rest.iter_mut().zip(pulls.as_flattened()).for_each(|(total, sum)| *total = *sum);
+            self.turn_back(view, &found, &mut total);
         }
         total
     }
