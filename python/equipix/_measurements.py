@@ -240,11 +240,6 @@ class Asked:
                 "'method' is 'coordinate-descent', which knows whole shifts and given fluxes: to "
                 "fit fluxes, shifts or the dark take 'multiscale'"
             )
-        if self.uncertainty and fitted:
-            raise InputError(
-                "'uncertainty' knows given fluxes and a subtracted dark alone: leave it out where "
-                "'flux' is fitted or has a 'flux_std', or where 'dark' is 'fit'"
-            )
         if self.dark == "fit" and self.one_level:
             raise InputError(
                 "'dark' is 'fit' with one flux for all: offset and gain cannot be told apart; "

@@ -6,6 +6,8 @@ from typing import Any, TypeAlias, final
 
 from numpy.typing import NDArray
 
+from equipix.uncertainty import Measurements
+
 __all__ = [
     "Accumulator",
     "Solution",
@@ -16,8 +18,10 @@ __all__ = [
     "file_format",
     "functional_variances",
     "locate_spots",
+    "offset_variances",
     "planned_components",
     "read_file",
+    "shift_variances",
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
@@ -52,6 +56,8 @@ class Solution:
     def sensitivity(self) -> NDArray[Any]: ...
     @property
     def beam(self) -> NDArray[Any]: ...
+    @property
+    def coefficients(self) -> NDArray[Any] | None: ...
     @property
     def beam_origin(self) -> tuple[int, int]: ...
     @property
@@ -103,32 +109,38 @@ def calibrate_frames(
     progress: Callable[[int, int, str], object] | None,
 ) -> Solution: ...
 def error_map(
-    frames: NDArray[Any],
-    shifts: NDArray[Any],
-    *,
-    rotation: list[int],
-    flux: list[float],
-    variance: NDArray[Any] | None,
-    mask: NDArray[Any] | None,
+    measurements: Measurements,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
+    *,
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
 ) -> tuple[NDArray[Any], int, float]: ...
 def functional_variances(
-    frames: NDArray[Any],
-    shifts: NDArray[Any],
-    *,
-    rotation: list[int],
-    flux: list[float],
-    variance: NDArray[Any] | None,
-    mask: NDArray[Any] | None,
+    measurements: Measurements,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
+    *,
     functionals: NDArray[Any],
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
 ) -> NDArray[Any]: ...
+def shift_variances(
+    measurements: Measurements,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    *,
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> list[list[float]]: ...
+def offset_variances(
+    measurements: Measurements,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    *,
+    workers: int | None,
+    progress: Callable[[int, int, str], object] | None,
+) -> list[float]: ...
 def locate_spots(
     before: NDArray[Any],
     after: NDArray[Any],

@@ -49,11 +49,14 @@ from equipix.prediction import light, positions, predictions
 from equipix.results import Flag, FrameStatistics
 from equipix.shifts import as_positions, round_shifts
 from equipix.uncertainty import (
+    JointFit,
     Measurements,
     checked_weights,
     determined,
     error_map,
     functional_std,
+    offset_std,
+    shift_std_left,
     tilt,
     tilt_weights,
 )
@@ -150,12 +153,19 @@ class Calibration:
         The dark frame in DN, if it is part of the calibration.
     metadata : dict
         Versions, options and origin, as JSON values; under ``uncertainty`` the draws that
-        `sensitivity_std` was made of, and its relative standard error.
+        `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
+        was fitted together with fluxes, the standard deviation of b in its error b·M, which
+        they hardly tell, and what the noise of its own measurements leaves of a pixel.
     sensitivity_std : ndarray, shape (rows, cols), or None
-        Standard deviation of `sensitivity` by noise, large scales included, in the gauge mean 1;
-        NaN where undetermined. In `sensitivity`'s dtype; None unless asked for.
+        Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
+        uncertain, large scales included, in the gauge mean 1; NaN where undetermined. In
+        `sensitivity`'s dtype; None unless asked for.
     tilt_std : ndarray, shape (2,), or None
-        Standard deviation of `tilt` by noise; None unless asked for.
+        Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None unless
+        asked for.
+    shift_std : ndarray, shape (n, 2), or None
+        Standard deviation of `shifts`, in pixels, where they had one before; None unless asked
+        for.
     measurements : Measurements or None
         References to what the calibration was made from, for `std_of`; None if read from a file.
     rejected : ndarray of bool, shape (n, rows, cols), or None
@@ -180,6 +190,7 @@ class Calibration:
     metadata: dict[str, Any] = field(default_factory=dict)
     sensitivity_std: NDArray[Any] | None = None
     tilt_std: NDArray[Any] | None = None
+    shift_std: NDArray[Any] | None = None
     measurements: Measurements | None = None
     rejected: NDArray[np.bool_] | None = None
 
@@ -270,12 +281,6 @@ class Calibration:
             raise InputError(
                 "this calibration was read from a file, which does not hold the measurements: "
                 "call std_of on the result of calibrate or Experiment.run"
-            )
-        options = self.metadata["options"]
-        if options["flux"] != "known" or options["dark"] == "fit":
-            raise InputError(
-                "this calibration has fitted fluxes, fluxes with a 'flux_std' or a fitted dark: "
-                "what those leave uncertain is not known to std_of"
             )
         check_progress(progress)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
@@ -505,7 +510,8 @@ class Calibration:
             "error_estimate": self.error_estimate,
             "tilt_std": None
             if self.tilt_std is None
-            else [std if np.isfinite(std) else None for std in self.tilt_std.tolist()],
+            else [std if np.isfinite(std) else str(std) for std in self.tilt_std.tolist()],
+            "shift_std": None if self.shift_std is None else self.shift_std.tolist(),
             "history": {
                 "sweep": self.history.sweep.tolist(),
                 "objective": self.history.objective.tolist(),
@@ -603,10 +609,10 @@ def calibrate(
         from falling. Passes that only estimate the error
         of coordinate descent are not counted.
     uncertainty : bool
-        Whether to find `Calibration.sensitivity_std` and `Calibration.tilt_std`, what noise leaves
-        uncertain; takes some ten times as long as the calibration. Without `variance` the scatter
-        of the residuals tells the noise. Between pixels the map is that of the nearest whole
-        shifts, a few per cent too large; errors of fluxes and shifts are not in it.
+        Whether to find `Calibration.sensitivity_std`, `Calibration.tilt_std` and, of shifts that
+        were refined, `Calibration.shift_std`: what noise leaves uncertain, and what priors on
+        fluxes and shifts do. Takes some ten times as long as the calibration, between pixels some
+        thirty times. Without `variance` the scatter of the residuals tells the noise.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.
@@ -736,6 +742,8 @@ def calibrate(
             result, rejected = solve_robustly(data, models, variances, tolerance)
         else:
             result = solve(variances, masked)
+    freedom = result.degrees_of_freedom
+    reduced_chi2 = result.misfit / freedom if freedom > 0 else float("nan")
     measurements = Measurements(
         values,
         np.rint(places).astype(np.int64),
@@ -743,9 +751,21 @@ def calibrate(
         list(result.flux),
         variances,
         masked if rejected is None else ~data.usable() | rejected,
-        result.beam_origin,
+        None
+        if result.coefficients is None
+        else JointFit(
+            measured=places.astype(np.float64),
+            shift_std=shift_error,
+            flux_model=flux_model,
+            offset=dark == "fit",
+            shifts=np.array(result.shifts),
+            refined=result.refinement == "refined",
+            leaves_tilt=result.leaves_tilt,
+            coefficients=result.coefficients,
+            unit=1.0 if variances is not None or np.isnan(reduced_chi2) else reduced_chi2,
+        ),
     )
-    calibration = _wrapped(result, values.dtype, places, measurements, rejected)
+    calibration = _wrapped(result, values.dtype, places, measurements, reduced_chi2, rejected)
     options: dict[str, Any] = {
         "method": method,
         "tolerance": tolerance,
@@ -761,6 +781,8 @@ def calibrate(
         started=started.isoformat(timespec="seconds"),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+    if dark == "fit" and flux_model[0] != "known":
+        calibration.metadata["dark"] = _dark_std(calibration, workers)
     _flag(calibration, data, variances)
     _flag_known(calibration, statistics, saturated, noisy)
     _warn(calibration, tolerance, result)
@@ -784,16 +806,43 @@ def _with_std(
             workers=workers,
             progress=progress,
         )
-    weights = tilt_weights(calibration._valid)
-    tilt_std = np.full(2, np.nan)
-    if np.isfinite(weights).all():
-        tilt_std = np.asarray(calibration.std_of(weights, workers=workers))
+    left = shift_std_left(
+        measurements, sensitivity, calibration.beam, calibration.reduced_chi2, workers=workers
+    )
     return replace(
         calibration,
         sensitivity_std=std.astype(sensitivity.dtype, copy=False),
-        tilt_std=tilt_std,
+        tilt_std=_tilt_std(calibration, workers),
+        shift_std=left,
         metadata=calibration.metadata | {"uncertainty": exactness},
     )
+
+
+def _tilt_std(calibration: Calibration, workers: int | None) -> NDArray[Any]:
+    measurements = calibration.measurements
+    if measurements is not None and measurements.joint and measurements.joint.leaves_tilt:
+        return np.full(2, np.inf)
+    weights = tilt_weights(calibration._valid)
+    if not np.isfinite(weights).all():
+        return np.full(2, np.nan)
+    return np.asarray(calibration.std_of(weights, workers=workers))
+
+
+def _dark_std(calibration: Calibration, workers: int | None) -> dict[str, float | None]:
+    """How well a fitted dark is known; None: of a fit that did not converge nothing is."""
+    measurements = calibration.measurements
+    assert measurements is not None
+    along, alone = offset_std(
+        measurements,
+        calibration.sensitivity,
+        calibration.beam,
+        calibration.reduced_chi2,
+        workers=workers,
+    )
+    return {
+        "std_along_sensitivity": along if calibration.converged else None,
+        "std_of_a_pixel": alone,
+    }
 
 
 def _flag_known(
@@ -845,10 +894,9 @@ def _wrapped(
     dtype: np.dtype[Any],
     shifts: NDArray[Any],
     measurements: Measurements,
+    reduced_chi2: float,
     rejected: NDArray[np.bool_] | None,
 ) -> Calibration:
-    objective = result.misfit
-    freedom = result.degrees_of_freedom
     return Calibration(
         sensitivity=result.sensitivity.astype(dtype, copy=False),
         beam=result.beam,
@@ -856,8 +904,8 @@ def _wrapped(
         flags=result.flags,
         shifts=np.array(shifts if result.shifts is None else result.shifts, dtype=np.float64),
         flux=np.array(result.flux),
-        objective=objective,
-        reduced_chi2=objective / freedom if freedom > 0 else float("nan"),
+        objective=result.misfit,
+        reduced_chi2=reduced_chi2,
         components=result.components,
         component_labels=result.component_labels,
         sweeps=int(result.sweeps[-1]),
@@ -893,6 +941,19 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
             IdentifiabilityWarning,
             stacklevel=3,
         )
+    dark = calibration.metadata.get("dark")
+    if dark:
+        along, alone = dark["std_along_sensitivity"], dark["std_of_a_pixel"]
+        if along is None or along > alone:
+            told = "is not told at all" if along is None else f"has the standard deviation {along:.1e}"
+            warnings.warn(
+                "offset and gain can hardly be told apart: with fitted fluxes the dark may hold any "
+                f"multiple b of the sensitivity, and b {told}, where noise leaves {alone:.1e} of a "
+                "pixel alone; give the ratio of the levels as 'flux', or take larger shifts in a "
+                "beam that varies more",
+                IdentifiabilityWarning,
+                stacklevel=3,
+            )
     measurements = calibration.measurements
     weighted = measurements is not None and measurements.variance is not None
     if weighted and calibration.converged and calibration.reduced_chi2 > _MISFIT:

@@ -55,7 +55,8 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
     numbers = content["calibration"]
     history = numbers["history"]
     row, col = numbers["beam_origin"]
-    chi2, tilt_std = numbers["reduced_chi2"], numbers.get("tilt_std")
+    chi2 = numbers["reduced_chi2"]
+    tilt_std, shift_std = numbers.get("tilt_std"), numbers.get("shift_std")
     rejected = pages.get("rejected")
     return Calibration(
         sensitivity=pages["sensitivity"],
@@ -80,6 +81,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         metadata=content["metadata"],
         sensitivity_std=pages.get("sensitivity_std"),
         tilt_std=None if tilt_std is None else np.array(tilt_std, dtype=np.float64),
+        shift_std=None if shift_std is None else np.array(shift_std, dtype=np.float64),
         rejected=None
         if rejected is None
         else rejected.reshape(-1, *pages["sensitivity"].shape).astype(bool),

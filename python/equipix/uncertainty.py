@@ -22,6 +22,43 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
+class JointFit:
+    """What a fit of more than M and L knew before, and found besides.
+
+    Attributes
+    ----------
+    measured : ndarray, shape (n, 2), float64
+        Shifts as they were given.
+    shift_std : ndarray, shape (n, 2), float64, or None
+        Their standard deviations, if they were to be refined.
+    flux_model : tuple of str and list of float
+        What was known of the fluxes: its kind, with standard deviations or times.
+    offset : bool
+        Whether an offset of each pixel was sought.
+    shifts : ndarray, shape (n, 2), float64
+        Shifts as found.
+    refined : bool
+        Whether they were refined.
+    leaves_tilt : bool
+        Whether the fluxes leave a tilt of ln M undetermined.
+    coefficients : ndarray, shape of the spline's grid, float64
+        Coefficients of the spline that the beam is; its values where all shifts are whole.
+    unit : float
+        Variance of a value of weight 1.
+    """
+
+    measured: NDArray[Any]
+    shift_std: NDArray[Any] | None
+    flux_model: tuple[str, list[float]]
+    offset: bool
+    shifts: NDArray[Any]
+    refined: bool
+    leaves_tilt: bool
+    coefficients: NDArray[Any]
+    unit: float
+
+
+@dataclass(frozen=True, eq=False)
 class Measurements:
     """What a calibration was made from, in the compiled part's shapes.
 
@@ -30,17 +67,17 @@ class Measurements:
     frames : ndarray, shape (n, rows, cols)
         Values; what is not finite is not used.
     shifts : ndarray, shape (n, 2), int64
-        Whole-pixel shifts (row, col).
+        The nearest whole-pixel shifts (row, col).
     rotation : list of int
         Rotation of each exposure, in degrees.
     flux : list of float
-        Relative flux of each exposure.
+        Relative flux of each exposure, as found.
     variance : ndarray, shape (n,) or (n, rows, cols), or None
         Variance of the values; None: all weights are 1.
     mask : ndarray of bool, shape (rows, cols) or (n, rows, cols), or None
         True = do not use.
-    beam_origin : tuple of int
-        The cell of the beam's grid that the sensor's first pixel sees at shift 0.
+    joint : JointFit or None
+        What else was sought; None: M and L alone, at whole shifts.
     """
 
     frames: NDArray[Any]
@@ -49,29 +86,14 @@ class Measurements:
     flux: list[float]
     variance: NDArray[Any] | None
     mask: NDArray[np.bool_] | None
-    beam_origin: tuple[int, int]
+    joint: JointFit | None
 
-    def arguments(self, sensitivity: NDArray[Any], beam: NDArray[Any]) -> dict[str, Any]:
-        """The keywords of the compiled part at a solution M and L."""
-        return {
-            "frames": self.frames,
-            "shifts": self.shifts,
-            "rotation": self.rotation,
-            "flux": self.flux,
-            "variance": self.variance,
-            "mask": self.mask,
-            "sensitivity": np.ascontiguousarray(sensitivity, np.float64),
-            "beam": self._seen(beam),
-        }
-
-    def _seen(self, beam: NDArray[Any]) -> NDArray[Any]:
-        """The beam on the grid of whole shifts; that of a spline is somewhat wider."""
-        rows, cols = self.frames.shape[1:]
-        sizes = [(cols, rows) if turn in (90, 270) else (rows, cols) for turn in self.rotation]
-        low = np.minimum(self.shifts.min(axis=0), 0)
-        high = np.maximum((self.shifts + sizes).max(axis=0), (rows, cols))
-        (top, left), (bottom, right) = np.add([low, high], self.beam_origin)
-        return np.ascontiguousarray(beam[top:bottom, left:right])
+    def solution(
+        self, sensitivity: NDArray[Any], beam: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The solution as the compiled part takes it: M, and L or its coefficients."""
+        cells = beam if self.joint is None else self.joint.coefficients
+        return np.ascontiguousarray(sensitivity, np.float64), np.ascontiguousarray(cells)
 
     def scale(self, reduced_chi2: float) -> float:
         """What standard deviations of unit weights are multiplied by.
@@ -131,12 +153,14 @@ def error_map(
     solutions of the linearised problem for noise alone. There are as many draws as bring the
     relative standard error to 2 %.
     """
+    scale = measurements.scale(reduced_chi2)
     std, draws, exactness = _native.error_map(
-        **measurements.arguments(sensitivity, beam),
+        measurements,
+        *measurements.solution(sensitivity, beam),
         workers=positive_workers(workers),
         progress=progress,
     )
-    std *= measurements.scale(reduced_chi2)
+    std *= scale
     return std, {"draws": draws, "relative_standard_error": exactness}
 
 
@@ -179,14 +203,106 @@ def functional_std(
     With g = weights/M the variance is gᵀ S⁻¹ g, in the gauge mean(M) = 1: the solution of one
     linear problem, to 1e-4 of the variance.
     """
+    scale = measurements.scale(reduced_chi2)
     functionals = np.divide(weights, sensitivity, where=weights != 0, out=np.zeros(weights.shape))
     variances = _native.functional_variances(
-        **measurements.arguments(sensitivity, beam),
+        measurements,
+        *measurements.solution(sensitivity, beam),
         functionals=functionals,
         workers=positive_workers(workers),
         progress=progress,
     )
-    return np.asarray(np.sqrt(variances) * measurements.scale(reduced_chi2))
+    return np.asarray(np.sqrt(variances) * scale)
+
+
+def shift_std_left(
+    measurements: Measurements,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    reduced_chi2: float,
+    *,
+    workers: int | None = None,
+) -> Floats | None:
+    """Standard deviation of each shift that had one before: of those refined, what is left of it.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        What the calibration was made from.
+    sensitivity : ndarray, shape (rows, cols)
+        The solution M, of mean 1.
+    beam : ndarray, shape of the padded grid
+        The solution L.
+    reduced_chi2 : float
+        Of the fit: the variance of a value where none was given.
+    workers : int, optional
+        Number of threads.
+
+    Returns
+    -------
+    ndarray, shape (n, 2), float64, or None
+        The standard deviations, in pixels; None if the shifts were given as exact.
+    """
+    fit = measurements.joint
+    if fit is None or fit.shift_std is None:
+        return None
+    if not fit.refined:
+        return fit.shift_std
+    scale = measurements.scale(reduced_chi2)
+    variances = _native.shift_variances(
+        measurements,
+        *measurements.solution(sensitivity, beam),
+        workers=positive_workers(workers),
+        progress=None,
+    )
+    return np.sqrt(variances) * scale
+
+
+def offset_std(
+    measurements: Measurements,
+    sensitivity: NDArray[Any],
+    beam: NDArray[Any],
+    reduced_chi2: float,
+    *,
+    workers: int | None = None,
+) -> tuple[float, float]:
+    """How well fitted offsets O are known: in what their errors have in common, and alone.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        What the calibration was made from.
+    sensitivity : ndarray, shape (rows, cols)
+        The solution M, of mean 1.
+    beam : ndarray, shape of the padded grid
+        The solution L.
+    reduced_chi2 : float
+        Of the fit: the variance of a value where none was given.
+    workers : int, optional
+        Number of threads.
+
+    Returns
+    -------
+    along : float
+        Standard deviation of b, the least-squares part b·M of all errors, in the units of the
+        frames.
+    alone : float
+        Root mean square of what the noise of a pixel's own measurements does to its offset.
+
+    Notes
+    -----
+    With fitted ratios of the levels nothing that is measured changes when O → O + b·M, L → L − b
+    and the ratios follow, if L is the same at all positions of a pixel: then b is not told.
+    """
+    scale = measurements.scale(reduced_chi2)
+    variances = _native.offset_variances(
+        measurements,
+        *measurements.solution(sensitivity, beam),
+        workers=positive_workers(workers),
+        progress=None,
+    )
+    along, alone = np.sqrt(variances) * scale
+    return float(along), float(alone)
 
 
 def checked_weights(weights: ArrayLike, determined: NDArray[np.bool_]) -> Floats:

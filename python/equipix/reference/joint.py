@@ -46,9 +46,13 @@ class JointSolution:
     objective : list of float
         F before each step; τ follows the weights, so it may rise a little.
     std : ndarray, shape (rows, cols)
-        Standard deviation of the sensitivity, where no tilt is left to the gauge.
+        Standard deviation of the sensitivity; the penalty counts as a measurement.
     dark_std : ndarray, shape (rows, cols)
         Standard deviation of the offset.
+    dark_along_std : float
+        Standard deviation of b, the least-squares part b·M of the offsets' errors.
+    shift_std : ndarray, shape (n, 2)
+        Standard deviation of the shifts, if they were sought.
     """
 
     sensitivity: Array
@@ -60,6 +64,8 @@ class JointSolution:
     objective: list[float]
     std: Array
     dark_std: Array
+    dark_along_std: float
+    shift_std: Array
 
 
 def joint(
@@ -109,7 +115,7 @@ def joint(
     measured = np.array(shifts, float)
     given = np.ones(count) if flux is None or isinstance(flux, str) else np.asarray(flux, float)
     by_theta, leaves_tilt = _flux_columns(flux, flux_std, time, measured, turns)
-    by_zeta, shift_prior = _shift_columns(shift_std, count)
+    by_zeta, shift_prior, of_mean_shift = _shift_columns(shift_std, count)
     flux_prior = np.eye(by_theta.shape[1]) if flux_std is not None else by_theta[:0]
     priors = _diagonal_blocks(flux_prior, shift_prior)
     grid = _Grid((rows, cols), measured, turns, by_zeta.size > 0 or bool(np.any(measured % 1)))
@@ -175,15 +181,26 @@ def joint(
         beam, logs = beam * np.exp(logs.mean()), logs - logs.mean()
 
     scale = np.nanmean(sensitivity)
-    # Measurements and priors scatter by 1 in these units, the penalty not at all.
+    # Measurements and priors scatter by 1 in these units; so does the penalty, which leaves open
+    # what it alone decides.
     response = np.zeros(matrix.T.shape)
     response[told] = np.linalg.pinv(matrix[:, told], rcond=1e-12)
-    response[:, len(root) : len(root) + len(rough)] = 0
-    of_mean = np.outer(sensitivity / scale, response[:pixels][weight > 0].mean(axis=0))
-    std = np.sqrt(np.sum((response[:pixels] - of_mean) ** 2, axis=1)) / scale
-    dark_std = (
-        np.sqrt(np.sum(response[pixels : ends[1]] ** 2, axis=1)) if sizes[1] else np.zeros(pixels)
-    )
+    of_gain, of_dark, _, _, of_zeta = np.split(response, ends[:-1])
+    if leaves_tilt:
+        # The gauge takes the slope out of a change of ln M.
+        valid = sensitivity > 0
+        slopes = grid.slope_of(valid, (of_gain.T / sensitivity)[:, valid].T)
+        of_gain = of_gain - sensitivity[:, None] * (grid.unshifted @ slopes)
+    of_mean = np.outer(sensitivity / scale, of_gain[weight > 0].mean(axis=0))
+    std = np.sqrt(np.sum((of_gain - of_mean) ** 2, axis=1)) / scale
+    dark_std, dark_along_std = np.zeros(pixels), 0.0
+    if sizes[1]:
+        dark_std = np.sqrt(np.sum(of_dark**2, axis=1))
+        m = np.where(weight > 0, sensitivity / scale, 0)
+        dark_along_std = float(np.linalg.norm(m @ of_dark) / np.sum(m**2))
+    left = np.zeros((count, 2))
+    if by_zeta.size:
+        left = np.sum((by_zeta @ of_zeta) ** 2, axis=1).reshape(count, 2) + of_mean_shift
     return JointSolution(
         sensitivity=(sensitivity / scale).reshape(rows, cols),
         dark=(offset if sizes[1] else np.zeros(pixels)).reshape(rows, cols),
@@ -194,6 +211,8 @@ def joint(
         objective=history,
         std=std.reshape(rows, cols),
         dark_std=dark_std.reshape(rows, cols),
+        dark_along_std=dark_along_std,
+        shift_std=np.sqrt(left),
     )
 
 
@@ -227,13 +246,14 @@ def _flux_columns(
     return np.empty((count, 0)), False
 
 
-def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Array]:
+def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Array, Array]:
     """Z of d = d₀ + Z·ζ, by exposure and axis, and the prior's (d − d₀)/s_d by ζ.
 
     To move all exposures alike moves but the beam: the mean of d − d₀, weighted by 1/s_d², is 0.
+    The last result is the variance of that mean, of which the prior alone tells.
     """
     if shift_std is None:
-        return np.empty((2 * count, 0)), np.empty((0, 0))
+        return np.empty((2 * count, 0)), np.empty((0, 0)), np.zeros(2)
     std = np.asarray(shift_std, float)
     std = np.maximum(
         np.broadcast_to(std[:, None] if std.ndim == 1 else std, (count, 2)), EXACT_SHIFT
@@ -244,7 +264,7 @@ def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Arra
         centred = np.eye(count) - precision[:, axis]
         columns[:, axis, :, axis] = centred * std[:, axis]
     by_zeta = columns.reshape(2 * count, 2 * count)
-    return by_zeta, by_zeta / std.reshape(-1, 1)
+    return by_zeta, by_zeta / std.reshape(-1, 1), 1 / np.sum(std**-2, axis=0)
 
 
 def _diagonal_blocks(first: Array, second: Array) -> Array:
@@ -334,5 +354,9 @@ class _Grid:
     def slope(self, sensitivity: Array) -> Array:
         """The least-squares slope of ln M along the rows and columns of the beam."""
         valid = sensitivity > 0
+        return self.slope_of(valid, np.log(sensitivity[valid]))
+
+    def slope_of(self, valid: Array, values: Array) -> Array:
+        """The least-squares slope of values of valid pixels."""
         plane = np.column_stack([np.ones(valid.sum()), self.unshifted[valid]])
-        return np.asarray(np.linalg.lstsq(plane, np.log(sensitivity[valid]))[0][1:])
+        return np.asarray(np.linalg.lstsq(plane, values)[0][1:])

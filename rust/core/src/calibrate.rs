@@ -39,6 +39,8 @@ pub struct Solution {
     pub sensitivity: Vec<f64>,
     /// The beam L on its padded grid, row by row, in the units of the frames; NaN where unobserved.
     pub beam: Vec<f64>,
+    /// The coefficients of the spline that L is, of a joint fit.
+    pub coefficients: Option<Vec<f64>>,
     /// Sizes of that grid.
     pub beam_shape: Shape,
     /// The cell that the sensor's first pixel sees at shift 0, unturned.
@@ -97,13 +99,16 @@ pub fn calibrate<T: Real>(
     left_out.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
     dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
     let components = Components::of(model, &ties, control)?;
-    let (sensitivity, beam, mut flags) = gauged(sensitivity, beam, &components, &left_out, workers);
+    let means = component_means(&sensitivity, &components, &left_out);
+    let (sensitivity, beam, mut flags) =
+        gauged(sensitivity, beam, &means, &components, &left_out, workers);
     for &pixel in &dead {
         flags[pixel] |= flag::DEAD | flag::DO_NOT_USE;
     }
     Ok(Solution {
         sensitivity,
         beam,
+        coefficients: None,
         beam_shape: model.geometry.beam,
         beam_origin: model.geometry.origin,
         flux: model.flux.clone(),
@@ -138,8 +143,11 @@ pub fn calibrate_jointly<T: Real>(
     })?;
     let fit = joint::solve(model, rotations, unknowns, stop, workers, control)?;
     let components = fit.components;
+    let means = component_means(&fit.sensitivity, &components, &fit.untold);
     let (mut sensitivity, beam, mut flags) =
-        gauged(fit.sensitivity, fit.beam, &components, &fit.untold, workers);
+        gauged(fit.sensitivity, fit.beam, &means, &components, &fit.untold, workers);
+    let mut coefficients = fit.coefficients;
+    coefficients.iter_mut().for_each(|coefficient| *coefficient *= means[0]);
     for &pixel in &fit.untold {
         sensitivity[pixel] = f64::NAN;
         flags[pixel] |= flag::NO_FLAT_FIELD | flag::DO_NOT_USE;
@@ -157,6 +165,7 @@ pub fn calibrate_jointly<T: Real>(
     Ok(Solution {
         sensitivity,
         beam,
+        coefficients: Some(coefficients),
         beam_shape: fit.beam_shape,
         beam_origin: fit.origin,
         flux: fit.flux,
@@ -177,11 +186,11 @@ pub fn calibrate_jointly<T: Real>(
 fn gauged(
     mut sensitivity: Vec<f64>,
     mut beam: Vec<f64>,
+    means: &[f64],
     components: &Components,
     left_out: &[usize],
     workers: &Workers,
 ) -> (Vec<f64>, Vec<f64>, Vec<u32>) {
-    let means = component_means(&sensitivity, components, left_out);
     rescale(&mut sensitivity, &components.pixels, workers, |value, label| {
         if label == 0 { value / means[0] } else { f64::NAN }
     });

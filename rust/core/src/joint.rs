@@ -11,6 +11,7 @@
 //! (`joint/precondition.rs`). The penalty (`joint/penalty.rs`) is slight: τ is 1e-5 of the mean
 //! weight of a cell.
 
+mod covariance;
 mod flux;
 mod freedom;
 mod gauge;
@@ -20,6 +21,8 @@ mod penalty;
 mod precondition;
 mod system;
 
+pub use covariance::Solved;
+pub(crate) use covariance::{Covariance, Functional};
 pub use flux::Flux;
 
 use crate::conjugate::Ritz;
@@ -108,6 +111,8 @@ pub struct Fit {
     pub offset: Option<Vec<f64>>,
     /// L at the cells of its grid, row by row; NaN where no measurement tells.
     pub beam: Vec<f64>,
+    /// The coefficients of the spline that L is, or L itself; 0 where no measurement tells.
+    pub coefficients: Vec<f64>,
     /// Sizes of the grid.
     pub beam_shape: Shape,
     /// The cell that the sensor's first pixel sees at shift 0, unturned.
@@ -255,6 +260,12 @@ pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>) -> u64 {
         + crate::precondition::bytes_needed(geometry)
 }
 
+/// What the covariance of a joint fit holds beside the measurements, in bytes: the fit's, and for each
+/// pixel the gauge, a change, and the map.
+pub(crate) fn bytes_needed_by_covariance<T: Real>(model: &Model<'_, T>) -> u64 {
+    bytes_needed(model) + 112 * model.geometry.sensor.len() as u64
+}
+
 /// Why it has ended, if it has.
 fn ended(looks: &[Look], search: &Search, stop: &Stop, limit: u64, stuck: bool) -> Option<Ended> {
     let last = looks.last()?;
@@ -393,6 +404,7 @@ fn finish<T: Real>(
         sensitivity,
         offset: system.with_offset.then_some(offset),
         beam: values_at_cells(system),
+        coefficients: system.state.beam.clone(),
         beam_shape: system.grid.geometry.beam,
         origin: system.grid.geometry.origin,
         flux: system.flux.clone(),
@@ -469,6 +481,8 @@ struct Search {
     product: Vec<f64>,
     square: f64,
     keep: f64,
+    /// x · b, of which b − S x lacks some.
+    energy: f64,
     ritz: Ritz,
     /// The change of M that goes with the direction.
     change: Vec<f64>,
@@ -495,6 +509,7 @@ impl Search {
         self.square = system.workers.dot(&slope, &self.direction);
         self.residual = slope;
         self.keep = 0.0;
+        self.energy = 0.0;
         self.ritz = Ritz::default();
         self.change.clear();
     }
@@ -522,6 +537,7 @@ impl Search {
         if !(step > 0.0 && step.is_finite()) {
             return false;
         }
+        self.energy += step * self.square;
         workers.add_multiple(&mut self.x, step, &self.direction);
         workers.add_multiple(&mut self.residual, -step, &self.product);
         let mut direction = preconditioner.apply(system, &self.residual);

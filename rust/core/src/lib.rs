@@ -140,6 +140,7 @@ pub mod parallel;
 #[doc(hidden)]
 pub mod parts;
 mod precondition;
+mod random;
 mod reduced;
 pub mod statistics;
 pub mod uncertainty;

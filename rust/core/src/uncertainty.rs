@@ -15,6 +15,8 @@
 //! the gauge mean(M) = 1 is δM − M mean(δM).
 //!
 //! A linear functional gᵀM has the variance gᵀ S⁻¹ g: one linear problem, no draws.
+//!
+//! After a joint fit the same is asked of its own linear problem (`joint/covariance.rs`).
 
 use crate::conjugate::{self, Search};
 use crate::control::Control;
@@ -22,6 +24,7 @@ use crate::error::Result;
 use crate::estimate::{FEWEST_ITERATIONS, Smallest};
 use crate::frames::Real;
 use crate::geometry::{Geometry, View};
+use crate::joint::{self, Covariance, Functional, Solved};
 use crate::memory;
 use crate::model::Model;
 use crate::parallel::Workers;
@@ -70,22 +73,29 @@ pub fn error_map<T: Real>(
         format!("the error map of {} exposures of {}", model.count(), model.sensor())
     })?;
     let mut system = System::new(model, sensitivity, beam, workers, control)?;
-    let known = system.known(control)?;
-    let mut squares = system.image(control);
-    let (mut draws, mut wanted, mut share) = (0, FIRST_DRAWS, 0.0);
-    while draws < wanted {
-        control.report("uncertainty", draws, wanted);
-        system.add_draw(draws, &mut squares, control)?;
-        draws += 1;
-        if draws == wanted {
-            share = system.sampled_share(&known, &squares, draws);
-            let needed = (exactness(share, 1) / EXACTNESS).powi(2).ceil() as u64;
-            wanted = needed.min(MOST_DRAWS);
-        }
-    }
-    control.report("uncertainty", draws, draws);
-    let std = system.deviations(&known, &squares, draws);
-    Ok(ErrorMap { std, draws, exactness: exactness(share, draws) })
+    let sampled = Sampled::of(&mut system, control)?;
+    Ok(sampled.map(system.deviations(&sampled)))
+}
+
+/// The standard deviation of M in each pixel after a joint fit of `model`, whose fluxes are those
+/// found and whose variances are those of the noise.
+///
+/// # Errors
+/// As [`error_map`].
+pub fn error_map_jointly<T: Real>(
+    model: &Model<'_, T>,
+    solved: &Solved<'_>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<ErrorMap> {
+    let mut covariance = prepared(model, solved, workers, control)?;
+    let sampled = Sampled::of(&mut covariance, control)?;
+    let scale = covariance.scale();
+    let std = (0..model.sensor().len()).map(|pixel| match solved.sensitivity[pixel].is_finite() {
+        true => (scale * sampled.variance(pixel)).sqrt(),
+        false => f64::NAN,
+    });
+    Ok(sampled.map(std.collect()))
 }
 
 /// The variance of each linear functional Σ g(p) M(p), its g being an image of `functionals`.
@@ -117,6 +127,164 @@ pub fn variances_of<T: Real>(
         .collect()
 }
 
+/// The variance after a joint fit of each functional Σ g(p) M(p), as [`variances_of`].
+///
+/// # Errors
+/// As [`error_map`].
+pub fn variances_of_jointly<T: Real>(
+    model: &Model<'_, T>,
+    solved: &Solved<'_>,
+    functionals: &[f64],
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let stack = functionals.chunks_exact(model.sensor().len());
+    let functionals = stack.map(|gain| Functional::Gain(gain.to_vec()));
+    variances(model, solved, functionals, workers, control)
+}
+
+/// The variances (row, column) of the shifts that a joint fit refined.
+///
+/// # Errors
+/// As [`error_map`].
+pub fn shift_variances<T: Real>(
+    model: &Model<'_, T>,
+    solved: &Solved<'_>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<[f64; 2]>> {
+    let count = model.count();
+    let functionals = (0..2 * count).map(|index| {
+        let mut shifts = vec![[0.0; 2]; count];
+        shifts.as_flattened_mut()[index] = 1.0;
+        Functional::Shifts(shifts)
+    });
+    let found = variances(model, solved, functionals, workers, control)?;
+    Ok(found.as_chunks().0.to_vec())
+}
+
+/// The variance of b, the least-squares part b M of the errors of offsets that a joint fit found, and
+/// the mean variance of an offset by the noise of its pixel alone.
+///
+/// # Errors
+/// As [`error_map`].
+pub fn offset_variances<T: Real>(
+    model: &Model<'_, T>,
+    solved: &Solved<'_>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<[f64; 2]> {
+    let mut covariance = prepared(model, solved, workers, control)?;
+    let along = covariance.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
+    Ok([along, covariance.mean_variance_of_offset_alone()])
+}
+
+fn prepared<'m, 'a, T: Real>(
+    model: &'m Model<'a, T>,
+    solved: &Solved<'_>,
+    workers: &'m Workers,
+    control: &'m Control,
+) -> Result<Covariance<'m, 'a, T>> {
+    memory::check(joint::bytes_needed_by_covariance(model), || {
+        format!("the uncertainty of {} exposures of {}", model.count(), model.sensor())
+    })?;
+    Covariance::new(model, solved, workers, control)
+}
+
+fn variances<T: Real>(
+    model: &Model<'_, T>,
+    solved: &Solved<'_>,
+    functionals: impl ExactSizeIterator<Item = Functional>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let mut covariance = prepared(model, solved, workers, control)?;
+    let total = functionals.len() as u64;
+    let found = (0..).zip(functionals).map(|(index, functional)| {
+        control.report("uncertainty", index, total);
+        covariance.variance_of(functional, LACK_OF_FUNCTIONAL, control)
+    });
+    found.collect()
+}
+
+/// A linear problem that draws can be made of. Images may be padded, all alike.
+trait Drawn {
+    /// 1 in the pixels that count, else 0.
+    fn valid(&self) -> &[f32];
+    /// The part of the variance of M that is known.
+    fn known(&mut self, control: &Control) -> Result<Vec<f32>>;
+    /// Adds the square of the rest of one draw.
+    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()>;
+}
+
+impl<T: Real> Drawn for Covariance<'_, '_, T> {
+    fn valid(&self) -> &[f32] {
+        self.valid()
+    }
+
+    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
+        Ok(Self::known(self))
+    }
+
+    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
+        self.add_draw(draw, LACK_OF_DRAW, squares, control)
+    }
+}
+
+/// A variance that is known in part, and in part the mean square of draws.
+struct Sampled {
+    known: Vec<f32>,
+    squares: Vec<f32>,
+    draws: u64,
+    exactness: f64,
+}
+
+impl Sampled {
+    /// As many draws as it takes.
+    fn of(problem: &mut impl Drawn, control: &Control) -> Result<Self> {
+        let known = problem.known(control)?;
+        let squares = vec![0.0; known.len()];
+        let mut sampled = Self { known, squares, draws: 0, exactness: f64::INFINITY };
+        let mut wanted = FIRST_DRAWS;
+        while sampled.draws < wanted {
+            control.report("uncertainty", sampled.draws, wanted);
+            problem.add_draw(sampled.draws, &mut sampled.squares, control)?;
+            sampled.draws += 1;
+            if sampled.draws == wanted {
+                let share = sampled.share(problem.valid());
+                let needed = (exactness(share, 1) / EXACTNESS).powi(2).ceil() as u64;
+                wanted = needed.min(MOST_DRAWS);
+                sampled.exactness = exactness(share, sampled.draws);
+            }
+        }
+        control.report("uncertainty", sampled.draws, sampled.draws);
+        Ok(sampled)
+    }
+
+    fn variance(&self, pixel: usize) -> f64 {
+        f64::from(self.known[pixel]) + f64::from(self.squares[pixel]) / self.draws as f64
+    }
+
+    /// The root mean square, over the valid pixels, of the share of the variance that is sampled,
+    /// without what the scatter of so many draws adds to it.
+    fn share(&self, valid: &[f32]) -> f64 {
+        let draws = self.draws as f64;
+        let mut count = 0.0;
+        let mut sum = 0.0;
+        for (pixel, &valid) in valid.iter().enumerate() {
+            let sampled = f64::from(self.squares[pixel]) / draws;
+            let share = sampled / self.variance(pixel).max(f64::MIN_POSITIVE);
+            sum += f64::from(valid) * share.powi(2);
+            count += f64::from(valid);
+        }
+        (sum / count * draws / (draws + 2.0)).sqrt()
+    }
+
+    const fn map(&self, std: Vec<f64>) -> ErrorMap {
+        ErrorMap { std, draws: self.draws, exactness: self.exactness }
+    }
+}
+
 /// The relative standard error of a deviation of whose square this share is the mean of the squares
 /// of so many draws: a square of a normal value scatters by √2 of its mean, and a root halves that.
 fn exactness(share: f64, draws: u64) -> f64 {
@@ -137,9 +305,6 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
 }
 
 /// The linear problem at the solution.
-///
-/// Another linear problem, with the pixels eliminated in place of the beam, would bring its own
-/// [`known`](Self::known), [`add_draw`](Self::add_draw) and [`variance_of`](Self::variance_of).
 struct System<'m, 'a, T> {
     model: &'m Model<'a, T>,
     workers: &'m Workers,
@@ -198,6 +363,82 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.search.reduced.padding.zeros(self.model.sensor().rows, self.workers, control)
     }
 
+    /// Solves S x = b, b being the residual, until x · b lacks at most this share.
+    fn solve(&mut self, lack: f64, control: &Control) -> Result<()> {
+        let Self { search, smallest, .. } = self;
+        search.begin(control)?;
+        let (mut iterations, mut earlier) = (0, 0.0);
+        while smallest.iterate(search, control)? {
+            iterations += 1;
+            if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
+                break;
+            }
+            // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
+            // iterations brought tells.
+            if iterations % FEWEST_ITERATIONS == 0 {
+                if search.energy - earlier <= NOTHING * lack * search.energy {
+                    break;
+                }
+                earlier = search.energy;
+            }
+        }
+        Ok(())
+    }
+
+    /// The variance of Σ g M.
+    fn variance_of(&mut self, functional: &[f64], control: &Control) -> Result<f64> {
+        let Self { search, slope, workers, valid, count, model, .. } = self;
+        let padding = search.reduced.padding;
+        // Pᵀ g = g − 1 (M · g)/N. Scaled, so that no g is beyond single precision.
+        let largest = functional.iter().fold(0.0_f64, |largest, g| largest.max(g.abs()));
+        if largest == 0.0 {
+            return Ok(0.0);
+        }
+        let to_single = |g: f64| (g / largest) as f32;
+        padding.copy(functional, model.sensor().cols, workers, slope, to_single);
+        let mean = dot(slope, &search.reduced.sensitivity, workers) / *count;
+        for (g, &valid) in slope.iter_mut().zip(valid.iter()) {
+            *g -= mean as f32 * valid;
+        }
+        search.residual.copy_from_slice(slope);
+        self.solve(LACK_OF_FUNCTIONAL, control)?;
+        let Self { search, slope, workers, .. } = self;
+        Ok(dot(slope, &search.x, workers) * (largest * search.reduced.scale.deviation()).powi(2))
+    }
+
+    /// The standard deviations in the units of M, row by row.
+    fn deviations(&self, sampled: &Sampled) -> Vec<f64> {
+        let reduced = &self.search.reduced;
+        let (padding, cols) = (reduced.padding, self.model.sensor().cols);
+        let scale = reduced.scale.deviation();
+        let mut std = vec![f64::NAN; self.model.sensor().len()];
+        self.workers.map_blocks(&mut std, BAND * cols, |band, rows| {
+            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
+                let row_of_sensor = band * BAND + index;
+                let [known, squares, valid] = [&sampled.known, &sampled.squares, &self.valid]
+                    .map(|image| padding.row(image, row_of_sensor));
+                for (col, std) in row.iter_mut().enumerate() {
+                    if valid[col] > 0.0 {
+                        let drawn = f64::from(squares[col]) / sampled.draws as f64;
+                        *std = scale * (f64::from(known[col]) + drawn).sqrt();
+                    }
+                }
+            }
+        });
+        for (pixel, inverse) in reduced.left_out_variances() {
+            if inverse > 0.0 && !self.undetermined[pixel] {
+                std[pixel] = scale * inverse.sqrt();
+            }
+        }
+        std
+    }
+}
+
+impl<T: Real> Drawn for System<'_, '_, T> {
+    fn valid(&self) -> &[f32] {
+        &self.valid
+    }
+
     /// The part of the variance that is known: the diagonal of P V Pᵀ, with V the first two terms of
     /// Cov M and P = 1 − M 1ᵀ/N, so V − 2 M (V 1)/N + M² (1ᵀV 1)/N².
     fn known(&mut self, control: &Control) -> Result<Vec<f32>> {
@@ -249,89 +490,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         });
         Ok(())
-    }
-
-    /// Solves S x = b, b being the residual, until x · b lacks at most this share.
-    fn solve(&mut self, lack: f64, control: &Control) -> Result<()> {
-        let Self { search, smallest, .. } = self;
-        search.begin(control)?;
-        let (mut iterations, mut earlier) = (0, 0.0);
-        while smallest.iterate(search, control)? {
-            iterations += 1;
-            if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
-                break;
-            }
-            // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
-            // iterations brought tells.
-            if iterations % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= NOTHING * lack * search.energy {
-                    break;
-                }
-                earlier = search.energy;
-            }
-        }
-        Ok(())
-    }
-
-    /// The variance of Σ g M.
-    fn variance_of(&mut self, functional: &[f64], control: &Control) -> Result<f64> {
-        let Self { search, slope, workers, valid, count, model, .. } = self;
-        let padding = search.reduced.padding;
-        // Pᵀ g = g − 1 (M · g)/N. Scaled, so that no g is beyond single precision.
-        let largest = functional.iter().fold(0.0_f64, |largest, g| largest.max(g.abs()));
-        if largest == 0.0 {
-            return Ok(0.0);
-        }
-        let to_single = |g: f64| (g / largest) as f32;
-        padding.copy(functional, model.sensor().cols, workers, slope, to_single);
-        let mean = dot(slope, &search.reduced.sensitivity, workers) / *count;
-        for (g, &valid) in slope.iter_mut().zip(valid.iter()) {
-            *g -= mean as f32 * valid;
-        }
-        search.residual.copy_from_slice(slope);
-        self.solve(LACK_OF_FUNCTIONAL, control)?;
-        let Self { search, slope, workers, .. } = self;
-        Ok(dot(slope, &search.x, workers) * (largest * search.reduced.scale.deviation()).powi(2))
-    }
-
-    /// The root mean square, over the valid pixels, of the share of the variance that is sampled,
-    /// without what the scatter of so many draws adds to it.
-    fn sampled_share(&self, known: &[f32], squares: &[f32], draws: u64) -> f64 {
-        let draws = draws as f64;
-        let pixels = known.iter().zip(squares).zip(&self.valid);
-        let shares = pixels.map(|((&known, &square), &valid)| {
-            let sampled = f64::from(square) / draws;
-            f64::from(valid)
-                * (sampled / (f64::from(known) + sampled).max(f64::MIN_POSITIVE)).powi(2)
-        });
-        (shares.sum::<f64>() / self.count * draws / (draws + 2.0)).sqrt()
-    }
-
-    /// The standard deviations in the units of M, row by row.
-    fn deviations(&self, known: &[f32], squares: &[f32], draws: u64) -> Vec<f64> {
-        let reduced = &self.search.reduced;
-        let (padding, cols) = (reduced.padding, self.model.sensor().cols);
-        let scale = reduced.scale.deviation();
-        let mut std = vec![f64::NAN; self.model.sensor().len()];
-        self.workers.map_blocks(&mut std, BAND * cols, |band, rows| {
-            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
-                let row_of_sensor = band * BAND + index;
-                let [known, squares, valid] =
-                    [known, squares, &self.valid].map(|image| padding.row(image, row_of_sensor));
-                for (col, std) in row.iter_mut().enumerate() {
-                    if valid[col] > 0.0 {
-                        let sampled = f64::from(squares[col]) / draws as f64;
-                        *std = scale * (f64::from(known[col]) + sampled).sqrt();
-                    }
-                }
-            }
-        });
-        for (pixel, inverse) in reduced.left_out_variances() {
-            if inverse > 0.0 && !self.undetermined[pixel] {
-                std[pixel] = scale * inverse.sqrt();
-            }
-        }
-        std
     }
 }
 

@@ -54,6 +54,7 @@ pub(crate) enum PyMask<'py> {
 pub(crate) struct PySolution {
     sensitivity: Py<PyArray2<f64>>,
     beam: Py<PyArray2<f64>>,
+    coefficients: Option<Py<PyArray2<f64>>>,
     beam_origin: (usize, usize),
     flags: Py<PyArray2<u32>>,
     component_labels: Py<PyArray2<i32>>,
@@ -105,14 +106,7 @@ pub(crate) fn calibrate_frames(
     workers: Option<NonZeroUsize>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<PySolution> {
-    let unknowns = Unknowns {
-        shifts: shifts.as_slice()?.as_chunks().0.to_vec(),
-        shift_std: shift_std
-            .map(|std| Ok::<_, PyErr>(std.as_slice()?.as_chunks().0.to_vec()))
-            .transpose()?,
-        flux: flux_named(flux_model).map_err(|error| errors::exception(py, &error))?,
-        offset,
-    };
+    let unknowns = unknowns(py, &shifts, shift_std.as_ref(), flux_model, offset)?;
     let stop = Stop { tolerance, max_sweeps };
     let mask = mask.as_ref().map_or(Ok(Mask::None), view_mask)?;
     let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
@@ -163,6 +157,26 @@ fn solve<T: Real>(
         calibrate_jointly(&model, &rotations, unknowns, setting.stop, &workers, control)?
     };
     Ok((solution, model.sensor()))
+}
+
+pub(crate) fn unknowns(
+    py: Python<'_>,
+    shifts: &PyReadonlyArray2<'_, f64>,
+    shift_std: Option<&PyReadonlyArray2<'_, f64>>,
+    flux_model: (String, Vec<f64>),
+    offset: bool,
+) -> PyResult<Unknowns> {
+    Ok(Unknowns {
+        shifts: pairs(shifts)?,
+        shift_std: shift_std.map(pairs).transpose()?,
+        flux: flux_named(flux_model).map_err(|error| errors::exception(py, &error))?,
+        offset,
+    })
+}
+
+/// Rows of two numbers.
+pub(crate) fn pairs(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<[f64; 2]>> {
+    Ok(array.as_slice()?.as_chunks().0.to_vec())
 }
 
 fn method_named(name: &str) -> Result<Method> {
@@ -229,6 +243,10 @@ fn wrap(py: Python<'_>, solution: Solution, sensor: Shape) -> PyResult<PySolutio
     Ok(PySolution {
         sensitivity: image(py, solution.sensitivity, sensor)?,
         beam: image(py, solution.beam, solution.beam_shape)?,
+        coefficients: solution
+            .coefficients
+            .map(|values| image(py, values, solution.beam_shape))
+            .transpose()?,
         beam_origin: solution.beam_origin.into(),
         flags: image(py, solution.flags, sensor)?,
         component_labels: image(py, solution.components.pixels, sensor)?,

@@ -31,7 +31,7 @@ mod _native {
     #[pymodule_export]
     use crate::plan::planned_components;
     #[pymodule_export]
-    use crate::uncertainty::{error_map, functional_variances};
+    use crate::uncertainty::{error_map, functional_variances, offset_variances, shift_variances};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

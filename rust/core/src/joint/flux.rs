@@ -6,6 +6,7 @@
 //! remains undetermined is left to the gauge. With a prior of weights π the same is done with
 //! Σ π a b in place of Σ a b: then the best of the parts that no measurement tells is the given one.
 
+use super::gauge::inverse;
 use crate::geometry::Rotation;
 
 /// What is known of the fluxes.
@@ -30,6 +31,9 @@ pub(super) struct Fluxes {
     /// The slope of ln L, a cell, that stands for what a drift linear in time has affine in the shifts,
     /// for θ = 1.
     pub(super) slope: [f64; 2],
+    /// The covariance of the slope along the shifts, a cell, of the part of ln c that hides in a tilt,
+    /// by the prior of each.
+    pub(super) hidden_slope: [[f64; 2]; 2],
     /// Whether a tilt of ln M is left undetermined.
     pub(super) leaves_tilt: bool,
 }
@@ -49,7 +53,7 @@ impl Fluxes {
             }
             hidden
         };
-        let mut slope = [0.0; 2];
+        let (mut slope, mut hidden_slope) = ([0.0; 2], [[0.0; 2]; 2]);
         let (columns, precisions, leaves_tilt) = match flux {
             Flux::Known => (Vec::new(), Vec::new(), false),
             Flux::Free => {
@@ -71,11 +75,14 @@ impl Fluxes {
                 let weights: Vec<f64> = std.iter().map(|std| 1.0 / (std * std)).collect();
                 let free = complement(&hidden(turned), (0..count).map(unit), &weights);
                 let precisions = vec![1.0; free.len()];
+                if !turned {
+                    hidden_slope = slope_covariance(&weights, shifts);
+                }
                 (free, precisions, false)
             }
         };
         let precisions = if precisions.is_empty() { vec![0.0; columns.len()] } else { precisions };
-        Self { columns, precisions, slope, leaves_tilt }
+        Self { columns, precisions, slope, hidden_slope, leaves_tilt }
     }
 
     /// T θ.
@@ -92,6 +99,20 @@ impl Fluxes {
         let dot = |column: &Vec<f64>| column.iter().zip(slopes).map(|(t, b)| t * b).sum();
         self.columns.iter().map(dot).collect()
     }
+}
+
+/// The covariance of γ in ln c = a + γ·d, of the weights of each ln c: (Σ π (d − d̄)(d − d̄)ᵀ)⁻¹.
+fn slope_covariance(weights: &[f64], shifts: &[[f64; 2]]) -> [[f64; 2]; 2] {
+    let sum = |value: &dyn Fn(&[f64; 2]) -> f64| -> f64 {
+        weights.iter().zip(shifts).map(|(weight, d)| weight * value(d)).sum()
+    };
+    let total = sum(&|_| 1.0);
+    let [row, col] = [sum(&|d| d[0]) / total, sum(&|d| d[1]) / total];
+    inverse([
+        sum(&|d| (d[0] - row).powi(2)),
+        sum(&|d| (d[0] - row) * (d[1] - col)),
+        sum(&|d| (d[1] - col).powi(2)),
+    ])
 }
 
 /// γ of t/|t·told| = told + c + γ·d, for d along which the times change at all.

@@ -10,21 +10,29 @@ use super::Fit;
 use crate::frames::Shape;
 use crate::geometry::Rotation;
 
-/// Gives L the slope `drift` that a lamp's drift has in the beam, brings the mean of ln c to 0, and the slope of ln M, least squares over the ordinary pixels of the largest
-/// component, if the fluxes leave it undetermined.
+/// What rounding leaves of a determinant.
+const SINGULAR: f64 = 1e-12;
+
+/// Gives L the slope `drift` that a lamp's drift has in the beam, brings the mean of ln c to 0, and the
+/// slope of ln M, least squares over the ordinary pixels of the largest component, if the fluxes
+/// leave it undetermined.
 pub(super) fn fix(fit: &mut Fit, drift: [f64; 2], rotation: Rotation, sensor: Shape) {
     untilt(fit, in_sensor(drift, rotation), rotation, sensor);
     if fit.leaves_tilt {
-        let slope = slope(&fit.sensitivity, &fit.components.pixels, sensor);
+        let slope = slopes(&fit.sensitivity, &fit.components.pixels, sensor).map(|weights| {
+            let pixels = weights.iter().zip(&fit.sensitivity).filter(|(w, _)| **w != 0.0);
+            pixels.map(|(weight, m)| weight * m.ln()).sum()
+        });
         untilt(fit, slope, rotation, sensor);
     }
     let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
     fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
-    fit.beam.iter_mut().for_each(|value| *value *= mean.exp());
+    let cells = fit.beam.iter_mut().chain(&mut fit.coefficients);
+    cells.for_each(|value| *value *= mean.exp());
 }
 
 /// A slope of ln L in the beam as one of ln M on a sensor that is turned: −α = Aᵀ β.
-const fn in_sensor([down, along]: [f64; 2], rotation: Rotation) -> [f64; 2] {
+pub(super) const fn in_sensor([down, along]: [f64; 2], rotation: Rotation) -> [f64; 2] {
     match rotation {
         Rotation::None => [down, along],
         Rotation::Quarter => [-along, down],
@@ -48,40 +56,50 @@ fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
         Rotation::Half => ([-row, -col], row * last_row + col * last_col),
         Rotation::ThreeQuarters => ([-col, row], col * last_col),
     };
-    for (cell, value) in fit.beam.iter_mut().enumerate() {
+    for (cell, (value, coefficient)) in fit.beam.iter_mut().zip(&mut fit.coefficients).enumerate() {
         let (row, col) = (cell / fit.beam_shape.cols, cell % fit.beam_shape.cols);
         let u = [row as f64 - fit.origin[0] as f64, col as f64 - fit.origin[1] as f64];
-        *value *= (down * u[0] + along * u[1] + corner).exp();
+        let factor = (down * u[0] + along * u[1] + corner).exp();
+        *value *= factor;
+        *coefficient *= factor;
     }
     for (c, d) in fit.flux.iter_mut().zip(&fit.shifts) {
         *c *= (-down * d[0] - along * d[1]).exp();
     }
 }
 
-/// The least-squares slope of ln M along rows and columns, a pixel, over pixels from half to twice the
-/// mean: the logarithm of a dead one would weigh more than all others of its row.
-fn slope(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [f64; 2] {
+/// Weights whose sums with ln M are its least-squares slopes along rows and columns, a pixel, over
+/// the pixels of label 0 from half to twice the mean: the logarithm of a dead one would weigh more
+/// than all others of its row.
+pub(super) fn slopes(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [Vec<f64>; 2] {
     let counted = || sensitivity.iter().zip(labels).filter(|(_, label)| **label == 0);
     let mean = counted().map(|(m, _)| m).sum::<f64>() / counted().count() as f64;
-    let pixels = || {
-        let known = sensitivity.iter().zip(labels).enumerate();
-        let ordinary = 0.5 * mean..2.0 * mean;
-        known.filter(move |(_, (m, label))| **label == 0 && ordinary.contains(m)).map(
-            |(pixel, (m, _))| [(pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64, m.ln()],
-        )
+    let ordinary = 0.5 * mean..2.0 * mean;
+    let counts = |pixel: usize| labels[pixel] == 0 && ordinary.contains(&sensitivity[pixel]);
+    let place = |pixel: usize| [(pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64];
+    let pixels = || (0..sensitivity.len()).filter(|&pixel| counts(pixel)).map(place);
+    let sum = pixels().fold([0.0; 3], |s, [row, col]| [s[0] + row, s[1] + col, s[2] + 1.0]);
+    let mean = [sum[0] / sum[2], sum[1] / sum[2]];
+    let from_mean = |[row, col]: [f64; 2]| [row - mean[0], col - mean[1]];
+    let [rr, rc, cc] = pixels()
+        .map(from_mean)
+        .fold([0.0; 3], |sum, [r, c]| [sum[0] + r * r, sum[1] + r * c, sum[2] + c * c]);
+    let inverse = inverse([rr, rc, cc]);
+    let weight = |pixel: usize, [of_row, of_col]: [f64; 2]| {
+        let [r, c] = from_mean(place(pixel));
+        if counts(pixel) { of_row * r + of_col * c } else { 0.0 }
     };
-    let sum = pixels().fold([0.0; 4], |sum, [row, col, log]| {
-        [sum[0] + row, sum[1] + col, sum[2] + log, sum[3] + 1.0]
-    });
-    let mean = [sum[0] / sum[3], sum[1] / sum[3], sum[2] / sum[3]];
-    let [rr, rc, cc, rl, cl] = pixels().fold([0.0; 5], |sum, [row, col, log]| {
-        let (r, c, l) = (row - mean[0], col - mean[1], log - mean[2]);
-        [sum[0] + r * r, sum[1] + r * c, sum[2] + c * c, sum[3] + r * l, sum[4] + c * l]
-    });
-    let determinant = rr * cc - rc * rc;
-    if determinant > 0.0 {
-        [(cc * rl - rc * cl) / determinant, (rr * cl - rc * rl) / determinant]
+    inverse.map(|axis| (0..sensitivity.len()).map(|pixel| weight(pixel, axis)).collect())
+}
+
+/// The inverse of a symmetric matrix [a b; b c], 0 along an axis that it does not tell.
+pub(super) fn inverse([a, b, c]: [f64; 3]) -> [[f64; 2]; 2] {
+    let determinant = a * c - b * b;
+    if determinant > SINGULAR * a * c {
+        let mixed = -b / determinant;
+        [[c / determinant, mixed], [mixed, a / determinant]]
     } else {
-        [if rr > 0.0 { rl / rr } else { 0.0 }, if cc > 0.0 { cl / cc } else { 0.0 }]
+        let alone = |x: f64| if x > 0.0 { 1.0 / x } else { 0.0 };
+        [[alone(a), 0.0], [0.0, alone(c)]]
     }
 }

@@ -83,11 +83,38 @@ impl Penalty {
         workers: &Workers,
     ) -> f64 {
         let (differences, energy) = self.differences(&x, workers);
-        self.adjoint(&differences, &mut x, workers);
-        let scale = workers.dot(beam, &x) / self.norm;
-        workers.add_multiple(&mut x, -scale, &self.pull);
-        workers.add_multiple(sums, share * self.tau, &x);
+        self.pull_at(beam, &differences, share * self.tau, &mut x, sums, workers);
         self.tau * energy
+    }
+
+    /// Adds √τ Pᵀ Gᵀ s, whose covariance is that of the penalty, for signs s.
+    pub(super) fn add_draw(
+        &self,
+        beam: &[f64],
+        mut sign: impl FnMut() -> f64,
+        sums: &mut [f64],
+        workers: &Workers,
+    ) {
+        let mut draw = |counted: &Vec<f64>| counted.iter().map(|c| c * sign()).collect();
+        let differences = [draw(&self.counted[0]), draw(&self.counted[1])];
+        let mut room = vec![0.0; beam.len()];
+        self.pull_at(beam, &differences, self.tau.sqrt(), &mut room, sums, workers);
+    }
+
+    /// Adds `share` Pᵀ Gᵀ of differences.
+    fn pull_at(
+        &self,
+        beam: &[f64],
+        differences: &[Vec<f64>; 2],
+        share: f64,
+        room: &mut [f64],
+        sums: &mut [f64],
+        workers: &Workers,
+    ) {
+        self.adjoint(differences, room, workers);
+        let scale = workers.dot(beam, room) / self.norm;
+        workers.add_multiple(room, -scale, &self.pull);
+        workers.add_multiple(sums, share, room);
     }
 
     /// G x, down and along, and ‖G x‖².

@@ -134,7 +134,9 @@ impl Preconditioner {
         });
         let coarse = &heights[self.hats.count()..];
         z[beam.len()..].iter_mut().zip(coarse).for_each(|(z, height)| *z += height);
-        // What moves all exposures alike is no error, and what rounding leaves of it must not grow.
+        // A multiple of the beam is no error, nor is what moves all exposures alike; what rounding
+        // leaves of them must not grow.
+        system.take_scale_out(&mut z[..beam.len()]);
         let shifts = &mut z[beam.len() + system.fluxes.columns.len()..];
         let moves = system.centred(shifts);
         shifts.copy_from_slice(moves.as_flattened());

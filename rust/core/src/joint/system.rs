@@ -70,6 +70,8 @@ pub(super) struct System<'m, 'a, T> {
     pulls: Vec<f64>,
     /// Σ w c² M² of the pixels that see a cell, by their factors.
     pub(super) weights: Vec<f64>,
+    /// D a/(aᵀD a) with these weights D and the coefficients a.
+    scale: Vec<f64>,
     pub(super) penalty: Option<Penalty>,
 }
 
@@ -83,18 +85,18 @@ pub(super) struct Block {
 }
 
 /// Room of one thread for a row of pixels.
-struct Room {
-    weights: Vec<f64>,
-    values: Vec<f64>,
+pub(super) struct Room {
+    pub(super) weights: Vec<f64>,
+    pub(super) values: Vec<f64>,
     /// A row of coefficients, or one of pixels with zeros around.
     row: Vec<f64>,
-    sums: [Vec<f64>; 2],
+    pub(super) sums: [Vec<f64>; 2],
     slope: Vec<f64>,
 }
 
 /// What one pass gathers besides the pulls: F, and the slopes of ln c and d of each exposure.
 #[derive(Clone, Default)]
-struct Sums {
+pub(super) struct Sums {
     objective: f64,
     flux: Vec<f64>,
     shifts: Vec<[f64; 2]>,
@@ -125,6 +127,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             rows: workers.filled(sensor.rows * Row::length(count, sensor.cols), 0.0, control),
             pulls: workers.filled(sensor.rows * count * wide, 0.0, control),
             weights: Vec::new(),
+            scale: Vec::new(),
             penalty: None,
             state,
             grid,
@@ -205,7 +208,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// How many pixels have a measurement.
     pub(super) fn measured(&self) -> usize {
         let mut count = 0;
-        self.for_rows(|[_, _, inverse, _]| count += inverse.iter().filter(|i| **i > 0.0).count());
+        self.for_rows(|[_, _, inverse, ..]| count += inverse.iter().filter(|i| **i > 0.0).count());
         count
     }
 
@@ -213,7 +216,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     pub(super) fn untold(&self) -> Vec<usize> {
         let (mut untold, mut first) = (Vec::new(), 0);
         if self.with_offset {
-            self.for_rows(|[_, _, gain, offset]| {
+            self.for_rows(|[_, _, gain, _, offset, _]| {
                 let pixels = gain.iter().zip(offset).enumerate();
                 let told = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
                 untold.extend(told.map(|(col, _)| first + col));
@@ -277,32 +280,38 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// Changes of shifts less their mean, by the weights of the prior: to move all exposures moves
     /// but the beam, which no measurement tells.
+    ///
+    /// As Σ_j π_j (d_k − d_j)/Σ π: where one shift is all but exact, it is all but the mean, and what
+    /// rounding leaves of their difference would pull at it with all its weight.
     pub(super) fn centred(&self, shifts: &[f64]) -> Vec<[f64; 2]> {
-        let mut shifts = shifts.as_chunks().0.to_vec();
-        if let Some(prior) = &self.shift_prior {
-            for axis in 0..2 {
-                let weights = || prior.precisions.iter().map(|p| p[axis]);
-                let sum: f64 =
-                    shifts.iter().zip(weights()).map(|(d, p): (&[f64; 2], _)| p * d[axis]).sum();
-                let mean = sum / weights().sum::<f64>();
-                shifts.iter_mut().for_each(|shift| shift[axis] -= mean);
-            }
-        }
-        shifts
+        let shifts = shifts.as_chunks().0;
+        let Some(shares) = self.shares() else { return shifts.to_vec() };
+        let from_mean = |shift: &[f64; 2], axis: usize| -> f64 {
+            let others = shares.iter().zip(shifts);
+            others
+                .map(|(share, other): (_, &[f64; 2])| share[axis] * (shift[axis] - other[axis]))
+                .sum()
+        };
+        shifts.iter().map(|shift| [0, 1].map(|axis| from_mean(shift, axis))).collect()
     }
 
     /// What pulls at shifts pulls at them less their mean: the transpose of [`centred`](Self::centred).
-    fn centred_pulls(&self, mut pulls: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
-        if let Some(prior) = &self.shift_prior {
-            for axis in 0..2 {
-                let sum: f64 = pulls.iter().map(|pull| pull[axis]).sum();
-                let weights: f64 = prior.precisions.iter().map(|p| p[axis]).sum();
-                for (pull, precision) in pulls.iter_mut().zip(&prior.precisions) {
-                    pull[axis] -= precision[axis] / weights * sum;
-                }
-            }
-        }
-        pulls
+    pub(super) fn centred_pulls(&self, pulls: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+        let Some(shares) = self.shares() else { return pulls };
+        let left = |k: usize, axis: usize| -> f64 {
+            let others = (0..pulls.len()).filter(|&j| j != k);
+            others
+                .map(|j| shares[j][axis] * pulls[k][axis] - shares[k][axis] * pulls[j][axis])
+                .sum()
+        };
+        (0..pulls.len()).map(|k| [0, 1].map(|axis| left(k, axis))).collect()
+    }
+
+    /// The share of each shift in their mean, if they are sought.
+    fn shares(&self) -> Option<Vec<[f64; 2]>> {
+        let precisions = &self.shift_prior.as_ref()?.precisions;
+        let sum = [0, 1].map(|axis| precisions.iter().map(|p| p[axis]).sum::<f64>());
+        Some(precisions.iter().map(|p| [p[0] / sum[0], p[1] / sum[1]]).collect())
     }
 
     /// The priors' weights of the parameters.
@@ -311,9 +320,19 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.fluxes.precisions.iter().chain(shifts).map(|precision| self.unit * precision).collect()
     }
 
+    /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam that no measurement tells.
+    pub(super) fn take_scale_out(&self, x: &mut [f64]) {
+        let multiple = self.workers.dot(&self.scale, x);
+        self.workers.add_multiple(x, -multiple, &self.state.beam);
+    }
+
     /// D, Σ w c² M² by the pixels' factors, and the penalty where it is seen.
     fn weigh(&mut self, tau: f64, control: &Control) -> Result<()> {
         self.weights = self.diagonal(false, control)?;
+        let pulls = self.weights.iter().zip(&self.state.beam).map(|(d, a)| d * a);
+        self.scale = pulls.collect();
+        let norm = self.workers.dot(&self.scale, &self.state.beam);
+        self.scale.iter_mut().for_each(|pull| *pull /= norm);
         if self.grid.is_spline() {
             let total: f64 = self.weights.iter().sum();
             let typical = self.workers.dot(&self.weights, &self.weights) / total;
@@ -366,7 +385,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// The mean M of the pixels with measurements.
     pub(super) fn mean_sensitivity(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
-        self.for_rows(|[sensitivity, _, inverse, _]| {
+        self.for_rows(|[sensitivity, _, inverse, ..]| {
             for (m, inverse) in sensitivity.iter().zip(inverse) {
                 if *inverse > 0.0 {
                     sum += m;
@@ -377,13 +396,14 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         sum / f64::from(count.max(1))
     }
 
-    /// Calls `visit([M, O, the inverse's first and last element])` for each row of pixels: that of M, and
-    /// that of O, which is 0 where no offset is told.
-    pub(super) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 4])) {
+    /// Calls `visit([M, O, i₁₁, i₁₂, i₂₂, the last change of M])` for each row of pixels: i is the
+    /// inverse of their normal matrices, i₁₁ that of M, i₂₂ that of O, which is 0 where no offset is
+    /// told.
+    pub(super) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 6])) {
         let (cols, count) = (self.model.sensor().cols, self.model.count());
         for row in self.rows.chunks_exact(Row::length(count, cols)) {
             let part = |index: usize| &row[(count + index) * cols..][..cols];
-            visit([part(0), part(1), part(2), part(4)]);
+            visit([0, 1, 2, 3, 4, 5].map(part));
         }
     }
 
@@ -487,7 +507,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's
     /// values, and spreads those along the columns of the views; returns the sums, those of shifts by
     /// the slopes of `beams`, the beam in each view.
-    fn pass(
+    pub(super) fn pass(
         &mut self,
         beams: Option<&[Vec<f64>]>,
         control: &Control,
@@ -568,7 +588,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// Collects what the last pass spread, on cells, then θ and the shifts.
-    fn collect(&self, sums: Sums) -> Vec<f64> {
+    pub(super) fn collect(&self, sums: Sums) -> Vec<f64> {
         let mut total = self.collect_cells();
         total.extend(self.fluxes.gather(&sums.flux));
         total.extend_from_slice(self.centred_pulls(sums.shifts).as_flattened());
@@ -639,7 +659,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// The beam in the order of each view, if its slopes are asked for.
-    fn beam_views(&self) -> Option<Vec<Vec<f64>>> {
+    pub(super) fn beam_views(&self) -> Option<Vec<Vec<f64>>> {
         self.shift_prior.as_ref().map(|_| self.views_of(&self.state.beam))
     }
 
@@ -681,7 +701,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// The weights of one row of an exposure.
-    fn weigh_row(&self, exposure: usize, row: usize, room: &mut Room) {
+    pub(super) fn weigh_row(&self, exposure: usize, row: usize, room: &mut Room) {
         let cols = self.model.sensor().cols;
         let weights = &mut room.weights[exposure * cols..][..cols];
         match self.model.uniform_weight(exposure) {

@@ -10,14 +10,12 @@
 //! and b has the covariance S. No more than that is asked of a draw, so that e is as large as its
 //! standard deviation everywhere and only its signs are drawn: a bit for each measurement.
 
-use rand_xoshiro::Xoshiro256PlusPlus;
-use rand_xoshiro::rand_core::{Rng, SeedableRng};
-
 use super::kernel::{NoiseSlope, Sign, TwoTerms};
 use super::{BAND, ExposureScratch, LANES, Reduced, RowWeight, Shown};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::random;
 
 impl<T: Real> Reduced<'_, '_, T> {
     /// Writes the b of draw number `draw` to `slope`.
@@ -97,8 +95,8 @@ impl<T: Real> Reduced<'_, '_, T> {
     ) -> &'s [f32] {
         let (sensor, count) = (self.model.sensor(), self.model.count() as u64);
         let number = (draw * count + exposure) * sensor.rows as u64 + row as u64;
-        let mut random = Xoshiro256PlusPlus::seed_from_u64(number);
-        let signs: Vec<u32> = (0..sensor.cols.div_ceil(LANES)).map(|_| random.next_u32()).collect();
+        let mut bits = random::bits(number);
+        let signs: Vec<u32> = (0..sensor.cols.div_ceil(LANES)).map(|_| bits()).collect();
         noise.resize(2 * self.padding.lead + self.padding.width, 0.0);
         let padded = &mut noise[self.padding.lead..];
         pulp::Arch::new().dispatch(Sign {
