@@ -41,7 +41,7 @@ _ROUNDS = 4
 """Of finer fits, and of leaving out what stands far outside."""
 
 _ODD = 30.0
-"""Median absolute residuals, 20 standard deviations: neither noise nor the waves of a wrong sign."""
+"""Median absolute residuals, 20 standard deviations: no noise, nor the waves of a wrong sign."""
 
 _BLOCK, _MOST = 4, 2 / 3
 """Pixels along a block, and the share of blocks where a fit that is better must be better: what a
@@ -104,45 +104,17 @@ def shift_sign(
     reversed shifts leave of a smooth beam looks like a drifting lamp; of a Gaussian one nothing is
     left: ln L is quadratic, and with 1/L for L, M·L² for M and fluxes to match they fit as well.
 
-    F is known where the estimated error of M is below 0.3 of the relative noise that the fit leaves:
-    it is then at most 2e-4 of itself above its minimum (measured). That is asked of the higher F
-    alone; one that is lower before its end is lower still at it.
-
-    A central window tells it, some four times as wide as the largest shift s. Where that is many
-    pixels it is as small as leaves a quarter of the measurements to judge by:
-    (n − 1)·w² − (w + s)² ≥ w²/2, its cells being at most (w + s)².
+    F is known where the estimated error of M is below 0.3 of the relative noise that the fit leaves
+    (it was then at most 2e-4 of itself above its minimum). That is asked of the higher F alone; one
+    that is lower before its end is lower still at it. What one of the fits leaves far outside the
+    others, such as dust, is left out of both.
     """
-    count = len(shifts)
-    # Where the sensor's middle looks: a quarter turn exchanges its coordinates.
-    turned = np.array(measured.rotation) % 180 == 90
-    middle = (np.array(measured.frames.shape[1:]) - 1) / 2
-    middles = np.where(turned[:, None], middle[::-1], middle)
-    reach = max(float(np.ptp(middles + sign * shifts, axis=0).max()) for sign in (1, -1))
-    if count < 3 or reach == 0:
+    side = _side(measured, shifts)
+    window = _Window.cut(measured, side)
+    if len(shifts) < 3 or (len(shifts) - 2) * window.values[0].size < _FEWEST:
         return "undetermined"
-    side = min(_WIDE * reach, max(_LEAST, reach / ((count - 1.5) ** 0.5 - 1)))
-    window = _Window.cut(measured, round(side))
-    if (count - 2) * window.values[0].size < _FEWEST:
-        return "undetermined"
-
-    def fit(sign: int, noise: float | None) -> _Fit:
-        return window.fit(sign * shifts, noise, workers, progress)
-
-    noises: list[float | None] = [None, None]
     try:
-        fits = [fit(1, None), fit(-1, None)]
-        for _ in range(_ROUNDS):
-            odd = _odd(fits)
-            if odd.any():
-                window = window.without(odd)
-                fits = [fit(sign, noise) for sign, noise in zip((1, -1), noises, strict=True)]
-                continue
-            open_ = [not (each.settled or each.stuck) for each in fits]
-            if _lower(fits) is not None or not any(open_):
-                break
-            for k in np.flatnonzero(open_):
-                noises[k] = fits[k].noise
-                fits[k] = fit((1, -1)[k], noises[k])
+        fits = _fits(window, shifts, workers, progress)
     except (InputError, InsufficientMemoryError):
         # All arguments are good for the whole sensor: the window has too little light or room.
         return "undetermined"
@@ -161,8 +133,48 @@ def shift_sign(
     return "contradicted"
 
 
+def _side(measured: Measurements, shifts: NDArray[Any]) -> int:
+    """Pixels along the window: some four times the largest shift s.
+
+    Where that is many it is as small as leaves half a measurement a pixel to judge by:
+    (n − 1)·w² − (w + s)² ≥ w²/2, the cells being at most (w + s)². 0 if nothing moves.
+    """
+    # Where the sensor's middle looks: a quarter turn exchanges its coordinates.
+    turned = np.array(measured.rotation) % 180 == 90
+    middle = (np.array(measured.frames.shape[1:]) - 1) / 2
+    middles = np.where(turned[:, None], middle[::-1], middle)
+    reach = max(float(np.ptp(middles + sign * shifts, axis=0).max()) for sign in (1, -1))
+    enough: float = reach / (max(len(shifts) - 1.5, 1.5) ** 0.5 - 1)
+    return round(min(_WIDE * reach, max(_LEAST, enough)))
+
+
+def _fits(
+    window: _Window, shifts: NDArray[Any], workers: int | None, progress: Progress | None
+) -> list[_Fit]:
+    """The fits with the shifts as given and with all of them reversed, as fine as it takes."""
+
+    def fit(k: int) -> _Fit:
+        return window.fit((shifts, -shifts)[k], noises[k], workers, progress)
+
+    noises: list[float | None] = [None, None]
+    fits = [fit(0), fit(1)]
+    for _ in range(_ROUNDS):
+        odd = _odd(fits)
+        if odd.any():
+            window = window.without(odd)
+            fits = [fit(0), fit(1)]
+            continue
+        unsettled = [k for k in (0, 1) if not (fits[k].settled or fits[k].stuck)]
+        if not unsettled or _lower(fits) is not None:
+            break
+        for k in unsettled:
+            noises[k] = fits[k].noise
+            fits[k] = fit(k)
+    return fits
+
+
 def _lower(fits: list[_Fit]) -> int | None:
-    """Which fit has the lower F, if the other's is known and far enough above it, in most places."""
+    """Which fit has the lower F, if the other's is known and far above it, in most places."""
     freedom = min(fit.freedom for fit in fits)
     lower = int(fits[1].left < fits[0].left)
     low, high = fits[lower], fits[1 - lower]
@@ -202,7 +214,8 @@ class _Window(NamedTuple):
         sizes = np.minimum(shape, side)
         first = (shape - sizes) // 2
         last = shape - sizes - first
-        part = (..., *(slice(a, a + size) for a, size in zip(first, sizes, strict=True)))
+        rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
+        part = (..., rows, cols)
         variance, mask = measured.variance, measured.mask
         if variance is not None and variance.ndim == 3:
             variance = np.ascontiguousarray(variance[part])
@@ -236,7 +249,7 @@ class _Window(NamedTuple):
         """Fit beam and sensitivity, with free fluxes: coarsely, or finer than that noise."""
         places = shifts + self.corners
         places -= np.floor(places.min(axis=0))
-        fine = noise is not None
+        tolerance = _COARSE if noise is None else max(_FINER * noise, np.finfo(float).eps)
         solution = _native.calibrate_frames(
             self.values,
             places.astype(np.float64),
@@ -248,8 +261,8 @@ class _Window(NamedTuple):
             variance=self.variance,
             mask=self.mask,
             method="multiscale",
-            tolerance=max(_FINER * noise, np.finfo(float).eps) if fine else _COARSE,
-            max_sweeps=_MOST_FINE if fine else _MOST_COARSE,
+            tolerance=tolerance,
+            max_sweeps=_MOST_COARSE if noise is None else _MOST_FINE,
             workers=workers,
             progress=None if progress is None else _as_check(progress),
         )
@@ -285,9 +298,11 @@ class _Window(NamedTuple):
             scale = np.ones(1)
         else:
             scale = variance if variance.ndim == 3 else variance[:, None, None]
-        return np.divide(squares, scale, out=np.full(squares.shape, np.nan), where=used)
+        weighted = np.full(squares.shape, np.nan)
+        np.divide(squares, scale, out=weighted, where=used)
+        return weighted
 
 
 def _as_check(progress: Progress) -> Progress:
     """Progress under a name of its own."""
-    return lambda done, total, _: progress(done, total, "check sign of shifts")
+    return lambda done, total, _: progress(done, total, "sign of shifts")

@@ -660,11 +660,11 @@ def calibrate(
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
     Gauss-Newton steps in which M follows at its closed form.
 
-    The sign of the shifts is asked of the central pixels, some four times as many along each axis as
-    the largest shift: fitted with the shifts as given and with all of them reversed, fluxes free in
-    both, the lower F must be lower by 6·√(2/dof) of itself, in most places. It is not asked, so
-    "undetermined", of fewer than three exposures or a thousand degrees of freedom, of a dark that is
-    fitted, where nothing moves, nor where the middle of the sensor has no light.
+    The sign of the shifts is asked of the central pixels, some four times as many along each axis
+    as the largest shift: fitted with the shifts as given and with all of them reversed, fluxes free
+    in both, the lower F must be lower by 6·√(2/dof) of itself, in most places. It is undetermined
+    without a question with fewer than three exposures or a thousand degrees of freedom, with
+    ``dark="fit"``, where nothing moves, and where the middle of the sensor has no light.
 
     References
     ----------
