@@ -105,7 +105,9 @@ def test_inspect_shows_the_calibration(run, calibration):
     assert status == 0
     for line in (r"shape +64 × 80", r"converged +yes", r"flagged pixels +DO_NOT_USE 8"):
         assert re.search(line, out)
+    assert re.search(r"shift sign +undetermined", out)
     _, out, _ = run("inspect", calibration, "--json")
+    assert json.loads(out)["shift_sign"] == "undetermined"
     assert json.loads(out)["metadata"]["sensor"]["bit_depth"] == 12
 
 

@@ -114,6 +114,39 @@ def test_measured_shifts_are_the_stage_s(manifest, virtual):
     np.testing.assert_allclose(shifts, virtual.truth.shifts, atol=0.1)
 
 
+def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
+    """Six sensors in a narrow beam; calibrated with the shifts as measured once, and twice."""
+    once = Experiment.measure_shifts
+    errors_of, scores, blocks = ([], []), [], ([], [], [])
+    for seed in range(6):
+        truth = simulate.paper_sensitivity(SHAPE, rng=seed)
+        beam = simulate.gaussian_beam(SHAPE, width=50)
+        virtual = simulate.experiment(
+            truth, beam, SHIFTS, frames=24, aperture_frames=24, dead=0, hot=0, rng=50 + seed
+        )
+        experiment = Experiment.load(virtual.write(tmp_path / str(seed)))
+        for k in (0, 1):
+            with monkeypatch.context() as patch:
+                if k == 0:
+                    patch.setattr(Experiment, "measure_shifts", lambda self, *_: once(self))
+                found = experiment.run(tolerance=1e-4)
+            error = np.array(found.metadata["measured_shifts"]) - virtual.truth.shifts
+            errors_of[k].append(error[1:])
+            of_m = simulate.relative_error(found.sensitivity, truth)
+            blocks[k].append(rms(simulate.block_means(of_m)))
+        blocks[2].append(virtual.noise_prediction(rng=seed)[1])
+        scores.append(errors_of[1][-1] / np.array(found.metadata["measured_shift_std"])[1:])
+    # Pixels uneven by 5 %, 0.029 rms, become uneven by what noise leaves of M, some 1e-3. The noise
+    # of the images stays.
+    assert rms(np.array(errors_of[1])) < rms(np.array(errors_of[0])) / 4
+    # Six times eight sums over one to four moves, as good as some 24 numbers: 3/√48.
+    assert rms(np.array(scores)) == pytest.approx(1, abs=0.43)
+    # 120 blocks scatter by 7 % in the rms, the prediction of 4 draws each by half of that: 2.5 σ.
+    first, second, noise = (rms(np.array(each)) for each in blocks)
+    assert second == pytest.approx(noise, rel=0.2)
+    assert first > 1.5 * second
+
+
 def test_turned_exposures_are_placed_by_the_aperture():
     """Numbers of the rotation formula: the same hole before and after a turn."""
     from equipix.experiment import _in_beam

@@ -37,6 +37,7 @@ LAYERS = (
     {
         "_manifest",
         "_measurements",
+        "_shift_sign",
         "_terminal",
         "_weights",
         "correction",

@@ -19,6 +19,7 @@ from equipix.errors import (
     IdentifiabilityWarning,
     InputError,
     MisfitWarning,
+    ShiftSignWarning,
 )
 from equipix.results import Flag
 
@@ -183,7 +184,10 @@ class TestBetweenPixels:
 
     def test_a_terrible_fit_is_told(self):
         frames, shifts, _ = structured(0)
-        with pytest.warns(MisfitWarning, match="times what the variances say"):
+        with (
+            pytest.warns(MisfitWarning, match="times what the variances say"),
+            pytest.warns(ShiftSignWarning),
+        ):
             equipix.calibrate(frames, -shifts, tolerance=1e-4, variance=np.full(5, NOISE**2))
 
     def test_rounded_shifts_ruin_it(self):

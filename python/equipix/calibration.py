@@ -34,6 +34,7 @@ from equipix._measurements import (
     union,
     warn_of_order,
 )
+from equipix._shift_sign import ShiftSign, shift_sign
 from equipix._weights import Problem, modelled, solve_robustly
 from equipix.correction import Flagged, apply_gain
 from equipix.defects import noisy_pixels, odd_responses
@@ -170,6 +171,9 @@ class Calibration:
         References to what the calibration was made from, for `std_of`; None if read from a file.
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
+    shift_sign : {"confirmed", "contradicted", "undetermined"}
+        Whether the data confirm the sign of the shifts, contradict it, or do not tell it, as those
+        of a Gaussian beam, whatever its width; see `calibrate`.
     """
 
     sensitivity: NDArray[Any]
@@ -193,6 +197,7 @@ class Calibration:
     shift_std: NDArray[Any] | None = None
     measurements: Measurements | None = None
     rejected: NDArray[np.bool_] | None = None
+    shift_sign: ShiftSign = "undetermined"
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -508,6 +513,7 @@ class Calibration:
             "sweeps": self.sweeps,
             "converged": self.converged,
             "error_estimate": self.error_estimate,
+            "shift_sign": self.shift_sign,
             "tilt_std": None
             if self.tilt_std is None
             else [std if np.isfinite(std) else str(std) for std in self.tilt_std.tolist()],
@@ -560,8 +566,9 @@ def calibrate(
         every exposure is masked and flagged ``HOT``.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
-        unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result without
-        any residual to show it. Where they are not whole numbers the beam is a cubic spline;
+        unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result, in a smooth
+        beam without any residual to show it; `Calibration.shift_sign` says whether the data confirm
+        it. Where they are not whole numbers the beam is a cubic spline;
         coordinate descent rounds them.
     variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
         Variance of the values given; without it all weights are 1. A noise model, or one for each
@@ -643,6 +650,8 @@ def calibrate(
         If the tolerance was not reached.
     MisfitWarning
         If residuals are more than twice what the variances given say.
+    ShiftSignWarning
+        If the data contradict the sign of the shifts.
 
     Notes
     -----
@@ -656,6 +665,12 @@ def calibrate(
     With shifts between pixels L is a cubic B-spline on the padded grid, with a penalty of 1e-5 of a
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
     Gauss-Newton steps in which M follows at its closed form.
+
+    The sign of the shifts is asked of the central pixels, some four times as many along each axis
+    as the largest shift: fitted with the shifts as given and with all of them reversed, fluxes free
+    in both, the lower F must be lower by 6·√(2/dof) of itself, in most places. It is undetermined
+    without a question with fewer than three exposures or a thousand degrees of freedom, with
+    ``dark="fit"``, where nothing moves, and where the middle of the sensor has no light.
 
     References
     ----------
@@ -765,7 +780,10 @@ def calibrate(
             unit=1.0 if variances is not None or np.isnan(reduced_chi2) else reduced_chi2,
         ),
     )
-    calibration = _wrapped(result, values.dtype, places, measurements, reduced_chi2, rejected)
+    sign: ShiftSign = "undetermined"
+    if dark != "fit":
+        sign = shift_sign(measurements, places, workers=workers, progress=progress)
+    calibration = _wrapped(result, values.dtype, places, measurements, reduced_chi2, rejected, sign)
     options: dict[str, Any] = {
         "method": method,
         "tolerance": tolerance,
@@ -896,6 +914,7 @@ def _wrapped(
     measurements: Measurements,
     reduced_chi2: float,
     rejected: NDArray[np.bool_] | None,
+    sign: ShiftSign,
 ) -> Calibration:
     return Calibration(
         sensitivity=result.sensitivity.astype(dtype, copy=False),
@@ -915,6 +934,7 @@ def _wrapped(
         dark=None if result.offset is None else result.offset.astype(dtype, copy=False),
         measurements=measurements,
         rejected=rejected,
+        shift_sign=sign,
     )
 
 
@@ -945,7 +965,9 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
     if dark:
         along, alone = dark["std_along_sensitivity"], dark["std_of_a_pixel"]
         if along is None or along > alone:
-            told = "is not told at all" if along is None else f"has the standard deviation {along:.1e}"
+            told = (
+                "is not told at all" if along is None else f"has the standard deviation {along:.1e}"
+            )
             warnings.warn(
                 "offset and gain can hardly be told apart: with fitted fluxes the dark may hold any "
                 f"multiple b of the sensitivity, and b {told}, where noise leaves {alone:.1e} of a "

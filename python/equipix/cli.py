@@ -161,6 +161,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         "sweeps": calibration.sweeps,
         "reduced_chi2": calibration.reduced_chi2,
         "components": calibration.components,
+        "shift_sign": calibration.shift_sign,
         "fluxes": calibration.metadata.get("options", {}).get("flux", "known"),
         "flagged_pixels": flagged,
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import warnings
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Self
@@ -19,6 +20,7 @@ from equipix.errors import FileError, InputError
 from equipix.frames import average
 from equipix.io import as_path, frame_format, read_frames
 from equipix.noise import NoiseModel, photon_transfer
+from equipix.results import Flag
 from equipix.shifts import measure_shift, round_shifts
 
 if TYPE_CHECKING:
@@ -36,6 +38,12 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int, int, str], object]
 
+
+_AROUND = 8
+"""Pixels to each side of a spot's middle that stand for those under it."""
+
+_ROUGH = 1e-4
+"""Tolerance of the calibration that the aperture's images are corrected by: 3e-5 pixel."""
 
 _UNEVEN_PIXELS = 0.008
 """Error of a centroid by unequal pixels under the spot, in pixels: s/(2√π) for a disc of any size
@@ -119,8 +127,16 @@ class Experiment:
                     f"of shape {wanted[1:]} as in {first}"
                 )
 
-    def measure_shifts(self) -> tuple[NDArray[Any], NDArray[Any]]:
+    def measure_shifts(
+        self, calibration: Calibration | None = None
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Shift of each exposure and its standard error.
+
+        Parameters
+        ----------
+        calibration : Calibration, optional
+            A first calibration from this experiment, which the images of the aperture are then
+            corrected by; its flagged pixels stay as they are.
 
         Returns
         -------
@@ -129,7 +145,7 @@ class Experiment:
         std : ndarray, shape (n, 2)
             Standard errors; for shifts that the file gives those that it gives, or 0. Those of
             successive moves add in quadrature, and so does what the unequal pixels under a spot do
-            to its centroid.
+            to its centroid: 0.008 pixel, or s/(2√π) where a calibration leaves them unequal by s.
 
         Raises
         ------
@@ -152,12 +168,12 @@ class Experiment:
                 shifts.append(np.array(new.shift))
                 variances.append(np.square(new.shift_std or [0.0, 0.0]))
                 continue
-            spots, shape = self._aperture(new)
+            spots, shape = self._aperture(new, calibration)
             u_before, variance_before = _in_beam(spots.before, old.rotation, shape)
             u_after, variance_after = _in_beam(spots.after, new.rotation, shape)
             shifts.append(shifts[-1] + u_before - u_after)
-            noise = variance_before + variance_after
-            variances.append(variances[-1] + noise + 2 * _UNEVEN_PIXELS**2)
+            uneven = sum(_uneven_pixels(spot, calibration) for spot in (spots.before, spots.after))
+            variances.append(variances[-1] + variance_before + variance_after + uneven)
         return np.array(shifts), np.sqrt(variances)
 
     def run(
@@ -211,15 +227,14 @@ class Experiment:
 
         Notes
         -----
-        Shifts with a standard error are refined, with it as their prior: see `calibrate`.
+        Shifts with a standard error are refined, with it as their prior: see `calibrate`. Those
+        that images of an aperture tell are measured twice, the second time on images corrected by
+        a first calibration.
         """
         started = datetime.now(UTC)
         _check_options(tolerance, max_sweeps, workers)
         self.check_formats()
         shifts, std = self.measure_shifts()
-        refined = method == "multiscale" and bool(std.any())
-        if method != "multiscale":
-            shifts = round_shifts(shifts, std).astype(np.float64)
         with naming_memory("averaging"):
             measured = self._average(workers, progress)
             noise = self._noise(measured)
@@ -229,32 +244,45 @@ class Experiment:
                 hot_pixels(measured.dark, noise),
                 measured.saturated,
             )
-        solved = calibrate(
-            measured.signals,
-            shifts,
-            shift_std=std if refined else None,
-            variance=models,
-            mask=flags != 0,
-            flux=self._column("flux") if flux is None else flux,
-            flux_std=self._column("flux_std") if flux is None else None,
-            time=self._column("time") if flux == "linear" else None,
-            rotation=[exposure.rotation for exposure in self.manifest.exposure],
-            robust=robust,
-            method=method,
-            tolerance=tolerance,
-            max_sweeps=max_sweeps,
-            uncertainty=uncertainty,
-            workers=workers,
-            progress=progress,
-        )
+
+        def solve(tolerance: float, *, uncertainty: bool) -> Calibration:
+            refined = method == "multiscale" and bool(std.any())
+            solved = calibrate(
+                measured.signals,
+                shifts if method == "multiscale" else round_shifts(shifts, std),
+                shift_std=std if refined else None,
+                variance=models,
+                mask=flags != 0,
+                flux=self._column("flux") if flux is None else flux,
+                flux_std=self._column("flux_std") if flux is None else None,
+                time=self._column("time") if flux == "linear" else None,
+                rotation=[exposure.rotation for exposure in self.manifest.exposure],
+                robust=robust,
+                method=method,
+                tolerance=tolerance,
+                max_sweeps=max_sweeps,
+                uncertainty=uncertainty,
+                workers=workers,
+                progress=progress,
+            )
+            dark = measured.dark.mean.astype(np.float32)
+            return replace(solved, dark=dark, flags=solved.flags | flags)
+
+        moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
+        if moved and method == "multiscale":
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the second calibration has them all
+                first = solve(max(tolerance, _ROUGH), uncertainty=False)
+            shifts, std = self.measure_shifts(first)
+        solved = solve(tolerance, uncertainty=uncertainty)
         return replace(
             solved,
-            dark=measured.dark.mean.astype(np.float32),
-            flags=solved.flags | flags,
             metadata=solved.metadata | self._metadata(started, shifts, std, noise),
         )
 
-    def _aperture(self, exposure: Exposure) -> tuple[ShiftMeasurement, tuple[int, int]]:
+    def _aperture(
+        self, exposure: Exposure, calibration: Calibration | None
+    ) -> tuple[ShiftMeasurement, tuple[int, int]]:
         """Find the spots of the move to `exposure`, and the shape of the sensor."""
         before, after = (
             read_frames(find_files(self.path, entry))
@@ -263,6 +291,10 @@ class Experiment:
         )
         try:
             level = self.manifest.sensor.saturation_level
+            if calibration is not None:
+                # In other units; the first measurement has seen that nothing saturates.
+                before, after = _equalised(before, calibration), _equalised(after, calibration)
+                level = None
             return measure_shift(before, after, saturation=level), before.shape[-2:]
         except InputError as error:
             raise type(error)(
@@ -395,6 +427,42 @@ def _in_beam(
     }[rotation]
     variance = np.square(spot.std)
     return np.array(position), variance[::-1] if rotation in (90, 270) else variance
+
+
+def _equalised(frames: NDArray[Any], calibration: Calibration) -> NDArray[Any]:
+    """Frames corrected; of flagged pixels, which the centroid mends, the dark alone."""
+    usable = (calibration.flags & Flag.DO_NOT_USE) == 0
+    gain = np.where(usable, calibration.sensitivity, 1)
+    assert calibration.dark is not None
+    return np.asarray((frames - calibration.dark) / gain)
+
+
+def _uneven_pixels(spot: Spot, calibration: Calibration | None) -> float:
+    """Variance of a centroid by unequal pixels under the spot: s²/4π for a disc of any size.
+
+    After a calibration s is the error of M that noise leaves. A pixel's n measurements tell M with
+    the variance 1/Σ w c²L², if the beam is known; it takes about one of them, hence n/(n − 2).
+    """
+    if calibration is None:
+        return _UNEVEN_PIXELS**2
+    measurements = calibration.measurements
+    assert measurements is not None
+    count = len(measurements.frames)
+    row, col = np.rint(spot.position).astype(int)
+    around = (
+        ...,
+        slice(max(row - _AROUND, 0), row + _AROUND),
+        slice(max(col - _AROUND, 0), col + _AROUND),
+    )
+    known = np.square(measurements.frames[around], dtype=np.float64)
+    if measurements.variance is None:
+        known /= calibration.reduced_chi2
+    elif measurements.variance.ndim == 3:
+        known /= measurements.variance[around]
+    else:
+        known /= measurements.variance[:, None, None]
+    left = count / max(count - 2, 1) / float(np.nanmedian(known.sum(axis=0)))
+    return float(min(left / (4 * np.pi), _UNEVEN_PIXELS**2))
 
 
 def _sha256(path: Path) -> str:

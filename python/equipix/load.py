@@ -72,6 +72,7 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         sweeps=numbers["sweeps"],
         converged=numbers["converged"],
         error_estimate=numbers["error_estimate"],
+        shift_sign=numbers.get("shift_sign", "undetermined"),
         history=History(
             np.array(history["sweep"], dtype=np.uint64),
             np.array(history["objective"]),

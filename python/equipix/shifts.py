@@ -112,7 +112,8 @@ def measure_shift(
     estimated from its roughness, which takes non-uniformity for noise. Not included: vibration,
     and that the two positions fall on different pixels: a non-uniformity of relative rms s, white
     in space, moves the centroid of a disc of any size by s/(2√π) = 0.28 s pixel rms along each
-    axis, so a uniform ±5 % moves it by 0.008 pixel and a measured shift by 0.011 pixel.
+    axis, so a uniform ±5 % moves it by 0.008 pixel and a measured shift by 0.011 pixel. On images
+    corrected by a first calibration s is the noise of M: so `Experiment` measures a second time.
 
     Examples
     --------
