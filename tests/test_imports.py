@@ -76,7 +76,7 @@ CHAIN = (
     {"connectivity"},
     {"model"},
     {"geometry"},
-    {"linalg", "memory", "parallel"},
+    {"linalg", "memory", "parallel", "random"},
     {"control"},
     {"frames"},
     {"error"},
@@ -96,7 +96,7 @@ CRATES = {
     "image": {"io"},
     "numpy": set[str](),
     "pyo3": set[str](),
-    "rand_xoshiro": {"reduced"},
+    "rand_xoshiro": {"random"},
     "rayon": {"parallel"},
     "tiff": {"io"},
 }

@@ -969,10 +969,10 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
                 "is not told at all" if along is None else f"has the standard deviation {along:.1e}"
             )
             warnings.warn(
-                "offset and gain can hardly be told apart: with fitted fluxes the dark may hold any "
-                f"multiple b of the sensitivity, and b {told}, where noise leaves {alone:.1e} of a "
-                "pixel alone; give the ratio of the levels as 'flux', or take larger shifts in a "
-                "beam that varies more",
+                "offset and gain can hardly be told apart: with fitted fluxes the dark may hold "
+                f"any multiple b of the sensitivity, and b {told}, where noise leaves {alone:.1e} "
+                "of a pixel alone; give the ratio of the levels as 'flux', or take larger shifts "
+                "in a beam that varies more",
                 IdentifiabilityWarning,
                 stacklevel=3,
             )

@@ -45,8 +45,8 @@ class JointSolution:
         d of each exposure.
     objective : list of float
         F before each step; τ follows the weights, so it may rise a little.
-    std : ndarray, shape (rows, cols)
-        Standard deviation of the sensitivity; the penalty counts as a measurement.
+    covariance : ndarray, shape (rows * cols, rows * cols)
+        Covariance of the sensitivity; the penalty counts as a measurement.
     dark_std : ndarray, shape (rows, cols)
         Standard deviation of the offset.
     dark_along_std : float
@@ -62,10 +62,15 @@ class JointSolution:
     flux: Array
     shifts: Array
     objective: list[float]
-    std: Array
+    covariance: Array
     dark_std: Array
     dark_along_std: float
     shift_std: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of the sensitivity, shape (rows, cols)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)).reshape(self.sensitivity.shape))
 
 
 def joint(
@@ -170,7 +175,7 @@ def joint(
     sensitivity, offset, beam, theta, zeta = np.split(x, ends[:-1])
     places = measured + (by_zeta @ zeta).reshape(count, 2)
     logs = np.log(given) + by_theta @ theta
-    sensitivity = np.where(weight > 0, sensitivity, np.nan)
+    sensitivity = found = np.where(weight > 0, sensitivity, np.nan)
     beam = grid.at_cells(beam, weights)
     if isinstance(flux, str):
         if leaves_tilt:
@@ -188,11 +193,12 @@ def joint(
     of_gain, of_dark, _, _, of_zeta = np.split(response, ends[:-1])
     if leaves_tilt:
         # The gauge takes the slope out of a change of ln M.
+        of_gain = of_gain * (sensitivity / found)[:, None]
         valid = sensitivity > 0
         slopes = grid.slope_of(valid, (of_gain.T / sensitivity)[:, valid].T)
         of_gain = of_gain - sensitivity[:, None] * (grid.unshifted @ slopes)
     of_mean = np.outer(sensitivity / scale, of_gain[weight > 0].mean(axis=0))
-    std = np.sqrt(np.sum((of_gain - of_mean) ** 2, axis=1)) / scale
+    of_gain = (of_gain - of_mean) / scale
     dark_std, dark_along_std = np.zeros(pixels), 0.0
     if sizes[1]:
         dark_std = np.sqrt(np.sum(of_dark**2, axis=1))
@@ -209,7 +215,7 @@ def joint(
         flux=np.exp(logs),
         shifts=places,
         objective=history,
-        std=std.reshape(rows, cols),
+        covariance=of_gain @ of_gain.T,
         dark_std=dark_std.reshape(rows, cols),
         dark_along_std=dark_along_std,
         shift_std=np.sqrt(left),

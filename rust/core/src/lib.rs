@@ -38,6 +38,7 @@
 //! linalg          sparse Cholesky factors
 //! parallel        threads; the same bytes for any number of them
 //! memory          what memory may still be had
+//! random          random signs
 //! control         cancellation and progress
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
