@@ -16,9 +16,13 @@ mod freedom;
 mod gauge;
 mod grid;
 mod kernel;
+mod pass;
 mod penalty;
 mod precondition;
+mod rim;
+mod survey;
 mod system;
+mod wide;
 
 pub use flux::Flux;
 
@@ -61,7 +65,9 @@ const CURVED: [f64; 2] = [1e-8, 0.03];
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
 /// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
-/// Products that an ordinary fit takes: what progress is measured against at first.
+/// Passes over the measurements that a look takes at most: M, the weights, a product.
+const A_LOOK: u64 = 3;
+/// Passes that an ordinary fit takes: what progress is measured against at first.
 const TYPICAL: u64 = 120;
 
 /// What is unknown besides sensitivity and beam.
@@ -152,7 +158,6 @@ pub fn solve<T: Real>(
     let mut system = start(model, rotations, unknowns, workers, control)?;
     let mut search = Search::default();
     let mut looks: Vec<Look> = Vec::new();
-    let mut products = FIRST_SWEEPS as u64;
     let mut taken: Option<Vec<f64>> = None;
     let mut halvings = 0;
     let mut stuck = false;
@@ -162,7 +167,6 @@ pub fn solve<T: Real>(
     let mut shifts = shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
-        products += 1;
         let highest = looks
             .last()
             .map_or(f64::INFINITY, |last| last.objective + rounding(model, last.objective));
@@ -184,8 +188,7 @@ pub fn solve<T: Real>(
             if !model.variance_is_known() {
                 system.unit = system.misfit / freedom(&system);
             }
-            system.penalty = None;
-            system.linearise(SMOOTHING, control)?
+            system.renew(SMOOTHING, control)?
         } else {
             (objective, slope)
         };
@@ -195,8 +198,7 @@ pub fn solve<T: Real>(
         };
         search.begin(&system, &two_level, slope);
         let first = search.product(&mut system, control)?;
-        products += 1;
-        looks.push(Look { sweep: products, objective, error: first / search.smallest });
+        looks.push(Look { sweep: products(&system), objective, error: first / search.smallest });
         let near = first / search.smallest <= BEFORE_SHIFTS.max(stop.tolerance)
             && search.iterations >= FEWEST_ITERATIONS;
         if let Some(prior) = shift_prior.take_if(|_| near) {
@@ -219,13 +221,13 @@ pub fn solve<T: Real>(
             return Ok(fit);
         }
         let reachable = first * first.clamp(CURVED[0], CURVED[1]);
-        while products + 1 < limit {
-            control.report("calibrate", products, TYPICAL.max(products).min(limit));
+        while products(&system) + A_LOOK < limit {
+            let done = products(&system);
+            control.report("calibrate", done, TYPICAL.max(done).min(limit));
             if !search.step(&system, &two_level) {
                 break;
             }
             let size = search.product(&mut system, control)?;
-            products += 1;
             let near = size <= reachable || size / search.smallest <= AIM * stop.tolerance;
             if near && search.iterations >= FEWEST_ITERATIONS {
                 break;
@@ -235,8 +237,7 @@ pub fn solve<T: Real>(
         if let Some(penalty) = &system.penalty {
             // A multiple of the beam is no step, but the penalty would see one.
             let cells = system.state.beam.len();
-            let relative = penalty.relative(&system.state.beam, &step[..cells], workers);
-            step[..cells].copy_from_slice(&relative);
+            penalty.relative(&system.state.beam, &mut step[..cells], workers);
         }
         advance(&mut system, &step, 1.0);
         taken = Some(step);
@@ -255,6 +256,11 @@ pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>) -> u64 {
         + crate::precondition::bytes_needed(geometry)
 }
 
+/// Passes over the measurements so far.
+fn products<T: Real>(system: &System<'_, '_, T>) -> u64 {
+    FIRST_SWEEPS as u64 + system.passes
+}
+
 /// Why it has ended, if it has.
 fn ended(looks: &[Look], search: &Search, stop: &Stop, limit: u64, stuck: bool) -> Option<Ended> {
     let last = looks.last()?;
@@ -262,7 +268,7 @@ fn ended(looks: &[Look], search: &Search, stop: &Stop, limit: u64, stuck: bool) 
     let stalled = stalled_since(looks).is_some_and(|earlier| earlier >= SETTLING);
     if (search.iterations >= FEWEST_ITERATIONS || settled) && last.error <= stop.tolerance {
         Some(Ended::Converged)
-    } else if last.sweep + 1 >= limit {
+    } else if last.sweep + A_LOOK >= limit {
         Some(Ended::SweepsUsed)
     } else if stuck || stalled {
         Some(Ended::Stalled)
@@ -466,12 +472,11 @@ struct Search {
     x: Vec<f64>,
     residual: Vec<f64>,
     direction: Vec<f64>,
+    /// S times the direction, then P⁻¹ r.
     product: Vec<f64>,
     square: f64,
     keep: f64,
     ritz: Ritz,
-    /// The change of M that goes with the direction.
-    change: Vec<f64>,
     /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
     smallest: f64,
     iterations: u64,
@@ -491,12 +496,11 @@ impl Search {
         }
         self.sees_large_scales = preconditioner.sees_large_scales();
         self.x = vec![0.0; slope.len()];
-        self.direction = preconditioner.apply(system, &slope);
+        preconditioner.apply(system, &slope, &mut self.direction);
         self.square = system.workers.dot(&slope, &self.direction);
         self.residual = slope;
         self.keep = 0.0;
         self.ritz = Ritz::default();
-        self.change.clear();
     }
 
     /// Multiplies S by the direction; returns the largest relative change of M that goes with P⁻¹ r.
@@ -505,8 +509,8 @@ impl Search {
         system: &mut System<'_, '_, T>,
         control: &Control,
     ) -> Result<f64> {
-        self.product = system.multiply(&self.direction, control)?;
-        let size = system.largest_change(self.keep, &mut self.change) / system.mean_sensitivity();
+        let Self { direction, product, keep, .. } = self;
+        let size = system.multiply(direction, product, *keep, control)? / system.mean;
         let known = size.is_finite() && self.square.is_finite() && self.sees_large_scales;
         Ok(if known { size } else { f64::INFINITY })
     }
@@ -524,11 +528,11 @@ impl Search {
         }
         workers.add_multiple(&mut self.x, step, &self.direction);
         workers.add_multiple(&mut self.residual, -step, &self.product);
-        let mut direction = preconditioner.apply(system, &self.residual);
-        let square = workers.dot(&self.residual, &direction);
+        preconditioner.apply(system, &self.residual, &mut self.product);
+        let square = workers.dot(&self.residual, &self.product);
         self.keep = square / self.square;
-        workers.add_multiple(&mut direction, self.keep, &self.direction);
-        self.direction = direction;
+        workers.add_multiple(&mut self.product, self.keep, &self.direction);
+        std::mem::swap(&mut self.direction, &mut self.product);
         self.ritz.push(step, self.keep);
         self.square = square;
         self.smallest = self.smallest.min(self.ritz.smallest());

@@ -5,13 +5,12 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
-use super::kernel::Add;
 use crate::frames::Shape;
-use crate::parallel::{Workers, dot};
+use crate::parallel::Workers;
 
 const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
-const BAND: usize = 16;
+const BAND: usize = 32;
 
 pub(super) struct Penalty {
     shape: Shape,
@@ -21,6 +20,9 @@ pub(super) struct Penalty {
     /// D a and aᵀ D a.
     pull: Vec<f64>,
     norm: f64,
+    /// GᵀG a and ‖G a‖².
+    bent: Vec<f64>,
+    energy: f64,
 }
 
 impl Penalty {
@@ -48,91 +50,91 @@ impl Penalty {
         let counted = [count(0, cols), count(1, 1)];
         let pull: Vec<f64> = weights.iter().zip(beam).map(|(d, a)| d * a).collect();
         let norm = workers.dot(&pull, beam);
-        Self { shape, tau, counted, pull, norm }
-    }
-
-    /// The diagonal of τ GᵀG.
-    pub(super) fn diagonal(&self) -> Vec<f64> {
-        let mut diagonal = vec![0.0; self.pull.len()];
-        for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
-            for (cell, counted) in counted.iter().enumerate().filter(|(_, counted)| **counted > 0.0)
-            {
-                for (i, factor) in FOURTH.iter().enumerate() {
-                    diagonal[cell + i * step] += self.tau * counted * factor * factor;
-                }
-            }
-        }
-        diagonal
+        let bent = vec![0.0; shape.len()];
+        let mut penalty = Self { shape, tau, counted, pull, norm, bent, energy: 0.0 };
+        let mut bent = vec![0.0; shape.len()];
+        penalty.add_curvature(beam, 1.0, &mut bent, workers);
+        penalty.energy = workers.dot(&bent, beam);
+        penalty.bent = bent;
+        penalty
     }
 
     /// P x.
-    pub(super) fn relative(&self, beam: &[f64], x: &[f64], workers: &Workers) -> Vec<f64> {
+    pub(super) fn relative(&self, beam: &[f64], x: &mut [f64], workers: &Workers) {
         let scale = workers.dot(&self.pull, x) / self.norm;
-        let mut relative = x.to_vec();
-        workers.add_multiple(&mut relative, -scale, beam);
-        relative
+        workers.add_multiple(x, -scale, beam);
     }
 
-    /// Adds `share` τ Pᵀ GᵀG x to `sums`; returns τ ‖G x‖².
-    pub(super) fn add(
-        &self,
-        beam: &[f64],
-        mut x: Vec<f64>,
-        share: f64,
-        sums: &mut [f64],
-        workers: &Workers,
-    ) -> f64 {
-        let (differences, energy) = self.differences(&x, workers);
-        self.adjoint(&differences, &mut x, workers);
-        let scale = workers.dot(beam, &x) / self.norm;
-        workers.add_multiple(&mut x, -scale, &self.pull);
-        workers.add_multiple(sums, share * self.tau, &x);
-        self.tau * energy
+    /// Takes τ Pᵀ GᵀG a from a slope; returns τ ‖G a‖².
+    pub(super) fn pull(&self, slope: &mut [f64], workers: &Workers) -> f64 {
+        workers.add_multiple(slope, -self.tau, &self.bent);
+        workers.add_multiple(slope, self.tau * self.energy / self.norm, &self.pull);
+        self.tau * self.energy
     }
 
-    /// G x, down and along, and ‖G x‖².
-    fn differences(&self, x: &[f64], workers: &Workers) -> ([Vec<f64>; 2], f64) {
-        let cols = self.shape.cols;
-        let size = BAND * cols;
-        let mut differences = [0, 1].map(|_| vec![0.0; x.len()]);
-        let [down, along] = &mut differences;
-        let energies = workers.map_pairs(down, along, [size; 2], |band, down, along| {
-            let first = band * size;
-            let mut energy = 0.0;
-            for (axis, part, step) in [(0, down, cols), (1, along, 1)] {
-                let counted = &self.counted[axis][first..][..part.len()];
-                pulp::Arch::new().dispatch(Differ { x, first, step, counted, sums: &mut *part });
-                energy += dot(part, part);
+    /// Adds τ Pᵀ GᵀG P x to `sums`.
+    pub(super) fn add_product(&self, x: &[f64], sums: &mut [f64], workers: &Workers) {
+        let scale = workers.dot(&self.pull, x) / self.norm;
+        let back = (workers.dot(&self.bent, x) - scale * self.energy) / self.norm;
+        self.add_curvature(x, self.tau, sums, workers);
+        workers.add_multiple(sums, -scale * self.tau, &self.bent);
+        workers.add_multiple(sums, -back * self.tau, &self.pull);
+    }
+
+    /// Calls `visit(other, value)` for the elements of τ GᵀG in the row of a cell; the values of one
+    /// place add up.
+    pub(super) fn for_row(&self, cell: usize, mut visit: impl FnMut(usize, f64)) {
+        for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
+            for (i, own) in FOURTH.iter().enumerate() {
+                let Some(first) = cell.checked_sub(i * step) else { continue };
+                if counted[first] > 0.0 {
+                    for (j, other) in FOURTH.iter().enumerate() {
+                        visit(first + j * step, self.tau * own * other);
+                    }
+                }
             }
-            energy
-        });
-        (differences, energies.into_iter().sum())
+        }
     }
 
-    /// Gᵀ of differences, which are 0 where they do not count.
-    fn adjoint(&self, [down, along]: &[Vec<f64>; 2], sums: &mut [f64], workers: &Workers) {
-        let cols = self.shape.cols;
+    /// Adds `factor` GᵀG x to `sums`.
+    fn add_curvature(&self, x: &[f64], factor: f64, sums: &mut [f64], workers: &Workers) {
+        let Shape { rows, cols } = self.shape;
+        let [down, along] = &self.counted;
         workers.map_blocks(sums, BAND * cols, |band, part| {
-            part.fill(0.0);
-            for (values, step) in [(down, cols), (along, 1)] {
-                for (i, factor) in FOURTH.iter().enumerate() {
-                    // Values from so many cells further back; before the first there are none.
-                    let first = band * BAND * cols;
-                    let missing = (i * step).saturating_sub(first).min(part.len());
-                    let values = &values[first + missing - i * step..];
-                    let (factor, sums) = (*factor, &mut part[missing..]);
-                    pulp::Arch::new().dispatch(Add { factor, values, sums });
+            // Differences that begin in this row and the four before; along it with zeros around.
+            let mut differences = [(); 5].map(|()| vec![0.0; cols]);
+            let mut beside = vec![0.0; cols + 4];
+            let first = band * BAND;
+            for row in first.saturating_sub(4)..first + part.len() / cols {
+                differences.rotate_left(1);
+                let line = |i: usize| &x[(row + i) * cols..][..cols];
+                let sums = &mut differences[4][..];
+                if row + 4 < rows {
+                    let (values, counted) = (std::array::from_fn(line), &down[row * cols..]);
+                    pulp::Arch::new().dispatch(Differ { values, counted, sums });
+                } else {
+                    sums.fill(0.0);
+                }
+                let Some(own) = row.checked_sub(first) else { continue };
+                let part = &mut part[own * cols..][..cols];
+                let values = [4, 3, 2, 1, 0].map(|i| &differences[i][..]);
+                pulp::Arch::new().dispatch(Bend { values, factor, sums: &mut *part });
+                if cols > 4 {
+                    let (line, counted) = (line(0), &along[row * cols..]);
+                    let (values, sums) =
+                        (std::array::from_fn(|i| &line[i..cols - 4 + i]), &mut beside[4..cols]);
+                    pulp::Arch::new().dispatch(Differ { values, counted, sums });
+                    let values = [4, 3, 2, 1, 0].map(|i| &beside[i..cols + i]);
+                    pulp::Arch::new().dispatch(Bend { values, factor, sums: part });
                 }
             }
         });
     }
 }
 
-/// Fourth differences of x from a cell on, where they count.
+/// Fourth differences, where they count.
 struct Differ<'s> {
-    x: &'s [f64],
-    first: usize,
-    step: usize,
+    values: [&'s [f64]; 5],
     counted: &'s [f64],
     sums: &'s mut [f64],
 }
@@ -142,14 +144,30 @@ impl pulp::NullaryFnOnce for Differ<'_> {
 
     #[inline(always)]
     fn call(self) {
-        // Behind the last cell nothing counts.
-        let reach = 4 * self.step;
-        let whole = self.sums.len().min(self.x.len().saturating_sub(self.first + reach));
-        let [a, b, c, d, e] =
-            [0, 1, 2, 3, 4].map(|i| &self.x[(self.first + i * self.step).min(self.x.len())..]);
+        let [a, b, c, d, e] = self.values;
         let inputs = a.iter().zip(b).zip(c).zip(d).zip(e).zip(self.counted);
-        for (sum, (((((a, b), c), d), e), counted)) in self.sums[..whole].iter_mut().zip(inputs) {
+        for (sum, (((((a, b), c), d), e), counted)) in self.sums.iter_mut().zip(inputs) {
             *sum = counted * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
+        }
+    }
+}
+
+/// Adds a multiple of fourth differences.
+struct Bend<'s> {
+    values: [&'s [f64]; 5],
+    factor: f64,
+    sums: &'s mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Bend<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [a, b, c, d, e] = self.values;
+        let inputs = a.iter().zip(b).zip(c).zip(d).zip(e);
+        for (sum, ((((a, b), c), d), e)) in self.sums.iter_mut().zip(inputs) {
+            *sum += self.factor * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
         }
     }
 }
@@ -169,17 +187,24 @@ mod tests {
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
         let penalty = Penalty::new(shape, &beam, &weights, 1.0, &workers);
-        let energy = |penalty: &Penalty, beam: &[f64], x: &[f64]| {
-            let relative = penalty.relative(beam, x, &workers);
-            penalty.add(beam, relative, 1.0, &mut vec![0.0; 99], &workers)
+        let product = |x: &[f64]| {
+            let mut sums = vec![0.0; 99];
+            penalty.add_product(x, &mut sums, &workers);
+            sums
         };
+        let energy = |x: &[f64]| product(x).iter().zip(x).map(|(s, x)| s * x).sum::<f64>();
         let twice: Vec<f64> = beam.iter().map(|a| 2.0 * a).collect();
+        // Sums of some 99 · 30 products of size 1000.
+        assert!(energy(&twice).abs() < 1e-9);
+        assert!(energy(&cubic) > 1.0);
         // Values to 1000, differences of sums of 16 of them.
-        assert!(energy(&penalty, &beam, &twice) < 1e-25);
-        assert!(energy(&penalty, &beam, &cubic) > 1.0);
-        assert!(penalty.add(&beam, cubic, 1.0, &mut vec![0.0; 99], &workers) < 1e-15);
+        let mut bent = vec![0.0; 99];
+        penalty.add_curvature(&cubic, 1.0, &mut bent, &workers);
+        assert!(bent.iter().all(|value| value.abs() < 1e-9));
         // Row 5 of 9 is in four of five differences down, column 5 of 11 in all five along.
-        assert!(penalty.diagonal()[60] == 69.0 + 70.0);
+        let mut diagonal = 0.0;
+        penalty.for_row(60, |other, value| diagonal += if other == 60 { value } else { 0.0 });
+        assert!(diagonal == 69.0 + 70.0);
     }
 
     #[test]
@@ -191,12 +216,16 @@ mod tests {
         let penalty = Penalty::new(shape, &beam, &[1.0; 56], 0.7, &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 56];
-            let relative = penalty.relative(&beam, x, &workers);
-            let energy = penalty.add(&beam, relative, 1.0, &mut sums, &workers);
-            (sums, energy)
+            penalty.add_product(x, &mut sums, &workers);
+            sums
         };
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let ((ax, energy), (ay, _)) = (product(&x), product(&y));
+        let (ax, ay) = (product(&x), product(&y));
+        let mut relative = x.clone();
+        penalty.relative(&beam, &mut relative, &workers);
+        let mut bent = vec![0.0; 56];
+        penalty.add_curvature(&relative, 0.7, &mut bent, &workers);
+        let energy = dot(&bent, &relative);
         // Sums of some 56 · 20 products of size 100.
         assert!((dot(&ax, &y) - dot(&ay, &x)).abs() < 1e-10);
         assert!((dot(&ax, &x) - energy).abs() < 1e-10);
