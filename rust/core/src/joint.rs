@@ -245,14 +245,27 @@ pub fn solve<T: Real>(
     }
 }
 
-/// What the joint fit holds beside the measurements at its fullest, in bytes: the light and the pulls
-/// of each measurement, five numbers a pixel, and for each cell five vectors, weights, penalty and two
-/// copies for each view.
-pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>) -> u64 {
+/// What the joint fit holds beside the measurements at its fullest, in bytes:
+///
+/// | array | in bytes |
+/// |---|---|
+/// | the light of each measurement | 8 |
+/// | M, its normal matrix, its change; O and two more elements | 24 or 48 for each pixel |
+/// | the sums of all bands ([`pass`]) | 8 · 2.2 at most for each cell of each view |
+/// | the beam, seven vectors of a search, weights, the penalty, the preconditioner | 8 · 16 for each cell |
+/// | with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
+/// | the rim and its factor | some 2000 for each of six cells of each row and column |
+/// | the result and its components | 30 for each pixel, 21 for each cell |
+pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>, unknowns: &Unknowns) -> u64 {
     let geometry = &model.geometry;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let (count, views) = (model.count() as u64, geometry.views.len() as u64);
-    8 * ((2 * count + 7) * pixels + (16 + 2 * views) * cells)
+    let of_pixel = 8 * count + if unknowns.offset { 48 } else { 24 } + 30;
+    let turned = if views > 1 { 24 * views } else { 0 };
+    let rim = 12_000 * (geometry.beam.rows + geometry.beam.cols) as u64;
+    of_pixel * pixels
+        + (18 * views + turned + 149) * cells
+        + rim
         + crate::precondition::bytes_needed(geometry)
 }
 
@@ -294,7 +307,7 @@ fn start<'m, 'a, T: Real>(
         descent.sweep(control)?;
     }
     let state = State {
-        beam: first_beam(&grid, model, &descent.beam()),
+        beam: first_beam(&grid, model, &descent.beam(), workers, control)?,
         theta: vec![0.0; fluxes.columns.len()],
         shifts: unknowns.shifts.clone(),
     };
@@ -310,42 +323,51 @@ fn shift_prior(unknowns: &Unknowns) -> Option<ShiftPrior> {
 }
 
 /// A beam known where pixels look at whole shifts, on the grid: cells around take what is beside them.
-fn first_beam<T: Real>(grid: &Grid, model: &Model<'_, T>, known: &[f64]) -> Vec<f64> {
+fn first_beam<T: Real>(
+    grid: &Grid,
+    model: &Model<'_, T>,
+    known: &[f64],
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<f64>> {
     let (shape, origin) = (grid.geometry.beam, grid.geometry.origin);
     let (from, start) = (model.geometry.beam, model.geometry.origin);
     let mut beam = vec![0.0; shape.len()];
-    for (cell, value) in beam.iter_mut().enumerate() {
-        let row = (cell / shape.cols + start[0]).checked_sub(origin[0]);
-        let col = (cell % shape.cols + start[1]).checked_sub(origin[1]);
-        if let (Some(row), Some(col)) = (row, col)
-            && row < from.rows
-            && col < from.cols
-        {
-            *value = known[row * from.cols + col];
+    workers.map_blocks(&mut beam, shape.cols, |row, cells| {
+        let row = (row + start[0]).checked_sub(origin[0]).filter(|&row| row < from.rows);
+        let Some(row) = row else { return };
+        for (col, value) in cells.iter_mut().enumerate() {
+            let col = (col + start[1]).checked_sub(origin[1]).filter(|&col| col < from.cols);
+            *value = col.map_or(0.0, |col| known[row * from.cols + col]);
         }
-    }
+    });
     if !grid.is_spline() {
-        return beam;
+        return Ok(beam);
     }
     // As far as factors and margins reach beyond the nearest whole shift.
     for _ in 0..grid.width {
+        control.check()?;
         let before = beam.clone();
-        for (cell, value) in beam.iter_mut().enumerate().filter(|(_, value)| **value == 0.0) {
-            let (row, col) = (cell / shape.cols, cell % shape.cols);
-            let beside = [
-                (row > 0).then(|| cell - shape.cols),
-                (row + 1 < shape.rows).then(|| cell + shape.cols),
-                (col > 0).then(|| cell - 1),
-                (col + 1 < shape.cols).then(|| cell + 1),
-            ];
-            let lit = beside.into_iter().flatten().map(|cell| before[cell]).filter(|&a| a != 0.0);
-            let (sum, count) = lit.fold((0.0, 0.0), |(sum, count), a| (sum + a, count + 1.0));
-            if count > 0.0 {
-                *value = sum / count;
+        workers.map_blocks(&mut beam, shape.cols, |row, cells| {
+            let dark = cells.iter_mut().enumerate().filter(|(_, value)| **value == 0.0);
+            for (col, value) in dark {
+                let cell = row * shape.cols + col;
+                let beside = [
+                    (row > 0).then(|| cell - shape.cols),
+                    (row + 1 < shape.rows).then(|| cell + shape.cols),
+                    (col > 0).then(|| cell - 1),
+                    (col + 1 < shape.cols).then(|| cell + 1),
+                ];
+                let lit = beside.into_iter().flatten().map(|cell| before[cell]);
+                let lit = lit.filter(|&a| a != 0.0);
+                let (sum, count) = lit.fold((0.0, 0.0), |(sum, count), a| (sum + a, count + 1.0));
+                if count > 0.0 {
+                    *value = sum / count;
+                }
             }
-        }
+        });
     }
-    beam
+    Ok(beam)
 }
 
 /// Takes a share of a step.

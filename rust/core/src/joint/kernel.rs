@@ -49,30 +49,6 @@ impl pulp::NullaryFnOnce for Combine<'_> {
     }
 }
 
-/// sums += f · values.
-pub(super) struct Add<'s> {
-    pub(super) factor: f64,
-    pub(super) values: &'s [f64],
-    pub(super) sums: &'s mut [f64],
-}
-
-impl Add<'_> {
-    pub(super) fn dispatch(self) {
-        pulp::Arch::new().dispatch(self);
-    }
-}
-
-impl pulp::NullaryFnOnce for Add<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        for (sum, value) in self.sums.iter_mut().zip(self.values) {
-            *sum += self.factor * value;
-        }
-    }
-}
-
 /// A row of values for each exposure, with [`AROUND`] zeros on either side of each.
 pub(super) struct Lines {
     values: Vec<f64>,

@@ -9,14 +9,14 @@
 use std::borrow::Cow;
 
 use super::grid::{TAPS, Taps, Window};
-use super::kernel::{AROUND, Add, Combine, Lines, Row};
+use super::kernel::{AROUND, Combine, Lines, Row};
 use super::system::System;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::geometry::{Rotation, View};
 use crate::model::Stretch;
-use crate::parallel::dot;
+use crate::parallel::{Add, dot};
 
 /// Rows of pixels in a band, at least: a band adds to as many rows of cells and those that shifts reach.
 const FEWEST_ROWS: usize = 32;
@@ -107,9 +107,12 @@ impl Room {
     pub(super) fn begin(&mut self, light: &[f64], shares: &[f64], moves: &[[f64; 2]]) {
         let cols = light.len() / shares.len();
         let values = &mut self.lines[TAPS - 1];
+        values.clear();
         for (k, (light, share)) in light.chunks_exact(cols).zip(shares).enumerate() {
             let values = values.of_mut(k);
-            values.iter_mut().zip(light).for_each(|(value, light)| *value = share * light);
+            if *share != 0.0 {
+                Add { factor: *share, values: light, sums: &mut *values }.dispatch();
+            }
             for (slopes, &factor) in self.slopes.iter().zip(moves.get(k).into_iter().flatten()) {
                 Add { factor, values: &slopes[k * cols..][..cols], sums: &mut *values }.dispatch();
             }

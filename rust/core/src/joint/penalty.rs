@@ -48,7 +48,11 @@ impl Penalty {
             counted
         };
         let counted = [count(0, cols), count(1, 1)];
-        let pull: Vec<f64> = weights.iter().zip(beam).map(|(d, a)| d * a).collect();
+        let mut pull = vec![0.0; shape.len()];
+        workers.map_blocks(&mut pull, cols, |row, pull| {
+            let cells = weights[row * cols..].iter().zip(&beam[row * cols..]);
+            pull.iter_mut().zip(cells).for_each(|(pull, (d, a))| *pull = d * a);
+        });
         let norm = workers.dot(&pull, beam);
         let bent = vec![0.0; shape.len()];
         let mut penalty = Self { shape, tau, counted, pull, norm, bent, energy: 0.0 };

@@ -52,15 +52,21 @@ impl Rim {
             let own = cells[first..].iter().take(BLOCK).enumerate();
             for (index, &cell) in own {
                 let (cell, number) = (cell as usize, (first + index) as u32);
+                let mut row: Vec<(u32, f64)> = Vec::new();
                 let mut sum = 0.0;
                 system.for_neighbours(cell, |other, value| {
                     sum += if other == cell { value } else { 0.0 };
                     if let Some(&other) = numbers.get(other)
                         && other <= number
                     {
-                        entries.push((number, other, value));
+                        row.push((other, value));
                     }
                 });
+                row.sort_by_key(|&(other, _)| other);
+                let places = row.chunk_by(|a, b| a.0 == b.0);
+                entries.extend(places.map(|place| {
+                    (number, place[0].0, place.iter().map(|(_, value)| value).sum::<f64>())
+                }));
                 diagonal.push(sum);
             }
             Ok((entries, diagonal))

@@ -26,18 +26,25 @@ impl Wide {
         let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
+        let of = |value: &(dyn Fn(usize) -> f32 + Sync)| {
+            let mut values = vec![0.0; beam.len()];
+            system.workers.map_blocks(&mut values, cols, |row, values| {
+                let cells = values.iter_mut().zip(row * cols..);
+                cells.for_each(|(each, cell)| *each = value(cell));
+            });
+            values
+        };
         let slopes = [cols, 1].map(|step| {
-            let mut slopes = vec![0.0; beam.len()];
-            if system.grid.is_spline() {
-                for cell in step..beam.len() - step {
-                    if [cell - step, cell, cell + step].into_iter().all(seen) {
-                        slopes[cell] = ((beam[cell + step] - beam[cell - step]) / 6.0) as f32;
-                    }
+            of(&|cell: usize| {
+                let inside = system.grid.is_spline() && cell >= step && cell + step < beam.len();
+                if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
+                    ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
+                } else {
+                    0.0
                 }
-            }
-            slopes
+            })
         });
-        Self { hats, cols, beam: (0..beam.len()).map(level).collect(), slopes }
+        Self { hats, cols, beam: of(&level), slopes }
     }
 
     /// Φᵀ r.
