@@ -227,6 +227,7 @@ pub fn solve<T: Real>(
             if !search.step(&system, &two_level) {
                 break;
             }
+            control.check()?;
             let size = search.product(&mut system, control)?;
             let near = size <= reachable || size / search.smallest <= AIM * stop.tolerance;
             if near && search.iterations >= FEWEST_ITERATIONS {

@@ -180,6 +180,7 @@ impl<T: Real> System<'_, '_, T> {
         self.passes += 1;
         control.check()?;
         self.fold(cells);
+        control.check()?;
         let mut total = self.no_sums();
         for sums in bands {
             total.objective += sums.objective;

@@ -26,41 +26,40 @@ pub(super) struct Penalty {
 }
 
 impl Penalty {
-    /// The penalty at a beam of weights D, seen where they are above 0.
-    pub(super) fn new(
-        shape: Shape,
-        beam: &[f64],
-        weights: &[f64],
-        tau: f64,
-        workers: &Workers,
-    ) -> Self {
+    /// The penalty of weight τ on beams of weights D, seen where they are above 0.
+    pub(super) fn new(shape: Shape, weights: &[f64], tau: f64, workers: &Workers) -> Self {
         let Shape { rows, cols } = shape;
-        let count = |axis: usize, step: usize| {
+        let count = |width: usize, height: usize, step: usize| {
             let mut counted = vec![0.0; shape.len()];
             workers.map_blocks(&mut counted, cols, |row, counted| {
-                for (col, counted) in counted.iter_mut().enumerate() {
-                    let inside = if axis == 0 { row + 4 < rows } else { col + 4 < cols };
-                    let cell = row * cols + col;
-                    let seen = inside && (0..5).all(|i| weights[cell + i * step] > 0.0);
-                    *counted = f64::from(u8::from(seen));
+                if row >= height || width == 0 {
+                    return;
                 }
+                let weights = std::array::from_fn(|i| &weights[row * cols + i * step..][..width]);
+                pulp::Arch::new().dispatch(Count { weights, counted: &mut counted[..width] });
             });
             counted
         };
-        let counted = [count(0, cols), count(1, 1)];
-        let mut pull = vec![0.0; shape.len()];
-        workers.map_blocks(&mut pull, cols, |row, pull| {
+        let counted =
+            [count(cols, rows.saturating_sub(4), cols), count(cols.saturating_sub(4), rows, 1)];
+        Self { shape, tau, counted, pull: Vec::new(), norm: 0.0, bent: Vec::new(), energy: 0.0 }
+    }
+
+    /// Takes the beam a of weights D that its multiples are free of.
+    pub(super) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
+        let cols = self.shape.cols;
+        self.pull.resize(beam.len(), 0.0);
+        workers.map_blocks(&mut self.pull, cols, |row, pull| {
             let cells = weights[row * cols..].iter().zip(&beam[row * cols..]);
             pull.iter_mut().zip(cells).for_each(|(pull, (d, a))| *pull = d * a);
         });
-        let norm = workers.dot(&pull, beam);
-        let bent = vec![0.0; shape.len()];
-        let mut penalty = Self { shape, tau, counted, pull, norm, bent, energy: 0.0 };
-        let mut bent = vec![0.0; shape.len()];
-        penalty.add_curvature(beam, 1.0, &mut bent, workers);
-        penalty.energy = workers.dot(&bent, beam);
-        penalty.bent = bent;
-        penalty
+        self.norm = workers.dot(&self.pull, beam);
+        let mut bent = std::mem::take(&mut self.bent);
+        bent.clear();
+        bent.resize(beam.len(), 0.0);
+        self.add_curvature(beam, 1.0, &mut bent, workers);
+        self.energy = workers.dot(&bent, beam);
+        self.bent = bent;
     }
 
     /// P x.
@@ -136,6 +135,26 @@ impl Penalty {
     }
 }
 
+/// Whether all five weights are above 0.
+struct Count<'s> {
+    weights: [&'s [f64]; 5],
+    counted: &'s mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Count<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [a, b, c, d, e] = self.weights;
+        let weights = a.iter().zip(b).zip(c).zip(d).zip(e);
+        for (counted, ((((a, b), c), d), e)) in self.counted.iter_mut().zip(weights) {
+            let least = a.min(b.min(*c)).min(d.min(*e));
+            *counted = if least > 0.0 { 1.0 } else { 0.0 };
+        }
+    }
+}
+
 /// Fourth differences, where they count.
 struct Differ<'s> {
     values: [&'s [f64]; 5],
@@ -190,7 +209,8 @@ mod tests {
         let mut weights = vec![1.0; 99];
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
-        let penalty = Penalty::new(shape, &beam, &weights, 1.0, &workers);
+        let mut penalty = Penalty::new(shape, &weights, 1.0, &workers);
+        penalty.turn_to(&beam, &weights, &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 99];
             penalty.add_product(x, &mut sums, &workers);
@@ -217,7 +237,8 @@ mod tests {
         let random = |seed: f64| (0..56).map(|i| (f64::from(i) * seed).sin() + 1.5).collect();
         let (beam, x, y): (Vec<f64>, Vec<f64>, Vec<f64>) = (random(1.7), random(2.9), random(4.1));
         let workers = Workers::new(None).unwrap();
-        let penalty = Penalty::new(shape, &beam, &[1.0; 56], 0.7, &workers);
+        let mut penalty = Penalty::new(shape, &[1.0; 56], 0.7, &workers);
+        penalty.turn_to(&beam, &[1.0; 56], &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 56];
             penalty.add_product(x, &mut sums, &workers);

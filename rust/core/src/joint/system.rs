@@ -135,19 +135,17 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.mean = self.mean_sensitivity();
         // Cells come into sight where shifts move.
         if self.weights.is_empty() || self.shift_prior.is_some() {
-            self.weigh(control)?;
+            self.weigh(tau, control)?;
         }
-        self.penalise(tau);
-        Ok(self.whole())
+        self.whole(control)
     }
 
     /// What [`linearise`](Self::linearise) gives, at weights D and a weight of the penalty of the state
     /// there.
     pub(super) fn renew(&mut self, tau: f64, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.weigh(control)?;
         self.penalty = None;
-        self.penalise(tau);
-        Ok(self.whole())
+        self.weigh(tau, control)?;
+        self.whole(control)
     }
 
     /// Where the exposures lie, and the sums that this takes.
@@ -182,14 +180,18 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// F and half the slope of −F, with the penalty and the priors.
-    fn whole(&self) -> (f64, Vec<f64>) {
+    fn whole(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
+        if let Some(penalty) = &mut self.penalty {
+            penalty.turn_to(&self.state.beam, &self.weights, self.workers);
+            control.check()?;
+        }
         let mut slope = self.pull.clone();
         let mut objective = self.misfit + self.pull_by_priors(&mut slope);
         if let Some(penalty) = &self.penalty {
-            let beam = &self.state.beam;
-            objective += penalty.pull(&mut slope[..beam.len()], self.workers);
+            objective += penalty.pull(&mut slope[..self.state.beam.len()], self.workers);
         }
-        (objective, slope)
+        control.check()?;
+        Ok((objective, slope))
     }
 
     /// What was gathered of fluxes and shifts, behind what cells got.
@@ -332,8 +334,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.fluxes.precisions.iter().chain(shifts).map(|precision| self.unit * precision).collect()
     }
 
-    /// D, Σ w c² M² over the pixels that see a cell, by their factors.
-    fn weigh(&mut self, control: &Control) -> Result<()> {
+    /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
+    fn weigh(&mut self, tau: f64, control: &Control) -> Result<()> {
         let mut weights = vec![0.0; self.state.beam.len()];
         self.pass(&mut weights, control, |system, row_index, row, room, _| {
             let cols = system.model.sensor().cols;
@@ -347,19 +349,15 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         })?;
         self.weights = weights;
-        Ok(())
-    }
-
-    /// The penalty at the beam and its weights.
-    fn penalise(&mut self, tau: f64) {
         if self.grid.is_spline() {
             let total: f64 = self.weights.iter().sum();
             let typical = self.workers.dot(&self.weights, &self.weights) / total;
-            let (shape, beam) = (self.grid.geometry.beam, &self.state.beam);
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(tau * typical, |penalty| penalty.tau);
-            self.penalty = Some(Penalty::new(shape, beam, &self.weights, tau, self.workers));
+            let shape = self.grid.geometry.beam;
+            self.penalty = Some(Penalty::new(shape, &self.weights, tau, self.workers));
         }
+        control.check()
     }
 
     /// w (c M)² of up to four pixels of a row of an exposure.

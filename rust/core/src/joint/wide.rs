@@ -5,7 +5,7 @@
 //! the beam is one.
 
 use super::system::System;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
 use crate::parallel::Workers;
 use crate::precondition::hats::Hats;
 
@@ -26,25 +26,16 @@ impl Wide {
         let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
-        let of = |value: &(dyn Fn(usize) -> f32 + Sync)| {
-            let mut values = vec![0.0; beam.len()];
-            system.workers.map_blocks(&mut values, cols, |row, values| {
-                let cells = values.iter_mut().zip(row * cols..);
-                cells.for_each(|(each, cell)| *each = value(cell));
-            });
-            values
+        let slope = |cell: usize, step: usize| {
+            let inside = system.grid.is_spline() && cell >= step && cell + step < beam.len();
+            if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
+                ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
+            } else {
+                0.0
+            }
         };
-        let slopes = [cols, 1].map(|step| {
-            of(&|cell: usize| {
-                let inside = system.grid.is_spline() && cell >= step && cell + step < beam.len();
-                if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
-                    ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
-                } else {
-                    0.0
-                }
-            })
-        });
-        Self { hats, cols, beam: of(&level), slopes }
+        let [down, along] = [cols, 1].map(|step| on_cells(system, |cell| slope(cell, step)));
+        Self { hats, cols, beam: on_cells(system, level), slopes: [down, along] }
     }
 
     /// Φᵀ r.
@@ -134,6 +125,20 @@ impl Wide {
             }
         }
     }
+}
+
+/// A value for each cell.
+fn on_cells<T: Real>(
+    system: &System<'_, '_, T>,
+    value: impl Fn(usize) -> f32 + Sync + Send,
+) -> Vec<f32> {
+    let Shape { cols, .. } = system.grid.geometry.beam;
+    let mut values = vec![0.0; system.state.beam.len()];
+    system.workers.map_blocks(&mut values, cols, |row, values| {
+        let cells = values.iter_mut().zip(row * cols..);
+        cells.for_each(|(each, cell)| *each = value(cell));
+    });
+    values
 }
 
 /// Sums of r a down a coarse cell, by the heights of the hats above and below, of r ∂a/3 along rows
