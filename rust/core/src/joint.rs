@@ -196,7 +196,7 @@ pub fn solve<T: Real>(
             Some(two_level) => two_level,
             None => Preconditioner::new(&mut system, control)?,
         };
-        search.begin(&system, &two_level, slope);
+        search.begin(&system, &two_level, slope, control)?;
         let first = search.product(&mut system, control)?;
         looks.push(Look { sweep: products(&system), objective, error: first / search.smallest });
         let near = first / search.smallest <= BEFORE_SHIFTS.max(stop.tolerance)
@@ -333,7 +333,7 @@ fn first_beam<T: Real>(
 ) -> Result<Vec<f64>> {
     let (shape, origin) = (grid.geometry.beam, grid.geometry.origin);
     let (from, start) = (model.geometry.beam, model.geometry.origin);
-    let mut beam = vec![0.0; shape.len()];
+    let mut beam = workers.filled(shape.len(), 0.0, control);
     workers.map_blocks(&mut beam, shape.cols, |row, cells| {
         let row = (row + start[0]).checked_sub(origin[0]).filter(|&row| row < from.rows);
         let Some(row) = row else { return };
@@ -346,9 +346,10 @@ fn first_beam<T: Real>(
         return Ok(beam);
     }
     // As far as factors and margins reach beyond the nearest whole shift.
+    let mut before = workers.filled(shape.len(), 0.0, control);
     for _ in 0..grid.width {
         control.check()?;
-        let before = beam.clone();
+        before.copy_from_slice(&beam);
         workers.map_blocks(&mut beam, shape.cols, |row, cells| {
             let dark = cells.iter_mut().enumerate().filter(|(_, value)| **value == 0.0);
             for (col, value) in dark {
@@ -513,17 +514,24 @@ impl Search {
         system: &System<'_, '_, T>,
         preconditioner: &Preconditioner,
         slope: Vec<f64>,
-    ) {
+        control: &Control,
+    ) -> Result<()> {
         if self.iterations == 0 {
             self.smallest = crate::precondition::DAMPING;
         }
         self.sees_large_scales = preconditioner.sees_large_scales();
-        self.x = vec![0.0; slope.len()];
+        let zeros = || system.workers.filled(slope.len(), 0.0, control);
+        self.x = zeros();
+        if self.direction.len() != slope.len() {
+            (self.direction, self.product) = (zeros(), zeros());
+        }
+        control.check()?;
         preconditioner.apply(system, &slope, &mut self.direction);
         self.square = system.workers.dot(&slope, &self.direction);
         self.residual = slope;
         self.keep = 0.0;
         self.ritz = Ritz::default();
+        Ok(())
     }
 
     /// Multiplies S by the direction; returns the largest relative change of M that goes with P⁻¹ r.

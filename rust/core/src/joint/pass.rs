@@ -140,7 +140,7 @@ pub(super) type Views<'v> = [Cow<'v, [f64]>];
 
 impl<T: Real> System<'_, '_, T> {
     /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's values,
-    /// and the slopes of the beam if shifts are sought; adds what cells get of them to `cells`.
+    /// and the slopes of the beam if shifts are sought; finds what `cells` get of them.
     pub(super) fn pass(
         &mut self,
         cells: &mut [f64],
@@ -179,7 +179,7 @@ impl<T: Real> System<'_, '_, T> {
         (self.rows, self.sums) = (rows, sums);
         self.passes += 1;
         control.check()?;
-        self.fold(cells);
+        self.fold(cells, control);
         control.check()?;
         let mut total = self.no_sums();
         for sums in bands {
@@ -236,8 +236,9 @@ impl<T: Real> System<'_, '_, T> {
         }
     }
 
-    /// Adds the sums of all bands to values on cells.
-    fn fold(&self, cells: &mut [f64]) {
+    /// What cells get: the sums of all bands.
+    fn fold(&self, cells: &mut [f64], control: &Control) {
+        self.workers.fill(cells, 0.0, control);
         let (bands, sums) = (&self.bands, &self.sums[..]);
         for (index, view) in self.grid.geometry.views.iter().enumerate() {
             let cols = view.shape.cols;
@@ -255,7 +256,7 @@ impl<T: Real> System<'_, '_, T> {
             if view.rotation == Rotation::None {
                 fold_all(cells);
             } else {
-                let mut found = vec![0.0; view.shape.len()];
+                let mut found = self.workers.filled(view.shape.len(), 0.0, control);
                 fold_all(&mut found);
                 self.turn_back(view, &found, cells);
             }

@@ -5,6 +5,7 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
+use crate::control::Control;
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
@@ -27,10 +28,17 @@ pub(super) struct Penalty {
 
 impl Penalty {
     /// The penalty of weight τ on beams of weights D, seen where they are above 0.
-    pub(super) fn new(shape: Shape, weights: &[f64], tau: f64, workers: &Workers) -> Self {
+    pub(super) fn new(
+        shape: Shape,
+        weights: &[f64],
+        tau: f64,
+        workers: &Workers,
+        control: &Control,
+    ) -> Self {
         let Shape { rows, cols } = shape;
+        let zeros = || workers.filled(shape.len(), 0.0, control);
         let count = |width: usize, height: usize, step: usize| {
-            let mut counted = vec![0.0; shape.len()];
+            let mut counted = zeros();
             workers.map_blocks(&mut counted, cols, |row, counted| {
                 if row >= height || width == 0 {
                     return;
@@ -42,21 +50,20 @@ impl Penalty {
         };
         let counted =
             [count(cols, rows.saturating_sub(4), cols), count(cols.saturating_sub(4), rows, 1)];
-        Self { shape, tau, counted, pull: Vec::new(), norm: 0.0, bent: Vec::new(), energy: 0.0 }
+        let (pull, bent) = (zeros(), zeros());
+        Self { shape, tau, counted, pull, norm: 0.0, bent, energy: 0.0 }
     }
 
     /// Takes the beam a of weights D that its multiples are free of.
     pub(super) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
         let cols = self.shape.cols;
-        self.pull.resize(beam.len(), 0.0);
         workers.map_blocks(&mut self.pull, cols, |row, pull| {
             let cells = weights[row * cols..].iter().zip(&beam[row * cols..]);
             pull.iter_mut().zip(cells).for_each(|(pull, (d, a))| *pull = d * a);
         });
         self.norm = workers.dot(&self.pull, beam);
         let mut bent = std::mem::take(&mut self.bent);
-        bent.clear();
-        bent.resize(beam.len(), 0.0);
+        workers.map_blocks(&mut bent, cols, |_, bent| bent.fill(0.0));
         self.add_curvature(beam, 1.0, &mut bent, workers);
         self.energy = workers.dot(&bent, beam);
         self.bent = bent;
@@ -209,7 +216,7 @@ mod tests {
         let mut weights = vec![1.0; 99];
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
-        let mut penalty = Penalty::new(shape, &weights, 1.0, &workers);
+        let mut penalty = Penalty::new(shape, &weights, 1.0, &workers, &Control::default());
         penalty.turn_to(&beam, &weights, &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 99];
@@ -237,7 +244,7 @@ mod tests {
         let random = |seed: f64| (0..56).map(|i| (f64::from(i) * seed).sin() + 1.5).collect();
         let (beam, x, y): (Vec<f64>, Vec<f64>, Vec<f64>) = (random(1.7), random(2.9), random(4.1));
         let workers = Workers::new(None).unwrap();
-        let mut penalty = Penalty::new(shape, &[1.0; 56], 0.7, &workers);
+        let mut penalty = Penalty::new(shape, &[1.0; 56], 0.7, &workers, &Control::default());
         penalty.turn_to(&beam, &[1.0; 56], &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 56];

@@ -104,7 +104,7 @@ impl Preconditioner {
         let mut inverse: Vec<f64> = weights.iter().map(told).collect();
         rim.cells().for_each(|cell| inverse[cell] = 0.0);
         let params = whole.into_iter().map(invert).collect();
-        let (wide, filters) = (Wide::new(hats, system), system.grid.is_spline());
+        let (wide, filters) = (Wide::new(hats, system, control), system.grid.is_spline());
         let cols = system.grid.geometry.beam.cols;
         Ok(Self { wide, inverse, rim, params, coarse, cols, filters })
     }
@@ -121,9 +121,7 @@ impl Preconditioner {
         let mut heights = self.wide.gather(of_cells, workers);
         heights.extend_from_slice(of_params);
         self.coarse.solve(&mut heights, DAMPING);
-        z.clear();
         z.resize(of_cells.len(), 0.0);
-        self.rim.solve(of_cells, z);
         workers.map_blocks(z, BAND * cols, |band, part| {
             let first = band * BAND;
             if self.filters {
@@ -134,6 +132,7 @@ impl Preconditioner {
             }
             self.wide.spread(&heights, first, part);
         });
+        self.rim.add(of_cells, z);
         let coarse = &heights[self.wide.hats.count()..];
         let params = of_params.iter().zip(&self.params).zip(coarse);
         z.extend(params.map(|((r, inverse), height)| r * inverse + height));
@@ -143,7 +142,7 @@ impl Preconditioner {
         shifts.copy_from_slice(moves.as_flattened());
     }
 
-    /// χ K D⁻¹ K χ r on rows of cells from `first` on; cells where χ is 0 keep what they hold.
+    /// χ K D⁻¹ K χ r on rows of cells from `first` on.
     fn filter(&self, r: &[f64], first: usize, z: &mut [f64]) {
         let (cols, around) = (self.cols, FILTER.len() / 2);
         let [mut before, mut between] = [(); 2].map(|()| Window::new(cols));
@@ -174,7 +173,7 @@ impl Preconditioner {
                 let row = of(first + own);
                 let output = found.iter().zip(&self.inverse[row]);
                 for (z, (found, d)) in z[of(own)].iter_mut().zip(output) {
-                    *z = if *d > 0.0 { *found } else { *z };
+                    *z = if *d > 0.0 { *found } else { 0.0 };
                 }
             }
         }

@@ -38,7 +38,8 @@ impl Rim {
         let cells = if system.grid.is_spline() { cells(system) } else { Vec::new() };
         let side = system.state.beam.len().isqrt();
         let fits = cells.len() <= WIDEST * side;
-        let mut numbers = vec![u32::MAX; if fits { system.state.beam.len() } else { 0 }];
+        let length = if fits { system.state.beam.len() } else { 0 };
+        let mut numbers = system.workers.filled(length, u32::MAX, control);
         if fits {
             for (number, &cell) in cells.iter().enumerate() {
                 numbers[cell as usize] = number as u32;
@@ -88,14 +89,14 @@ impl Rim {
         self.cells.iter().map(|&cell| cell as usize)
     }
 
-    /// (N + τ GᵀG)⁻¹ r on the rim.
-    pub(super) fn solve(&self, r: &[f64], z: &mut [f64]) {
+    /// Adds (N + τ GᵀG)⁻¹ r on the rim.
+    pub(super) fn add(&self, r: &[f64], z: &mut [f64]) {
         let mut values: Vec<f64> = self.cells().map(|cell| r[cell]).collect();
         match &self.factor {
             Some(factor) => factor.solve(&mut values),
             None => values.iter_mut().zip(&self.inverse).for_each(|(value, i)| *value *= i),
         }
-        self.cells().zip(values).for_each(|(cell, value)| z[cell] = value);
+        self.cells().zip(values).for_each(|(cell, value)| z[cell] += value);
     }
 }
 

@@ -126,7 +126,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let logs = self.fluxes.spread(&self.state.theta, self.model.count());
         self.flux = self.model.flux.iter().zip(&logs).map(|(c, log)| c * log.exp()).collect();
         let beam = std::mem::take(&mut self.state.beam);
-        let mut pull = vec![0.0; beam.len()];
+        let mut pull = self.workers.filled(beam.len(), 0.0, control);
         let found = self.solve_pixels(&beam, &mut pull, control);
         self.state.beam = beam;
         let found = found?;
@@ -185,7 +185,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             penalty.turn_to(&self.state.beam, &self.weights, self.workers);
             control.check()?;
         }
-        let mut slope = self.pull.clone();
+        let mut slope = self.workers.filled(self.pull.len(), 0.0, control);
+        slope.copy_from_slice(&self.pull);
         let mut objective = self.misfit + self.pull_by_priors(&mut slope);
         if let Some(penalty) = &self.penalty {
             objective += penalty.pull(&mut slope[..self.state.beam.len()], self.workers);
@@ -257,7 +258,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let params = self.fluxes.columns.len();
         let moves = self.centred(&x[cells + params..]);
         let beam = std::mem::take(&mut self.state.beam);
-        product.clear();
         product.resize(cells, 0.0);
         let sums = self.follow(&beam, x, &moves, product, share, control);
         self.state.beam = beam;
@@ -336,7 +336,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
     fn weigh(&mut self, tau: f64, control: &Control) -> Result<()> {
-        let mut weights = vec![0.0; self.state.beam.len()];
+        let mut weights = self.workers.filled(self.state.beam.len(), 0.0, control);
         self.pass(&mut weights, control, |system, row_index, row, room, _| {
             let cols = system.model.sensor().cols;
             system.weigh_row(row_index, room);
@@ -355,7 +355,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(tau * typical, |penalty| penalty.tau);
             let shape = self.grid.geometry.beam;
-            self.penalty = Some(Penalty::new(shape, &self.weights, tau, self.workers));
+            self.penalty = Some(Penalty::new(shape, &self.weights, tau, self.workers, control));
         }
         control.check()
     }

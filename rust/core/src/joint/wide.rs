@@ -5,6 +5,7 @@
 //! the beam is one.
 
 use super::system::System;
+use crate::control::Control;
 use crate::frames::{Real, Shape};
 use crate::parallel::Workers;
 use crate::precondition::hats::Hats;
@@ -22,7 +23,7 @@ pub(super) struct Wide {
 }
 
 impl Wide {
-    pub(super) fn new<T: Real>(hats: Hats, system: &System<'_, '_, T>) -> Self {
+    pub(super) fn new<T: Real>(hats: Hats, system: &System<'_, '_, T>, control: &Control) -> Self {
         let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
@@ -34,8 +35,9 @@ impl Wide {
                 0.0
             }
         };
-        let [down, along] = [cols, 1].map(|step| on_cells(system, |cell| slope(cell, step)));
-        Self { hats, cols, beam: on_cells(system, level), slopes: [down, along] }
+        let [down, along] =
+            [cols, 1].map(|step| on_cells(system, control, |cell| slope(cell, step)));
+        Self { hats, cols, beam: on_cells(system, control, level), slopes: [down, along] }
     }
 
     /// Φᵀ r.
@@ -130,10 +132,11 @@ impl Wide {
 /// A value for each cell.
 fn on_cells<T: Real>(
     system: &System<'_, '_, T>,
+    control: &Control,
     value: impl Fn(usize) -> f32 + Sync + Send,
 ) -> Vec<f32> {
     let Shape { cols, .. } = system.grid.geometry.beam;
-    let mut values = vec![0.0; system.state.beam.len()];
+    let mut values = system.workers.filled(system.state.beam.len(), 0.0, control);
     system.workers.map_blocks(&mut values, cols, |row, values| {
         let cells = values.iter_mut().zip(row * cols..);
         cells.for_each(|(each, cell)| *each = value(cell));
