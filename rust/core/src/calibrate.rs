@@ -138,7 +138,7 @@ pub fn calibrate_jointly<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Solution> {
-    memory::check(joint::bytes_needed(model), || {
+    memory::check(joint::bytes_needed(model, unknowns), || {
         format!("fitting {} exposures of {} jointly", model.count(), model.sensor())
     })?;
     let fit = joint::solve(model, rotations, unknowns, stop, workers, control)?;

@@ -17,9 +17,13 @@ mod freedom;
 mod gauge;
 mod grid;
 mod kernel;
+mod pass;
 mod penalty;
 mod precondition;
+mod rim;
+mod survey;
 mod system;
+mod wide;
 
 pub use covariance::Solved;
 pub(crate) use covariance::{Covariance, Functional};
@@ -64,7 +68,9 @@ const CURVED: [f64; 2] = [1e-8, 0.03];
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
 /// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
-/// Products that an ordinary fit takes: what progress is measured against at first.
+/// Passes over the measurements that a look takes at most: M, the weights, a product.
+const A_LOOK: u64 = 3;
+/// Passes that an ordinary fit takes: what progress is measured against at first.
 const TYPICAL: u64 = 120;
 
 /// What is unknown besides sensitivity and beam.
@@ -157,7 +163,6 @@ pub fn solve<T: Real>(
     let mut system = start(model, rotations, unknowns, workers, control)?;
     let mut search = Search::default();
     let mut looks: Vec<Look> = Vec::new();
-    let mut products = FIRST_SWEEPS as u64;
     let mut taken: Option<Vec<f64>> = None;
     let mut halvings = 0;
     let mut stuck = false;
@@ -167,7 +172,6 @@ pub fn solve<T: Real>(
     let mut shifts = shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
-        products += 1;
         let highest = looks
             .last()
             .map_or(f64::INFINITY, |last| last.objective + rounding(model, last.objective));
@@ -189,8 +193,7 @@ pub fn solve<T: Real>(
             if !model.variance_is_known() {
                 system.unit = system.misfit / freedom(&system);
             }
-            system.penalty = None;
-            system.linearise(SMOOTHING, control)?
+            system.renew(SMOOTHING, control)?
         } else {
             (objective, slope)
         };
@@ -198,10 +201,9 @@ pub fn solve<T: Real>(
             Some(two_level) => two_level,
             None => Preconditioner::new(&mut system, control)?,
         };
-        search.begin(&system, &two_level, slope);
+        search.begin(&system, &two_level, slope, control)?;
         let first = search.product(&mut system, control)?;
-        products += 1;
-        looks.push(Look { sweep: products, objective, error: first / search.smallest });
+        looks.push(Look { sweep: products(&system), objective, error: first / search.smallest });
         let near = first / search.smallest <= BEFORE_SHIFTS.max(stop.tolerance)
             && search.iterations >= FEWEST_ITERATIONS;
         if let Some(prior) = shift_prior.take_if(|_| near) {
@@ -224,46 +226,66 @@ pub fn solve<T: Real>(
             return Ok(fit);
         }
         let reachable = first * first.clamp(CURVED[0], CURVED[1]);
-        while products + 1 < limit {
-            control.report("calibrate", products, TYPICAL.max(products).min(limit));
+        while products(&system) + A_LOOK < limit {
+            let done = products(&system);
+            control.report("calibrate", done, TYPICAL.max(done).min(limit));
             if !search.step(&system, &two_level) {
                 break;
             }
+            control.check()?;
             let size = search.product(&mut system, control)?;
-            products += 1;
             let near = size <= reachable || size / search.smallest <= AIM * stop.tolerance;
             if near && search.iterations >= FEWEST_ITERATIONS {
                 break;
             }
         }
         let mut step = std::mem::take(&mut search.x);
-        if let Some(penalty) = &system.penalty {
-            // A multiple of the beam is no step, but the penalty would see one.
-            let cells = system.state.beam.len();
-            let relative = penalty.relative(&system.state.beam, &step[..cells], workers);
-            step[..cells].copy_from_slice(&relative);
-        }
+        // A multiple of the beam is no step, but the penalty would see one.
+        system.take_scale_out(&mut step[..system.grid.geometry.beam.len()]);
         advance(&mut system, &step, 1.0);
         taken = Some(step);
-        preconditioner = Some(two_level);
+        // Where shifts still move, cells come into sight and go out of it.
+        let moving = system.shift_prior.is_some() && looks.len() < SETTLING;
+        preconditioner = (!moving).then_some(two_level);
     }
 }
 
-/// What the joint fit holds beside the measurements at its fullest, in bytes: the light and the pulls
-/// of each measurement, five numbers a pixel, and for each cell five vectors, weights, penalty and two
-/// copies for each view.
-pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>) -> u64 {
+/// What the joint fit holds beside the measurements at its fullest, in bytes:
+///
+/// | array | in bytes |
+/// |---|---|
+/// | the light of each measurement | 8 |
+/// | M, its normal matrix, its change; O and two more elements | 24 or 48 for each pixel |
+/// | the sums of all bands ([`pass`]) | 8 · 2.2 at most for each cell of each view |
+/// | the beam, seven vectors of a search, weights, the penalty, the preconditioner | 8 · 16 for each cell |
+/// | with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
+/// | the rim and its factor | some 2000 for each of six cells of each row and column |
+/// | the result and its components | 30 for each pixel, 21 for each cell |
+pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>, unknowns: &Unknowns) -> u64 {
     let geometry = &model.geometry;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let (count, views) = (model.count() as u64, geometry.views.len() as u64);
-    8 * ((2 * count + 7) * pixels + (16 + 2 * views) * cells)
+    let of_pixel = 8 * count + if unknowns.offset { 48 } else { 24 } + 30;
+    let turned = if views > 1 { 24 * views } else { 0 };
+    let rim = 12_000 * (geometry.beam.rows + geometry.beam.cols) as u64;
+    of_pixel * pixels
+        + (18 * views + turned + 149) * cells
+        + rim
         + crate::precondition::bytes_needed(geometry)
 }
 
 /// What the covariance of a joint fit holds beside the measurements, in bytes: the fit's, and for each
 /// pixel the gauge, a change, and the map.
-pub(crate) fn bytes_needed_by_covariance<T: Real>(model: &Model<'_, T>) -> u64 {
-    bytes_needed(model) + 112 * model.geometry.sensor.len() as u64
+pub(crate) fn bytes_needed_by_covariance<T: Real>(
+    model: &Model<'_, T>,
+    unknowns: &Unknowns,
+) -> u64 {
+    bytes_needed(model, unknowns) + 112 * model.geometry.sensor.len() as u64
+}
+
+/// Passes over the measurements so far.
+fn products<T: Real>(system: &System<'_, '_, T>) -> u64 {
+    FIRST_SWEEPS as u64 + system.passes
 }
 
 /// Why it has ended, if it has.
@@ -273,7 +295,7 @@ fn ended(looks: &[Look], search: &Search, stop: &Stop, limit: u64, stuck: bool) 
     let stalled = stalled_since(looks).is_some_and(|earlier| earlier >= SETTLING);
     if (search.iterations >= FEWEST_ITERATIONS || settled) && last.error <= stop.tolerance {
         Some(Ended::Converged)
-    } else if last.sweep + 1 >= limit {
+    } else if last.sweep + A_LOOK >= limit {
         Some(Ended::SweepsUsed)
     } else if stuck || stalled {
         Some(Ended::Stalled)
@@ -299,7 +321,7 @@ fn start<'m, 'a, T: Real>(
         descent.sweep(control)?;
     }
     let state = State {
-        beam: first_beam(&grid, model, &descent.beam()),
+        beam: first_beam(&grid, model, &descent.beam(), workers, control)?,
         theta: vec![0.0; fluxes.columns.len()],
         shifts: unknowns.shifts.clone(),
     };
@@ -315,42 +337,52 @@ fn shift_prior(unknowns: &Unknowns) -> Option<ShiftPrior> {
 }
 
 /// A beam known where pixels look at whole shifts, on the grid: cells around take what is beside them.
-fn first_beam<T: Real>(grid: &Grid, model: &Model<'_, T>, known: &[f64]) -> Vec<f64> {
+fn first_beam<T: Real>(
+    grid: &Grid,
+    model: &Model<'_, T>,
+    known: &[f64],
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<f64>> {
     let (shape, origin) = (grid.geometry.beam, grid.geometry.origin);
     let (from, start) = (model.geometry.beam, model.geometry.origin);
-    let mut beam = vec![0.0; shape.len()];
-    for (cell, value) in beam.iter_mut().enumerate() {
-        let row = (cell / shape.cols + start[0]).checked_sub(origin[0]);
-        let col = (cell % shape.cols + start[1]).checked_sub(origin[1]);
-        if let (Some(row), Some(col)) = (row, col)
-            && row < from.rows
-            && col < from.cols
-        {
-            *value = known[row * from.cols + col];
+    let mut beam = workers.filled(shape.len(), 0.0, control);
+    workers.map_blocks(&mut beam, shape.cols, |row, cells| {
+        let row = (row + start[0]).checked_sub(origin[0]).filter(|&row| row < from.rows);
+        let Some(row) = row else { return };
+        for (col, value) in cells.iter_mut().enumerate() {
+            let col = (col + start[1]).checked_sub(origin[1]).filter(|&col| col < from.cols);
+            *value = col.map_or(0.0, |col| known[row * from.cols + col]);
         }
-    }
+    });
     if !grid.is_spline() {
-        return beam;
+        return Ok(beam);
     }
     // As far as factors and margins reach beyond the nearest whole shift.
+    let mut before = workers.filled(shape.len(), 0.0, control);
     for _ in 0..grid.width {
-        let before = beam.clone();
-        for (cell, value) in beam.iter_mut().enumerate().filter(|(_, value)| **value == 0.0) {
-            let (row, col) = (cell / shape.cols, cell % shape.cols);
-            let beside = [
-                (row > 0).then(|| cell - shape.cols),
-                (row + 1 < shape.rows).then(|| cell + shape.cols),
-                (col > 0).then(|| cell - 1),
-                (col + 1 < shape.cols).then(|| cell + 1),
-            ];
-            let lit = beside.into_iter().flatten().map(|cell| before[cell]).filter(|&a| a != 0.0);
-            let (sum, count) = lit.fold((0.0, 0.0), |(sum, count), a| (sum + a, count + 1.0));
-            if count > 0.0 {
-                *value = sum / count;
+        control.check()?;
+        before.copy_from_slice(&beam);
+        workers.map_blocks(&mut beam, shape.cols, |row, cells| {
+            let dark = cells.iter_mut().enumerate().filter(|(_, value)| **value == 0.0);
+            for (col, value) in dark {
+                let cell = row * shape.cols + col;
+                let beside = [
+                    (row > 0).then(|| cell - shape.cols),
+                    (row + 1 < shape.rows).then(|| cell + shape.cols),
+                    (col > 0).then(|| cell - 1),
+                    (col + 1 < shape.cols).then(|| cell + 1),
+                ];
+                let lit = beside.into_iter().flatten().map(|cell| before[cell]);
+                let lit = lit.filter(|&a| a != 0.0);
+                let (sum, count) = lit.fold((0.0, 0.0), |(sum, count), a| (sum + a, count + 1.0));
+                if count > 0.0 {
+                    *value = sum / count;
+                }
             }
-        }
+        });
     }
-    beam
+    Ok(beam)
 }
 
 /// Takes a share of a step.
@@ -478,14 +510,13 @@ struct Search {
     x: Vec<f64>,
     residual: Vec<f64>,
     direction: Vec<f64>,
+    /// S times the direction, then P⁻¹ r.
     product: Vec<f64>,
     square: f64,
     keep: f64,
     /// x · b, of which b − S x lacks some.
     energy: f64,
     ritz: Ritz,
-    /// The change of M that goes with the direction.
-    change: Vec<f64>,
     /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
     smallest: f64,
     iterations: u64,
@@ -499,19 +530,25 @@ impl Search {
         system: &System<'_, '_, T>,
         preconditioner: &Preconditioner,
         slope: Vec<f64>,
-    ) {
+        control: &Control,
+    ) -> Result<()> {
         if self.iterations == 0 {
             self.smallest = crate::precondition::DAMPING;
         }
         self.sees_large_scales = preconditioner.sees_large_scales();
-        self.x = vec![0.0; slope.len()];
-        self.direction = preconditioner.apply(system, &slope);
+        let zeros = || system.workers.filled(slope.len(), 0.0, control);
+        self.x = zeros();
+        if self.direction.len() != slope.len() {
+            (self.direction, self.product) = (zeros(), zeros());
+        }
+        control.check()?;
+        preconditioner.apply(system, &slope, &mut self.direction);
         self.square = system.workers.dot(&slope, &self.direction);
         self.residual = slope;
         self.keep = 0.0;
         self.energy = 0.0;
         self.ritz = Ritz::default();
-        self.change.clear();
+        Ok(())
     }
 
     /// Multiplies S by the direction; returns the largest relative change of M that goes with P⁻¹ r.
@@ -520,8 +557,8 @@ impl Search {
         system: &mut System<'_, '_, T>,
         control: &Control,
     ) -> Result<f64> {
-        self.product = system.multiply(&self.direction, control)?;
-        let size = system.largest_change(self.keep, &mut self.change) / system.mean_sensitivity();
+        let Self { direction, product, keep, .. } = self;
+        let size = system.multiply(direction, product, *keep, control)? / system.mean;
         let known = size.is_finite() && self.square.is_finite() && self.sees_large_scales;
         Ok(if known { size } else { f64::INFINITY })
     }
@@ -540,11 +577,11 @@ impl Search {
         self.energy += step * self.square;
         workers.add_multiple(&mut self.x, step, &self.direction);
         workers.add_multiple(&mut self.residual, -step, &self.product);
-        let mut direction = preconditioner.apply(system, &self.residual);
-        let square = workers.dot(&self.residual, &direction);
+        preconditioner.apply(system, &self.residual, &mut self.product);
+        let square = workers.dot(&self.residual, &self.product);
         self.keep = square / self.square;
-        workers.add_multiple(&mut direction, self.keep, &self.direction);
-        self.direction = direction;
+        workers.add_multiple(&mut self.product, self.keep, &self.direction);
+        std::mem::swap(&mut self.direction, &mut self.product);
         self.ritz.push(step, self.keep);
         self.square = square;
         self.smallest = self.smallest.min(self.ritz.smallest());

@@ -17,16 +17,51 @@ const FILLED: usize = 1 << 16;
 
 /// a · b, in several sums side by side, which vector registers hold.
 pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
-    const LANES: usize = 16;
-    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    let mut sums = [0.0; LANES];
-    for (a, b) in a.iter().zip(b) {
-        for i in 0..LANES {
-            sums[i] += a[i] * b[i];
+    pulp::Arch::new().dispatch(Dot(a, b))
+}
+
+struct Dot<'s>(&'s [f64], &'s [f64]);
+
+impl pulp::NullaryFnOnce for Dot<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn call(self) -> f64 {
+        const LANES: usize = 16;
+        let ((a, rest_a), (b, rest_b)) = (self.0.as_chunks::<LANES>(), self.1.as_chunks::<LANES>());
+        let mut sums = [0.0; LANES];
+        for (a, b) in a.iter().zip(b) {
+            for i in 0..LANES {
+                sums[i] += a[i] * b[i];
+            }
+        }
+        let rest: f64 = rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum();
+        sums.iter().sum::<f64>() + rest
+    }
+}
+
+/// sums += f · values.
+pub(crate) struct Add<'s> {
+    pub(crate) factor: f64,
+    pub(crate) values: &'s [f64],
+    pub(crate) sums: &'s mut [f64],
+}
+
+impl Add<'_> {
+    pub(crate) fn dispatch(self) {
+        pulp::Arch::new().dispatch(self);
+    }
+}
+
+impl pulp::NullaryFnOnce for Add<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (sum, value) in self.sums.iter_mut().zip(self.values) {
+            *sum += self.factor * value;
         }
     }
-    let rest: f64 = rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum();
-    sums.iter().sum::<f64>() + rest
 }
 
 /// A pool of worker threads.
@@ -137,10 +172,8 @@ impl Workers {
 
     /// y ← y + f x.
     pub(crate) fn add_multiple(&self, y: &mut [f64], factor: f64, x: &[f64]) {
-        self.map_blocks(y, FILLED, |index, part| {
-            for (y, x) in part.iter_mut().zip(&x[index * FILLED..]) {
-                *y += factor * x;
-            }
+        self.map_blocks(y, FILLED, |index, sums| {
+            Add { factor, values: &x[index * FILLED..], sums }.dispatch();
         });
     }
 

@@ -185,7 +185,7 @@ fn prepared<'m, 'a, T: Real>(
     workers: &'m Workers,
     control: &'m Control,
 ) -> Result<Covariance<'m, 'a, T>> {
-    memory::check(joint::bytes_needed_by_covariance(model), || {
+    memory::check(joint::bytes_needed_by_covariance(model, solved.unknowns), || {
         format!("the uncertainty of {} exposures of {}", model.count(), model.sensor())
     })?;
     Covariance::new(model, solved, workers, control)

@@ -18,7 +18,8 @@
 
 use super::flux::{Flux, Fluxes};
 use super::grid::Grid;
-use super::kernel::Follow;
+use super::kernel::{Follow, Row};
+use super::pass::Room;
 use super::precondition::Preconditioner;
 use super::system::{ShiftPrior, State, System};
 use super::{SMOOTHING, Search, Unknowns, gauge, shift_prior};
@@ -136,7 +137,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
 
         let mut valid = vec![0.0; sensor.len()];
         let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
-        system.for_rows(|[_, _, inverse, ..]| {
+        system.for_rows(|[_, inverse, ..]| {
             for (pixel, inverse) in (first..).zip(inverse) {
                 if *inverse > 0.0 && sensitivity[pixel].is_finite() {
                     valid[pixel] = 1.0;
@@ -244,7 +245,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
             let mut moved = vec![0.0; slope.len()];
             moved.extend(wrong);
             let pulled = self.considering(|system| {
-                let pulled = system.multiply(&moved, control);
+                let pulled = product(system, &moved, control);
                 add_change(system, &mut change);
                 pulled
             })?;
@@ -252,7 +253,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
         }
         self.solve(slope, lack, control)?;
         let x = std::mem::take(&mut self.search.x);
-        self.system.multiply(&x, control)?;
+        product(&mut self.system, &x, control)?;
         add_change(&self.system, &mut change);
         let workers = self.system.workers;
         if let Some(drift) = &self.drift {
@@ -317,7 +318,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
             x.resize(others + seen.len(), 0.0);
-            let pulled = self.considering(|system| system.multiply(&x, control))?;
+            let pulled = self.considering(|system| product(system, &x, control))?;
             let left = seen.iter().zip(&pulled[others..]).map(|(seen, pulled)| seen - pulled);
             variance += left.zip(self.considered_variances()).map(|(h, v)| h * h * v).sum::<f64>();
         }
@@ -351,7 +352,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
             system.weights.iter().map(|w| if *w > 0.0 { of_beam } else { 0.0 }).collect();
         along.extend(system.fluxes.gather(&logs));
         along.resize(pull.len(), 0.0);
-        let pulled = system.multiply(&along, control)?;
+        let pulled = product(system, &along, control)?;
         let (size, height) = (workers.dot(&along, &pulled), workers.dot(&along, &pull));
         let mut found = 0.0;
         if size > 0.0 {
@@ -389,7 +390,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
     /// Solves S x = b.
     fn solve(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
-        search.begin(system, preconditioner, b);
+        search.begin(system, preconditioner, b, control)?;
         let mut earlier = 0.0;
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
@@ -415,32 +416,22 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
             (0..self.system.model.count()).map(|k| self.stream(draw, k, 0)).collect();
         let mut of_penalty = self.other_signs(draw, Other::Penalty);
         let mut of_priors = self.other_signs(draw, Other::Priors);
-        let beams = self.system.beam_views();
         let system = &mut self.system;
-        let sums = system.pass(beams.as_deref(), control, |system, row_index, row, room| {
+        let mut slope = pull_by(system, control, |system, row_index, row, room| {
             let cols = system.model.sensor().cols;
-            for (k, flux) in system.flux.iter().enumerate() {
-                system.weigh_row(k, row_index, room);
+            let (weights, values, sums) = room.parts();
+            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&system.flux).enumerate() {
                 let mut sign = random::signs(streams[k] + row_index as u64);
-                let values = &mut room.values[k * cols..][..cols];
-                let weights = &room.weights[k * cols..];
-                for ((value, weight), m) in values.iter_mut().zip(weights).zip(&*row.sensitivity) {
+                let pixels = weights.iter().zip(&*row.sensitivity);
+                for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
                     // As a change of the light, which a pixel without response does not show.
                     let shown = weight.sqrt() * flux * m;
                     *value = if shown == 0.0 { 0.0 } else { sign() / shown };
                 }
             }
-            let [first, second] = &mut room.sums;
-            pulp::Arch::new().dispatch(Follow {
-                row,
-                fluxes: &system.flux,
-                weights: &room.weights,
-                values: &mut room.values,
-                sums: [first, second],
-            });
-            0.0
+            let fluxes = &system.flux[..];
+            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
         })?;
-        let mut slope = system.collect(sums);
         let cells = system.state.beam.len();
         if let Some(penalty) = &system.penalty {
             let beam = &system.state.beam;
@@ -469,14 +460,14 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
     /// D⁻¹ of each pixel's M.
     fn own(&self) -> Vec<f64> {
         let mut own = Vec::with_capacity(self.valid.len());
-        self.system.for_rows(|[_, _, inverse, ..]| own.extend_from_slice(inverse));
+        self.system.for_rows(|[_, inverse, ..]| own.extend_from_slice(inverse));
         own
     }
 
     /// The mean variance of an offset, by what noise does to its pixel alone.
     pub(crate) fn mean_variance_of_offset_alone(&self) -> f64 {
         let mut variances = Vec::with_capacity(self.valid.len());
-        self.system.for_rows(|[_, _, _, _, inverse, _]| variances.extend_from_slice(inverse));
+        self.system.for_rows(|[.., inverse]| variances.extend_from_slice(inverse));
         let count: f64 = self.valid.iter().map(|valid| f64::from(*valid)).sum();
         variances.iter().zip(&self.valid).map(|(v, valid)| v * f64::from(*valid)).sum::<f64>()
             / count
@@ -485,10 +476,13 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
     /// The variance of Σ g M + Σ h O of what noise does to each pixel alone.
     fn own_of(&self, gain: &[f64], offset: &[f64]) -> f64 {
         let (mut variance, mut first) = (0.0, 0);
-        self.system.for_rows(|[_, _, gains, mixed, offsets, _]| {
-            for (col, ((a, b), c)) in gains.iter().zip(mixed).zip(offsets).enumerate() {
+        self.system.for_rows(|[_, gains, _, _, mixed, offsets]| {
+            for (a, g) in gains.iter().zip(&gain[first..]) {
+                variance += a * g * g;
+            }
+            for (col, (b, c)) in mixed.iter().zip(offsets).enumerate() {
                 let (g, h) = (gain[first + col], offset[first + col]);
-                variance += a * g * g + 2.0 * b * g * h + c * h * h;
+                variance += 2.0 * b * g * h + c * h * h;
             }
             first += gains.len();
         });
@@ -504,32 +498,62 @@ fn pull_of<T: Real>(
     offset: &[f64],
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let beams = system.beam_views();
-    let sums = system.pass(beams.as_deref(), control, |system, row_index, row, room| {
+    pull_by(system, control, |system, row_index, row, room| {
         let cols = system.model.sensor().cols;
         let (gain, offset) = (&gain[row_index * cols..], &offset[row_index * cols..]);
-        let [i11, i12, i22] = row.inverse;
-        for (k, flux) in system.flux.iter().enumerate() {
-            system.weigh_row(k, row_index, room);
-            for col in 0..cols {
-                let at = k * cols + col;
-                let along_light = i11[col] * gain[col] + i12[col] * offset[col];
-                let alone = i12[col] * gain[col] + i22[col] * offset[col];
-                room.values[at] = -flux
-                    * row.sensitivity[col]
-                    * room.weights[at]
-                    * (along_light * row.light[at] + alone);
+        let [_, i12, i22] = row.offset;
+        let (weights, values, _) = room.parts();
+        for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&system.flux).enumerate() {
+            let light = &row.light[k * cols..];
+            for (col, value) in values.of_mut(k).iter_mut().enumerate() {
+                let (mut along_light, mut alone) = (row.inverse[col] * gain[col], 0.0);
+                if !i22.is_empty() {
+                    along_light += i12[col] * offset[col];
+                    alone = i12[col] * gain[col] + i22[col] * offset[col];
+                }
+                let change = along_light * light[col] + alone;
+                *value = -flux * row.sensitivity[col] * weights[col] * change;
             }
         }
-        0.0
-    })?;
-    Ok(system.collect(sums))
+    })
+}
+
+/// What pixels pull at the unknowns if `work` leaves their pulls in the room's values, with their
+/// weights beside.
+fn pull_by<T: Real>(
+    system: &mut System<'_, '_, T>,
+    control: &Control,
+    work: impl Fn(&System<'_, '_, T>, usize, Row<'_>, &mut Room) + Sync,
+) -> Result<Vec<f64>> {
+    let beam = std::mem::take(&mut system.state.beam);
+    let views = system.views_of(&beam);
+    let mut pull = vec![0.0; beam.len()];
+    let found = system.pass(&mut pull, control, |system, row_index, row, room, _| {
+        system.weigh_row(row_index, room);
+        system.see_slopes(&views, row_index, room);
+        work(system, row_index, row, room);
+    });
+    drop(views);
+    system.state.beam = beam;
+    system.append(&found?, &mut pull);
+    Ok(pull)
+}
+
+/// S x.
+fn product<T: Real>(
+    system: &mut System<'_, '_, T>,
+    x: &[f64],
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let mut product = Vec::new();
+    system.multiply(x, &mut product, 0.0, control)?;
+    Ok(product)
 }
 
 /// Adds the change of M that goes with the last product.
 fn add_change<T: Real>(system: &System<'_, '_, T>, change: &mut [f64]) {
     let mut sums = change.iter_mut();
-    system.for_rows(|[.., change]| {
+    system.for_rows(|[_, _, change, ..]| {
         sums.by_ref().zip(change).for_each(|(sum, change)| *sum += change);
     });
 }

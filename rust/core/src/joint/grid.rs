@@ -57,10 +57,6 @@ impl Taps {
         self.slopes.reverse();
         self
     }
-
-    fn squared(self) -> Self {
-        Self { values: self.values.map(|value| value * value), ..self }
-    }
 }
 
 /// Where an exposure lies in its view: pixel p sees the cells from p + (`row`, `col`) on.
@@ -73,15 +69,6 @@ pub(super) struct Window {
     pub(super) along_cols: Taps,
     /// Whether rows of the view are columns of the beam.
     pub(super) swaps_axes: bool,
-}
-
-impl Window {
-    /// The same with the squares of all factors.
-    pub(super) fn squared(mut self) -> Self {
-        self.along_rows = self.along_rows.squared();
-        self.along_cols = self.along_cols.squared();
-        self
-    }
 }
 
 /// The beam's grid, wide enough for all that the pixels see.

@@ -2,97 +2,102 @@
 
 use super::grid::TAPS;
 
+/// Zeros beside a row, which factors reach.
+pub(super) const AROUND: usize = TAPS - 1;
+/// Values side by side, which vector registers hold.
+const LANES: usize = 16;
+
 /// One exposure's place in a row: a stretch of `cols` values after those of the exposures before.
 #[inline(always)]
 fn of(values: &[f64], exposure: usize, cols: usize) -> &[f64] {
     &values[exposure * cols..][..cols]
 }
 
-/// A row of pixels as they see the beam: Σ_ij t_i u_j a(i, col + j), from rows of coefficients.
-pub(super) struct Interpolate<'s> {
-    pub(super) rows: &'s [&'s [f64]],
-    pub(super) along_rows: &'s [f64; TAPS],
-    pub(super) along_cols: &'s [f64; TAPS],
-    /// Room for a row of coefficients.
+/// Adds Σ_ij t_i u_j a(i, col + j) of rows of values to a row of sums: what pixels see of coefficients, and,
+/// with the factors reversed, what cells get of the pixels' pulls.
+pub(super) struct Combine<'s> {
+    pub(super) rows: [&'s [f64]; TAPS],
+    pub(super) along_rows: [f64; TAPS],
+    pub(super) along_cols: [f64; TAPS],
+    /// Room for a row of values.
     pub(super) room: &'s mut [f64],
-    pub(super) seen: &'s mut [f64],
+    pub(super) sums: &'s mut [f64],
 }
 
-impl pulp::NullaryFnOnce for Interpolate<'_> {
+impl Combine<'_> {
+    pub(super) fn dispatch(self) {
+        pulp::Arch::new().dispatch(self);
+    }
+}
+
+impl pulp::NullaryFnOnce for Combine<'_> {
     type Output = ();
 
     #[inline(always)]
     fn call(self) {
-        let [a, b, c, d] = self.rows else {
-            self.seen.copy_from_slice(self.rows[0]);
-            return;
-        };
-        let [s, t, u, v] = *self.along_rows;
-        for ((((sum, a), b), c), d) in self.room.iter_mut().zip(*a).zip(*b).zip(*c).zip(*d) {
-            *sum = s * a + t * b + u * c + v * d;
+        let [s, t, u, v] = self.along_rows;
+        let [a, b, c, d] = self.rows;
+        for ((((room, a), b), c), d) in self.room.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *room = s * a + t * b + u * c + v * d;
         }
-        let [s, t, u, v] = *self.along_cols;
-        let cols = self.seen.len();
+        let [s, t, u, v] = self.along_cols;
+        let cols = self.sums.len();
         let [a, b, c, d] = [0, 1, 2, 3].map(|from| &self.room[from..from + cols]);
-        for ((((seen, a), b), c), d) in self.seen.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *seen = s * a + t * b + u * c + v * d;
-        }
-    }
-}
-
-/// The adjoint along columns: sums(x) = Σ_j u_j values(x − j), where `values` has zeros around.
-pub(super) struct Spread<'s> {
-    pub(super) values: &'s [f64],
-    pub(super) along_cols: &'s [f64; TAPS],
-    pub(super) sums: &'s mut [f64],
-}
-
-impl pulp::NullaryFnOnce for Spread<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        let [s, t, u, v] = *self.along_cols;
-        let wide = self.sums.len();
-        let [d, c, b, a] = [0, 1, 2, 3].map(|from| &self.values[from..from + wide]);
         for ((((sum, a), b), c), d) in self.sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *sum = s * a + t * b + u * c + v * d;
+            *sum += s * a + t * b + u * c + v * d;
         }
     }
 }
 
-/// The adjoint along rows: sums += t · values.
-pub(super) struct Add<'s> {
-    pub(super) factor: f64,
-    pub(super) values: &'s [f64],
-    pub(super) sums: &'s mut [f64],
+/// A row of values for each exposure, with [`AROUND`] zeros on either side of each.
+pub(super) struct Lines {
+    values: Vec<f64>,
+    cols: usize,
 }
 
-impl pulp::NullaryFnOnce for Add<'_> {
-    type Output = ();
+impl Lines {
+    pub(super) fn new(exposures: usize, cols: usize) -> Self {
+        Self { values: vec![0.0; exposures * (cols + 2 * AROUND)], cols }
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.values.fill(0.0);
+    }
+
+    /// The row of one exposure.
+    #[inline(always)]
+    pub(super) fn of(&self, exposure: usize) -> &[f64] {
+        &self.values[exposure * (self.cols + 2 * AROUND) + AROUND..][..self.cols]
+    }
 
     #[inline(always)]
-    fn call(self) {
-        for (sum, value) in self.sums.iter_mut().zip(self.values) {
-            *sum += self.factor * value;
-        }
+    pub(super) fn of_mut(&mut self, exposure: usize) -> &mut [f64] {
+        &mut self.values[exposure * (self.cols + 2 * AROUND) + AROUND..][..self.cols]
+    }
+
+    /// That row with the zeros around.
+    pub(super) fn padded(&self, exposure: usize) -> &[f64] {
+        let width = self.cols + 2 * AROUND;
+        &self.values[exposure * width..][..width]
     }
 }
 
-/// What is kept of a row of pixels from one linearisation on: the light c L that each exposure
-/// shows, M, the offset O, the inverse of their normal matrix, and the last change of M.
+/// What is kept of a row of pixels from one linearisation on: the light c L that each exposure shows, M,
+/// the first element of the inverse of the normal matrix, the last change of M, and, where it is sought,
+/// the offset O with the other two elements.
 pub(super) struct Row<'s> {
     pub(super) light: &'s mut [f64],
     pub(super) sensitivity: &'s mut [f64],
-    pub(super) offset: &'s mut [f64],
-    pub(super) inverse: [&'s mut [f64]; 3],
+    pub(super) inverse: &'s mut [f64],
     pub(super) change: &'s mut [f64],
+    /// O, the element beside and the last one; empty unless O is sought.
+    pub(super) offset: [&'s mut [f64]; 3],
 }
 
 impl<'s> Row<'s> {
     /// Values that a row of `cols` pixels takes.
-    pub(super) fn length(exposures: usize, cols: usize) -> usize {
-        (exposures + 6) * cols
+    pub(super) fn length(exposures: usize, cols: usize, with_offset: bool) -> usize {
+        (exposures + if with_offset { 6 } else { 3 }) * cols
     }
 
     pub(super) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
@@ -102,9 +107,9 @@ impl<'s> Row<'s> {
         Self {
             light,
             sensitivity: next(),
-            offset: next(),
-            inverse: [next(), next(), next()],
+            inverse: next(),
             change: next(),
+            offset: [next(), next(), next()],
         }
     }
 }
@@ -123,8 +128,9 @@ pub(super) struct Solve<'s> {
     pub(super) fluxes: &'s [f64],
     pub(super) weights: &'s [f64],
     /// y, then the pull.
-    pub(super) values: &'s mut [f64],
-    pub(super) with_offset: bool,
+    pub(super) values: &'s mut Lines,
+    /// Σ w e y, Σ w e, Σ w and Σ w y: room for four rows.
+    pub(super) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
     pub(super) singular: f64,
 }
@@ -134,91 +140,141 @@ impl pulp::NullaryFnOnce for Solve<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Row { light, sensitivity, offset, inverse: [i11, i12, i22], .. } = self.row;
+        let Row { light, sensitivity, inverse, offset: [offset, i12, i22], .. } = self.row;
         let cols = sensitivity.len();
-        for col in 0..cols {
-            let [mut ee, mut e, mut one, mut ey, mut y] = [0.0; 5];
-            for k in 0..self.fluxes.len() {
-                let at = k * cols + col;
-                let we = self.weights[at] * light[at];
-                ee += we * light[at];
-                e += we;
-                one += self.weights[at];
-                ey += we * self.values[at];
-                y += self.weights[at] * self.values[at];
+        let with_offset = !offset.is_empty();
+        let [along, e, one, alone] = self.sums.each_mut().map(|sums| &mut sums[..cols]);
+        for sums in [&mut *inverse, &mut *along, &mut *e, &mut *one, &mut *alone] {
+            sums.fill(0.0);
+        }
+        for k in 0..self.fluxes.len() {
+            let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
+            let values = self.values.of(k);
+            for col in 0..cols {
+                let we = weights[col] * light[col];
+                inverse[col] += we * light[col];
+                along[col] += we * values[col];
             }
-            let determinant = ee * one - e * e;
-            let inverse = if self.with_offset && determinant > self.singular * ee * one {
-                [one / determinant, -e / determinant, ee / determinant]
-            } else if ee > 0.0 {
-                [1.0 / ee, 0.0, 0.0]
-            } else {
-                [0.0; 3]
-            };
-            [i11[col], i12[col], i22[col]] = inverse;
-            sensitivity[col] = if ee > 0.0 { inverse[0] * ey + inverse[1] * y } else { 1.0 };
-            offset[col] = inverse[1] * ey + inverse[2] * y;
+            if with_offset {
+                for col in 0..cols {
+                    e[col] += weights[col] * light[col];
+                    one[col] += weights[col];
+                    alone[col] += weights[col] * values[col];
+                }
+            }
+        }
+        for col in 0..cols {
+            let (ee, ey) = (inverse[col], along[col]);
+            inverse[col] = if ee > 0.0 { 1.0 / ee } else { 0.0 };
+            sensitivity[col] = if ee > 0.0 { ey / ee } else { 1.0 };
+            if with_offset {
+                let determinant = ee * one[col] - e[col] * e[col];
+                [i12[col], i22[col], offset[col]] = [0.0; 3];
+                if determinant > self.singular * ee * one[col] {
+                    inverse[col] = one[col] / determinant;
+                    i12[col] = -e[col] / determinant;
+                    i22[col] = ee / determinant;
+                    sensitivity[col] = inverse[col] * ey + i12[col] * alone[col];
+                    offset[col] = i12[col] * ey + i22[col] * alone[col];
+                }
+            }
         }
         let mut objective = 0.0;
         for (k, flux) in self.fluxes.iter().enumerate() {
             let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
-            let values = &mut self.values[k * cols..][..cols];
+            let values = self.values.of_mut(k);
             for col in 0..cols {
-                let residual = values[col] - light[col] * sensitivity[col] - offset[col];
-                let pull = weights[col] * residual;
-                objective += pull * residual;
+                values[col] -= light[col] * sensitivity[col];
+            }
+            values.iter_mut().zip(&*offset).for_each(|(value, offset)| *value -= offset);
+            let squares = &mut along[..];
+            for col in 0..cols {
+                let pull = weights[col] * values[col];
+                squares[col] = pull * values[col];
                 values[col] = flux * sensitivity[col] * pull;
             }
+            objective += sum(squares);
         }
         objective
     }
 }
 
+#[inline(always)]
+fn sum(values: &[f64]) -> f64 {
+    let (lanes, rest) = values.as_chunks::<LANES>();
+    let mut sums = [0.0; LANES];
+    for values in lanes {
+        for i in 0..LANES {
+            sums[i] += values[i];
+        }
+    }
+    sums.iter().chain(rest).sum()
+}
+
 /// What a change of the light pulls at the beam once M and O have followed it: v → c M w (u − α e − β)
-/// with u = c M v, and the change −α of M.
+/// with u = c M v, and the change −α of M; returns the largest size of that less a share of the change
+/// before.
 pub(super) struct Follow<'s> {
     pub(super) row: Row<'s>,
     pub(super) fluxes: &'s [f64],
     pub(super) weights: &'s [f64],
     /// v, then the pull.
-    pub(super) values: &'s mut [f64],
-    /// Room for two rows.
-    pub(super) sums: [&'s mut [f64]; 2],
+    pub(super) values: &'s mut Lines,
+    /// Room for rows.
+    pub(super) sums: &'s mut [Vec<f64>; 4],
+    /// The share of the change before.
+    pub(super) share: f64,
 }
 
 impl pulp::NullaryFnOnce for Follow<'_> {
-    type Output = ();
+    type Output = f64;
 
     #[inline(always)]
-    fn call(self) {
-        let Row { light, sensitivity, inverse: [i11, i12, i22], change, .. } = self.row;
-        let [along_light, alone] = self.sums;
+    fn call(self) -> f64 {
+        let Row { light, sensitivity, inverse, change, offset: [offset, i12, i22] } = self.row;
         let cols = sensitivity.len();
-        along_light.fill(0.0);
+        let with_offset = !offset.is_empty();
+        let [along, alone, ..] = self.sums.each_mut().map(|sums| &mut sums[..cols]);
+        along.fill(0.0);
         alone.fill(0.0);
         for (k, flux) in self.fluxes.iter().enumerate() {
             let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
-            let values = &mut self.values[k * cols..][..cols];
+            let values = self.values.of_mut(k);
             for col in 0..cols {
                 values[col] *= flux * sensitivity[col];
-                let pull = weights[col] * values[col];
-                along_light[col] += pull * light[col];
-                alone[col] += pull;
+                along[col] += weights[col] * values[col] * light[col];
+            }
+            if with_offset {
+                for col in 0..cols {
+                    alone[col] += weights[col] * values[col];
+                }
             }
         }
         for col in 0..cols {
-            let (s, t) = (along_light[col], alone[col]);
-            along_light[col] = i11[col] * s + i12[col] * t;
-            alone[col] = i12[col] * s + i22[col] * t;
-            change[col] = -along_light[col];
+            let s = along[col];
+            along[col] = inverse[col] * s;
+            if with_offset {
+                along[col] += i12[col] * alone[col];
+                alone[col] = i12[col] * s + i22[col] * alone[col];
+            }
         }
         for (k, flux) in self.fluxes.iter().enumerate() {
             let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
-            let values = &mut self.values[k * cols..][..cols];
+            let values = self.values.of_mut(k);
             for col in 0..cols {
-                let left = values[col] - along_light[col] * light[col] - alone[col];
+                let left = values[col] - along[col] * light[col] - alone[col];
                 values[col] = flux * sensitivity[col] * weights[col] * left;
             }
         }
+        let mut largest = [0.0_f64; LANES];
+        for (change, along) in change.chunks_mut(LANES).zip(along.chunks(LANES)) {
+            for ((change, along), largest) in change.iter_mut().zip(along).zip(&mut largest) {
+                // A maximum would lose what is no number, a minimum does not.
+                let size = (along + self.share * *change).abs().min(f64::INFINITY);
+                *largest = largest.max(size);
+                *change = -along;
+            }
+        }
+        largest.into_iter().fold(0.0, f64::max)
     }
 }

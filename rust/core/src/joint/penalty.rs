@@ -5,13 +5,13 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
-use super::kernel::Add;
+use crate::control::Control;
 use crate::frames::Shape;
-use crate::parallel::{Workers, dot};
+use crate::parallel::Workers;
 
 const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
-const BAND: usize = 16;
+const BAND: usize = 32;
 
 pub(super) struct Penalty {
     shape: Shape,
@@ -21,70 +21,68 @@ pub(super) struct Penalty {
     /// D a and aᵀ D a.
     pull: Vec<f64>,
     norm: f64,
+    /// GᵀG a and ‖G a‖².
+    bent: Vec<f64>,
+    energy: f64,
 }
 
 impl Penalty {
-    /// The penalty at a beam of weights D, seen where they are above 0.
+    /// The penalty of weight τ on beams of weights D, seen where they are above 0.
     pub(super) fn new(
         shape: Shape,
-        beam: &[f64],
         weights: &[f64],
         tau: f64,
         workers: &Workers,
+        control: &Control,
     ) -> Self {
         let Shape { rows, cols } = shape;
-        let count = |axis: usize, step: usize| {
-            let mut counted = vec![0.0; shape.len()];
+        let zeros = || workers.filled(shape.len(), 0.0, control);
+        let count = |width: usize, height: usize, step: usize| {
+            let mut counted = zeros();
             workers.map_blocks(&mut counted, cols, |row, counted| {
-                for (col, counted) in counted.iter_mut().enumerate() {
-                    let inside = if axis == 0 { row + 4 < rows } else { col + 4 < cols };
-                    let cell = row * cols + col;
-                    let seen = inside && (0..5).all(|i| weights[cell + i * step] > 0.0);
-                    *counted = f64::from(u8::from(seen));
+                if row >= height || width == 0 {
+                    return;
                 }
+                let weights = std::array::from_fn(|i| &weights[row * cols + i * step..][..width]);
+                pulp::Arch::new().dispatch(Count { weights, counted: &mut counted[..width] });
             });
             counted
         };
-        let counted = [count(0, cols), count(1, 1)];
-        let pull: Vec<f64> = weights.iter().zip(beam).map(|(d, a)| d * a).collect();
-        let norm = workers.dot(&pull, beam);
-        Self { shape, tau, counted, pull, norm }
+        let counted =
+            [count(cols, rows.saturating_sub(4), cols), count(cols.saturating_sub(4), rows, 1)];
+        let (pull, bent) = (zeros(), zeros());
+        Self { shape, tau, counted, pull, norm: 0.0, bent, energy: 0.0 }
     }
 
-    /// The diagonal of τ GᵀG.
-    pub(super) fn diagonal(&self) -> Vec<f64> {
-        let mut diagonal = vec![0.0; self.pull.len()];
-        for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
-            for (cell, counted) in counted.iter().enumerate().filter(|(_, counted)| **counted > 0.0)
-            {
-                for (i, factor) in FOURTH.iter().enumerate() {
-                    diagonal[cell + i * step] += self.tau * counted * factor * factor;
-                }
-            }
-        }
-        diagonal
+    /// Takes the beam a of weights D that its multiples are free of.
+    pub(super) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
+        let cols = self.shape.cols;
+        workers.map_blocks(&mut self.pull, cols, |row, pull| {
+            let cells = weights[row * cols..].iter().zip(&beam[row * cols..]);
+            pull.iter_mut().zip(cells).for_each(|(pull, (d, a))| *pull = d * a);
+        });
+        self.norm = workers.dot(&self.pull, beam);
+        let mut bent = std::mem::take(&mut self.bent);
+        workers.map_blocks(&mut bent, cols, |_, bent| bent.fill(0.0));
+        self.add_curvature(beam, 1.0, &mut bent, workers);
+        self.energy = workers.dot(&bent, beam);
+        self.bent = bent;
     }
 
-    /// P x.
-    pub(super) fn relative(&self, beam: &[f64], x: &[f64], workers: &Workers) -> Vec<f64> {
+    /// Takes τ Pᵀ GᵀG a from a slope; returns τ ‖G a‖².
+    pub(super) fn pull(&self, slope: &mut [f64], workers: &Workers) -> f64 {
+        workers.add_multiple(slope, -self.tau, &self.bent);
+        workers.add_multiple(slope, self.tau * self.energy / self.norm, &self.pull);
+        self.tau * self.energy
+    }
+
+    /// Adds τ Pᵀ GᵀG P x to `sums`.
+    pub(super) fn add_product(&self, x: &[f64], sums: &mut [f64], workers: &Workers) {
         let scale = workers.dot(&self.pull, x) / self.norm;
-        let mut relative = x.to_vec();
-        workers.add_multiple(&mut relative, -scale, beam);
-        relative
-    }
-
-    /// Adds `share` τ Pᵀ GᵀG x to `sums`; returns τ ‖G x‖².
-    pub(super) fn add(
-        &self,
-        beam: &[f64],
-        mut x: Vec<f64>,
-        share: f64,
-        sums: &mut [f64],
-        workers: &Workers,
-    ) -> f64 {
-        let (differences, energy) = self.differences(&x, workers);
-        self.pull_at(beam, &differences, share * self.tau, &mut x, sums, workers);
-        self.tau * energy
+        let back = (workers.dot(&self.bent, x) - scale * self.energy) / self.norm;
+        self.add_curvature(x, self.tau, sums, workers);
+        workers.add_multiple(sums, -scale * self.tau, &self.bent);
+        workers.add_multiple(sums, -back * self.tau, &self.pull);
     }
 
     /// Adds √τ Pᵀ Gᵀ s, whose covariance is that of the penalty, for signs s.
@@ -95,71 +93,94 @@ impl Penalty {
         sums: &mut [f64],
         workers: &Workers,
     ) {
-        let mut draw = |counted: &Vec<f64>| counted.iter().map(|c| c * sign()).collect();
-        let differences = [draw(&self.counted[0]), draw(&self.counted[1])];
-        let mut room = vec![0.0; beam.len()];
-        self.pull_at(beam, &differences, self.tau.sqrt(), &mut room, sums, workers);
-    }
-
-    /// Adds `share` Pᵀ Gᵀ of differences.
-    fn pull_at(
-        &self,
-        beam: &[f64],
-        differences: &[Vec<f64>; 2],
-        share: f64,
-        room: &mut [f64],
-        sums: &mut [f64],
-        workers: &Workers,
-    ) {
-        self.adjoint(differences, room, workers);
-        let scale = workers.dot(beam, room) / self.norm;
-        workers.add_multiple(room, -scale, &self.pull);
-        workers.add_multiple(sums, share, room);
-    }
-
-    /// G x, down and along, and ‖G x‖².
-    fn differences(&self, x: &[f64], workers: &Workers) -> ([Vec<f64>; 2], f64) {
-        let cols = self.shape.cols;
-        let size = BAND * cols;
-        let mut differences = [0, 1].map(|_| vec![0.0; x.len()]);
-        let [down, along] = &mut differences;
-        let energies = workers.map_pairs(down, along, [size; 2], |band, down, along| {
-            let first = band * size;
-            let mut energy = 0.0;
-            for (axis, part, step) in [(0, down, cols), (1, along, 1)] {
-                let counted = &self.counted[axis][first..][..part.len()];
-                pulp::Arch::new().dispatch(Differ { x, first, step, counted, sums: &mut *part });
-                energy += dot(part, part);
-            }
-            energy
-        });
-        (differences, energies.into_iter().sum())
-    }
-
-    /// Gᵀ of differences, which are 0 where they do not count.
-    fn adjoint(&self, [down, along]: &[Vec<f64>; 2], sums: &mut [f64], workers: &Workers) {
-        let cols = self.shape.cols;
-        workers.map_blocks(sums, BAND * cols, |band, part| {
-            part.fill(0.0);
-            for (values, step) in [(down, cols), (along, 1)] {
+        let mut drawn = vec![0.0; beam.len()];
+        for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
+            for first in (0..counted.len()).filter(|&first| counted[first] > 0.0) {
+                let sign = sign();
                 for (i, factor) in FOURTH.iter().enumerate() {
-                    // Values from so many cells further back; before the first there are none.
-                    let first = band * BAND * cols;
-                    let missing = (i * step).saturating_sub(first).min(part.len());
-                    let values = &values[first + missing - i * step..];
-                    let (factor, sums) = (*factor, &mut part[missing..]);
-                    pulp::Arch::new().dispatch(Add { factor, values, sums });
+                    drawn[first + i * step] += sign * factor;
+                }
+            }
+        }
+        let scale = workers.dot(beam, &drawn) / self.norm;
+        workers.add_multiple(&mut drawn, -scale, &self.pull);
+        workers.add_multiple(sums, self.tau.sqrt(), &drawn);
+    }
+
+    /// Calls `visit(other, value)` for the elements of τ GᵀG in the row of a cell; the values of one
+    /// place add up.
+    pub(super) fn for_row(&self, cell: usize, mut visit: impl FnMut(usize, f64)) {
+        for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
+            for (i, own) in FOURTH.iter().enumerate() {
+                let Some(first) = cell.checked_sub(i * step) else { continue };
+                if counted[first] > 0.0 {
+                    for (j, other) in FOURTH.iter().enumerate() {
+                        visit(first + j * step, self.tau * own * other);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Adds `factor` GᵀG x to `sums`.
+    fn add_curvature(&self, x: &[f64], factor: f64, sums: &mut [f64], workers: &Workers) {
+        let Shape { rows, cols } = self.shape;
+        let [down, along] = &self.counted;
+        workers.map_blocks(sums, BAND * cols, |band, part| {
+            // Differences that begin in this row and the four before; along it with zeros around.
+            let mut differences = [(); 5].map(|()| vec![0.0; cols]);
+            let mut beside = vec![0.0; cols + 4];
+            let first = band * BAND;
+            for row in first.saturating_sub(4)..first + part.len() / cols {
+                differences.rotate_left(1);
+                let line = |i: usize| &x[(row + i) * cols..][..cols];
+                let sums = &mut differences[4][..];
+                if row + 4 < rows {
+                    let (values, counted) = (std::array::from_fn(line), &down[row * cols..]);
+                    pulp::Arch::new().dispatch(Differ { values, counted, sums });
+                } else {
+                    sums.fill(0.0);
+                }
+                let Some(own) = row.checked_sub(first) else { continue };
+                let part = &mut part[own * cols..][..cols];
+                let values = [4, 3, 2, 1, 0].map(|i| &differences[i][..]);
+                pulp::Arch::new().dispatch(Bend { values, factor, sums: &mut *part });
+                if cols > 4 {
+                    let (line, counted) = (line(0), &along[row * cols..]);
+                    let (values, sums) =
+                        (std::array::from_fn(|i| &line[i..cols - 4 + i]), &mut beside[4..cols]);
+                    pulp::Arch::new().dispatch(Differ { values, counted, sums });
+                    let values = [4, 3, 2, 1, 0].map(|i| &beside[i..cols + i]);
+                    pulp::Arch::new().dispatch(Bend { values, factor, sums: part });
                 }
             }
         });
     }
 }
 
-/// Fourth differences of x from a cell on, where they count.
+/// Whether all five weights are above 0.
+struct Count<'s> {
+    weights: [&'s [f64]; 5],
+    counted: &'s mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Count<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [a, b, c, d, e] = self.weights;
+        let weights = a.iter().zip(b).zip(c).zip(d).zip(e);
+        for (counted, ((((a, b), c), d), e)) in self.counted.iter_mut().zip(weights) {
+            let least = a.min(b.min(*c)).min(d.min(*e));
+            *counted = if least > 0.0 { 1.0 } else { 0.0 };
+        }
+    }
+}
+
+/// Fourth differences, where they count.
 struct Differ<'s> {
-    x: &'s [f64],
-    first: usize,
-    step: usize,
+    values: [&'s [f64]; 5],
     counted: &'s [f64],
     sums: &'s mut [f64],
 }
@@ -169,14 +190,30 @@ impl pulp::NullaryFnOnce for Differ<'_> {
 
     #[inline(always)]
     fn call(self) {
-        // Behind the last cell nothing counts.
-        let reach = 4 * self.step;
-        let whole = self.sums.len().min(self.x.len().saturating_sub(self.first + reach));
-        let [a, b, c, d, e] =
-            [0, 1, 2, 3, 4].map(|i| &self.x[(self.first + i * self.step).min(self.x.len())..]);
+        let [a, b, c, d, e] = self.values;
         let inputs = a.iter().zip(b).zip(c).zip(d).zip(e).zip(self.counted);
-        for (sum, (((((a, b), c), d), e), counted)) in self.sums[..whole].iter_mut().zip(inputs) {
+        for (sum, (((((a, b), c), d), e), counted)) in self.sums.iter_mut().zip(inputs) {
             *sum = counted * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
+        }
+    }
+}
+
+/// Adds a multiple of fourth differences.
+struct Bend<'s> {
+    values: [&'s [f64]; 5],
+    factor: f64,
+    sums: &'s mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Bend<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [a, b, c, d, e] = self.values;
+        let inputs = a.iter().zip(b).zip(c).zip(d).zip(e);
+        for (sum, ((((a, b), c), d), e)) in self.sums.iter_mut().zip(inputs) {
+            *sum += self.factor * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
         }
     }
 }
@@ -195,18 +232,26 @@ mod tests {
         let mut weights = vec![1.0; 99];
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
-        let penalty = Penalty::new(shape, &beam, &weights, 1.0, &workers);
-        let energy = |penalty: &Penalty, beam: &[f64], x: &[f64]| {
-            let relative = penalty.relative(beam, x, &workers);
-            penalty.add(beam, relative, 1.0, &mut vec![0.0; 99], &workers)
+        let mut penalty = Penalty::new(shape, &weights, 1.0, &workers, &Control::default());
+        penalty.turn_to(&beam, &weights, &workers);
+        let product = |x: &[f64]| {
+            let mut sums = vec![0.0; 99];
+            penalty.add_product(x, &mut sums, &workers);
+            sums
         };
+        let energy = |x: &[f64]| product(x).iter().zip(x).map(|(s, x)| s * x).sum::<f64>();
         let twice: Vec<f64> = beam.iter().map(|a| 2.0 * a).collect();
+        // Sums of some 99 · 30 products of size 1000.
+        assert!(energy(&twice).abs() < 1e-9);
+        assert!(energy(&cubic) > 1.0);
         // Values to 1000, differences of sums of 16 of them.
-        assert!(energy(&penalty, &beam, &twice) < 1e-25);
-        assert!(energy(&penalty, &beam, &cubic) > 1.0);
-        assert!(penalty.add(&beam, cubic, 1.0, &mut vec![0.0; 99], &workers) < 1e-15);
+        let mut bent = vec![0.0; 99];
+        penalty.add_curvature(&cubic, 1.0, &mut bent, &workers);
+        assert!(bent.iter().all(|value| value.abs() < 1e-9));
         // Row 5 of 9 is in four of five differences down, column 5 of 11 in all five along.
-        assert!(penalty.diagonal()[60] == 69.0 + 70.0);
+        let mut diagonal = 0.0;
+        penalty.for_row(60, |other, value| diagonal += if other == 60 { value } else { 0.0 });
+        assert!(diagonal == 69.0 + 70.0);
     }
 
     #[test]
@@ -215,15 +260,21 @@ mod tests {
         let random = |seed: f64| (0..56).map(|i| (f64::from(i) * seed).sin() + 1.5).collect();
         let (beam, x, y): (Vec<f64>, Vec<f64>, Vec<f64>) = (random(1.7), random(2.9), random(4.1));
         let workers = Workers::new(None).unwrap();
-        let penalty = Penalty::new(shape, &beam, &[1.0; 56], 0.7, &workers);
+        let mut penalty = Penalty::new(shape, &[1.0; 56], 0.7, &workers, &Control::default());
+        penalty.turn_to(&beam, &[1.0; 56], &workers);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 56];
-            let relative = penalty.relative(&beam, x, &workers);
-            let energy = penalty.add(&beam, relative, 1.0, &mut sums, &workers);
-            (sums, energy)
+            penalty.add_product(x, &mut sums, &workers);
+            sums
         };
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let ((ax, energy), (ay, _)) = (product(&x), product(&y));
+        let (ax, ay) = (product(&x), product(&y));
+        let mut relative = x.clone();
+        let multiple = dot(&penalty.pull, &x) / penalty.norm;
+        relative.iter_mut().zip(&beam).for_each(|(x, a)| *x -= multiple * a);
+        let mut bent = vec![0.0; 56];
+        penalty.add_curvature(&relative, 0.7, &mut bent, &workers);
+        let energy = dot(&bent, &relative);
         // Sums of some 56 · 20 products of size 100.
         assert!((dot(&ax, &y) - dot(&ay, &x)).abs() < 1e-10);
         assert!((dot(&ax, &x) - energy).abs() < 1e-10);

@@ -1,36 +1,49 @@
-//! The preconditioner of the joint problem: its diagonal, and hats on a coarse grid over the beam.
+//! The preconditioner of the joint problem: a filter, the rim, and hats on a coarse grid over the beam.
 //!
-//! As in [`precondition`](crate::precondition), with the columns of Φ hats times the beam. Fluxes
-//! and shifts stand beside the hats in the coarse problem: a tilt or a bend of M that they could explain
-//! is told from theirs by large scales alone.
+//! ```text
+//! P⁻¹ r = χ K D⁻¹ K χ r + R (N + τ GᵀG)⁻¹ Rᵀ r + γ Φ A⁻¹ Φᵀ r
+//! ```
 //!
-//! A spline of coefficients h a is not h times the spline of coefficients a: with the factors 1/6, 4/6,
-//! 1/6 of B it has ∇h·∇a/3 more, to first order. The columns of Φ have that much less, so that a tilt
-//! of the beam is one.
+//! Coefficients of a spline are no values: what pixels see of a fine pattern is a third of it along each
+//! axis, by the factors 1/6, 4/6, 1/6. K is a filter that is near to their inverse, so that D weighs
+//! values. χ is 1 but at the rim of the beam, where R takes over (`joint/rim.rs`). The third part is that of
+//! [`precondition`](crate::precondition), with the columns of Φ hats times the beam
+//! (`joint/wide.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
+//! that they could explain is told from theirs by large scales alone.
 
-use super::system::{Block, System};
+use super::rim::Rim;
+use super::survey::Block;
+use super::system::System;
+use super::wide::Wide;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
-use crate::parallel::Workers;
 use crate::precondition::coarse::{Arm, Coarse};
 use crate::precondition::hats::Hats;
 use crate::precondition::{DAMPING, spacing};
 
 /// Blocks of pixels along the distance of two hats.
 const BLOCKS: usize = 3;
-/// Rows of cells whose sums over hats a thread makes at a time.
-const SUMMED: usize = 32;
-/// Cells with less than this share of the mean diagonal are as good as unseen.
+/// Rows of cells that a thread takes at a time.
+const BAND: usize = 32;
+/// Cells with less than this share of the mean weight are as good as unseen.
 const FAINTEST: f64 = 1e-12;
+/// K along an axis, 1 + t/8 + 2t²/25 with t = 2 − 2 cos q: 2.8 at the finest pattern where the inverse of
+/// 1/6, 4/6, 1/6 is 3.
+const FILTER: [f64; 5] = [0.08, -0.445, 1.73, -0.445, 0.08];
+
 pub(super) struct Preconditioner {
-    hats: Hats,
-    /// 1/D of cells, θ and shifts; 0 for what no measurement tells.
+    wide: Wide,
+    /// 1/D of cells that are not of the rim, else 0.
     inverse: Vec<f64>,
+    rim: Rim,
+    /// 1/D of θ and shifts; 0 for what no measurement tells.
+    params: Vec<f64>,
     coarse: Coarse,
-    /// a, and ∂a/3 along rows and columns where the beam is a spline.
-    beam: Vec<f64>,
-    slopes: [Vec<f64>; 2],
+    /// Cells of a row.
+    cols: usize,
+    /// Whether the beam is a spline.
+    filters: bool,
 }
 
 impl Preconditioner {
@@ -83,14 +96,17 @@ impl Preconditioner {
             }
         }
         let coarse = Coarse::of_stars(&hats, &own, stars, control)?;
-        let mut diagonal = system.diagonal(true, control)?;
-        let least = FAINTEST * diagonal.iter().sum::<f64>() / diagonal.len() as f64;
-        diagonal.iter_mut().filter(|d| **d <= least).for_each(|d| *d = 0.0);
-        diagonal.extend(whole);
-        let inverse = diagonal.iter().map(|&d| if d > 0.0 { 1.0 / d } else { 0.0 }).collect();
-        let beam = system.state.beam.clone();
-        let slopes = slopes(system);
-        Ok(Self { hats, inverse, coarse, beam, slopes })
+        let rim = Rim::new(system, control)?;
+        let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
+        let weights = &system.weights;
+        let least = FAINTEST * weights.iter().sum::<f64>() / weights.len() as f64;
+        let told = |&d: &f64| if d > least { 1.0 / d } else { 0.0 };
+        let mut inverse: Vec<f64> = weights.iter().map(told).collect();
+        rim.cells().for_each(|cell| inverse[cell] = 0.0);
+        let params = whole.into_iter().map(invert).collect();
+        let (wide, filters) = (Wide::new(hats, system, control), system.grid.is_spline());
+        let cols = system.grid.geometry.beam.cols;
+        Ok(Self { wide, inverse, rim, params, coarse, cols, filters })
     }
 
     /// Whether the coarse matrix has a factor.
@@ -98,106 +114,123 @@ impl Preconditioner {
         self.coarse.is_factorised()
     }
 
-    /// P⁻¹ r.
-    pub(super) fn apply<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64]) -> Vec<f64> {
-        let (beam, workers, hats) = (&self.beam, system.workers, &self.hats);
-        let cols = system.grid.geometry.beam.cols;
-        let nodes = hats.cols.nodes;
-        let rows = beam.len() / cols;
-        let mut heights = self.gather(r, cols, system.workers);
-        heights.extend_from_slice(&r[beam.len()..]);
+    /// z = P⁻¹ r.
+    pub(super) fn apply<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64], z: &mut Vec<f64>) {
+        let (workers, cols) = (system.workers, system.grid.geometry.beam.cols);
+        let (of_cells, of_params) = r.split_at(self.inverse.len());
+        let mut heights = self.wide.gather(of_cells, workers);
+        heights.extend_from_slice(of_params);
         self.coarse.solve(&mut heights, DAMPING);
-        let mut z = vec![0.0; r.len()];
-        workers.map_blocks(&mut z, cols, |row, part| {
-            let first = row * cols;
-            let own = r[first..].iter().zip(&self.inverse[first..]);
-            part.iter_mut().zip(own).for_each(|(z, (r, inverse))| *z = r * inverse);
-            if row >= rows {
-                return;
+        z.resize(of_cells.len(), 0.0);
+        workers.map_blocks(z, BAND * cols, |band, part| {
+            let first = band * BAND;
+            if self.filters {
+                self.filter(of_cells, first, part);
+            } else {
+                let own = of_cells[first * cols..].iter().zip(&self.inverse[first * cols..]);
+                part.iter_mut().zip(own).for_each(|(z, (r, inverse))| *z = r * inverse);
             }
-            let (node, height) = hats.rows.at(row as f64);
-            let [above, below] = [node, node + 1].map(|node| &heights[node * nodes..][..nodes]);
-            let [down, along] = &self.slopes;
-            for (col, z) in part.iter_mut().enumerate() {
-                let (cell, (node, share)) = (first + col, hats.columns[col]);
-                let (node, share) = (node as usize, f64::from(share));
-                let at = |node: usize| above[node] + height * (below[node] - above[node]);
-                let fall = |node: usize| (below[node] - above[node]) / hats.rows.spacing;
-                let (left, right) = (at(node), at(node + 1));
-                let smooth = left + share * (right - left);
-                let sloping = (right - left) / hats.cols.spacing;
-                let falling = fall(node) + share * (fall(node + 1) - fall(node));
-                if self.inverse[cell] > 0.0 {
-                    *z += beam[cell] * smooth - down[cell] * falling - along[cell] * sloping;
-                }
-            }
+            self.wide.spread(&heights, first, part);
         });
-        let coarse = &heights[self.hats.count()..];
-        z[beam.len()..].iter_mut().zip(coarse).for_each(|(z, height)| *z += height);
+        self.rim.add(of_cells, z);
+        let coarse = &heights[self.wide.hats.count()..];
+        let params = of_params.iter().zip(&self.params).zip(coarse);
+        z.extend(params.map(|((r, inverse), height)| r * inverse + height));
         // A multiple of the beam is no error, nor is what moves all exposures alike; what rounding
         // leaves of them must not grow.
-        system.take_scale_out(&mut z[..beam.len()]);
-        let shifts = &mut z[beam.len() + system.fluxes.columns.len()..];
+        system.take_scale_out(&mut z[..self.inverse.len()]);
+        let shifts = &mut z[self.inverse.len() + system.fluxes.columns.len()..];
         let moves = system.centred(shifts);
         shifts.copy_from_slice(moves.as_flattened());
-        z
     }
 
-    /// Φᵀ r.
-    fn gather(&self, r: &[f64], cols: usize, workers: &Workers) -> Vec<f64> {
-        let (beam, [down, along], hats) = (&self.beam, &self.slopes, &self.hats);
-        let (rows, nodes) = (beam.len() / cols, hats.cols.nodes);
-        let bands = workers.map(rows.div_ceil(SUMMED), |band| {
-            let mut sums: Vec<(usize, Vec<f64>)> = Vec::new();
-            for row in band * SUMMED..rows.min((band + 1) * SUMMED) {
-                let [mut level, mut falling] = [vec![0.0; nodes], vec![0.0; nodes]];
-                for (col, &(node, share)) in hats.columns.iter().enumerate() {
-                    let (cell, node, share) = (row * cols + col, node as usize, f64::from(share));
-                    let (value, sloping) = (r[cell] * beam[cell], r[cell] * along[cell]);
-                    let (part, turn) = (share * value, sloping / hats.cols.spacing);
-                    level[node] += value - part + turn;
-                    level[node + 1] += part - turn;
-                    let (fall, part) = (r[cell] * down[cell], share * r[cell] * down[cell]);
-                    falling[node] += fall - part;
-                    falling[node + 1] += part;
+    /// χ K D⁻¹ K χ r on rows of cells from `first` on.
+    fn filter(&self, r: &[f64], first: usize, z: &mut [f64]) {
+        let (cols, around) = (self.cols, FILTER.len() / 2);
+        let [mut before, mut between] = [(); 2].map(|()| Window::new(cols));
+        let mut found = vec![0.0; cols];
+        // Rows that come in, counted from as many above as both filters reach.
+        for step in 0..z.len() / cols + 4 * around {
+            let line = before.next();
+            let inside = |row: Option<usize>| row.filter(|&row| row < r.len() / cols);
+            let of = |row: usize| row * cols..(row + 1) * cols;
+            match inside((first + step).checked_sub(2 * around)).map(of) {
+                Some(row) => {
+                    let input = r[row.clone()].iter().zip(&self.inverse[row]);
+                    let told = |(r, d): (&f64, &f64)| if *d > 0.0 { *r } else { 0.0 };
+                    line.iter_mut().zip(input).for_each(|(line, input)| *line = told(input));
                 }
-                let (node, height) = hats.rows.at(row as f64);
-                let fall = 1.0 / hats.rows.spacing;
-                for (node, share, turn) in [(node, 1.0 - height, fall), (node + 1, height, -fall)] {
-                    if sums.iter().all(|(known, _)| *known != node) {
-                        sums.push((node, vec![0.0; nodes]));
-                    }
-                    for (_, sums) in sums.iter_mut().filter(|(known, _)| *known == node) {
-                        let both = level.iter().zip(&falling);
-                        sums.iter_mut()
-                            .zip(both)
-                            .for_each(|(s, (a, b))| *s += share * a + turn * b);
-                    }
+                None => line.fill(0.0),
+            }
+            let line = between.next();
+            match inside((first + step).checked_sub(3 * around)).map(of) {
+                Some(row) => {
+                    before.filter(line);
+                    line.iter_mut().zip(&self.inverse[row]).for_each(|(line, d)| *line *= d);
+                }
+                None => line.fill(0.0),
+            }
+            if let Some(own) = step.checked_sub(4 * around) {
+                between.filter(&mut found);
+                let row = of(first + own);
+                let output = found.iter().zip(&self.inverse[row]);
+                for (z, (found, d)) in z[of(own)].iter_mut().zip(output) {
+                    *z = if *d > 0.0 { *found } else { 0.0 };
                 }
             }
-            sums
-        });
-        let mut heights = vec![0.0; hats.count()];
-        for (node, sums) in bands.into_iter().flatten() {
-            heights[node * nodes..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
         }
-        heights
     }
 }
 
-/// A third of the slopes of a, a cell, down and along; 0 beside cells that are not seen.
-fn slopes<T: Real>(system: &System<'_, '_, T>) -> [Vec<f64>; 2] {
-    let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
-    let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
-    [cols, 1].map(|step| {
-        let mut slopes = vec![0.0; beam.len()];
-        if system.grid.is_spline() {
-            for cell in step..beam.len() - step {
-                if seen(cell - step) && seen(cell + step) {
-                    slopes[cell] = (beam[cell + step] - beam[cell - step]) / 6.0;
-                }
-            }
+/// As many rows of cells as the filter takes.
+struct Window {
+    rows: [Vec<f64>; FILTER.len()],
+    /// One row, with zeros around.
+    line: Vec<f64>,
+}
+
+impl Window {
+    fn new(cols: usize) -> Self {
+        let rows = [(); FILTER.len()].map(|()| vec![0.0; cols]);
+        Self { rows, line: vec![0.0; cols + FILTER.len() - 1] }
+    }
+
+    /// Room for the row that comes in; the first one goes.
+    fn next(&mut self) -> &mut [f64] {
+        self.rows.rotate_left(1);
+        &mut self.rows[FILTER.len() - 1]
+    }
+
+    /// K at the row in the middle.
+    fn filter(&mut self, found: &mut [f64]) {
+        let Self { rows, line } = self;
+        let rows = rows.each_ref().map(|row| &row[..]);
+        pulp::Arch::new().dispatch(Filter { rows, line, found });
+    }
+}
+
+struct Filter<'s> {
+    rows: [&'s [f64]; FILTER.len()],
+    line: &'s mut [f64],
+    found: &'s mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Filter<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let cols = self.found.len();
+        let [s, t, u, v, w] = FILTER;
+        let [a, b, c, d, e] = self.rows.map(|row| &row[..cols]);
+        let line = &mut self.line[..cols + FILTER.len() - 1];
+        let inner = &mut line[FILTER.len() / 2..][..cols];
+        for col in 0..cols {
+            inner[col] = s * a[col] + t * b[col] + u * c[col] + v * d[col] + w * e[col];
         }
-        slopes
-    })
+        let [a, b, c, d, e] = [0, 1, 2, 3, 4].map(|from| &line[from..from + cols]);
+        for col in 0..cols {
+            self.found[col] = s * a[col] + t * b[col] + u * c[col] + v * d[col] + w * e[col];
+        }
+    }
 }

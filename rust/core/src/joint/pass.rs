@@ -1,0 +1,384 @@
+//! One pass over the measurements: what pixels see of values on cells, and what cells get of the pixels'
+//! pulls.
+//!
+//! The sensor is cut into bands of rows. A band interpolates, lets its pixels pull, keeps the pulls of
+//! the last four rows of pixels, and adds what they make to the cells that it sees, in sums of its own;
+//! these are folded in the order of the bands. So between the two nothing of the size of the data is
+//! written, and the same bytes come out for any number of threads.
+
+use std::borrow::Cow;
+
+use super::grid::{TAPS, Taps, Window};
+use super::kernel::{AROUND, Combine, Lines, Row};
+use super::system::System;
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::geometry::{Rotation, View};
+use crate::model::Stretch;
+use crate::parallel::{Add, dot};
+
+/// Rows of pixels in a band, at least: a band adds to as many rows of cells and those that shifts reach.
+const FEWEST_ROWS: usize = 32;
+/// Rows of cells that a thread folds at a time.
+const FOLDED: usize = 16;
+
+/// How the sensor is cut into bands, and where their sums lie.
+#[derive(Default)]
+pub(super) struct Bands {
+    /// Rows of pixels.
+    pub(super) height: usize,
+    strips: Vec<Strip>,
+    /// Values of one band's sums.
+    length: usize,
+}
+
+/// The sums of a band in one view.
+#[derive(Clone, Copy)]
+struct Strip {
+    /// The row of the view that the first one of band 0 is.
+    first: usize,
+    rows: usize,
+    cols: usize,
+    /// Where they begin among the sums of the band.
+    start: usize,
+}
+
+impl Bands {
+    pub(super) fn new(windows: &[Window], views: &[View], width: usize) -> Self {
+        let reach = |view: usize| {
+            let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);
+            let first = rows.clone().min().unwrap_or(0);
+            (first, rows.max().unwrap_or(0) - first)
+        };
+        let reaches: Vec<_> = (0..views.len()).map(reach).collect();
+        let furthest = reaches.iter().map(|reach| reach.1).max().unwrap_or(0);
+        let height = FEWEST_ROWS.max(furthest);
+        let mut length = 0;
+        let strips = views.iter().zip(reaches).map(|(view, (first, reach))| {
+            let (rows, cols, start) = (height + reach + width - 1, view.shape.cols, length);
+            length += rows * cols;
+            Strip { first, rows, cols, start }
+        });
+        let strips = strips.collect();
+        Self { height, strips, length }
+    }
+
+    /// Values of all bands of a sensor of so many rows.
+    pub(super) fn size(&self, rows: usize) -> usize {
+        rows.div_ceil(self.height) * self.length
+    }
+
+    /// The bands that see a row of a view, each with that row of its sums.
+    fn seeing<'s>(
+        &self,
+        sums: &'s [f64],
+        view: usize,
+        row: usize,
+    ) -> impl Iterator<Item = &'s [f64]> + use<'s> {
+        let (height, length, strip) = (self.height, self.length, self.strips[view]);
+        let before = (row + height).saturating_sub(strip.first + strip.rows) / height;
+        let bands = before..sums.len() / length;
+        bands.map_while(move |band| {
+            let at = row.checked_sub(strip.first + band * height)?;
+            Some(&sums[band * length + strip.start + at * strip.cols..][..strip.cols])
+        })
+    }
+}
+
+/// Room of one thread for a row of pixels.
+pub(super) struct Room {
+    pub(super) weights: Vec<f64>,
+    /// Values of the row, then its pulls; before them the pulls of the rows before.
+    lines: [Lines; TAPS],
+    line: Vec<f64>,
+    pub(super) sums: [Vec<f64>; 4],
+    /// ∂L/∂d of the row, by axis and exposure, where shifts are sought.
+    pub(super) slopes: [Vec<f64>; 2],
+}
+
+impl Room {
+    /// Values of the row.
+    pub(super) fn values(&mut self) -> &mut Lines {
+        &mut self.lines[TAPS - 1]
+    }
+
+    /// Begins a row with what changes of ln c, divided by c, and of d make of the light.
+    pub(super) fn begin(&mut self, light: &[f64], shares: &[f64], moves: &[[f64; 2]]) {
+        let cols = light.len() / shares.len();
+        let values = &mut self.lines[TAPS - 1];
+        values.clear();
+        for (k, (light, share)) in light.chunks_exact(cols).zip(shares).enumerate() {
+            let values = values.of_mut(k);
+            if *share != 0.0 {
+                Add { factor: *share, values: light, sums: &mut *values }.dispatch();
+            }
+            for (slopes, &factor) in self.slopes.iter().zip(moves.get(k).into_iter().flatten()) {
+                Add { factor, values: &slopes[k * cols..][..cols], sums: &mut *values }.dispatch();
+            }
+        }
+    }
+
+    /// What the kernels need beside the row: the weights, the values, and room for sums.
+    pub(super) fn parts(&mut self) -> (&[f64], &mut Lines, &mut [Vec<f64>; 4]) {
+        (&self.weights, &mut self.lines[TAPS - 1], &mut self.sums)
+    }
+}
+
+/// What one pass gathers besides the pulls: F, the largest change of M, and the slopes of ln c and d of
+/// each exposure.
+#[derive(Clone, Default)]
+pub(super) struct Sums {
+    pub(super) objective: f64,
+    pub(super) largest: f64,
+    pub(super) flux: Vec<f64>,
+    pub(super) shifts: Vec<[f64; 2]>,
+}
+
+/// Values on cells in the order of each view.
+pub(super) type Views<'v> = [Cow<'v, [f64]>];
+
+impl<T: Real> System<'_, '_, T> {
+    /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's values,
+    /// and the slopes of the beam if shifts are sought; finds what `cells` get of them.
+    pub(super) fn pass(
+        &mut self,
+        cells: &mut [f64],
+        control: &Control,
+        work: impl Fn(&Self, usize, Row<'_>, &mut Room, &mut Sums) + Sync,
+    ) -> Result<Sums> {
+        let (sensor, count) = (self.model.sensor(), self.model.count());
+        let length = Row::length(count, sensor.cols, self.with_offset);
+        let mut rows = std::mem::take(&mut self.rows);
+        let mut sums = std::mem::take(&mut self.sums);
+        let (system, height) = (&*self, self.bands.height);
+        let sizes = [height * length, self.bands.length];
+        let bands = system.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
+            let mut room = system.room();
+            let mut found = system.no_sums();
+            strips.fill(0.0);
+            let rows = rows.chunks_exact_mut(length);
+            let last = rows.len();
+            for (index, row) in rows.enumerate() {
+                if control.is_cancelled() {
+                    break;
+                }
+                room.lines.rotate_left(1);
+                let parts = Row::of(row, count, sensor.cols);
+                work(system, band * height + index, parts, &mut room, &mut found);
+                system.gather(row, &mut room, &mut found);
+                system.spread(index, &mut room, strips);
+            }
+            for index in last..last + system.grid.width - 1 {
+                room.lines.rotate_left(1);
+                room.values().clear();
+                system.spread(index, &mut room, strips);
+            }
+            found
+        });
+        (self.rows, self.sums) = (rows, sums);
+        self.passes += 1;
+        control.check()?;
+        self.fold(cells, control);
+        control.check()?;
+        let mut total = self.no_sums();
+        for sums in bands {
+            total.objective += sums.objective;
+            total.largest = total.largest.max(sums.largest);
+            total.flux.iter_mut().zip(sums.flux).for_each(|(total, sum)| *total += sum);
+            let pairs = total.shifts.as_flattened_mut().iter_mut();
+            pairs.zip(sums.shifts.as_flattened()).for_each(|(total, sum)| *total += sum);
+        }
+        Ok(total)
+    }
+
+    fn no_sums(&self) -> Sums {
+        let count = self.model.count();
+        let moved = if self.shift_prior.is_some() { count } else { 0 };
+        Sums { flux: vec![0.0; count], shifts: vec![[0.0; 2]; moved], ..Sums::default() }
+    }
+
+    /// The pulls of a row at fluxes and shifts.
+    fn gather(&self, row: &[f64], room: &mut Room, found: &mut Sums) {
+        let cols = self.model.sensor().cols;
+        for (k, flux) in self.flux.iter().enumerate() {
+            let pull = room.lines[TAPS - 1].of(k);
+            if !self.fluxes.columns.is_empty() {
+                found.flux[k] += dot(&row[k * cols..][..cols], pull) / flux;
+            }
+            if let Some(found) = found.shifts.get_mut(k) {
+                for (found, slopes) in found.iter_mut().zip(&room.slopes) {
+                    *found += dot(&slopes[k * cols..][..cols], pull);
+                }
+            }
+        }
+    }
+
+    /// Adds to a band's sums what the pulls of the last rows make of the row of cells that the first
+    /// factors lead to.
+    fn spread(&self, index: usize, room: &mut Room, strips: &mut [f64]) {
+        let wide = self.model.sensor().cols + self.grid.width - 1;
+        for (k, window) in self.windows.iter().enumerate() {
+            let strip = &self.bands.strips[window.view];
+            let at = strip.start + (index + window.row - strip.first) * strip.cols + window.col;
+            let sums = &mut strips[at..][..wide];
+            if !self.grid.is_spline() {
+                Add { factor: 1.0, values: room.lines[TAPS - 1].of(k), sums }.dispatch();
+                continue;
+            }
+            let rows = room.lines.each_ref().map(|lines| lines.padded(k));
+            let [along_rows, along_cols] = [&window.along_rows, &window.along_cols].map(|taps| {
+                let [s, t, u, v] = taps.values;
+                [v, u, t, s]
+            });
+            let room = &mut room.line[..wide + AROUND];
+            Combine { rows, along_rows, along_cols, room, sums }.dispatch();
+        }
+    }
+
+    /// What cells get: the sums of all bands.
+    fn fold(&self, cells: &mut [f64], control: &Control) {
+        self.workers.fill(cells, 0.0, control);
+        let (bands, sums) = (&self.bands, &self.sums[..]);
+        for (index, view) in self.grid.geometry.views.iter().enumerate() {
+            let cols = view.shape.cols;
+            let fold = |part: &mut [f64], first: usize| {
+                for (row, part) in part.chunks_exact_mut(cols).enumerate() {
+                    for values in bands.seeing(sums, index, first + row) {
+                        Add { factor: 1.0, values, sums: &mut *part }.dispatch();
+                    }
+                }
+            };
+            let fold_all = |cells: &mut [f64]| {
+                let fold = |block: usize, part: &mut [f64]| fold(part, block * FOLDED);
+                self.workers.map_blocks(cells, FOLDED * cols, fold);
+            };
+            if view.rotation == Rotation::None {
+                fold_all(cells);
+            } else {
+                let mut found = self.workers.filled(view.shape.len(), 0.0, control);
+                fold_all(&mut found);
+                self.turn_back(view, &found, cells);
+            }
+        }
+    }
+
+    /// Adds what was found in a view to the beam's grid.
+    fn turn_back(&self, view: &View, found: &[f64], cells: &mut [f64]) {
+        self.workers.map_blocks(cells, self.grid.geometry.beam.cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell += found[view.places.at(row, col)];
+            }
+        });
+    }
+
+    /// Values on cells in the order of each view.
+    pub(super) fn views_of<'v>(&self, cells: &'v [f64]) -> Vec<Cow<'v, [f64]>> {
+        let turned = |view: &View| {
+            if view.rotation == Rotation::None {
+                return Cow::Borrowed(cells);
+            }
+            let mut turned = vec![0.0; cells.len()];
+            self.workers.map_blocks(&mut turned, view.shape.cols, |row, values| {
+                for (col, value) in values.iter_mut().enumerate() {
+                    *value = cells[view.cells.at(row, col)];
+                }
+            });
+            Cow::Owned(turned)
+        };
+        self.grid.geometry.views.iter().map(turned).collect()
+    }
+
+    /// Adds to `seen` what the pixels of one row of an exposure see of values on cells, by these factors
+    /// along rows and columns.
+    pub(super) fn interpolate(
+        &self,
+        views: &Views<'_>,
+        window: &Window,
+        row: usize,
+        [along_rows, along_cols]: [[f64; TAPS]; 2],
+        line: &mut [f64],
+        seen: &mut [f64],
+    ) {
+        let cols = self.grid.geometry.views[window.view].shape.cols;
+        let wide = seen.len() + self.grid.width - 1;
+        let of = |i| &views[window.view][(row + window.row + i) * cols + window.col..][..wide];
+        if !self.grid.is_spline() {
+            return Add { factor: along_rows[0] * along_cols[0], values: of(0), sums: seen }
+                .dispatch();
+        }
+        let (rows, room) = (std::array::from_fn(of), &mut line[..wide]);
+        Combine { rows, along_rows, along_cols, room, sums: seen }.dispatch();
+    }
+
+    /// What the pixels of a row see of values on cells, added to the room's values.
+    pub(super) fn see(&self, views: &Views<'_>, row: usize, room: &mut Room) {
+        for (k, window) in self.windows.iter().enumerate() {
+            let taps = [window.along_rows.values, window.along_cols.values];
+            let Room { lines: [.., values], line, .. } = room;
+            self.interpolate(views, window, row, taps, line, values.of_mut(k));
+        }
+    }
+
+    /// The slopes along both axes of the beam that the pixels of a row see, left in the room, where shifts
+    /// are sought.
+    pub(super) fn see_slopes(&self, views: &Views<'_>, row: usize, room: &mut Room) {
+        let cols = self.model.sensor().cols;
+        for (axis, slopes) in room.slopes.iter_mut().enumerate() {
+            slopes.fill(0.0);
+            for (window, slopes) in self.windows.iter().zip(slopes.chunks_exact_mut(cols)) {
+                let taps = slopes_along(window, axis);
+                self.interpolate(views, window, row, taps, &mut room.line, slopes);
+            }
+        }
+    }
+
+    /// The weights and values of one row of each exposure.
+    pub(super) fn measure(&self, row: usize, room: &mut Room) {
+        let cols = self.model.sensor().cols;
+        let Room { weights, lines: [.., values], .. } = room;
+        for (k, weights) in weights.chunks_exact_mut(cols).enumerate() {
+            let values = values.of_mut(k);
+            match self.model.stretch(k, row, 0..cols, weights) {
+                Stretch::Uniform(measured, _) => {
+                    values.iter_mut().zip(measured).for_each(|(value, y)| *value = y.to_f64());
+                }
+                Stretch::Weighted(measured, weights) => {
+                    for ((value, y), weight) in values.iter_mut().zip(measured).zip(weights) {
+                        *value = if *weight > 0.0 { y.to_f64() } else { 0.0 };
+                    }
+                }
+            }
+        }
+    }
+
+    /// The weights of one row of each exposure; those that are all the same stand in the room.
+    pub(super) fn weigh_row(&self, row: usize, room: &mut Room) {
+        let cols = self.model.sensor().cols;
+        for (k, weights) in room.weights.chunks_exact_mut(cols).enumerate() {
+            if self.model.uniform_weight(k).is_none() {
+                let _ = self.model.stretch(k, row, 0..cols, weights);
+            }
+        }
+    }
+
+    pub(super) fn room(&self) -> Room {
+        let (cols, count) = (self.model.sensor().cols, self.model.count());
+        let moved = if self.shift_prior.is_some() { count * cols } else { 0 };
+        let weight = |k| self.model.uniform_weight(k).unwrap_or(0.0);
+        Room {
+            weights: (0..count).flat_map(|k| std::iter::repeat_n(weight(k), cols)).collect(),
+            lines: [(); TAPS].map(|()| Lines::new(count, cols)),
+            line: vec![0.0; cols + 2 * AROUND],
+            sums: [(); 4].map(|()| vec![0.0; cols]),
+            slopes: [(); 2].map(|()| vec![0.0; moved]),
+        }
+    }
+}
+
+/// The factors of ∂L/∂d along one axis of the beam.
+pub(super) fn slopes_along(window: &Window, axis: usize) -> [[f64; TAPS]; 2] {
+    let (rows, cols): (&Taps, &Taps) = (&window.along_rows, &window.along_cols);
+    let along_rows = (axis == 0) != window.swaps_axes;
+    if along_rows { [rows.slopes, cols.values] } else { [rows.values, cols.slopes] }
+}

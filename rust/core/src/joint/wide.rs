@@ -1,0 +1,203 @@
+//! The columns Φ of the second level: hats on a coarse grid, times the beam.
+//!
+//! A spline of coefficients h a is not h times the spline of coefficients a: with the factors 1/6, 4/6,
+//! 1/6 of B it has ∇h·∇a/3 more, to first order. The columns have that much less, so that a tilt of
+//! the beam is one.
+
+use super::system::System;
+use crate::control::Control;
+use crate::frames::{Real, Shape};
+use crate::parallel::Workers;
+use crate::precondition::hats::Hats;
+
+/// Rows of cells whose sums over hats a thread makes at a time.
+const SUMMED: usize = 32;
+
+pub(super) struct Wide {
+    pub(super) hats: Hats,
+    cols: usize,
+    /// a, and ∂a/3 along rows and columns where the beam is a spline, in single precision; 0 for cells
+    /// that are not seen.
+    beam: Vec<f32>,
+    slopes: [Vec<f32>; 2],
+}
+
+impl Wide {
+    pub(super) fn new<T: Real>(hats: Hats, system: &System<'_, '_, T>, control: &Control) -> Self {
+        let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
+        let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
+        let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
+        let slope = |cell: usize, step: usize| {
+            let inside = system.grid.is_spline() && cell >= step && cell + step < beam.len();
+            if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
+                ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
+            } else {
+                0.0
+            }
+        };
+        let [down, along] =
+            [cols, 1].map(|step| on_cells(system, control, |cell| slope(cell, step)));
+        Self { hats, cols, beam: on_cells(system, control, level), slopes: [down, along] }
+    }
+
+    /// Φᵀ r.
+    pub(super) fn gather(&self, r: &[f64], workers: &Workers) -> Vec<f64> {
+        let (hats, cols) = (&self.hats, self.cols);
+        let rows = self.beam.len() / cols;
+        let bands = workers.map(rows.div_ceil(SUMMED), |band| {
+            let mut found: Vec<(usize, Vec<f64>)> = Vec::new();
+            let mut sums = [(); 5].map(|()| vec![0.0; cols]);
+            let band = band * SUMMED..rows.min((band + 1) * SUMMED);
+            for row in band.clone() {
+                let (node, height) = hats.rows.at(row as f64);
+                let cells = row * cols..(row + 1) * cols;
+                pulp::Arch::new().dispatch(Level {
+                    values: &r[cells.clone()],
+                    beam: &self.beam[cells.clone()],
+                    slopes: self.slopes.each_ref().map(|slopes| &slopes[cells.clone()]),
+                    height,
+                    sums: sums.each_mut().map(|sums| &mut sums[..]),
+                });
+                let is_last = row + 1 == band.end;
+                if is_last || hats.rows.at((row + 1) as f64).0 != node {
+                    found.extend(self.close(node, &sums));
+                    sums.iter_mut().for_each(|sums| sums.fill(0.0));
+                }
+            }
+            found
+        });
+        let mut heights = vec![0.0; hats.count()];
+        for (first, sums) in bands.into_iter().flatten() {
+            heights[first..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
+        }
+        heights
+    }
+
+    /// Sums along the coarse rows above and below, each with its first hat.
+    fn close(&self, node: usize, sums: &[Vec<f64>; 5]) -> [(usize, Vec<f64>); 2] {
+        let (nodes, spacing) = (self.hats.cols.nodes, self.hats.cols.spacing);
+        let [levels, turns, fall] = [&sums[..2], &sums[2..4], &sums[4..]];
+        [0, 1].map(|below| {
+            let mut found = vec![0.0; nodes];
+            let sign = [1.0, -1.0][below] / self.hats.rows.spacing;
+            for (col, &(node, share)) in self.hats.columns.iter().enumerate() {
+                let (node, share) = (node as usize, f64::from(share));
+                let value = levels[below][col] + sign * fall[0][col];
+                let moved = share * value - turns[below][col] / spacing;
+                found[node] += value - moved;
+                found[node + 1] += moved;
+            }
+            ((node + below) * nodes, found)
+        })
+    }
+
+    /// Adds Φ y to rows of cells from `first` on.
+    pub(super) fn spread(&self, heights: &[f64], first: usize, z: &mut [f64]) {
+        let cols = self.cols;
+        let mut last = usize::MAX;
+        let mut lines = [(); 4].map(|()| vec![0.0; cols]);
+        for (row, z) in z.chunks_exact_mut(cols).enumerate() {
+            let row = first + row;
+            let (node, height) = self.hats.rows.at(row as f64);
+            if node != last {
+                self.open(node, heights, &mut lines);
+                last = node;
+            }
+            let cells = row * cols..(row + 1) * cols;
+            pulp::Arch::new().dispatch(Smooth {
+                z,
+                beam: &self.beam[cells.clone()],
+                slopes: self.slopes.each_ref().map(|slopes| &slopes[cells.clone()]),
+                height,
+                spacing: self.hats.rows.spacing,
+                lines: lines.each_ref().map(|line| &line[..]),
+            });
+        }
+    }
+
+    /// The heights along the coarse rows above and below at every column, and their slopes.
+    fn open(&self, node: usize, heights: &[f64], lines: &mut [Vec<f64>; 4]) {
+        let (nodes, spacing) = (self.hats.cols.nodes, self.hats.cols.spacing);
+        for below in 0..2 {
+            let heights = &heights[(node + below) * nodes..][..nodes];
+            for (col, &(node, share)) in self.hats.columns.iter().enumerate() {
+                let (left, right) = (heights[node as usize], heights[node as usize + 1]);
+                lines[below][col] = left + f64::from(share) * (right - left);
+                lines[2 + below][col] = (right - left) / spacing;
+            }
+        }
+    }
+}
+
+/// A value for each cell.
+fn on_cells<T: Real>(
+    system: &System<'_, '_, T>,
+    control: &Control,
+    value: impl Fn(usize) -> f32 + Sync + Send,
+) -> Vec<f32> {
+    let Shape { cols, .. } = system.grid.geometry.beam;
+    let mut values = system.workers.filled(system.state.beam.len(), 0.0, control);
+    system.workers.map_blocks(&mut values, cols, |row, values| {
+        let cells = values.iter_mut().zip(row * cols..);
+        cells.for_each(|(each, cell)| *each = value(cell));
+    });
+    values
+}
+
+/// Sums of r a down a coarse cell, by the heights of the hats above and below, of r ∂a/3 along rows
+/// likewise, and of r ∂a/3 down, which a falling hat has less.
+struct Level<'s> {
+    values: &'s [f64],
+    beam: &'s [f32],
+    slopes: [&'s [f32]; 2],
+    height: f64,
+    sums: [&'s mut [f64]; 5],
+}
+
+impl pulp::NullaryFnOnce for Level<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [above, below, above_turn, below_turn, fall] = self.sums;
+        let [down, along] = self.slopes;
+        for col in 0..self.values.len() {
+            let r = self.values[col];
+            let (level, turn) = (r * f64::from(self.beam[col]), r * f64::from(along[col]));
+            above[col] += (1.0 - self.height) * level;
+            below[col] += self.height * level;
+            above_turn[col] += (1.0 - self.height) * turn;
+            below_turn[col] += self.height * turn;
+            fall[col] += r * f64::from(down[col]);
+        }
+    }
+}
+
+/// Adds smooth heights h times the spline: h a − ∇h·∇a/3.
+struct Smooth<'s> {
+    z: &'s mut [f64],
+    beam: &'s [f32],
+    slopes: [&'s [f32]; 2],
+    height: f64,
+    spacing: f64,
+    /// h above and below, and its slopes along.
+    lines: [&'s [f64]; 4],
+}
+
+impl pulp::NullaryFnOnce for Smooth<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [above, below, above_slope, below_slope] = self.lines;
+        let [down, along] = self.slopes;
+        for col in 0..self.z.len() {
+            let fall = below[col] - above[col];
+            let height = above[col] + self.height * fall;
+            let slope = above_slope[col] + self.height * (below_slope[col] - above_slope[col]);
+            let (a, along, down) =
+                (f64::from(self.beam[col]), f64::from(along[col]), f64::from(down[col]));
+            self.z[col] += a * height - along * slope - down * fall / self.spacing;
+        }
+    }
+}
