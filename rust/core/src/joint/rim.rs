@@ -80,6 +80,7 @@ impl Rim {
                 |(number, value): (usize, &f64)| (number as u32, number as u32, RIDGE * value);
             entries.extend(diagonal.iter().enumerate().map(ridge));
         }
+        control.check()?;
         let factor = fits.then(|| Cholesky::new(cells.len(), &entries)).flatten();
         let inverse = diagonal.iter().map(|&d| if d > 0.0 { 1.0 / d } else { 0.0 }).collect();
         Ok(Self { cells, factor, inverse })
