@@ -20,14 +20,15 @@ import numpy as np, equipix
 frames = np.random.default_rng(0).uniform(1, 2, (5, {rows}, {cols})).astype(np.float32)
 print("ready", flush=True)
 try:
-    equipix.calibrate(frames, equipix.cross_pattern(2, 3), method="{method}", tolerance=1e-300)
+    shifts = equipix.cross_pattern(2, 3) + {fraction}
+    equipix.calibrate(frames, shifts, method="{method}", tolerance=1e-300)
 except KeyboardInterrupt:
     print("interrupted", flush=True)
 """
 
 
-def seconds_to_stop(rows, cols, method, after_s=1.0):
-    code = ENDLESS.format(rows=rows, cols=cols, method=method)
+def seconds_to_stop(rows, cols, method, after_s=1.0, fraction=0):
+    code = ENDLESS.format(rows=rows, cols=cols, method=method, fraction=fraction)
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -51,6 +52,13 @@ def test_ctrl_c_stops_the_solver():
 def test_ctrl_c_stops_the_solver_on_a_large_sensor(method, after_s):
     """Whichever of its stages it is in: counting, labelling, factorising, iterating."""
     assert seconds_to_stop(6000, 6000, method, after_s) < 0.5
+
+
+@pytest.mark.timing
+@pytest.mark.parametrize("after_s", [0.5, 3.0, 6.0, 9.0])
+def test_ctrl_c_stops_the_joint_fit_on_a_large_sensor(after_s):
+    """Sweeps, the first beam, the preconditioner, products."""
+    assert seconds_to_stop(6000, 6000, "multiscale", after_s, fraction=0.25) < 0.5
 
 
 def calibrated(seed):

@@ -321,7 +321,7 @@ fn start<'m, 'a, T: Real>(
         descent.sweep(control)?;
     }
     let state = State {
-        beam: first_beam(&grid, model, &descent.beam(), workers, control)?,
+        beam: first_beam(&grid, &descent, model, workers, control)?,
         theta: vec![0.0; fluxes.columns.len()],
         shifts: unknowns.shifts.clone(),
     };
@@ -336,23 +336,24 @@ fn shift_prior(unknowns: &Unknowns) -> Option<ShiftPrior> {
     })
 }
 
-/// A beam known where pixels look at whole shifts, on the grid: cells around take what is beside them.
+/// The beam that sweeps at whole shifts have found, on the grid: cells around take what is beside them.
 fn first_beam<T: Real>(
     grid: &Grid,
+    descent: &Descent<'_, '_, T>,
     model: &Model<'_, T>,
-    known: &[f64],
     workers: &Workers,
     control: &Control,
 ) -> Result<Vec<f64>> {
     let (shape, origin) = (grid.geometry.beam, grid.geometry.origin);
     let (from, start) = (model.geometry.beam, model.geometry.origin);
+    let (known, places) = (&descent.beams()[0], model.geometry.views[0].places);
     let mut beam = workers.filled(shape.len(), 0.0, control);
     workers.map_blocks(&mut beam, shape.cols, |row, cells| {
         let row = (row + start[0]).checked_sub(origin[0]).filter(|&row| row < from.rows);
         let Some(row) = row else { return };
         for (col, value) in cells.iter_mut().enumerate() {
             let col = (col + start[1]).checked_sub(origin[1]).filter(|&col| col < from.cols);
-            *value = col.map_or(0.0, |col| known[row * from.cols + col]);
+            *value = col.map_or(0.0, |col| known[places.at(row, col)]);
         }
     });
     if !grid.is_spline() {

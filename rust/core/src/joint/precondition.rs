@@ -132,7 +132,7 @@ impl Preconditioner {
             }
             self.wide.spread(&heights, first, part);
         });
-        self.rim.add(of_cells, z);
+        self.rim.add(of_cells, z, workers);
         let coarse = &heights[self.wide.hats.count()..];
         let params = of_params.iter().zip(&self.params).zip(coarse);
         z.extend(params.map(|((r, inverse), height)| r * inverse + height));

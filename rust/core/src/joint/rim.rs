@@ -11,6 +11,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::linalg::Cholesky;
+use crate::parallel::Workers;
 
 /// A cell is of the rim if one so near has less than this share of its weight: the outermost factor of a
 /// spline is at most a sixth.
@@ -23,10 +24,16 @@ const WIDEST: usize = 50;
 const RIDGE: f64 = 1e-10;
 /// Cells that lie within a spline's reach of each other, along one axis.
 const REACH: usize = 2 * TAPS - 1;
-/// Cells of the rim that a thread takes at a time.
-const BLOCK: usize = 64;
+/// The rim is factorised in tiles of the grid so many cells wide, which hardly know of each other:
+/// each in some hundredths of a second, which nothing interrupts.
+const TILE: usize = 512;
 
 pub(super) struct Rim {
+    parts: Vec<Part>,
+}
+
+/// The rim in one tile.
+struct Part {
     cells: Vec<u32>,
     factor: Option<Cholesky>,
     /// 1/(N + τ GᵀG), of the diagonal, where there is no factor.
@@ -35,68 +42,74 @@ pub(super) struct Rim {
 
 impl Rim {
     pub(super) fn new<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Self> {
-        let cells = if system.grid.is_spline() { cells(system) } else { Vec::new() };
-        let side = system.state.beam.len().isqrt();
-        let fits = cells.len() <= WIDEST * side;
-        let length = if fits { system.state.beam.len() } else { 0 };
+        let mut cells = if system.grid.is_spline() { cells(system) } else { Vec::new() };
+        let (length, cols) = (system.state.beam.len(), system.grid.geometry.beam.cols);
+        let fits = cells.len() <= WIDEST * length.isqrt();
+        let tile = |&cell: &u32| (cell as usize / cols / TILE, cell as usize % cols / TILE);
+        cells.sort_by_key(tile);
+        let parts: Vec<&[u32]> = cells.chunk_by(|a, b| tile(a) == tile(b)).collect();
         let mut numbers = system.workers.filled(length, u32::MAX, control);
-        if fits {
-            for (number, &cell) in cells.iter().enumerate() {
-                numbers[cell as usize] = number as u32;
-            }
+        for part in &parts {
+            part.iter().zip(0..).for_each(|(&cell, number)| numbers[cell as usize] = number);
         }
-        let blocks = system.workers.map(cells.len().div_ceil(BLOCK), |block| {
+        let parts = system.workers.map(parts.len(), |index| {
             control.check()?;
-            let first = block * BLOCK;
-            let mut entries = Vec::new();
-            let mut diagonal = Vec::new();
-            let own = cells[first..].iter().take(BLOCK).enumerate();
-            for (index, &cell) in own {
-                let (cell, number) = (cell as usize, (first + index) as u32);
-                let mut row: Vec<(u32, f64)> = Vec::new();
-                let mut sum = 0.0;
-                system.for_neighbours(cell, |other, value| {
-                    sum += if other == cell { value } else { 0.0 };
-                    if let Some(&other) = numbers.get(other)
-                        && other <= number
-                    {
-                        row.push((other, value));
-                    }
-                });
-                row.sort_by_key(|&(other, _)| other);
-                let places = row.chunk_by(|a, b| a.0 == b.0);
-                entries.extend(places.map(|place| {
-                    (number, place[0].0, place.iter().map(|(_, value)| value).sum::<f64>())
-                }));
-                diagonal.push(sum);
-            }
-            Ok((entries, diagonal))
+            Ok(Part::new(system, parts[index], &numbers, fits))
         });
-        let blocks: Result<Vec<_>> = blocks.into_iter().collect();
-        let (entries, diagonals): (Vec<_>, Vec<_>) = blocks?.into_iter().unzip();
-        let (mut entries, diagonal) = (entries.concat(), diagonals.concat());
-        if fits {
-            let ridge =
-                |(number, value): (usize, &f64)| (number as u32, number as u32, RIDGE * value);
-            entries.extend(diagonal.iter().enumerate().map(ridge));
-        }
-        let factor = fits.then(|| Cholesky::new(cells.len(), &entries)).flatten();
-        let inverse = diagonal.iter().map(|&d| if d > 0.0 { 1.0 / d } else { 0.0 }).collect();
-        Ok(Self { cells, factor, inverse })
+        Ok(Self { parts: parts.into_iter().collect::<Result<_>>()? })
     }
 
     pub(super) fn cells(&self) -> impl Iterator<Item = usize> {
-        self.cells.iter().map(|&cell| cell as usize)
+        self.parts.iter().flat_map(|part| &part.cells).map(|&cell| cell as usize)
     }
 
     /// Adds (N + τ GᵀG)⁻¹ r on the rim.
-    pub(super) fn add(&self, r: &[f64], z: &mut [f64]) {
-        let mut values: Vec<f64> = self.cells().map(|cell| r[cell]).collect();
+    pub(super) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
+        let found = workers.map(self.parts.len(), |index| self.parts[index].solve(r));
+        self.cells().zip(found.into_iter().flatten()).for_each(|(cell, value)| z[cell] += value);
+    }
+}
+
+impl Part {
+    /// The part of these cells, by the number that each cell has among those of its part.
+    fn new<T: Real>(
+        system: &System<'_, '_, T>,
+        cells: &[u32],
+        numbers: &[u32],
+        fits: bool,
+    ) -> Self {
+        let (mut entries, mut inverse) = (Vec::new(), Vec::new());
+        for (&cell, number) in cells.iter().zip(0..) {
+            let mut row: Vec<(u32, f64)> = Vec::new();
+            system.for_neighbours(cell as usize, |other, value| {
+                let other_number = numbers[other];
+                let is_own = cells.get(other_number as usize) == Some(&(other as u32));
+                if is_own && other_number <= number {
+                    row.push((other_number, value));
+                }
+            });
+            row.sort_by_key(|&(other, _)| other);
+            let places = row.chunk_by(|a, b| a.0 == b.0);
+            let sums = places.map(|place| (place[0].0, place.iter().map(|at| at.1).sum::<f64>()));
+            entries.extend(sums.map(|(other, sum)| (number, other, sum)));
+            let diagonal = entries.last().map_or(0.0, |&(_, _, value)| value);
+            entries.push((number, number, RIDGE * diagonal));
+            inverse.push(if diagonal > 0.0 { 1.0 / diagonal } else { 0.0 });
+            if !fits {
+                entries.clear();
+            }
+        }
+        let factor = fits.then(|| Cholesky::new(cells.len(), &entries)).flatten();
+        Self { cells: cells.to_vec(), factor, inverse }
+    }
+
+    fn solve(&self, r: &[f64]) -> Vec<f64> {
+        let mut values: Vec<f64> = self.cells.iter().map(|&cell| r[cell as usize]).collect();
         match &self.factor {
             Some(factor) => factor.solve(&mut values),
             None => values.iter_mut().zip(&self.inverse).for_each(|(value, i)| *value *= i),
         }
-        self.cells().zip(values).for_each(|(cell, value)| z[cell] += value);
+        values
     }
 }
 
