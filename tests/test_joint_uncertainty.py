@@ -60,9 +60,8 @@ class TestAgainstDenseAlgebra:
         # The variance lacks 1e-4 at most of what the other unknowns bring to it.
         assert cal.std_of(weights) == pytest.approx(wanted, rel=1e-4)
 
-    @pytest.mark.parametrize("flux_std", [None, 1e-3])
-    def test_refined_shifts(self, flux_std):
-        shape, std = (10, 40), np.array([0, 0.05, 0.03, 0.05, 0.05])
+    def test_refined_shifts(self):
+        shape, std = (8, 32), np.array([0, 0.05, 0.03, 0.05, 0.05])
         rng = np.random.default_rng(3)
         shifts = between(SMALL_CROSS, rng)
         sensitivity = simulate.paper_sensitivity(shape, rng=rng)
@@ -70,7 +69,7 @@ class TestAgainstDenseAlgebra:
         frames = simulate.exposures(sensitivity, beam, shifts)
         frames += 1e-4 * rng.standard_normal(frames.shape)
         given = shifts + std[:, None] * rng.standard_normal(shifts.shape)
-        options = {"variance": np.full(5, 1e-8), "shift_std": std, "flux_std": flux_std}
+        options = {"variance": np.full(5, 1e-8), "shift_std": std}
         cal = equipix.calibrate(frames, given, uncertainty=True, **options)
         assert cal.metadata["options"]["shifts"] == "refined"
         dense = reference.joint(frames, given, **options)
@@ -116,6 +115,7 @@ class TestAgainstSimulatedExperiments:
             for seed in range(sensors)
         ]
         pixels, means, modes = np.sqrt(np.mean(squares, axis=0))
+        print(f"\nz of pixels {pixels:.3f}, 16x16 means {means:.3f}, long cosines {modes:.3f}")
         # The limits of the design. By chance: 4e-4 over 3.84e6 pixels, plus the map's own 2 %
         # squared; over 200 × 12 modes 0.014, over blocks, which share slow errors, as much.
         assert pixels == pytest.approx(1, abs=0.03)
@@ -210,20 +210,21 @@ def test_shifts_that_no_beam_tells_are_wrong_by_their_prior():
     truth = simulate.paper_sensitivity(shape, rng=rng)
     beam = simulate.gaussian_beam(shape, width=60)
     clean = simulate.exposures(truth, beam, shifts)
-    options = {"variance": np.full(5, 1e-10), "tolerance": 1e-9}
+    frames = clean + 1e-3 * rng.standard_normal(clean.shape)
+    options = {"variance": np.full(5, 1e-6)}
     weights = lowest_modes(shape, np.ones(shape, bool), count=3)
 
     def modes(moved):
-        cal = equipix.calibrate(clean, shifts + moved, shift_std=1e-9, **options)
+        cal = equipix.calibrate(clean, shifts + moved, tolerance=1e-9, **options)
         return np.einsum("mrc,rc->m", weights, np.log(cal.sensitivity))
 
     # Derivatives by the central difference of 0.02 pixel, of an error cubic in it.
     step = 0.01 * np.eye(10).reshape(10, 5, 2)
     slopes = np.array([(modes(move) - modes(-move)) / 0.02 for move in step])
-    cal = equipix.calibrate(clean, shifts, shift_std=std, uncertainty=True, **options)
+    cal = equipix.calibrate(frames, shifts, shift_std=std, uncertainty=True, **options)
     assert cal.metadata["options"]["shifts"] == "as given: the beam tells none"
     np.testing.assert_array_equal(cal.shift_std, np.full((5, 2), std))
-    exact = equipix.calibrate(clean, shifts + 1e-9, **options)
+    exact = equipix.calibrate(frames, shifts + 1e-9, **options)
     # What moves all exposures alike moves the beam; the prior's mean is no error of M.
     by_axis = slopes.reshape(5, 2, -1)
     moved = std**2 * np.sum((by_axis - by_axis.mean(axis=0)) ** 2, axis=(0, 1))

@@ -108,6 +108,7 @@ class TestAgainstSimulatedExperiments:
     def test_z_scores(self, masked):
         squares = np.array([self.mean_squares(seed, masked) for seed in range(4)])
         pixels, means, modes = np.sqrt(squares.mean(axis=0))
+        print(f"\nz of pixels {pixels:.3f}, 16x16 means {means:.3f}, long cosines {modes:.3f}")
         # The limits of the design. By chance: 4e-4 over 3.84e6 pixels, plus the map's own 2 %
         # squared; over 200 × 12 modes 0.014, over blocks, which share slow errors, as much.
         assert pixels == pytest.approx(1, abs=0.03)

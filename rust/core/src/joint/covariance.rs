@@ -118,7 +118,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
         let sensor = model.sensor();
         let fitted = unknowns.shift_std.is_some();
         let grid = Grid::new(sensor, &unknowns.shifts, rotations, fitted)?;
-        let fluxes = Fluxes::new(&unknowns.flux, &unknowns.shifts, rotations);
+        let fluxes = Fluxes::new(&unknowns.flux, solved.shifts, rotations);
         let state = State {
             beam: solved.coefficients.to_vec(),
             theta: vec![0.0; fluxes.columns.len()],
