@@ -372,6 +372,21 @@ class TestSuggest:
     def test_says_that_drift_will_tilt(self):
         with pytest.warns(DriftWarning):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)
+        plan.suggest((64, 80), 4, 5, patterns=1)  # warnings are errors here
+
+    @pytest.mark.parametrize(
+        ("shape", "exposures", "options", "words"),
+        [
+            ((64, 80), 5, {"noise": np.nan}, "'noise' is nan"),
+            ((64, 80), 5, {"drift": np.nan}, "'drift' is nan"),
+            ((64, 80), 5, {"noise": "much"}, "'noise' is 'much'"),
+            ((64, 80), 1, {}, "'exposures' is 1, expected two or more"),
+            ((1, 1), None, {}, r"'shape' is \(1, 1\)"),
+        ],
+    )
+    def test_refuses(self, shape, exposures, options, words):
+        with pytest.raises(InputError, match=words):
+            plan.suggest(shape, exposures, 9, **options)
 
     @pytest.mark.parametrize(
         ("arguments", "words"),

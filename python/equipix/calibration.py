@@ -31,6 +31,7 @@ from equipix._measurements import (
     as_statistics,
     as_values,
     as_variances,
+    moves,
     union,
     warn_of_order,
 )
@@ -720,6 +721,8 @@ def calibrate(
         method=method,
         flux=flux_model[0],
         shifts_refined=shift_error is not None,
+        shifts_whole=bool((places == np.rint(places)).all()),
+        moves=moves(places, turns, values.shape[1:]),
         dark=dark,
         one_level=flux_model[0] in ("known", "prior") and len(set(fluxes.tolist())) == 1,
         modelled=bool(models),

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.calibration import calibrate
-from equipix.errors import IdentifiabilityWarning
+from equipix import _native
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -96,11 +94,24 @@ def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats)
     ratios: list[float] = []
     for _ in range(min(max(_PIXELS // local.size, _FEWEST), _MOST)):
         frames = light + _NOISE * rng.standard_normal(light.shape)
-        with warnings.catch_warnings():
-            # Said of the whole sensor already; and what a part leaves undetermined is not counted.
-            warnings.simplefilter("ignore", IdentifiabilityWarning)
-            # One thread: on so small a part, two would mostly wait for each other.
-            solved = calibrate(frames, positions, flux=powers, tolerance=_TOLERANCE, workers=1)
+        # Not `calibrate`, which would ask each draw for the sign of the shifts as well. One thread:
+        # on so small a part, two would mostly wait for each other.
+        solved = _native.calibrate_frames(
+            frames,
+            positions.astype(np.float64),
+            shift_std=None,
+            rotation=[0] * len(positions),
+            flux=powers.tolist(),
+            flux_model=("known", []),
+            offset=False,
+            variance=None,
+            mask=None,
+            method="multiscale",
+            tolerance=_TOLERANCE,
+            max_sweeps=None,
+            workers=1,
+            progress=None,
+        )
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
         ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))

@@ -128,7 +128,7 @@ def _exchanged(
         gained = times[ranks[second]] - times[ranks[first]]
         hidden = np.sum((times[ranks] @ basis + gained[:, None] * apart) ** 2, axis=1)
         pair = hidden.argmin()
-        if not (hidden[pair] < best * (1 - 1e-9) and best > 10.0**-_TIE):
+        if not (hidden[pair] < best * (1 - 1e-9) and best > 0.4 * 10.0**-_TIE):
             return ranks
         best, chosen = hidden[pair], [first[pair], second[pair]]
         ranks[chosen] = ranks[chosen[::-1]]
