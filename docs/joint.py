@@ -146,7 +146,7 @@ def main() -> None:
     figure = Figure(figsize=(11, 10.8), layout="constrained")
     figure.suptitle(
         f"Error of the sensitivity M, in %: {SHAPE[1]}×{SHAPE[0]} pixels, noise of an exposure "
-        f"{NOISE:.1%}; in a row one colour scale"
+        f"{100 * NOISE:g} %; in a row one colour scale"
     )
     grid = figure.subplots(len(faults), 3)
     for place, heading in zip(grid[0], HEADINGS, strict=True):
