@@ -21,6 +21,7 @@ figures: $(BIN)/.built-release
 	$(BIN)/python docs/convergence.py
 	$(BIN)/python docs/spectrum.py
 	$(BIN)/python docs/estimate.py
+	$(BIN)/python docs/joint.py
 	$(BIN)/python docs/plan.py
 	$(BIN)/python docs/section3.py
 	$(BIN)/python docs/uncertainty.py

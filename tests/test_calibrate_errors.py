@@ -70,7 +70,8 @@ def with_value(array, place, value):
         ({"rotation": [0, 0, 45, 0, 0]}, "'rotation' is .*45"),
         ({"method": "newton"}, "'method' is 'newton'"),
         ({"tolerance": 0}, "'tolerance' is 0"),
-        ({"tolerance": np.nan}, "'tolerance' is NaN"),
+        ({"tolerance": np.nan}, "'tolerance' is nan"),
+        ({"tolerance": 1}, "'tolerance' is 1, expected a relative error between 0 and 1"),
         ({"tolerance": "small"}, "'tolerance' is 'small'"),
         ({"tolerance": "1e-3"}, "'tolerance' is '1e-3'"),
         ({"tolerance": True}, "'tolerance' is True"),
@@ -87,6 +88,16 @@ def with_value(array, place, value):
 def test_calibrate_names_what_is_wrong(options, message):
     with pytest.raises(InputError, match=message):
         equipix.calibrate(**changed(**options))
+
+
+@pytest.mark.parametrize(
+    ("shift", "options"),
+    [((0.3, 0.4), {}), ((0, 0), {"flux": "fit"}), ((2, 2), {"shift_std": 0.1})],
+)
+@pytest.mark.parametrize("rotation", [None, [0, 180, 0, 180, 0]])
+def test_one_position_is_refused_where_the_solver_would_search_in_vain(shift, options, rotation):
+    with pytest.raises(InputError, match="'shifts' are all alike"):
+        equipix.calibrate(frames(), [shift] * 5, rotation=rotation, **options)
 
 
 def test_an_unmet_tolerance_says_what_would_meet_it():

@@ -111,6 +111,33 @@ def test_inspect_shows_the_calibration(run, calibration):
     assert json.loads(out)["metadata"]["sensor"]["bit_depth"] == 12
 
 
+@pytest.mark.parametrize("weights", ["equal", "variances"])
+def test_inspect_names_the_mean_square_residual(run, tmp_path, weights):
+    beam, shifts = simulate.gaussian_beam(SHAPE), equipix.cross_pattern(5, 7)
+    frames = simulate.exposures(np.ones(SHAPE), beam, shifts)
+    frames += 1e-3 * np.random.default_rng(1).standard_normal(frames.shape)
+    variance = None if weights == "equal" else np.full(5, 1e-6)
+    equipix.calibrate(frames, shifts, variance=variance).save(tmp_path / "cal.tif")
+    out = run("inspect", tmp_path / "cal.tif", "--json")[1]
+    # 13 000 degrees of freedom.
+    if weights == "equal":
+        assert json.loads(out)["variance_of_a_value"] == pytest.approx(1e-6, rel=0.05)
+        assert "reduced_chi2" not in json.loads(out)
+        assert "variance of a value" in run("inspect", tmp_path / "cal.tif")[1]
+    else:
+        assert json.loads(out)["reduced_chi2"] == pytest.approx(1, rel=0.05)
+        assert "variance_of_a_value" not in json.loads(out)
+
+
+def test_inspect_says_what_is_no_calibration(run, experiment, tmp_path):
+    frames, mean = experiment.parent / "frames/p0.tif", tmp_path / "mean.tif"
+    assert run("average", frames, "-o", mean)[0] == 0
+    np.savez(tmp_path / "arrays.npz", values=np.ones(3))
+    refused(run("inspect", mean), mean, "holds frame statistics, expected calibration")
+    for other in (frames, tmp_path / "arrays.npz"):
+        refused(run("inspect", other), other, "holds neither a calibration", "did not write it")
+
+
 def test_average_writes_statistics(run, experiment, tmp_path):
     frames, dark = experiment.parent / "frames", experiment.parent / "dark/dark.tif"
     output = tmp_path / "mean.tif"
@@ -139,6 +166,20 @@ def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_p
     np.testing.assert_array_equal(read_frames(one), expected)
     assert sorted(path.name for path in folder.iterdir()) == ["p0.tif", "p1.tif"]
     np.testing.assert_array_equal(read_frames(folder / "p1.tif"), expected[6:])
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_correct_warns_of_corrected_frames(run, experiment, calibration, tmp_path, folder):
+    inputs = [experiment.parent / f"frames/p{k}.tif" for k in range(2)]
+    once, twice = (tmp_path / (name if folder else f"{name}.tif") for name in ("once", "twice"))
+    status, _, err = run("correct", calibration, *inputs, "-o", once)
+    assert (status, err) == (0, "")
+    corrected = sorted(once.iterdir()) if folder else [once]
+    status, _, err = run("correct", calibration, *corrected, "-o", twice)
+    assert status == 0
+    more = " and 1 more" if folder else ""
+    assert err.startswith(f"equipix: warning: {corrected[0]}{more}: corrected already")
+    assert err.count("\n") == 1
 
 
 def test_correct_takes_another_dark(run, experiment, calibration, tmp_path):
@@ -207,7 +248,7 @@ def test_version(run):
     assert run("--version") == (0, f"{equipix.__version__}\n", "")
 
 
-@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1"])
 def test_a_tolerance_that_is_none_is_refused(run, experiment, tmp_path, value):
     output = tmp_path / "cal.tif"
     refused(run("calibrate", experiment, "-o", output, "--tolerance", value), "'tolerance' is")
@@ -384,9 +425,24 @@ class TestPlan:
         found = json.loads(out)["patterns"]
         assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(3, 1)}
 
+    def test_warns_of_drift_that_was_given(self, run):
+        command = ("plan", "--shape", 64, 80, "--max-shift", 9, 9)
+        status, out, err = run(*command)
+        assert (status, err) == (0, "")
+        assert "tilt from lamp drift" in out
+        err = run(*command, "--drift", "1e-4")[2]
+        assert err.startswith("equipix: warning: lamp drift will tilt")
+
+    def test_a_single_row(self, run, tmp_path):
+        command = ("plan", "--shape", 1, 40, "-o", tmp_path / "plan.png", "--drift", 0, "--json")
+        status, out, err = run(*command, "--max-shift", 5, 5)
+        assert (status, err) == (0, "")
+        assert json.loads(out)["patterns"][0]["shifts"] == [[0, 0], [0, 1]]
+
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
+            (("--max-shift", 9, 9, "--noise", "nan"), "'noise' is nan"),
             ((), "give either --shifts"),
             (("--shifts", CROSS, "--max-shift", 9, 9), "give either --shifts"),
             (("--shifts", "0,0 5"), "'--shifts' is '0,0 5'"),

@@ -260,6 +260,19 @@ def test_a_wrong_manifest_is_refused_by_name(edited, old, new, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_mistake_of_all_exposures_is_said_once(manifest, tmp_path):
+    text = manifest.read_text()
+    path = tmp_path / "experiment.toml"
+    path.write_text(re.sub(r'name = "p(\d)"', r'name = "p\1"\nshfit = [0, 1]\nflux = -\1', text))
+    with pytest.raises(errors.FileError) as caught:
+        Experiment.load(path)
+    problems = str(caught.value).removeprefix(f"{path}: ").split("; ")
+    assert problems == [
+        "'flux' in exposure 0 ('p0') holds 0, expected a positive number, and likewise in 4 more",
+        "unknown key 'shfit' in exposure 0 ('p0'), and likewise in 4 more",
+    ]
+
+
 def test_a_glob_is_in_natural_order_and_in_its_own_folder(tmp_path):
     from equipix._manifest import find_files
 

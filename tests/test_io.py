@@ -498,7 +498,7 @@ def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> No
     with pytest.raises(FileError, match=f"a{suffix}"):
         load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "something"})
-    with pytest.raises(FileError, match="something else than frame statistics"):
+    with pytest.raises(FileError, match="holds something, expected frame statistics"):
         load_statistics(path)
     io.save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
     with pytest.raises(FileError, match=r"has format 99.*install a newer one"):

@@ -17,6 +17,7 @@ from equipix.errors import (
     InputError,
     ShiftRoundingWarning,
 )
+from equipix.plan.noise import local_variance
 from equipix.plan.smooth import drift_tilt, tilt_rms
 
 WITHIN = 0.1
@@ -372,19 +373,26 @@ class TestSuggest:
     def test_says_that_drift_will_tilt(self):
         with pytest.warns(DriftWarning):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)
+        plan.suggest((64, 80), 4, 5, patterns=1)  # warnings are errors here
 
     @pytest.mark.parametrize(
-        ("arguments", "words"),
+        ("arguments", "options", "words"),
         [
-            (((64, 80), 2, 10), "no pattern of so many"),
-            (((64, 80), 5, -1), "'max_shift' is -1"),
-            (((64, 80), 5, (0, 10)), "no pattern of so many"),
-            (((64, 80), 0, 10), "'exposures' is 0"),
+            (((64, 80), 2, 10), {}, "no pattern of 2 exposures"),
+            (((64, 80), 5, -1), {}, "'max_shift' is -1"),
+            (((64, 80), 5, (0, 10)), {}, "no pattern of 5 exposures"),
+            (((64, 80), None, (0, 10)), {}, "no pattern of two to five exposures"),
+            (((64, 80), 0, 10), {}, "'exposures' is 0"),
+            (((64, 80), 1, 10), {}, "'exposures' is 1, expected two or more"),
+            (((64, 80), 5, 10), {"noise": np.nan}, "'noise' is nan"),
+            (((64, 80), 5, 10), {"noise": "much"}, "'noise' is 'much'"),
+            (((64, 80), 5, 10), {"drift": np.nan}, "'drift' is nan"),
+            (((1, 1), None, 10), {}, "'shape' is (1, 1)"),
         ],
     )
-    def test_refuses(self, arguments, words):
+    def test_refuses(self, arguments, options, words):
         with pytest.raises(InputError) as error:
-            plan.suggest(*arguments)
+            plan.suggest(*arguments, **options)
         assert words in str(error.value)
 
 
@@ -402,6 +410,27 @@ class TestBudget:
         # Both from 24 draws, whose mean squares scatter by 16 %: with such short shifts long waves
         # make up much of the error.
         assert budget.rms == pytest.approx(alone.rms, rel=3 * 0.16 / 2 * np.sqrt(2 / 24))
+
+    @pytest.mark.parametrize("width", [None, 9.0])
+    def test_the_local_variance_is_what_its_formula_says(self, width):
+        shape, rng = (70, 6), np.random.default_rng(3)
+        positions, powers = rng.integers(-4, 5, (7, 2)), rng.uniform(0.5, 1.5, 7)
+        centre = (np.array(shape) - 1) / 2
+        seen: dict[tuple[int, int], float] = {}
+        for position, power in zip(positions, powers, strict=True):
+            for p in np.ndindex(shape):
+                cell = tuple((p + position).tolist())
+                seen[cell] = seen.get(cell, 0) + power**2
+        wanted = np.empty(shape)
+        for p in np.ndindex(shape):
+            cells = p + positions
+            away = np.zeros(7) if width is None else ((cells - centre) ** 2).sum(axis=1)
+            weight = powers**2 * np.exp(-2 * away / (width or 1) ** 2)
+            counts = np.array([seen[tuple(cell)] for cell in cells.tolist()])
+            wanted[p] = 1 / (weight.sum() - np.sum(powers**2 * weight / counts))
+        found = np.concatenate(list(local_variance(shape, positions, powers, width)))
+        # Sums of seven terms of one sign, but for a difference of some tenths of them.
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
     def test_a_large_sensor_takes_no_longer_to_solve(self):
         small, large = (budget_of((size, size), CROSS, noise=1).rms for size in (256, 2000))

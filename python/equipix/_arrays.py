@@ -118,6 +118,16 @@ def number(name: str, value: float) -> float:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
 
 
+def as_tolerance(value: float) -> float:
+    """The largest relative error of the sensitivity, checked: with 1 nothing would be known."""
+    checked = number("tolerance", value)
+    if not 0 < checked < 1:
+        raise InputError(
+            f"'tolerance' is {value!r}, expected a relative error between 0 and 1, such as 1e-6"
+        )
+    return checked
+
+
 def check_progress(progress: object) -> None:
     """Refuse a progress callback that cannot be called."""
     if progress is not None and not callable(progress):

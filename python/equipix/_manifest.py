@@ -140,8 +140,7 @@ def read_manifest(path: Path) -> Manifest:
     try:
         return Manifest.model_validate(content)
     except ValidationError as error:
-        problems = {_sentence(detail, content): None for detail in error.errors()}
-        raise FileError(f"{path}: {'; '.join(problems)}") from None
+        raise FileError(f"{path}: {'; '.join(_problems(error.errors(), content))}") from None
 
 
 def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
@@ -154,6 +153,23 @@ def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
 
 def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("manifest", "{text}", {"text": text})
+
+
+def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]:
+    """Say each mistake once, with the number of exposures where many make the same."""
+    found: dict[tuple[object, ...], dict[int | None, str]] = {}
+    for detail in details:
+        location = detail["loc"]
+        exposure = next((part for part in location if isinstance(part, int)), None)
+        names = [part for part in location if isinstance(part, str)]
+        kinds = {"manifest": detail["msg"], "extra_forbidden": "unknown", "missing": "missing"}
+        mistake = (kinds.get(detail["type"], "value"), *names[:2])
+        found.setdefault(mistake, {}).setdefault(exposure, _sentence(detail, content))
+    sentences = [list(alike.values()) for alike in found.values()]
+    return [
+        first + (f", and likewise in {len(others)} more" if others else "")
+        for first, *others in sentences
+    ]
 
 
 def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:

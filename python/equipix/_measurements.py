@@ -169,6 +169,12 @@ def as_flux(
     return values, ("prior", std.tolist())
 
 
+def moves(shifts: NDArray[Any], rotation: NDArray[Any], shape: tuple[int, ...]) -> bool:
+    """Whether exposures differ by more than turns that go round among four pixels."""
+    rows, cols = shape
+    return bool(np.ptp(shifts, axis=0).any()) or (rows != cols and len(set(rotation % 180)) > 1)
+
+
 def warn_of_order(
     flux_model: tuple[str, list[float]], shifts: NDArray[Any], rotation: NDArray[Any]
 ) -> None:
@@ -217,6 +223,8 @@ class Asked:
     method: str
     flux: str
     shifts_refined: bool
+    shifts_whole: bool
+    moves: bool
     dark: str
     one_level: bool
     modelled: bool
@@ -239,6 +247,11 @@ class Asked:
             raise InputError(
                 "'method' is 'coordinate-descent', which knows whole shifts and given fluxes: to "
                 "fit fluxes, shifts or the dark take 'multiscale'"
+            )
+        if not self.moves and (fitted or self.shifts_refined or not self.shifts_whole):
+            raise InputError(
+                "'shifts' are all alike: each pixel sees one place of the beam, and nothing "
+                "compares it with others; move the sensor between exposures"
             )
         if self.dark == "fit" and self.one_level:
             raise InputError(

@@ -11,10 +11,10 @@ import numpy as np
 
 from equipix import _native
 from equipix._arrays import (
+    as_tolerance,
     check_count,
     check_progress,
     naming_memory,
-    number,
     per_exposure,
     positive_count,
     positive_workers,
@@ -31,6 +31,7 @@ from equipix._measurements import (
     as_statistics,
     as_values,
     as_variances,
+    moves,
     union,
     warn_of_order,
 )
@@ -153,7 +154,8 @@ class Calibration:
     dark : ndarray, shape (rows, cols), or None
         The dark frame in DN, if it is part of the calibration.
     metadata : dict
-        Versions, options and origin, as JSON values; under ``uncertainty`` the draws that
+        Versions, options and origin, as JSON values (``options["weights"]``: "equal" where no
+        variance was known, else "variances"); under ``uncertainty`` the draws that
         `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
         was fitted together with fluxes, the standard deviation of b in its error b·M, which
         they hardly tell, and what the noise of its own measurements leaves of a pixel.
@@ -609,7 +611,7 @@ def calibrate(
         takes some (sensor size / shift)² of them.
     tolerance : float
         Largest relative error of the sensitivity, against the minimum of the objective, at
-        which the solver stops. The estimate includes errors of the sensor's own size.
+        which the solver stops; below 1. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
         Most passes over the data or its weights, but for a few where a step turns out too long;
         unless given, as many as it takes. It also ends where rounding keeps the error estimate
@@ -695,6 +697,7 @@ def calibrate(
     if method not in get_args(Method):
         raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
     check_progress(progress)
+    tolerance = as_tolerance(tolerance)
     statistics = as_statistics(frames)
     noise = fit_frames(statistics) if variance is None and statistics else None
     noisy = noisy_pixels(statistics, noise) if noise is not None else None
@@ -718,6 +721,8 @@ def calibrate(
         method=method,
         flux=flux_model[0],
         shifts_refined=shift_error is not None,
+        shifts_whole=bool((places == np.rint(places)).all()),
+        moves=moves(places, turns, values.shape[1:]),
         dark=dark,
         one_level=flux_model[0] in ("known", "prior") and len(set(fluxes.tolist())) == 1,
         modelled=bool(models),
@@ -729,7 +734,7 @@ def calibrate(
     def solve(
         variances: NDArray[Any] | None,
         masked: NDArray[np.bool_] | None,
-        tolerance: float = number("tolerance", tolerance),
+        tolerance: float = tolerance,
     ) -> _native.Solution:
         return _native.calibrate_frames(
             values,
@@ -790,6 +795,7 @@ def calibrate(
         "max_sweeps": max_sweeps,
         "dark": dark,
         "flux": flux_model[0],
+        "weights": "equal" if variances is None else "variances",
     }
     if result.refinement:
         options["shifts"] = result.refinement

@@ -151,6 +151,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         for flag in Flag
         if (calibration.flags & flag).any()
     }
+    options = calibration.metadata.get("options", {})
     return {
         "shape": list(calibration.shape),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
@@ -159,12 +160,17 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         "converged": calibration.converged,
         "error_estimate": calibration.error_estimate,
         "sweeps": calibration.sweeps,
-        "reduced_chi2": calibration.reduced_chi2,
+        _misfit_name(options): calibration.reduced_chi2,
         "components": calibration.components,
         "shift_sign": calibration.shift_sign,
-        "fluxes": calibration.metadata.get("options", {}).get("flux", "known"),
+        "fluxes": options.get("flux", "known"),
         "flagged_pixels": flagged,
     }
+
+
+def _misfit_name(options: dict[str, Any]) -> str:
+    """What the mean square residual is: without variances to measure it by, one in DN²."""
+    return "variance_of_a_value" if options.get("weights") == "equal" else "reduced_chi2"
 
 
 def _uncertainty(calibration: Calibration) -> dict[str, Any]:
@@ -386,7 +392,10 @@ def plan(
         int | None, typer.Option(min=2, help="Of the patterns to find; the fewest unless given.")
     ] = None,
     noise: Annotated[float, typer.Option(help="Noise of an exposure, over its signal.")] = 1e-3,
-    drift: Annotated[float, typer.Option(help="Unknown relative change of the lamp.")] = 1e-4,
+    drift: Annotated[
+        float | None,
+        typer.Option(help="Unknown relative change of the lamp; noise/10 unless given."),
+    ] = None,
     shift_error: Annotated[float, typer.Option(help="Error of a shift, in pixels.")] = 0,
     beam_width: Annotated[
         float | None, typer.Option(help="Width of a Gaussian beam in pixels; even unless given.")
@@ -404,14 +413,14 @@ def plan(
         check_output(output, force=force)
     causes: dict[str, Any] = {
         "noise": noise,
-        "drift": drift,
         "shift_error": shift_error,
         "beam_width": beam_width,
     }
     if shifts is not None:
-        budgets = [error_budget(shape, _pairs(shifts), **causes)]
+        assumed = noise / 10 if drift is None else drift
+        budgets = [error_budget(shape, _pairs(shifts), drift=assumed, **causes)]
     elif max_shift is not None:
-        found = suggest(shape, exposures, max_shift, rng=rng, **causes)
+        found = suggest(shape, exposures, max_shift, rng=rng, drift=drift, **causes)
         budgets = [suggestion.budget for suggestion in found]
     if output is not None:
         save_figure(draw_plans(budgets), output, force=force)

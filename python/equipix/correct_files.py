@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix.errors import FileError, InputError
+from equipix.errors import AlreadyCorrectedWarning, FileError, InputError
 from equipix.frames import average, load_statistics
 from equipix.io import (
+    description,
     find_files,
     folder_beside,
     frame_format,
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int, int, str], object]
     Flagged = Literal["nan", "keep", "replace"]
+
+_MARK = "corrected by equipix"
+"""Description of what `correct_files` writes, so that it is not corrected again unnoticed."""
 
 
 def correct_files(
@@ -72,11 +77,17 @@ def correct_files(
         replace an input.
     InputError
         If the frames have another shape than the correction.
+
+    Warns
+    -----
+    AlreadyCorrectedWarning
+        If files were written by this function.
     """
     files = find_files(source)
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
     counts = {file: _count(file, correction) for file in files}
+    _warn_of_corrected(files)
     level = _dark_frame(dark)
     total, done = sum(counts.values()), 0
 
@@ -91,11 +102,12 @@ def correct_files(
     frame_bytes = 4 * correction.shape[0] * correction.shape[1]
     if not is_folder(output):
         with write_whole(output, force=force) as temporary:
-            write_frames(temporary, corrected(files), nbytes=total * frame_bytes)
+            write_frames(temporary, corrected(files), nbytes=total * frame_bytes, description=_MARK)
         return total
     with folder_beside(output) as folder:
         for file, path in zip(files, outputs, strict=True):
-            write_frames(folder / path.name, corrected([file]), nbytes=counts[file] * frame_bytes)
+            nbytes = counts[file] * frame_bytes
+            write_frames(folder / path.name, corrected([file]), nbytes=nbytes, description=_MARK)
         output.mkdir(exist_ok=True)
         for path in outputs:
             (folder / path.name).replace(path)
@@ -115,6 +127,19 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     if repeated := [name for name in names if names.count(name) > 1]:
         raise FileError(f"{output}: two inputs would become '{repeated[0]}': correct them apart")
     return [output / name for name in names]
+
+
+def _warn_of_corrected(files: list[Path]) -> None:
+    """Warn of what this module has written: of floating-point numbers, which cameras do not."""
+    floats = [file for file in files if frame_format(file)[1].kind == "f"]
+    if corrected := [file for file in floats if description(file) == _MARK]:
+        others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
+        warnings.warn(
+            f"{corrected[0]}{others}: corrected already; correcting again divides by the "
+            "sensitivity twice: give the raw frames",
+            AlreadyCorrectedWarning,
+            stacklevel=3,
+        )
 
 
 def _count(file: Path, correction: Correction) -> int:

@@ -49,5 +49,9 @@ class DriftWarning(EquipixWarning):
     """Lamp drift will tilt the sensitivity by more than noise leaves."""
 
 
+class AlreadyCorrectedWarning(EquipixWarning):
+    """Frames to correct have been corrected before."""
+
+
 class MisfitWarning(EquipixWarning):
     """Residuals are larger than the variances given explain."""

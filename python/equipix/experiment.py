@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import warnings
 from dataclasses import asdict, dataclass, replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from equipix._arrays import naming_memory, number, positive_count, positive_workers
+from equipix._arrays import as_tolerance, naming_memory, positive_count, positive_workers
 from equipix._manifest import find_files, read_manifest
 from equipix.calibration import calibrate
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
@@ -394,8 +393,7 @@ class _Measured:
 
 def _check_options(tolerance: float, max_sweeps: int | None, workers: int | None) -> None:
     """Refuse before the work starts what the solver would refuse after the averaging."""
-    if not 0 < number("tolerance", tolerance) < math.inf:
-        raise InputError(f"'tolerance' is {tolerance!r}, expected a positive number")
+    as_tolerance(tolerance)
     if max_sweeps is not None:
         positive_count("max_sweeps", max_sweeps)
     positive_workers(workers)

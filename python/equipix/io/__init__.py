@@ -3,7 +3,7 @@
 from equipix.io.images import frame_format, read_frames, stream_frames
 from equipix.io.names import as_path, find_files, refuse_inputs
 from equipix.io.pages import SUFFIXES, check_format, check_pages, load_pages, save_pages
-from equipix.io.tiff import write_frames
+from equipix.io.tiff import description, write_frames
 from equipix.io.whole import folder_beside, replace_folder, write_whole
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "as_path",
     "check_format",
     "check_pages",
+    "description",
     "find_files",
     "folder_beside",
     "frame_format",

@@ -94,7 +94,9 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     try:
         metadata = json.loads(description)
     except ValueError as error:
-        raise FileError(f"{path}: was not written by equipix: it lacks its metadata") from error
+        raise FileError(
+            f"{path}: holds neither a calibration nor frame statistics: equipix did not write it"
+        ) from error
     return pages, metadata
 
 
@@ -107,7 +109,10 @@ def check_format(path: str | PathLike[str], content: object, kind: str, newest: 
         If the metadata are not of such a file.
     """
     if not isinstance(content, dict) or content.get("kind") != kind:
-        raise FileError(f"{path}: holds something else than {kind} that equipix has saved")
+        held = content.get("kind") if isinstance(content, dict) else None
+        raise FileError(
+            f"{path}: holds {held or 'something else'}, expected {kind} that equipix has saved"
+        )
     number = content.get("format")
     if not isinstance(number, int) or isinstance(number, bool) or number < 1:
         raise FileError(f"{path}: is damaged: its format is {number!r}, expected a whole number")
@@ -158,7 +163,7 @@ def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) 
 def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         pages = {name: file[name] for name in file.files}
-    return pages, str(pages.pop("metadata"))
+    return pages, str(pages.pop("metadata", ""))
 
 
 SUFFIXES = (".tif", ".tiff", ".npz")

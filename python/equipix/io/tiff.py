@@ -76,7 +76,13 @@ def _check_page(path: Path, page: Any, length: int) -> None:
         raise FileError(f"{path}: claims {page.nbytes} bytes of pixels in a file of {length}")
 
 
-def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, nbytes: int) -> None:
+def write_frames(
+    path: str | PathLike[str],
+    frames: Iterable[NDArray[Any]],
+    *,
+    nbytes: int,
+    description: str | None = None,
+) -> None:
     """Write frames as the pages of a TIFF file, holding one at a time.
 
     Parameters
@@ -87,10 +93,13 @@ def write_frames(path: str | PathLike[str], frames: Iterable[NDArray[Any]], *, n
         The frames.
     nbytes : int
         Bytes of all frames together; above 4 GB they need BigTIFF.
+    description : str, optional
+        ASCII text that goes with the first page.
     """
     with tifffile.TiffWriter(path, bigtiff=nbytes > _TIFF_LIMIT) as file:
         for frame in frames:
-            file.write(frame, photometric="minisblack", metadata=None)
+            file.write(frame, photometric="minisblack", metadata=None, description=description)
+            description = None
 
 
 def write_pages(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
@@ -109,8 +118,17 @@ def write_pages(path: Path, pages: Mapping[str, NDArray[Any]], description: str)
 
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
-    """Read what `write_pages` wrote: arrays by name, and the description."""
+    """Read what `write_pages` wrote: arrays by name, and the description; of other files none."""
     with tifffile.TiffFile(path) as file:
         every: Sequence[Any] = file.pages
+        if any(_PAGE_NAME not in page.tags for page in every):
+            return {}, ""
         pages = {page.tags[_PAGE_NAME].value: page.asarray() for page in every}
         return pages, every[0].description
+
+
+def description(path: Path) -> str:
+    """Text that goes with the first page of a file; empty where there is none."""
+    with reading(path), tifffile.TiffFile(path) as file:
+        page: Any = file.pages[0]
+        return str(page.description)

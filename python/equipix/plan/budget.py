@@ -177,21 +177,18 @@ def error_budget(
     exact = as_shifts(shifts)
     if len(exact) < 2:
         raise InputError(f"'shifts' holds {len(exact)} exposures, expected at least two")
-    sigma = _positive("noise", noise)
-    errors = {"drift": drift, "shift_error": shift_error}
-    errors = {name: _positive(name, value, zero=True) for name, value in errors.items()}
-    width = None if beam_width is None else _positive("beam_width", beam_width)
+    check_causes(sizes, noise, drift, shift_error, beam_width)
     powers = per_exposure("flux", flux, len(exact), default=1)
     if not (np.isfinite(powers).all() and (powers > 0).all()):
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
     positions = np.rint(exact - exact[0]).astype(np.int64) + np.rint(exact[0]).astype(np.int64)
     components = _components(sizes, positions)
-    scale = sigma**2 * factor(sizes, positions, powers)
-    predicted = _Noise(sizes, positions, powers, width, scale)
-    drift_tilts = drift_tilt(sizes, exact, errors["drift"])
+    scale = noise**2 * factor(sizes, positions, powers)
+    predicted = _Noise(sizes, positions, powers, beam_width, scale)
+    drift_tilts = drift_tilt(sizes, exact, drift)
     moved: tuple[float, tuple[float, float]] = (0.0, (0.0, 0.0))
-    if width is not None and errors["shift_error"]:
-        moved = shift_error_effect(sizes, exact, powers, width, errors["shift_error"])
+    if beam_width is not None and shift_error:
+        moved = shift_error_effect(sizes, exact, powers, beam_width, shift_error)
     causes = {
         "noise": predicted.rms(),
         "drift": tilt_rms(drift_tilts),
@@ -211,12 +208,31 @@ def error_budget(
     )
 
 
-def _positive(name: str, value: float, *, zero: bool = False) -> float:
+def check_causes(
+    shape: tuple[int, int],
+    noise: float,
+    drift: float,
+    shift_error: float,
+    beam_width: float | None,
+) -> None:
+    """Refuse a sensor that has nothing to compare, and causes of errors that are no numbers.
+
+    The parameters are those of `error_budget`.
+    """
+    if shape == (1, 1):
+        raise InputError(f"'shape' is {shape}: one pixel has no other to be compared with")
+    _positive("noise", noise)
+    _positive("drift", drift, zero=True)
+    _positive("shift_error", shift_error, zero=True)
+    if beam_width is not None:
+        _positive("beam_width", beam_width)
+
+
+def _positive(name: str, value: float, *, zero: bool = False) -> None:
     """Check a number that is above 0, or may be 0."""
     checked = number(name, value)
     if not (0 < checked < np.inf or (zero and checked == 0)):
         raise InputError(f"'{name}' is {value!r}, expected a number above 0{' or 0' * zero}")
-    return checked
 
 
 def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.calibration import calibrate
-from equipix.errors import IdentifiabilityWarning
+from equipix import _native
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _BLOCK = 64
-"""Rows at a time."""
+"""Rows at a time, at least."""
 
 _SMALLEST, _SPANS = 256, 8
 """The part of a large sensor that is drawn: so many pixels, or spans of the shifts, wide. Of four
@@ -46,27 +44,32 @@ def local_variance(
     (S⁻¹)_pp ≈ 1 / (D_M (1 − K)); what longer ways back add is left to `factor`.
     """
     rows, cols = shape
-    inside = [_overlaps(size, positions[:, axis]) for axis, size in enumerate(shape)]
+    places = positions - positions.min(axis=0)
+    spans = places.max(axis=0)
+    seen_by = [_seen_by(size, places[:, axis]) for axis, size in enumerate(shape)]
     light = [_light(size, positions[:, axis], width) for axis, size in enumerate(shape)]
     powers2 = powers**2
-    for start in range(0, rows, _BLOCK):
-        part = slice(start, start + _BLOCK)
-        weights: Floats = np.zeros((min(_BLOCK, rows - start), cols))
+    # As many rows as the exposures are apart: then few cells belong to two blocks.
+    height = max(_BLOCK, int(spans[0]))
+    for start in range(0, rows, height):
+        part = slice(start, min(start + height, rows))
+        cells = slice(part.start, part.stop + spans[0])
+        seen = (seen_by[0][cells] * powers2) @ seen_by[1].T
+        weights: Floats = np.zeros((part.stop - part.start, cols))
         returning = np.zeros_like(weights)
-        for k, power2 in enumerate(powers2):
-            weight = power2 * np.outer(light[0][k, part], light[1][k])
-            seen = (inside[0][k, part] * powers2) @ inside[1][k].T
+        for k, (row, col) in enumerate(places):
+            weight = powers2[k] * np.outer(light[0][k, part], light[1][k])
             weights += weight
-            returning += power2 * weight / seen
+            returning += powers2[k] * weight / seen[row : row + len(weight), col : col + cols]
         # Alone in all its cells, a pixel is compared with nothing.
         rest = weights - returning
         yield np.divide(1, rest, where=rest > 1e-9 * weights, out=np.full_like(rest, np.inf))
 
 
-def _overlaps(size: int, positions: NDArray[np.int64]) -> Floats:
-    """Whether exposure l has the cell that row (or column) i sees in exposure k: (k, i, l)."""
-    places = np.arange(size)[:, None] + positions[:, None, None] - positions
-    return ((places >= 0) & (places < size)).astype(np.float64)
+def _seen_by(size: int, places: NDArray[np.int64]) -> Floats:
+    """Whether exposure l sees row (or column) i of the beam, counted from the first: (i, l)."""
+    away = np.arange(size + places.max())[:, None] - places
+    return ((away >= 0) & (away < size)).astype(np.float64)
 
 
 def _light(size: int, positions: NDArray[np.int64], width: float | None) -> Floats:
@@ -91,11 +94,24 @@ def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats)
     ratios: list[float] = []
     for _ in range(min(max(_PIXELS // local.size, _FEWEST), _MOST)):
         frames = light + _NOISE * rng.standard_normal(light.shape)
-        with warnings.catch_warnings():
-            # Said of the whole sensor already; and what a part leaves undetermined is not counted.
-            warnings.simplefilter("ignore", IdentifiabilityWarning)
-            # One thread: on so small a part, two would mostly wait for each other.
-            solved = calibrate(frames, positions, flux=powers, tolerance=_TOLERANCE, workers=1)
+        # Not `calibrate`, which would ask each draw for the sign of the shifts as well. One thread:
+        # on so small a part, two would mostly wait for each other.
+        solved = _native.calibrate_frames(
+            frames,
+            positions.astype(np.float64),
+            shift_std=None,
+            rotation=[0] * len(positions),
+            flux=powers.tolist(),
+            flux_model=("known", []),
+            offset=False,
+            variance=None,
+            mask=None,
+            method="multiscale",
+            tolerance=_TOLERANCE,
+            max_sweeps=None,
+            workers=1,
+            progress=None,
+        )
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
         ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from equipix._arrays import as_array, check_shape, positive_count
 from equipix.errors import DriftWarning, InputError
-from equipix.plan.budget import ErrorBudget, error_budget, warn_of_drift
+from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
 from equipix.plan.identifiability import is_connected
 from equipix.plan.order import advise_order
 
@@ -60,7 +60,7 @@ def suggest(
     max_shift: ArrayLike,
     *,
     noise: float = 1e-3,
-    drift: float = 1e-4,
+    drift: float | None = None,
     shift_error: float = 0,
     beam_width: float | None = None,
     patterns: int = 3,
@@ -80,8 +80,9 @@ def suggest(
         Travel of the stage, in pixels, along both axes or (row, col): shifts are 0 to that. It is
         cut where the sensor is smaller.
     noise, drift, shift_error, beam_width : float
-        As for `error_budget`, whose `rms` is what makes a pattern good. By default drift is a
-        tenth of the noise; for the order of the patterns only such ratios matter.
+        As for `error_budget`, whose `rms` is what makes a pattern good. Unless given, drift is a
+        tenth of the noise, of which nothing warns; for the order of the patterns only such ratios
+        matter.
     patterns : int
         How many patterns to return, at most.
     rng : numpy.random.Generator or int
@@ -100,7 +101,7 @@ def suggest(
     Warns
     -----
     DriftWarning
-        If even with the best pattern the tilt from drift exceeds the error from noise.
+        If even with the best pattern the tilt from the drift given exceeds the error from noise.
 
     Notes
     -----
@@ -121,11 +122,15 @@ def suggest(
     travel = _travel(max_shift, sizes)
     wanted = positive_count("patterns", patterns)
     random = np.random.default_rng(rng)
-    score = _Score(sizes, travel, noise, drift)
+    check_causes(sizes, noise, drift or 0, shift_error, beam_width)
+    lamp = noise / 10 if drift is None else drift
+    score = _Score(sizes, travel, noise, lamp)
     if exposures is None:
         counts = range(2, 6)
+    elif positive_count("exposures", exposures) == 1:
+        raise InputError("'exposures' is 1, expected two or more: one compares no pixels")
     else:
-        counts = range(positive_count("exposures", exposures), exposures + 1)
+        counts = range(exposures, exposures + 1)
     found: list[Points] = []
     for count in counts:
         starts = _starts(count, travel, random)
@@ -135,8 +140,8 @@ def suggest(
             break
     if not found:
         raise InputError(
-            f"'exposures' is {exposures}: no pattern of so many within 'max_shift' "
-            f"{travel.tolist()} was found that compares every pixel; allow more of either"
+            f"'max_shift' is {travel.tolist()}: no pattern of {exposures or 'two to five'} "
+            "exposures within it was found that compares every pixel; allow more of either"
         )
     suggestions = []
     with warnings.catch_warnings():
@@ -148,13 +153,14 @@ def suggest(
                 sizes,
                 shifts,
                 noise=noise,
-                drift=drift,
+                drift=lamp,
                 shift_error=shift_error,
                 beam_width=beam_width,
             )
             suggestions.append(Suggestion(shifts, budget))
     suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
-    warn_of_drift(suggestions[0].budget.rms_by_cause)
+    if drift is not None:
+        warn_of_drift(suggestions[0].budget.rms_by_cause)
     return suggestions[:wanted]
 
 
