@@ -370,6 +370,14 @@ class TestSuggest:
         assert plan.identify((40, 50), found).components == 1
         assert len(plan.suggest((1, 50), None, 12, drift=1e-6)[0].shifts) == 2
 
+    def test_tells_its_progress(self):
+        told = []
+        plan.suggest((40, 50), 4, 9, drift=0, progress=lambda *each: told.append(each))
+        for stage in ("searching 4 positions", "judging patterns"):
+            steps = [(done, total) for done, total, name in told if name == stage]
+            assert steps == sorted(steps)
+            assert steps[-1][0] == steps[-1][1]
+
     def test_says_that_drift_will_tilt(self):
         with pytest.warns(DriftWarning):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)

@@ -85,9 +85,9 @@ def test_a_structured_beam_contradicts_reversed_shifts(whole):
 def test_shifts_far_apart_ask_a_smaller_window():
     cross = equipix.cross_pattern(97, 160)
     frames, shifts = experiment(1, wavy(1), shape=(240, 320), cross=cross)
-    assert sign_of(frames, shifts, max_sweeps=20, tolerance=1) == "confirmed"
+    assert sign_of(frames, shifts, max_sweeps=20, tolerance=0.9) == "confirmed"
     with pytest.warns(ShiftSignWarning):
-        assert sign_of(frames, -shifts, max_sweeps=20, tolerance=1) == "contradicted"
+        assert sign_of(frames, -shifts, max_sweeps=20, tolerance=0.9) == "contradicted"
 
 
 @pytest.mark.parametrize("turn", [90, 180, 270])
@@ -196,7 +196,7 @@ def test_progress_and_its_exceptions_come_through():
     cross = equipix.cross_pattern(97, 160)
     frames, shifts = experiment(1, smooth, shape=(240, 320), cross=cross)
     with pytest.raises(EnoughError):
-        sign_of(frames, shifts, max_sweeps=20, tolerance=1, progress=stop)
+        sign_of(frames, shifts, max_sweeps=20, tolerance=0.9, progress=stop)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])

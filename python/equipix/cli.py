@@ -420,7 +420,10 @@ def plan(
         assumed = noise / 10 if drift is None else drift
         budgets = [error_budget(shape, _pairs(shifts), drift=assumed, **causes)]
     elif max_shift is not None:
-        found = suggest(shape, exposures, max_shift, rng=rng, drift=drift, **causes)
+        with progress_bars() as progress:
+            found = suggest(
+                shape, exposures, max_shift, drift=drift, rng=rng, progress=progress, **causes
+            )
         budgets = [suggestion.budget for suggestion in found]
     if output is not None:
         save_figure(draw_plans(budgets), output, force=force)

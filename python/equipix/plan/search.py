@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array, check_shape, positive_count
+from equipix._arrays import as_array, check_progress, check_shape, positive_count
 from equipix.errors import DriftWarning, InputError
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
 from equipix.plan.identifiability import is_connected
 from equipix.plan.order import advise_order
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import ArrayLike, NDArray
 
+    Progress = Callable[[int, int, str], object]
     Points = NDArray[np.int64]
     Floats = NDArray[np.float64]
 
@@ -65,6 +68,7 @@ def suggest(
     beam_width: float | None = None,
     patterns: int = 3,
     rng: int | np.random.Generator = 0,
+    progress: Progress | None = None,
 ) -> list[Suggestion]:
     """Find patterns of shifts within the stage's travel, best first.
 
@@ -87,6 +91,8 @@ def suggest(
         How many patterns to return, at most.
     rng : numpy.random.Generator or int
         Source of the random numbers of the search, or its seed: the same one finds the same.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` now and then: hundreds of exposures take minutes.
 
     Returns
     -------
@@ -121,6 +127,8 @@ def suggest(
     sizes = check_shape(shape)
     travel = _travel(max_shift, sizes)
     wanted = positive_count("patterns", patterns)
+    check_progress(progress)
+    report: Progress = progress or (lambda *_: None)
     random = np.random.default_rng(rng)
     check_causes(sizes, noise, drift or 0, shift_error, beam_width)
     lamp = noise / 10 if drift is None else drift
@@ -134,7 +142,12 @@ def suggest(
     found: list[Points] = []
     for count in counts:
         starts = _starts(count, travel, random)
-        ends = [_improved(start, sizes, travel, score, random) for start in starts]
+        stage = f"searching {count} positions"
+        ends = []
+        for done, start in enumerate(starts):
+            report(done, len(starts), stage)
+            ends.append(_improved(start, sizes, travel, score, random))
+        report(len(starts), len(starts), stage)
         found = _distinct([end for end in ends if end is not None], score)
         if found:
             break
@@ -146,7 +159,8 @@ def suggest(
     suggestions = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DriftWarning)
-        for points in found[: max(wanted, _FINALISTS)]:
+        finalists = found[: max(wanted, _FINALISTS)]
+        for done, points in enumerate(finalists, start=1):
             shifts = points - points.min(axis=0)
             shifts = shifts[advise_order(shifts)]
             budget = error_budget(
@@ -158,6 +172,7 @@ def suggest(
                 beam_width=beam_width,
             )
             suggestions.append(Suggestion(shifts, budget))
+            report(done, len(finalists), "judging patterns")
     suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
     if drift is not None:
         warn_of_drift(suggestions[0].budget.rms_by_cause)
