@@ -380,6 +380,20 @@ class TestLaws:
         np.testing.assert_allclose(joint, plain, atol=1e-7)
 
 
+def test_a_linear_drift_hides_one_tilt_alone():
+    # A raster in equal times, t = (2, 1)·d: a drift is told from all tilts but that along (2, 1).
+    shape, shifts = (30, 40), [(0, 0), (0, 1), (1, 0), (1, 1)]
+    v, u = np.indices(shape) / 100
+    truth = np.exp(0.02 * v - 0.04 * u)
+    frames = simulate.exposures(truth, simulate.gaussian_beam(shape, width=60), shifts)
+    options = {"flux": "linear", "time": [0, 1, 2, 3], "tolerance": 1e-8}
+    with pytest.warns(IdentifiabilityWarning, match="tilt"):
+        cal = equipix.calibrate(frames, shifts, **options)
+    # M to 1e-8, its slope over 30 rows to a twentieth of that a pixel.
+    np.testing.assert_allclose(slope(np.log(cal.sensitivity)), (2e-4, -4e-4), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(cal.flux, 1, rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

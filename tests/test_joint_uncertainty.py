@@ -28,6 +28,10 @@ CASES = {
         SMALL_CROSS,
         {"flux": "linear", "time": INTERLEAVED, "rotation": ALIKE},
     ),
+    "hidden linear drift": (
+        np.array([(0, 0), (0, 1), (1, 0), (1, 1), (0, 0)], float),
+        {"flux": "linear", "time": [0.0, 1.0, 2.0, 3.0, 0.0]},
+    ),
     "monitor": (SMALL_CROSS, {"flux_std": 1e-3}),
     "monitor, all turned": (SMALL_CROSS, {"flux_std": 1e-3, "rotation": ALIKE}),
     "monitor, turned": (SMALL_CROSS, {"flux_std": 1e-3, "rotation": TURNED}),
@@ -251,7 +255,7 @@ def test_gain_and_offset_that_cannot_be_told_apart_are_named():
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             cal = equipix.calibrate(
-                frames, twice, flux="fit", dark="fit", variance=np.full(10, 2.5e-7), max_sweeps=500
+                frames, twice, flux="fit", dark="fit", variance=np.full(10, 2.5e-7)
             )
         words = [str(each.message) for each in caught if each.category is IdentifiabilityWarning]
         assert any("offset and gain can hardly be told apart" in each for each in words) != told

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 ShiftSign = Literal["confirmed", "contradicted", "undetermined"]
 
+_MOST_EXPOSURES = 12
+"""Exposures that are asked, from first to last: each has a flux to be found."""
+
 _SIGMAS = 6.0
 """Standard deviations √(2/dof) of F that chance does not reach."""
 
@@ -99,7 +102,8 @@ def shift_sign(
     Returns
     -------
     {"confirmed", "contradicted", "undetermined"}
-        The sign with the lower F, if F is lower by more than 6·√(2/dof) of itself.
+        The sign with the lower F, if F is lower by more than 6·√(2/dof) of itself, and in two
+        thirds of all blocks of 4×4 pixels.
 
     Warns
     -----
@@ -118,8 +122,9 @@ def shift_sign(
     still at it. What one of the fits leaves far outside the
     others, such as dust, is left out of both.
     """
-    side = _side(measured, shifts)
-    window = _Window.cut(measured, side)
+    asked = np.unique(np.linspace(0, len(shifts) - 1, _MOST_EXPOSURES).round().astype(int))
+    shifts = shifts[asked]
+    window = _Window.cut(measured, asked, _side(measured, asked, shifts))
     if len(shifts) < 3 or (len(shifts) - 2) * window.values[0].size < _FEWEST:
         return "undetermined"
     try:
@@ -135,21 +140,22 @@ def shift_sign(
     warnings.warn(
         "the data contradict the sign of the shifts: reversed, with free fluxes, they leave "
         f"{fits[1].left / fits[0].left:.2g} times the squared residuals; a shift grows when the "
-        "sensor moves towards larger rows and columns: give 'shifts' of the other sign",
+        "sensor moves towards larger rows and columns: give 'shifts' of the other sign, or "
+        "exchange the images of the aperture before and after the moves",
         ShiftSignWarning,
         stacklevel=3,
     )
     return "contradicted"
 
 
-def _side(measured: Measurements, shifts: NDArray[Any]) -> int:
+def _side(measured: Measurements, asked: NDArray[Any], shifts: NDArray[Any]) -> int:
     """Pixels along the window: some four times the largest shift s.
 
     Where that is many it is as small as leaves half a measurement a pixel to judge by:
     (n − 1)·w² − (w + s)² ≥ w²/2, the cells being at most (w + s)². 0 if nothing moves.
     """
     # Where the sensor's middle looks: a quarter turn exchanges its coordinates.
-    turned = np.array(measured.rotation) % 180 == 90
+    turned = np.array(measured.rotation)[asked] % 180 == 90
     middle = (np.array(measured.frames.shape[1:]) - 1) / 2
     middles = np.where(turned[:, None], middle[::-1], middle)
     reach = max(float(np.ptp(middles + sign * shifts, axis=0).max()) for sign in (1, -1))
@@ -189,12 +195,20 @@ def _lower(fits: list[_Fit]) -> int | None:
     low, high = fits[lower], fits[1 - lower]
     if freedom < _FEWEST or high.noise == 0:
         return None
-    if high.least <= (1 + _SIGMAS * (2 / freedom) ** 0.5) * low.left:
+    # So that NaN decides nothing.
+    if not high.least > (1 + _SIGMAS * (2 / freedom) ** 0.5) * low.left:
         return None
-    excess = np.nansum(high.squares - low.squares, axis=0)
-    for axis, size in enumerate(excess.shape):
-        excess = np.add.reduceat(excess, np.arange(0, size, _BLOCK), axis=axis)
-    return lower if np.mean(excess > 0) > _MOST else None
+    excess = high.squares - low.squares
+    blocks = _sums_of_blocks(np.nansum(excess, axis=0))
+    measured = _sums_of_blocks(np.isfinite(excess).any(axis=0).astype(int)) > 0
+    return lower if np.mean(blocks[measured] > 0) > _MOST else None
+
+
+def _sums_of_blocks(image: NDArray[Any]) -> NDArray[Any]:
+    """Sums over blocks of `_BLOCK` pixels square."""
+    for axis, size in enumerate(image.shape):
+        image = np.add.reduceat(image, np.arange(0, size, _BLOCK), axis=axis)
+    return image
 
 
 def _odd(fits: list[_Fit]) -> NDArray[np.bool_]:
@@ -217,8 +231,8 @@ class _Window(NamedTuple):
     corners: NDArray[np.int64]
 
     @classmethod
-    def cut(cls, measured: Measurements, side: int) -> _Window:
-        """The central pixels, at most `side` along each axis."""
+    def cut(cls, measured: Measurements, asked: NDArray[Any], side: int) -> _Window:
+        """The central pixels of the exposures asked, at most `side` along each axis."""
         shape = np.array(measured.frames.shape[1:])
         sizes = np.minimum(shape, side)
         first = (shape - sizes) // 2
@@ -226,8 +240,11 @@ class _Window(NamedTuple):
         rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
         part = (..., rows, cols)
         variance, mask = measured.variance, measured.mask
-        if variance is not None and variance.ndim == 3:
-            variance = np.ascontiguousarray(variance[part])
+        if variance is not None:
+            variance = (variance[part] if variance.ndim == 3 else variance)[asked]
+        if mask is not None:
+            mask = mask[part][asked] if mask.ndim == 3 else np.ascontiguousarray(mask[part])
+        rotation = np.array(measured.rotation)[asked].tolist()
         # A p₀ + t of the sensor less t of the window: the window's corner at shift 0.
         corners = {
             0: first,
@@ -236,12 +253,12 @@ class _Window(NamedTuple):
             270: (last[1], first[0]),
         }
         return cls(
-            np.ascontiguousarray(measured.frames[part]),
+            np.ascontiguousarray(measured.frames[part][asked]),
             variance,
-            None if mask is None else np.ascontiguousarray(mask[part]),
-            measured.flux,
-            measured.rotation,
-            np.array([corners[turn] for turn in measured.rotation]),
+            mask,
+            np.array(measured.flux)[asked].tolist(),
+            rotation,
+            np.array([corners[turn] for turn in rotation]),
         )
 
     def without(self, odd: NDArray[np.bool_]) -> _Window:

@@ -620,8 +620,8 @@ def calibrate(
     uncertainty : bool
         Whether to find `Calibration.sensitivity_std`, `Calibration.tilt_std` and, of shifts that
         were refined, `Calibration.shift_std`: what noise leaves uncertain, and what priors on
-        fluxes and shifts do. Takes some ten times as long as the calibration, between pixels some
-        thirty times. Without `variance` the scatter of the residuals tells the noise.
+        fluxes and shifts do. Takes some ten times as long as the calibration, after a joint fit
+        some hundred times. Without `variance` the scatter of the residuals tells the noise.
     workers : int, optional
         Number of threads; unless given, as many as processors may be used. The result is the
         same to the last bit.
@@ -646,8 +646,9 @@ def calibrate(
     ShiftRoundingWarning
         If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
-        If the measurements leave parts of the sensor uncompared, hardly tell some pattern, or free
-        fluxes leave a tilt of the sensitivity undetermined.
+        If the measurements leave parts of the sensor uncompared or hardly tell some pattern; if
+        free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark can hardly be
+        told from the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
     MisfitWarning
@@ -668,10 +669,11 @@ def calibrate(
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
     Gauss-Newton steps in which M follows at its closed form.
 
-    The sign of the shifts is asked of the central pixels, some four times as many along each axis
-    as the largest shift: fitted with the shifts as given and with all of them reversed, fluxes free
-    in both, the lower F must be lower by 6·√(2/dof) of itself, in most places. It is undetermined
-    without a question with fewer than three exposures or a thousand degrees of freedom, with
+    The sign of the shifts is asked of twelve exposures at most and of the central pixels: four
+    times as many along each axis as the largest shift, or fewer where that is more than 80. Fitted
+    with the shifts as given and with all of them reversed, fluxes free in both, the lower F must be
+    lower by 6·√(2/dof) of itself, in two thirds of all places. It is undetermined without a
+    question with fewer than three exposures or a thousand degrees of freedom, with
     ``dark="fit"``, where nothing moves, and where the middle of the sensor has no light.
 
     References
@@ -853,16 +855,19 @@ def _tilt_std(calibration: Calibration, workers: int | None) -> NDArray[Any]:
 
 
 def _dark_std(calibration: Calibration, workers: int | None) -> dict[str, float | None]:
-    """How well a fitted dark is known; None: of a fit that did not converge nothing is."""
+    """How well a fitted dark is known; None where a fit did not converge or no noise is known."""
     measurements = calibration.measurements
     assert measurements is not None
-    along, alone = offset_std(
-        measurements,
-        calibration.sensitivity,
-        calibration.beam,
-        calibration.reduced_chi2,
-        workers=workers,
-    )
+    if measurements.variance is None and not np.isfinite(calibration.reduced_chi2):
+        return {"std_along_sensitivity": None, "std_of_a_pixel": None}
+    with naming_memory("the standard deviation of the dark"):
+        along, alone = offset_std(
+            measurements,
+            calibration.sensitivity,
+            calibration.beam,
+            calibration.reduced_chi2,
+            workers=workers,
+        )
     return {
         "std_along_sensitivity": along if calibration.converged else None,
         "std_of_a_pixel": alone,
@@ -967,18 +972,21 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
             IdentifiabilityWarning,
             stacklevel=3,
         )
+    limited = calibration.metadata["options"]["max_sweeps"] is not None
+    used_up = result.ended == "sweeps used"
     dark = calibration.metadata.get("dark")
     if dark:
         along, alone = dark["std_along_sensitivity"], dark["std_of_a_pixel"]
-        if along is None or along > alone:
-            told = (
-                "is not told at all" if along is None else f"has the standard deviation {along:.1e}"
-            )
+        told = None
+        if along is not None and along > alone:
+            told = f"has the standard deviation {along:.1e}, where noise leaves a pixel {alone:.1e}"
+        elif not calibration.converged and not (used_up and limited):
+            told = "is not told at all"
+        if told is not None:
             warnings.warn(
                 "offset and gain can hardly be told apart: with fitted fluxes the dark may hold "
-                f"any multiple b of the sensitivity, and b {told}, where noise leaves {alone:.1e} "
-                "of a pixel alone; give the ratio of the levels as 'flux', or take larger shifts "
-                "in a beam that varies more",
+                f"any multiple b of the sensitivity, and b {told}; give the ratio of the levels as "
+                "'flux', or take larger shifts in a beam that varies more",
                 IdentifiabilityWarning,
                 stacklevel=3,
             )
@@ -993,7 +1001,6 @@ def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) 
             stacklevel=3,
         )
     if not calibration.converged:
-        used_up = result.ended == "sweeps used"
         stuck = (
             "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
         )

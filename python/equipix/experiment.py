@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from equipix.calibration import Calibration, Method
     from equipix.results import FrameStatistics
     from equipix.shifts import ShiftMeasurement, Spot
+    from equipix.uncertainty import Measurements
 
     Progress = Callable[[int, int, str], object]
 
@@ -149,7 +150,10 @@ class Experiment:
         Raises
         ------
         FileError
-            If an aperture image cannot be read or shows no usable spot.
+            If an aperture image cannot be read.
+        InputError
+            If one shows no usable spot; if the calibration was read from a file, holds no dark, or
+            is of another sensor.
 
         Notes
         -----
@@ -431,8 +435,23 @@ def _equalised(frames: NDArray[Any], calibration: Calibration) -> NDArray[Any]:
     """Frames corrected; of flagged pixels, which the centroid mends, the dark alone."""
     usable = (calibration.flags & Flag.DO_NOT_USE) == 0
     gain = np.where(usable, calibration.sensitivity, 1)
-    assert calibration.dark is not None
+    if calibration.dark is None:
+        raise InputError("'calibration' holds no dark frame: give one that Experiment.run has made")
+    if frames.shape[-2:] != calibration.shape:
+        raise InputError(
+            f"'calibration' is of a sensor of {calibration.shape}, the images of the aperture have "
+            f"{frames.shape[-2:]} pixels"
+        )
     return np.asarray((frames - calibration.dark) / gain)
+
+
+def _measurements_of(calibration: Calibration) -> Measurements:
+    if calibration.measurements is None:
+        raise InputError(
+            "'calibration' was read from a file, which does not hold the measurements: give the "
+            "result of Experiment.run"
+        )
+    return calibration.measurements
 
 
 def _uneven_pixels(spot: Spot, calibration: Calibration | None) -> float:
@@ -443,8 +462,7 @@ def _uneven_pixels(spot: Spot, calibration: Calibration | None) -> float:
     """
     if calibration is None:
         return _UNEVEN_PIXELS**2
-    measurements = calibration.measurements
-    assert measurements is not None
+    measurements = _measurements_of(calibration)
     count = len(measurements.frames)
     row, col = np.rint(spot.position).astype(int)
     around = (
@@ -459,8 +477,10 @@ def _uneven_pixels(spot: Spot, calibration: Calibration | None) -> float:
         known /= measurements.variance[around]
     else:
         known /= measurements.variance[:, None, None]
-    left = count / max(count - 2, 1) / float(np.nanmedian(known.sum(axis=0)))
-    return float(min(left / (4 * np.pi), _UNEVEN_PIXELS**2))
+    told = float(np.median(np.nan_to_num(known).sum(axis=0)))
+    if not told > 0:  # no light around the spot, or no noise known
+        return _UNEVEN_PIXELS**2
+    return min(count / max(count - 2, 1) / told / (4 * np.pi), _UNEVEN_PIXELS**2)
 
 
 def _sha256(path: Path) -> str:

@@ -131,7 +131,7 @@ def error_map(
     sensitivity : ndarray, shape (rows, cols)
         The solution M, of mean 1.
     beam : ndarray, shape of the padded grid
-        The solution L.
+        The solution L; after a joint fit its coefficients stand in `measurements`.
     reduced_chi2 : float
         Of the fit: the variance of a value where none was given.
     workers : int, optional
@@ -146,12 +146,20 @@ def error_map(
     exactness : dict
         ``draws``, and ``relative_standard_error`` of the map, root mean square over the pixels.
 
+    Raises
+    ------
+    InputError
+        If no variance was given and no residual tells it.
+    InsufficientMemoryError
+        If the memory that it takes cannot be had.
+
     Notes
     -----
     Given L the pixels are independent, and given M the cells of L, so two terms of the variance
     are exact; the third, a fifth of the whole with five exposures, is the mean square over draws:
-    solutions of the linearised problem for noise alone. There are as many draws as bring the
-    relative standard error to 2 %.
+    solutions of the linearised problem for noise alone. After a joint fit only the first term is
+    exact, and some 45 % are drawn. There are as many draws as bring the relative standard error to
+    2 %.
     """
     scale = measurements.scale(reduced_chi2)
     std, draws, exactness = _native.error_map(
@@ -183,7 +191,7 @@ def functional_std(
     sensitivity : ndarray, shape (rows, cols)
         The solution M, of mean 1.
     beam : ndarray, shape of the padded grid
-        The solution L.
+        The solution L; after a joint fit its coefficients stand in `measurements`.
     reduced_chi2 : float
         Of the fit: the variance of a value where none was given.
     weights : ndarray, shape (m, rows, cols)
@@ -197,6 +205,13 @@ def functional_std(
     -------
     ndarray, shape (m,), float64
         The standard deviations.
+
+    Raises
+    ------
+    InputError
+        If no variance was given and no residual tells it.
+    InsufficientMemoryError
+        If the memory that it takes cannot be had.
 
     Notes
     -----
@@ -232,7 +247,7 @@ def shift_std_left(
     sensitivity : ndarray, shape (rows, cols)
         The solution M, of mean 1.
     beam : ndarray, shape of the padded grid
-        The solution L.
+        The solution L; after a joint fit its coefficients stand in `measurements`.
     reduced_chi2 : float
         Of the fit: the variance of a value where none was given.
     workers : int, optional
@@ -242,6 +257,13 @@ def shift_std_left(
     -------
     ndarray, shape (n, 2), float64, or None
         The standard deviations, in pixels; None if the shifts were given as exact.
+
+    Raises
+    ------
+    InputError
+        If no variance was given and no residual tells it.
+    InsufficientMemoryError
+        If the memory that it takes cannot be had.
     """
     fit = measurements.joint
     if fit is None or fit.shift_std is None:
@@ -275,7 +297,7 @@ def offset_std(
     sensitivity : ndarray, shape (rows, cols)
         The solution M, of mean 1.
     beam : ndarray, shape of the padded grid
-        The solution L.
+        The solution L; after a joint fit its coefficients stand in `measurements`.
     reduced_chi2 : float
         Of the fit: the variance of a value where none was given.
     workers : int, optional
@@ -288,6 +310,13 @@ def offset_std(
         frames.
     alone : float
         Root mean square of what the noise of a pixel's own measurements does to its offset.
+
+    Raises
+    ------
+    InputError
+        If no variance was given and no residual tells it.
+    InsufficientMemoryError
+        If the memory that it takes cannot be had.
 
     Notes
     -----

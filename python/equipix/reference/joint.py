@@ -119,7 +119,7 @@ def joint(
     turns = np.zeros(count, int) if rotation is None else np.asarray(rotation, int) // 90
     measured = np.array(shifts, float)
     given = np.ones(count) if flux is None or isinstance(flux, str) else np.asarray(flux, float)
-    by_theta, leaves_tilt = _flux_columns(flux, flux_std, time, measured, turns)
+    by_theta, open_ways = _flux_columns(flux, flux_std, time, measured, turns)
     by_zeta, shift_prior, of_mean_shift = _shift_columns(shift_std, count)
     flux_prior = np.eye(by_theta.shape[1]) if flux_std is not None else by_theta[:0]
     priors = _diagonal_blocks(flux_prior, shift_prior)
@@ -178,8 +178,8 @@ def joint(
     sensitivity = found = np.where(weight > 0, sensitivity, np.nan)
     beam = grid.at_cells(beam, weights)
     if isinstance(flux, str):
-        if leaves_tilt:
-            slope = grid.slope(sensitivity)
+        if open_ways.size:
+            slope = open_ways.T @ (open_ways @ grid.slope(sensitivity))
             sensitivity = sensitivity * np.exp(-grid.unshifted @ slope)
             beam = beam * np.exp(grid.cells @ slope)
             logs = logs - places @ slope
@@ -191,11 +191,12 @@ def joint(
     response = np.zeros(matrix.T.shape)
     response[told] = np.linalg.pinv(matrix[:, told], rcond=1e-12)
     of_gain, of_dark, _, _, of_zeta = np.split(response, ends[:-1])
-    if leaves_tilt:
+    if open_ways.size:
         # The gauge takes the slope out of a change of ln M.
         of_gain = of_gain * (sensitivity / found)[:, None]
         valid = sensitivity > 0
         slopes = grid.slope_of(valid, (of_gain.T / sensitivity)[:, valid].T)
+        slopes = open_ways.T @ (open_ways @ slopes)
         of_gain = of_gain - sensitivity[:, None] * (grid.unshifted @ slopes)
     of_mean = np.outer(sensitivity / scale, of_gain[weight > 0].mean(axis=0))
     of_gain = (of_gain - of_mean) / scale
@@ -228,28 +229,30 @@ def _flux_columns(
     time: ArrayLike | None,
     shifts: Array,
     turns: Array,
-) -> tuple[Array, bool]:
-    """T of ln c = ln c₀ + T·θ, and whether a tilt of ln M hides what is missing in it.
+) -> tuple[Array, Array]:
+    """T of ln c = ln c₀ + T·θ, and in which directions a tilt of ln M hides what T leaves out.
 
     M → M·exp(b·p), L → L·exp(−b·u) and ln c → ln c + b·d changes no measurement, unless exposures
     are turned against each other: then only a factor between L and c is not told.
     """
     count = len(shifts)
     if flux_std is not None:
-        return np.diag(np.broadcast_to(np.asarray(flux_std, float), count)), False
+        return np.diag(np.broadcast_to(np.asarray(flux_std, float), count)), np.empty((0, 2))
     constant = np.ones((count, 1))
     turned = bool(np.any(turns != turns[0]))
     hidden = constant if turned else np.hstack([constant, shifts])
     if isinstance(flux, str) and flux == "fit":
         left, sizes, _ = np.linalg.svd(hidden)
-        return left[:, np.sum(sizes > 1e-9 * sizes[0]) :], not turned
+        open_ways = np.empty((0, 2)) if turned else np.eye(2)
+        return left[:, np.sum(sizes > 1e-9 * sizes[0]) :], open_ways
     if isinstance(flux, str):
         times = np.asarray(time, float)
         told = times - hidden @ np.linalg.lstsq(hidden, times)[0]
         if np.linalg.norm(told) > 1e-9 * np.linalg.norm(times):
-            return (times - times.mean())[:, None] / np.ptp(times), False
-        return np.empty((count, 0)), True
-    return np.empty((count, 0)), False
+            return (times - times.mean())[:, None] / np.ptp(times), np.empty((0, 2))
+        growth = np.linalg.lstsq(shifts - shifts.mean(axis=0), times)[0]
+        return np.empty((count, 0)), (growth / np.linalg.norm(growth))[None]
+    return np.empty((count, 0)), np.empty((0, 2))
 
 
 def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Array, Array]:

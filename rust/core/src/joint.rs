@@ -117,7 +117,7 @@ pub struct Fit {
     pub offset: Option<Vec<f64>>,
     /// L at the cells of its grid, row by row; NaN where no measurement tells.
     pub beam: Vec<f64>,
-    /// The coefficients of the spline that L is, or L itself; 0 where no measurement tells.
+    /// The coefficients of the spline that L is, or L itself; of any value where no measurement tells.
     pub coefficients: Vec<f64>,
     /// Sizes of the grid.
     pub beam_shape: Shape,
@@ -221,7 +221,7 @@ pub fn solve<T: Real>(
             if matches!(unknowns.flux, Flux::Free | Flux::Linear(_)) {
                 let theta = system.state.theta.first().copied().unwrap_or_default();
                 let drift = system.fluxes.slope.map(|slope| theta * slope);
-                gauge::fix(&mut fit, drift, rotations[0], model.sensor());
+                gauge::fix(&mut fit, drift, &system.fluxes.open, rotations[0], model.sensor());
             }
             return Ok(fit);
         }
@@ -259,7 +259,7 @@ pub fn solve<T: Real>(
 /// | the sums of all bands ([`pass`]) | 8 · 2.2 at most for each cell of each view |
 /// | the beam, seven vectors of a search, weights, the penalty, the preconditioner | 8 · 16 for each cell |
 /// | with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
-/// | the rim and its factor | some 2000 for each of six cells of each row and column |
+/// | the rim and its factor | some 2000 for each of its cells, [`rim::WIDEST`] of each row and column at most |
 /// | the result and its components | 30 for each pixel, 21 for each cell |
 pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>, unknowns: &Unknowns) -> u64 {
     let geometry = &model.geometry;
@@ -267,7 +267,7 @@ pub(crate) fn bytes_needed<T: Real>(model: &Model<'_, T>, unknowns: &Unknowns) -
     let (count, views) = (model.count() as u64, geometry.views.len() as u64);
     let of_pixel = 8 * count + if unknowns.offset { 48 } else { 24 } + 30;
     let turned = if views > 1 { 24 * views } else { 0 };
-    let rim = 12_000 * (geometry.beam.rows + geometry.beam.cols) as u64;
+    let rim = 2000 * rim::WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
     of_pixel * pixels
         + (18 * views + turned + 149) * cells
         + rim
@@ -444,7 +444,7 @@ fn finish<T: Real>(
         shifts: system.state.shifts.clone(),
         refinement,
         untold: system.untold(),
-        leaves_tilt: system.fluxes.leaves_tilt,
+        leaves_tilt: !system.fluxes.open.is_empty(),
         smallest_ritz: search.smallest,
         misfit: system.misfit,
         unknowns: unknowns(system),

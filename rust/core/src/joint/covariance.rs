@@ -169,13 +169,18 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
             let turned = in_sensor(system.fluxes.hidden_slope, rotations[0]);
             let covariance = turned.map(|row| row.map(|x| x / solved.unit));
             hidden = Some(Hidden { tilts, covariance });
-        } else if system.fluxes.leaves_tilt {
+        } else if !system.fluxes.open.is_empty() {
             let labels: Vec<i32> = valid.iter().map(|valid| *valid as i32 - 1).collect();
             let slopes = gauge::slopes(&m, &labels, sensor);
-            for (tilt, mut slope) in tilts.into_iter().zip(slopes) {
+            for direction in &system.fluxes.open {
+                let [row, col] = gauge::in_sensor(*direction, rotations[0]);
+                let along = |[rows, cols]: &[Vec<f64>; 2]| -> Vec<f64> {
+                    rows.iter().zip(cols).map(|(r, c)| row * r + col * c).collect()
+                };
+                let mut slope = along(&slopes);
                 let pixels = slope.iter_mut().zip(&m).filter(|(weight, _)| **weight != 0.0);
                 pixels.for_each(|(weight, m)| *weight /= m);
-                parts.push([tilt, slope]);
+                parts.push([along(&tilts), slope]);
             }
         }
         Ok(Self {
@@ -350,7 +355,7 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
         let logs: Vec<f64> = flux.iter().map(|c| (-1.0 / c - of_beam) / light).collect();
         let mut along: Vec<f64> =
             system.weights.iter().map(|w| if *w > 0.0 { of_beam } else { 0.0 }).collect();
-        along.extend(system.fluxes.gather(&logs));
+        along.extend(system.fluxes.sought(&logs));
         along.resize(pull.len(), 0.0);
         let pulled = product(system, &along, control)?;
         let (size, height) = (workers.dot(&along, &pulled), workers.dot(&along, &pull));

@@ -26,6 +26,8 @@ pub enum Flux {
 pub(super) struct Fluxes {
     /// The columns of T.
     pub(super) columns: Vec<Vec<f64>>,
+    /// T is orthonormal by Σ w a b of these.
+    weights: Vec<f64>,
     /// The weight of θ² in F, for each column, where the noise is known.
     pub(super) precisions: Vec<f64>,
     /// The slope of ln L, a cell, that stands for what a drift linear in time has affine in the shifts,
@@ -34,8 +36,9 @@ pub(super) struct Fluxes {
     /// The covariance of the slope along the shifts, a cell, of the part of ln c that hides in a tilt,
     /// by the prior of each.
     pub(super) hidden_slope: [[f64; 2]; 2],
-    /// Whether a tilt of ln M is left undetermined.
-    pub(super) leaves_tilt: bool,
+    /// The directions in the beam, of length 1 and across each other, along which a tilt is left
+    /// undetermined.
+    pub(super) open: Vec<[f64; 2]>,
 }
 
 /// What rounding leaves of a vector of length 1.
@@ -54,35 +57,38 @@ impl Fluxes {
             hidden
         };
         let (mut slope, mut hidden_slope) = ([0.0; 2], [[0.0; 2]; 2]);
-        let (columns, precisions, leaves_tilt) = match flux {
-            Flux::Known => (Vec::new(), Vec::new(), false),
+        let weights: Vec<f64> = match flux {
+            Flux::Prior(std) => std.iter().map(|std| 1.0 / (std * std)).collect(),
+            _ => vec![1.0; count],
+        };
+        let (columns, precisions, open) = match flux {
+            Flux::Known => (Vec::new(), Vec::new(), Vec::new()),
             Flux::Free => {
-                let free = complement(&hidden(turned), (0..count).map(unit), &vec![1.0; count]);
-                (free, Vec::new(), !turned)
+                let free = complement(&hidden(turned), (0..count).map(unit), &weights);
+                let open = if turned { Vec::new() } else { vec![[1.0, 0.0], [0.0, 1.0]] };
+                (free, Vec::new(), open)
             }
             Flux::Linear(times) => {
                 // What of the times is affine in the shifts no measurement tells from a tilt: it
                 // follows from the rest.
-                let even = vec![1.0; count];
-                let told = complement(&hidden(turned), std::iter::once(times.clone()), &even);
+                let told = complement(&hidden(turned), std::iter::once(times.clone()), &weights);
                 if let (Some(told), false) = (told.first(), turned) {
                     slope = affine_part(times, told, shifts).map(|part| -part);
                 }
-                let leaves_tilt = told.is_empty();
-                (told, Vec::new(), leaves_tilt)
+                let open = if told.is_empty() { vec![growth(times, shifts)] } else { Vec::new() };
+                (told, Vec::new(), open)
             }
-            Flux::Prior(std) => {
-                let weights: Vec<f64> = std.iter().map(|std| 1.0 / (std * std)).collect();
+            Flux::Prior(_) => {
                 let free = complement(&hidden(turned), (0..count).map(unit), &weights);
                 let precisions = vec![1.0; free.len()];
                 if !turned {
                     hidden_slope = slope_covariance(&weights, shifts);
                 }
-                (free, precisions, false)
+                (free, precisions, Vec::new())
             }
         };
         let precisions = if precisions.is_empty() { vec![0.0; columns.len()] } else { precisions };
-        Self { columns, precisions, slope, hidden_slope, leaves_tilt }
+        Self { columns, weights, precisions, slope, hidden_slope, open }
     }
 
     /// T θ.
@@ -92,6 +98,12 @@ impl Fluxes {
             logs.iter_mut().zip(column).for_each(|(log, t)| *log += t * value);
         }
         logs
+    }
+
+    /// The θ whose T θ is nearest to logs, by the weights that T is orthonormal by.
+    pub(super) fn sought(&self, logs: &[f64]) -> Vec<f64> {
+        let weighted: Vec<f64> = logs.iter().zip(&self.weights).map(|(log, w)| w * log).collect();
+        self.gather(&weighted)
     }
 
     /// Tᵀ b.
@@ -113,6 +125,19 @@ fn slope_covariance(weights: &[f64], shifts: &[[f64; 2]]) -> [[f64; 2]; 2] {
         sum(&|d| (d[0] - row) * (d[1] - col)),
         sum(&|d| (d[1] - col).powi(2)),
     ])
+}
+
+/// The direction in which times grow that are affine in the shifts.
+fn growth(times: &[f64], shifts: &[[f64; 2]]) -> [f64; 2] {
+    let even = vec![1.0; times.len()];
+    let mean = |axis: usize| shifts.iter().map(|d| d[axis]).sum::<f64>() / times.len() as f64;
+    let along = [0, 1].map(|axis| {
+        let mean = mean(axis);
+        shifts.iter().zip(times).map(|(d, t)| (d[axis] - mean) * t).sum::<f64>()
+    });
+    let slope = slope_covariance(&even, shifts).map(|row| row[0] * along[0] + row[1] * along[1]);
+    let length = slope[0].hypot(slope[1]);
+    slope.map(|part| part / length)
 }
 
 /// γ of t/|t·told| = told + c + γ·d, for d along which the times change at all.
@@ -174,7 +199,7 @@ mod tests {
     #[test]
     fn free_fluxes_have_no_part_that_looks_like_a_tilt() {
         let fluxes = Fluxes::new(&Flux::Free, &CROSS, &[Rotation::None; 5]);
-        assert!(fluxes.leaves_tilt);
+        assert_eq!(fluxes.open, [[1.0, 0.0], [0.0, 1.0]]);
         assert_eq!(fluxes.columns.len(), 2);
         for column in &fluxes.columns {
             for weight in [|_: &[f64; 2]| 1.0, |d: &[f64; 2]| d[0], |d: &[f64; 2]| d[1]] {
@@ -189,7 +214,7 @@ mod tests {
         let mut rotations = [Rotation::None; 5];
         rotations[4] = Rotation::Half;
         let fluxes = Fluxes::new(&Flux::Free, &CROSS, &rotations);
-        assert!(!fluxes.leaves_tilt);
+        assert!(fluxes.open.is_empty());
         assert_eq!(fluxes.columns.len(), 4);
     }
 
@@ -198,10 +223,10 @@ mod tests {
         let line = [[0.0, 0.0], [0.0, 3.0], [0.0, 6.0], [0.0, 9.0]];
         let times = |scale: f64| Flux::Linear((0..4).map(|k| scale * f64::from(k)).collect());
         let fluxes = Fluxes::new(&times(60.0), &line, &[Rotation::None; 4]);
-        assert!(fluxes.leaves_tilt && fluxes.columns.is_empty());
+        assert!(fluxes.open == [[0.0, 1.0]] && fluxes.columns.is_empty());
         let fluxes =
             Fluxes::new(&Flux::Linear(vec![0.0, 3.0, 1.0, 2.0]), &line, &[Rotation::None; 4]);
-        assert!(!fluxes.leaves_tilt && fluxes.columns.len() == 1);
+        assert!(fluxes.open.is_empty() && fluxes.columns.len() == 1);
     }
 
     #[test]

@@ -14,16 +14,25 @@ use crate::geometry::Rotation;
 const SINGULAR: f64 = 1e-12;
 
 /// Gives L the slope `drift` that a lamp's drift has in the beam, brings the mean of ln c to 0, and the
-/// slope of ln M, least squares over the ordinary pixels of the largest component, if the fluxes
-/// leave it undetermined.
-pub(super) fn fix(fit: &mut Fit, drift: [f64; 2], rotation: Rotation, sensor: Shape) {
+/// slope of ln M, least squares over the ordinary pixels of the largest component, along the
+/// directions in the beam that the fluxes leave `open`.
+pub(super) fn fix(
+    fit: &mut Fit,
+    drift: [f64; 2],
+    open: &[[f64; 2]],
+    rotation: Rotation,
+    sensor: Shape,
+) {
     untilt(fit, in_sensor(drift, rotation), rotation, sensor);
-    if fit.leaves_tilt {
+    if !open.is_empty() {
         let slope = slopes(&fit.sensitivity, &fit.components.pixels, sensor).map(|weights| {
             let pixels = weights.iter().zip(&fit.sensitivity).filter(|(w, _)| **w != 0.0);
-            pixels.map(|(weight, m)| weight * m.ln()).sum()
+            pixels.map(|(weight, m)| weight * m.ln()).sum::<f64>()
         });
-        untilt(fit, slope, rotation, sensor);
+        for direction in open.iter().map(|direction| in_sensor(*direction, rotation)) {
+            let along = direction[0] * slope[0] + direction[1] * slope[1];
+            untilt(fit, direction.map(|part| along * part), rotation, sensor);
+        }
     }
     let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
     fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
@@ -92,14 +101,31 @@ pub(super) fn slopes(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [Vec
     inverse.map(|axis| (0..sensitivity.len()).map(|pixel| weight(pixel, axis)).collect())
 }
 
-/// The inverse of a symmetric matrix [a b; b c], 0 along an axis that it does not tell.
+/// The inverse of a matrix [a b; b c] without negative eigenvalues; 0 along the direction that one of
+/// rank 1 does not tell, and the matrix over its trace squared along the other.
 pub(super) fn inverse([a, b, c]: [f64; 3]) -> [[f64; 2]; 2] {
     let determinant = a * c - b * b;
-    if determinant > SINGULAR * a * c {
+    if determinant > SINGULAR * (a + c).powi(2) {
         let mixed = -b / determinant;
         [[c / determinant, mixed], [mixed, a / determinant]]
+    } else if a + c > 0.0 {
+        let square = (a + c).powi(2);
+        [[a / square, b / square], [b / square, c / square]]
     } else {
-        let alone = |x: f64| if x > 0.0 { 1.0 / x } else { 0.0 };
-        [[alone(a), 0.0], [0.0, alone(c)]]
+        [[0.0; 2]; 2]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_matrix_does_not_tell_is_left_out_of_its_inverse() {
+        assert_eq!(inverse([2.0, 1.0, 1.0]), [[1.0, -1.0], [-1.0, 2.0]]);
+        // 4 along (1, 1)/√2, nothing across.
+        assert_eq!(inverse([2.0, 2.0, 2.0]), [[0.125, 0.125], [0.125, 0.125]]);
+        assert_eq!(inverse([0.0, 0.0, 4.0]), [[0.0, 0.0], [0.0, 0.25]]);
+        assert_eq!(inverse([0.0; 3]), [[0.0; 2]; 2]);
     }
 }

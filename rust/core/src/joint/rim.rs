@@ -17,9 +17,8 @@ use crate::parallel::Workers;
 /// spline is at most a sixth.
 const NEAR: usize = 2;
 const SHARE: f64 = 1.0 / 6.0;
-/// A rim of more cells than this many times the side of the grid fills the image: then its diagonal has
-/// to do.
-const WIDEST: usize = 50;
+/// A rim of more cells than these of each row and column fills the image: then its diagonal has to do.
+pub(super) const WIDEST: usize = 12;
 /// What is added to the diagonal, as a share of it, for cells that rounding alone tells.
 const RIDGE: f64 = 1e-10;
 /// Cells that lie within a spline's reach of each other, along one axis.
@@ -44,7 +43,7 @@ impl Rim {
     pub(super) fn new<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Self> {
         let mut cells = if system.grid.is_spline() { cells(system) } else { Vec::new() };
         let (length, cols) = (system.state.beam.len(), system.grid.geometry.beam.cols);
-        let fits = cells.len() <= WIDEST * length.isqrt();
+        let fits = cells.len() <= WIDEST * (length / cols + cols);
         let tile = |&cell: &u32| (cell as usize / cols / TILE, cell as usize % cols / TILE);
         cells.sort_by_key(tile);
         let parts: Vec<&[u32]> = cells.chunk_by(|a, b| tile(a) == tile(b)).collect();

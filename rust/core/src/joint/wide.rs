@@ -28,7 +28,8 @@ impl Wide {
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
         let slope = |cell: usize, step: usize| {
-            let inside = system.grid.is_spline() && cell >= step && cell + step < beam.len();
+            let (place, length) = if step == 1 { (cell % cols, cols) } else { (cell, beam.len()) };
+            let inside = system.grid.is_spline() && place >= step && place + step < length;
             if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
                 ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
             } else {
