@@ -52,8 +52,10 @@ def as_values(frames: ArrayLike, statistics: list[FrameStatistics]) -> NDArray[A
     if statistics:
         frames = np.stack([np.where(f.saturated > 0, np.nan, f.mean) for f in statistics])
     values = as_floats("frames", frames, ndim=3)
-    if 0 in values.shape[1:]:
-        raise InputError(f"'frames' has shape {values.shape}, expected at least one pixel")
+    if 0 in values.shape:
+        raise InputError(
+            f"'frames' has shape {values.shape}, expected at least one exposure and one pixel"
+        )
     return values
 
 

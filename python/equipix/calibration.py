@@ -78,6 +78,9 @@ Method = Literal["multiscale", "coordinate-descent"]
 _MISFIT = 4.0
 """A reduced χ² this large has a cause other than variances that are a little off."""
 
+_NOT_FOUND = 0.1
+"""A joint fit that ends with so large an error of M has no errors that noise would make."""
+
 UNTOLD = 1e-4
 """A Ritz value this small stands for a pattern that no measurement tells: noise in it is 100 times
 what it is elsewhere."""
@@ -161,14 +164,16 @@ class Calibration:
         they hardly tell, and what the noise of its own measurements leaves of a pixel.
     sensitivity_std : ndarray, shape (rows, cols), or None
         Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
-        uncertain, large scales included, in the gauge mean 1; NaN where undetermined. In
-        `sensitivity`'s dtype; None unless asked for.
+        uncertain, large scales included, in the gauge mean 1, and slope 0 where free fluxes leave
+        a tilt undetermined; NaN where undetermined. In `sensitivity`'s dtype; None unless asked
+        for, or where a joint fit did not find M at all.
     tilt_std : ndarray, shape (2,), or None
         Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None unless
         asked for.
     shift_std : ndarray, shape (n, 2), or None
-        Standard deviation of `shifts`, in pixels, where they had one before; None unless asked
-        for.
+        Standard deviation of `shifts`, in pixels, where they had one before: of those refined, less
+        their mean by the prior's weights, since what moves all exposures alike moves but the beam;
+        else that given. None unless asked for.
     measurements : Measurements or None
         References to what the calibration was made from, for `std_of`; None if read from a file.
     rejected : ndarray of bool, shape (n, rows, cols), or None
@@ -251,7 +256,8 @@ class Calibration:
         Returns
         -------
         float, or ndarray of shape (m,)
-            One for each image of weights, in the gauge mean(M) = 1.
+            One for each image of weights, in the gauge mean(M) = 1; where free fluxes leave a tilt
+        undetermined, in that of slope 0: a sum that sees the tilt is as uncertain as `tilt_std`.
 
         Raises
         ------
@@ -822,6 +828,14 @@ def _with_std(
 ) -> Calibration:
     measurements = calibration.measurements
     assert measurements is not None
+    if measurements.joint and calibration.error_estimate > _NOT_FOUND:
+        warnings.warn(
+            f"no standard deviations: with an estimated error of {calibration.error_estimate:.1e} "
+            "the sensitivity is not found",
+            ConvergenceWarning,
+            stacklevel=3,
+        )
+        return calibration
     sensitivity = calibration.sensitivity
     with naming_memory("the error map"):
         std, exactness = error_map(

@@ -52,7 +52,7 @@ class JointSolution:
     dark_along_std : float
         Standard deviation of b, the least-squares part b·M of the offsets' errors.
     shift_std : ndarray, shape (n, 2)
-        Standard deviation of the shifts, if they were sought.
+        Standard deviation of the shifts less their mean by the prior's weights, if sought.
     """
 
     sensitivity: Array
@@ -120,7 +120,7 @@ def joint(
     measured = np.array(shifts, float)
     given = np.ones(count) if flux is None or isinstance(flux, str) else np.asarray(flux, float)
     by_theta, open_ways = _flux_columns(flux, flux_std, time, measured, turns)
-    by_zeta, shift_prior, of_mean_shift = _shift_columns(shift_std, count)
+    by_zeta, shift_prior = _shift_columns(shift_std, count)
     flux_prior = np.eye(by_theta.shape[1]) if flux_std is not None else by_theta[:0]
     priors = _diagonal_blocks(flux_prior, shift_prior)
     grid = _Grid((rows, cols), measured, turns, by_zeta.size > 0 or bool(np.any(measured % 1)))
@@ -207,7 +207,7 @@ def joint(
         dark_along_std = float(np.linalg.norm(m @ of_dark) / np.sum(m**2))
     left = np.zeros((count, 2))
     if by_zeta.size:
-        left = np.sum((by_zeta @ of_zeta) ** 2, axis=1).reshape(count, 2) + of_mean_shift
+        left = np.sum((by_zeta @ of_zeta) ** 2, axis=1).reshape(count, 2)
     return JointSolution(
         sensitivity=(sensitivity / scale).reshape(rows, cols),
         dark=(offset if sizes[1] else np.zeros(pixels)).reshape(rows, cols),
@@ -255,14 +255,13 @@ def _flux_columns(
     return np.empty((count, 0)), np.empty((0, 2))
 
 
-def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Array, Array]:
+def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Array]:
     """Z of d = d₀ + Z·ζ, by exposure and axis, and the prior's (d − d₀)/s_d by ζ.
 
     To move all exposures alike moves but the beam: the mean of d − d₀, weighted by 1/s_d², is 0.
-    The last result is the variance of that mean, of which the prior alone tells.
     """
     if shift_std is None:
-        return np.empty((2 * count, 0)), np.empty((0, 0)), np.zeros(2)
+        return np.empty((2 * count, 0)), np.empty((0, 0))
     std = np.asarray(shift_std, float)
     std = np.maximum(
         np.broadcast_to(std[:, None] if std.ndim == 1 else std, (count, 2)), EXACT_SHIFT
@@ -273,7 +272,7 @@ def _shift_columns(shift_std: ArrayLike | None, count: int) -> tuple[Array, Arra
         centred = np.eye(count) - precision[:, axis]
         columns[:, axis, :, axis] = centred * std[:, axis]
     by_zeta = columns.reshape(2 * count, 2 * count)
-    return by_zeta, by_zeta / std.reshape(-1, 1), 1 / np.sum(std**-2, axis=0)
+    return by_zeta, by_zeta / std.reshape(-1, 1)
 
 
 def _diagonal_blocks(first: Array, second: Array) -> Array:

@@ -172,8 +172,11 @@ pub fn solve<T: Real>(
     let mut shifts = shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
     loop {
         let (objective, slope) = system.linearise(SMOOTHING, control)?;
+        // Where shifts still move, cells come into the penalty, and F is not one function.
+        let moving = system.shift_prior.is_some() && looks.len() <= SETTLING;
         let highest = looks
             .last()
+            .filter(|_| !moving)
             .map_or(f64::INFINITY, |last| last.objective + rounding(model, last.objective));
         // A number that is none is no fall either.
         let fell = objective <= highest;
@@ -244,8 +247,6 @@ pub fn solve<T: Real>(
         system.take_scale_out(&mut step[..system.grid.geometry.beam.len()]);
         advance(&mut system, &step, 1.0);
         taken = Some(step);
-        // Where shifts still move, cells come into sight and go out of it.
-        let moving = system.shift_prior.is_some() && looks.len() < SETTLING;
         preconditioner = (!moving).then_some(two_level);
     }
 }

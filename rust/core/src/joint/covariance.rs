@@ -33,7 +33,7 @@ use crate::parallel::Workers;
 use crate::random;
 
 /// Iterations for one right-hand side that nobody waits for.
-const MOST_ITERATIONS: u64 = 2000;
+const MOST_ITERATIONS: u64 = 500;
 
 /// What is drawn besides the noise of exposures.
 enum Other {
@@ -70,7 +70,8 @@ pub struct Solved<'s> {
 pub(crate) enum Functional {
     /// Σ g M.
     Gain(Vec<f64>),
-    /// Σ q d, of the shifts (row, column) of all exposures.
+    /// Σ q d, of the shifts (row, column) of all exposures less their mean by the weights of the prior,
+    /// for which no measurement speaks.
     Shifts(Vec<[f64; 2]>),
     /// b of the least-squares part b M of the offsets' errors: what they have in common.
     Offset,
@@ -283,11 +284,11 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
             Functional::Gain(gain) => self.variance_of_gain(gain, lack, control),
             Functional::Shifts(shifts) => {
                 let mut pull = vec![0.0; self.system.size()];
-                let own = self.system.centred_pulls(shifts.clone());
+                let own = self.system.centred_pulls(shifts);
                 let others = pull.len() - own.as_flattened().len();
                 pull[others..].copy_from_slice(own.as_flattened());
                 self.solve(pull, lack, control)?;
-                Ok(self.search.energy + self.variance_of_mean(&shifts))
+                Ok(self.search.energy)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -366,17 +367,6 @@ impl<'m, 'a, T: Real> Covariance<'m, 'a, T> {
         }
         self.solve(pull, lack, control)?;
         Ok(variance + found + self.search.energy)
-    }
-
-    /// That part of the variance of Σ q d which lies in the mean of all shifts by the weights of
-    /// their prior, for which no measurement speaks: 1/Σ π for each axis.
-    fn variance_of_mean(&self, shifts: &[[f64; 2]]) -> f64 {
-        let Some(prior) = &self.system.shift_prior else { return 0.0 };
-        let along = |axis: usize| {
-            let sum: f64 = shifts.iter().map(|q| q[axis]).sum();
-            sum * sum / prior.precisions.iter().map(|p| self.system.unit * p[axis]).sum::<f64>()
-        };
-        along(0) + along(1)
     }
 
     fn considered_variances(&self) -> Vec<f64> {
