@@ -112,6 +112,7 @@ def test_turned_exposures(turn):
         {"robust": True},
         {"mask": np.random.default_rng(3).random(SENSOR) < 0.02},
         {"mask": np.random.default_rng(4).random((5, *SENSOR)) < 0.02},
+        {"mask": np.indices(SENSOR)[1] > 0.55 * SENSOR[1]},
     ],
     ids=lambda options: "-".join(options),
 )
