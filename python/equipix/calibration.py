@@ -257,7 +257,8 @@ class Calibration:
         -------
         float, or ndarray of shape (m,)
             One for each image of weights, in the gauge mean(M) = 1; where free fluxes leave a tilt
-        undetermined, in that of slope 0: a sum that sees the tilt is as uncertain as `tilt_std`.
+            undetermined, in that of slope 0, though a sum that sees the tilt is as uncertain as
+            `tilt_std`.
 
         Raises
         ------
