@@ -8,7 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from equipix import cli, demo, errors, measure_shift, report
+from equipix import cli, demo, errors, measure_shift
+from equipix.pictures import report
 
 pytest.importorskip("matplotlib")
 

@@ -20,8 +20,8 @@ import typer.main
 
 import equipix
 from equipix import simulate
-from equipix._manifest import Manifest
 from equipix.cli import app
+from equipix.experiment.manifest import Manifest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -113,7 +113,9 @@ def test_docstrings_have_examples_to_run():
         for test in finder.find(importlib.import_module(module))
         if test.examples
     ]
-    assert {"equipix.calibration.calibrate", "equipix.shifts.measure_shift"} <= set(examples)
+    assert {"equipix.calibration.calibrate.calibrate", "equipix.shifts.measure_shift"} <= set(
+        examples
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in equipix.__all__ if not name.startswith("_")])

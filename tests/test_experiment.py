@@ -149,7 +149,7 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
 
 def test_turned_exposures_are_placed_by_the_aperture():
     """Numbers of the rotation formula: the same hole before and after a turn."""
-    from equipix.experiment import _in_beam
+    from equipix.experiment.run import _in_beam
     from equipix.shifts import Spot
 
     shape, hole, shift = (30, 40), np.array([20.0, 25.0]), np.array([3.0, 5.0])
@@ -274,7 +274,7 @@ def test_a_mistake_of_all_exposures_is_said_once(manifest, tmp_path):
 
 
 def test_a_glob_is_in_natural_order_and_in_its_own_folder(tmp_path):
-    from equipix._manifest import find_files
+    from equipix.experiment.manifest import find_files
 
     folder = tmp_path / "run[1]"
     folder.mkdir()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import reference, simulate
+from equipix import Flag, reference, simulate
 from equipix.errors import (
     ConvergenceWarning,
     IdentifiabilityWarning,
@@ -21,7 +21,6 @@ from equipix.errors import (
     MisfitWarning,
     ShiftSignWarning,
 )
-from equipix.results import Flag
 
 SMALL = (9, 12)
 SMALL_CROSS = np.array([(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)], float)

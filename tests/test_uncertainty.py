@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import reference, simulate
+from equipix import Flag, reference, simulate
 from equipix.cli import main
 from equipix.errors import InputError
-from equipix.results import Flag
 from equipix.uncertainty import tilt_std
 
 CROSS = equipix.cross_pattern(2, 3)

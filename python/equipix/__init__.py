@@ -1,15 +1,49 @@
-"""Pixel sensitivity of image sensors, measured without a uniform light source."""
+"""Pixel sensitivity of image sensors, measured without a uniform light source.
 
-from equipix import errors, plan, simulate
+Importing the package loads NumPy and the compiled part; every public name is loaded on first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from equipix._native import __version__
-from equipix.calibration import Calibration, History, calibrate
-from equipix.comparison import Comparison, compare
-from equipix.experiment import Experiment
-from equipix.frames import average
-from equipix.load import load
-from equipix.noise import NoiseModel
-from equipix.results import Correction, Flag, FrameStatistics
-from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
+
+if TYPE_CHECKING:
+    from equipix import errors, plan, simulate, uncertainty
+    from equipix.calibration.calibrate import Calibration, History, calibrate
+    from equipix.comparison import Comparison, compare
+    from equipix.correction.protocol import Correction
+    from equipix.experiment.run import Experiment
+    from equipix.flags import Flag
+    from equipix.frames import FrameStatistics, average
+    from equipix.loading import load
+    from equipix.noise import NoiseModel
+    from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
+
+_HOMES = {
+    "Calibration": "calibration.calibrate",
+    "Comparison": "comparison",
+    "Correction": "correction.protocol",
+    "Experiment": "experiment.run",
+    "Flag": "flags",
+    "FrameStatistics": "frames",
+    "History": "calibration.calibrate",
+    "NoiseModel": "noise",
+    "ShiftMeasurement": "shifts",
+    "Spot": "shifts",
+    "average": "frames",
+    "calibrate": "calibration.calibrate",
+    "compare": "comparison",
+    "cross_pattern": "shifts",
+    "load": "loading",
+    "measure_shift": "shifts",
+}
+"""The module of each public name."""
+
+_MODULES = ("errors", "plan", "simulate", "uncertainty")
+"""Public modules."""
 
 __all__ = [
     "Calibration",
@@ -32,4 +66,19 @@ __all__ = [
     "measure_shift",
     "plan",
     "simulate",
+    "uncertainty",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"equipix.{name}")
+    if name in _HOMES:
+        value = getattr(import_module(f"equipix.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'equipix' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

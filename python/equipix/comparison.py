@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array, check_count
+from equipix._check import as_array, check_count
 from equipix.errors import InputError
-from equipix.results import Flag
-from equipix.simulate.accuracy import BLOCK, block_means, relative_error
-from equipix.uncertainty import determined
+from equipix.flags import Flag, determined
+from equipix.maps import BLOCK, block_means, relative_error, rms
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.calibration import Calibration
+    from equipix.calibration.calibrate import Calibration
 
 _MOST_BLOCKS = 16
 """Blocks whose uncertainty stands for all: each takes about as long as a calibration."""
@@ -131,8 +130,8 @@ def compare(
         sensitivities=sensitivities,
         agreement=sensitivities.std(axis=0, ddof=1),
         pairs=pairs,
-        rms=np.array([_rms(each) for each in differences]),
-        block_rms=np.array([_rms(block_means(each)) for each in differences]),
+        rms=np.array([rms(each) for each in differences]),
+        block_rms=np.array([rms(block_means(each)) for each in differences]),
         largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
         **_predictions(_expected(calibrations) if predicted is None else predicted, pairs, count),
     )
@@ -159,11 +158,11 @@ def _expected(calibrations: Sequence[Calibration]) -> NDArray[Any] | None:
             return None
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = each.sensitivity_std / each.sensitivity
-        pixels = _rms(relative[np.isfinite(relative) & ((each.flags & Flag.DO_NOT_USE) == 0)])
+        pixels = rms(relative[np.isfinite(relative) & ((each.flags & Flag.DO_NOT_USE) == 0)])
         blocks = (
             np.nan
             if each.measurements is None
-            else _rms(np.asarray(each.std_of(_some_blocks(each))))
+            else rms(np.asarray(each.std_of(_some_blocks(each))))
         )
         expected.append((pixels, blocks))
     return np.array(expected)
@@ -196,7 +195,3 @@ def _predictions(
         raise InputError(f"'predicted' has shape {errors.shape}, expected ({count}, 2)")
     rms, block_rms = np.sqrt((errors[pairs] ** 2).sum(axis=1)).T
     return {"predicted_rms": rms, "predicted_block_rms": block_rms}
-
-
-def _rms(values: NDArray[Any]) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.flags import Flag
 from equipix.noise import scatter_limit
-from equipix.results import Flag
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
+    from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
-    from equipix.results import FrameStatistics
 
 SIGMAS = 6.0
 """Standard deviations that chance does not reach on a sensor of some million pixels."""

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import simulate
-from equipix.experiment import Experiment
+from equipix._types import Progress
+from equipix.experiment.run import Experiment
 from equipix.frames import average
+from equipix.maps import rms_at_both_scales
 from equipix.shifts import cross_pattern
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from equipix.calibration import Calibration
+    from equipix.calibration.calibrate import Calibration
     from equipix.simulate import Camera, VirtualExperiment
 
-    Progress = Callable[[int, int, str], None]
 
 RMS_LIMIT, BLOCK_RMS_LIMIT = 1.1, 1.5
 """How far the errors may exceed what the noise predicts."""
@@ -197,12 +197,6 @@ def run_demo(
         flat_field=flat_field,
         predicted=virtual.noise_prediction(rng=rng),
     )
-
-
-def rms_at_both_scales(error: NDArray[Any]) -> tuple[float, float]:
-    """Root mean square of `error` over pixels, and of its means over 16×16 pixels."""
-    blocks = simulate.block_means(error)
-    return float(np.sqrt(np.nanmean(error**2))), float(np.sqrt(np.nanmean(blocks**2)))
 
 
 def _flat_field(camera: Camera, dark: NDArray[Any], frames: int, rng: int) -> NDArray[Any]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 import os
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix import _native, io
-from equipix._arrays import as_array, as_floats, naming_memory, positive_workers
+from equipix._check import as_array, as_floats, naming_memory, positive_workers
 from equipix.errors import InputError, UnsupportedFileError
-from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -32,6 +32,31 @@ _PAGES = {
     "saturated": np.uint32,
 }
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStatistics:
+    """Mean and scatter of repeated frames of one scene.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (rows, cols), float64
+        Mean of the frames, the dark mean subtracted if there was one, in DN.
+    variance : ndarray, shape (rows, cols), float64
+        Unbiased sample variance of one frame, in DN²; NaN where fewer than two samples count.
+    variance_of_mean : ndarray, shape (rows, cols), float64
+        Variance of `mean`, in DN²: ``variance / count``, plus that of the dark mean.
+    count : ndarray, shape (rows, cols), uint32
+        Number of samples that went into the mean.
+    saturated : ndarray, shape (rows, cols), uint32
+        Number of samples at or above the saturation level.
+    """
+
+    mean: NDArray[Any]
+    variance: NDArray[Any]
+    variance_of_mean: NDArray[Any]
+    count: NDArray[Any]
+    saturated: NDArray[Any]
 
 
 def average(

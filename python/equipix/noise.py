@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from equipix._arrays import number
+from equipix._check import number
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.results import FrameStatistics
+    from equipix.frames import FrameStatistics
 
 _BINS = 64
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import as_array, as_shifts
+from equipix._check import as_array, as_shifts
 from equipix.errors import InputError, ShiftRoundingWarning
 
 if TYPE_CHECKING:

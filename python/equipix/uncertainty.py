@@ -8,17 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import as_array, per_exposure, positive_workers
+from equipix._check import as_array, per_exposure, positive_workers
+from equipix._types import Floats, Progress
 from equipix.errors import InputError
-from equipix.results import Flag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
-    Progress = Callable[[int, int, str], object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,55 +363,6 @@ def checked_weights(weights: ArrayLike, determined: NDArray[np.bool_]) -> Floats
             f"the first at ({row}, {col}): set it to 0 there"
         )
     return stack
-
-
-def determined(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where ln M is known: M is above 0, and its measurements carry weight."""
-    weak = (flags & Flag.UNRELIABLE_FLAT) != 0
-    return np.asarray((sensitivity > 0) & ~weak)
-
-
-def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
-    """Weights whose sums with ln M are its least-squares slopes, edge to edge.
-
-    Parameters
-    ----------
-    valid : ndarray of bool, shape (rows, cols)
-        The pixels that count; at least three, not in one line.
-
-    Returns
-    -------
-    ndarray, shape (2, rows, cols), float64
-        For the slopes along rows and columns, each times the size of the sensor along it. NaN
-        where the valid pixels tell no slope.
-    """
-    count = max(int(np.count_nonzero(valid)), 1)
-    coordinates = np.indices(valid.shape) / np.reshape(valid.shape, (2, 1, 1))
-    means = np.sum(coordinates, axis=(1, 2), where=valid) / count
-    centred = np.where(valid, coordinates - means[:, None, None], 0)
-    normal = np.einsum("arc,brc->ab", centred, centred)
-    if np.linalg.matrix_rank(normal, tol=1e-12 * count) < 2:
-        return np.full((2, *valid.shape), np.nan)
-    return np.asarray(np.einsum("ab,brc->arc", np.linalg.inv(normal), centred))
-
-
-def tilt(sensitivity: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
-    """Least-squares slope of ln M over valid pixels, edge to edge, (row, col).
-
-    Parameters
-    ----------
-    sensitivity : ndarray, shape (rows, cols)
-        M.
-    valid : ndarray of bool, shape (rows, cols)
-        The pixels that count.
-
-    Returns
-    -------
-    ndarray, shape (2,), float64
-        How much ln M grows from one edge of the sensor to the other.
-    """
-    logarithm = np.log(sensitivity, where=valid, out=np.zeros(valid.shape))
-    return np.asarray(np.einsum("arc,rc->a", tilt_weights(valid), logarithm))
 
 
 def tilt_std(

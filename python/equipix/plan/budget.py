@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._arrays import as_shifts, check_shape, number, per_exposure
+from equipix._check import as_shifts, check_shape, number, per_exposure
 from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError
 from equipix.plan.identifiability import identify, is_connected
 from equipix.plan.noise import factor, local_variance
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.plan.noise import Floats
+    from equipix._types import Floats
 
 
 @dataclass(frozen=True, eq=False, repr=False)

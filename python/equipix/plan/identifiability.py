@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import as_shifts, check_shape, naming_memory, per_exposure
-from equipix._measurements import as_mask
+from equipix._check import as_shifts, check_shape, naming_memory, per_exposure
 from equipix.errors import InputError
+from equipix.exposures.checks import as_mask
 from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:

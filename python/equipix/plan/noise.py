@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix import _native
+from equipix._types import Floats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 _BLOCK = 64
 """Rows at a time, at least."""

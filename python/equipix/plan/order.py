@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._arrays import as_shifts
+from equipix._check import as_shifts
 from equipix.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,20 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array, check_progress, check_shape, positive_count
+from equipix._check import as_array, check_progress, check_shape, positive_count
+from equipix._types import Floats, Progress
 from equipix.errors import DriftWarning, InputError
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
 from equipix.plan.identifiability import is_connected
 from equipix.plan.order import advise_order
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import ArrayLike, NDArray
 
-    Progress = Callable[[int, int, str], object]
     Points = NDArray[np.int64]
-    Floats = NDArray[np.float64]
 
 _STARTS, _FINALISTS = 10, 6
 """Searches from different patterns, and how many of their ends get a full error budget."""

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from equipix._types import Floats
 
-    Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    pass
+
 
 _DEGREE = 6
 """Of the polynomials: 3 leaves 0.3 % of the error, measured against `calibrate`; 6, 0.1 %."""

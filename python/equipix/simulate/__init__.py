@@ -1,6 +1,7 @@
 """Virtual sensors, beams and cameras: experiments whose truth is known."""
 
-from equipix.simulate.accuracy import block_means, noise_prediction, relative_error
+from equipix.maps import block_means, relative_error
+from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
 from equipix.simulate.rig import Truth, VirtualExperiment, experiment
 from equipix.simulate.signal import (

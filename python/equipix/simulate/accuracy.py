@@ -1,4 +1,4 @@
-"""How far a measured sensitivity is from the true one, and how far noise alone would put it."""
+"""Error of the sensitivity that noise alone leaves at the optimum."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._arrays import as_array, as_shifts
+from equipix._check import as_array, as_shifts
 from equipix.errors import InputError
+from equipix.maps import rms_at_both_scales
 from equipix.simulate.signal import exposures
 
 if TYPE_CHECKING:
@@ -15,72 +16,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.simulate.signal import Beam, Floats, Rng
-
-BLOCK = 16
-
-
-def relative_error(sensitivity: ArrayLike, truth: ArrayLike) -> Floats:
-    """Relative error of a measured sensitivity, both in the gauge mean 1.
-
-    Parameters
-    ----------
-    sensitivity : array_like, shape (rows, cols)
-        The measured sensitivity; NaN where undetermined.
-    truth : array_like, shape (rows, cols)
-        The true one; NaN in pixels that are not to count.
-
-    Returns
-    -------
-    ndarray, shape (rows, cols), float64
-        (M − M₀)/M₀ after both are divided by their means over the pixels where both are
-        finite; NaN elsewhere.
-
-    Examples
-    --------
-    >>> from equipix import simulate
-    >>> simulate.relative_error([[2.0, 2.0]], [[3.0, 3.0]])
-    array([[0., 0.]])
-    """
-    measured = as_array("sensitivity", sensitivity, ndim=2)
-    true = as_array("truth", truth, ndim=2)
-    ratio = measured / true
-    valid = np.isfinite(ratio)
-    scale = np.mean(measured, where=valid) / np.mean(true, where=valid)
-    return np.where(valid, ratio / scale - 1, np.nan)
-
-
-def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:
-    """Average over square blocks: what is left of an error at large scales.
-
-    Parameters
-    ----------
-    image : array_like, shape (rows, cols)
-        The image; NaN pixels do not count.
-    size : int
-        Edge of a block in pixels.
-
-    Returns
-    -------
-    ndarray, shape (rows // size, cols // size), float64
-        The means of all whole blocks, counted from the first row and column; NaN for a block
-        without a valid pixel.
-
-    Raises
-    ------
-    InputError
-        If the image holds no whole block.
-    """
-    pixels = as_array("image", image, ndim=2).astype(np.float64)
-    rows, cols = pixels.shape[0] // size, pixels.shape[1] // size
-    if rows == 0 or cols == 0:
-        raise InputError(f"'image' has shape {pixels.shape}, smaller than one block of {size}")
-    blocks = pixels[: rows * size, : cols * size].reshape(rows, size, cols, size)
-    valid = np.isfinite(blocks)
-    count = valid.sum(axis=(1, 3))
-    total = np.sum(blocks, axis=(1, 3), where=valid)
-    means: Floats = np.divide(total, count, where=count > 0, out=np.full((rows, cols), np.nan))
-    return means
+    from equipix.simulate.signal import Beam
+from equipix._types import Floats, Rng
 
 
 def noise_prediction(
@@ -160,7 +97,7 @@ def noise_prediction(
     for _ in range(draws):
         steps = system.solve(system.noise(rng))
         error = steps - np.average(steps, weights=truth * used)
-        results.append(_rms_at_both_scales(np.where(used, error, np.nan)))
+        results.append(rms_at_both_scales(np.where(used, error, np.nan)))
     rms, block_rms = np.mean(results, axis=0)
     return float(rms), float(block_rms)
 
@@ -169,14 +106,6 @@ def _like_signal(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats
     if np.shape(values) not in ((), shape[1:], shape):
         raise InputError(f"'{name}' has shape {np.shape(values)}, expected {shape} or {shape[1:]}")
     return as_array(name, values, ndim=(0, 2, 3)).astype(np.float64)
-
-
-def _rms_at_both_scales(error: Floats) -> tuple[float, float]:
-    return _rms(error), _rms(block_means(error)) if min(error.shape) >= BLOCK else np.nan
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
 
 
 class ReducedSystem:

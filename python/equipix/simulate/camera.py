@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from equipix._arrays import as_array
+from equipix._check import as_array
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.simulate.signal import Floats, Rng
+    from equipix._types import Floats, Rng
 
 Pixels: TypeAlias = "NDArray[np.int64]"
 

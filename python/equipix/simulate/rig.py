@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array, as_shifts
+from equipix._check import as_array, as_shifts
 from equipix.errors import InputError
 from equipix.io import as_path
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
 from equipix.simulate.signal import Beam, window
-from equipix.simulate.store import Progress, write_experiment
+from equipix.simulate.store import write_experiment
 
 if TYPE_CHECKING:
     import os
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from equipix._types import Floats, Progress, Rng
     from equipix.simulate.camera import Pixels
-    from equipix.simulate.signal import Floats, Rng
 
 FULL_SCALE_E = 20_000.0
 """Electrons that fill the range of the ADC where no gain is given."""

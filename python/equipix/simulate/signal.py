@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from equipix._arrays import as_array, as_shifts
+from equipix._check import as_array, as_shifts
+from equipix._types import Floats, Rng
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-Floats: TypeAlias = "NDArray[np.float64]"
 Beam: TypeAlias = "Callable[[Floats, Floats], Floats]"
-Rng: TypeAlias = "np.random.Generator | int"
 
 
 def paper_sensitivity(shape: tuple[int, int], *, spread: float = 0.05, rng: Rng) -> Floats:

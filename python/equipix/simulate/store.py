@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._types import Progress
 from equipix.errors import FileError
 from equipix.io import folder_beside, replace_folder, write_frames
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix.simulate.rig import VirtualExperiment
-
-Progress: TypeAlias = "Callable[[int, int, str], None]"
 
 
 def write_experiment(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from equipix._types import Flagged, Progress
 from equipix.errors import AlreadyCorrectedWarning, FileError, InputError
 from equipix.frames import average, load_statistics
 from equipix.io import (
@@ -21,15 +22,13 @@ from equipix.io import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from equipix.results import Correction
+    from equipix.correction.protocol import Correction
 
-    Progress = Callable[[int, int, str], object]
-    Flagged = Literal["nan", "keep", "replace"]
 
 _MARK = "corrected by equipix"
 """Description of what `correct_files` writes, so that it is not corrected again unnoticed."""

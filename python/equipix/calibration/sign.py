@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from equipix import _native
+from equipix._types import Progress, ShiftSign
 from equipix.errors import InputError, InsufficientMemoryError, ShiftSignWarning
 from equipix.prediction import positions, predictions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from equipix.uncertainty import Measurements
 
-    Progress = Callable[[int, int, str], object]
-
-ShiftSign = Literal["confirmed", "contradicted", "undetermined"]
 
 _MOST_EXPOSURES = 12
 """Exposures that are asked, from first to last: each has a flux to be found."""

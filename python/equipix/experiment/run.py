@@ -11,32 +11,30 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from equipix._arrays import as_tolerance, naming_memory, positive_count, positive_workers
-from equipix._manifest import find_files, read_manifest
-from equipix.calibration import calibrate
+from equipix._check import as_tolerance, naming_memory, positive_count, positive_workers
+from equipix._types import Progress
+from equipix.calibration.calibrate import calibrate
 from equipix.defects import dead_pixels, hot_pixels, pixel_flags
 from equipix.errors import FileError, InputError
+from equipix.experiment.manifest import find_files, read_manifest
+from equipix.flags import Flag
 from equipix.frames import average
 from equipix.io import as_path, frame_format, read_frames
 from equipix.noise import NoiseModel, photon_transfer
-from equipix.results import Flag
 from equipix.shifts import measure_shift, round_shifts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from os import PathLike
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from equipix._manifest import Exposure, Manifest
-    from equipix._measurements import FluxModel
-    from equipix.calibration import Calibration, Method
-    from equipix.results import FrameStatistics
+    from equipix._types import FluxModel, Method
+    from equipix.calibration.calibrate import Calibration
+    from equipix.experiment.manifest import Exposure, Manifest
+    from equipix.frames import FrameStatistics
     from equipix.shifts import ShiftMeasurement, Spot
     from equipix.uncertainty import Measurements
-
-    Progress = Callable[[int, int, str], object]
 
 
 _AROUND = 8

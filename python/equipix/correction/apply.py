@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from equipix._arrays import as_array
+from equipix._check import as_array
+from equipix._types import Flagged
 from equipix.errors import InputError
-from equipix.results import Flag, FrameStatistics
+from equipix.flags import Flag
+from equipix.frames import FrameStatistics
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-
-Flagged = Literal["nan", "keep", "replace"]
 
 
 def apply_gain(

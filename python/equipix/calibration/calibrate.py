@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 import numpy as np
 
 from equipix import _native
-from equipix._arrays import (
+from equipix._check import (
     as_tolerance,
     check_count,
     check_progress,
@@ -19,9 +19,19 @@ from equipix._arrays import (
     positive_count,
     positive_workers,
 )
-from equipix._measurements import (
+from equipix._types import Flagged, Method, Progress, ShiftSign
+from equipix.calibration.sign import shift_sign
+from equipix.calibration.weights import Problem, modelled, solve_robustly
+from equipix.correction.apply import apply_gain
+from equipix.defects import noisy_pixels, odd_responses
+from equipix.errors import (
+    ConvergenceWarning,
+    IdentifiabilityWarning,
+    InputError,
+    MisfitWarning,
+)
+from equipix.exposures.checks import (
     Asked,
-    FluxModel,
     as_flux,
     as_mask,
     as_models,
@@ -35,45 +45,31 @@ from equipix._measurements import (
     union,
     warn_of_order,
 )
-from equipix._shift_sign import ShiftSign, shift_sign
-from equipix._weights import Problem, modelled, solve_robustly
-from equipix.correction import Flagged, apply_gain
-from equipix.defects import noisy_pixels, odd_responses
-from equipix.errors import (
-    ConvergenceWarning,
-    IdentifiabilityWarning,
-    InputError,
-    MisfitWarning,
-)
+from equipix.flags import Flag, determined
+from equipix.frames import FrameStatistics
 from equipix.io import save_pages
+from equipix.maps import tilt, tilt_weights
 from equipix.noise import fit_frames
 from equipix.prediction import light, positions, predictions
-from equipix.results import Flag, FrameStatistics
 from equipix.shifts import as_positions, round_shifts
 from equipix.uncertainty import (
     JointFit,
     Measurements,
     checked_weights,
-    determined,
     error_map,
     functional_std,
     offset_std,
     shift_std_left,
-    tilt,
-    tilt_weights,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
 
     from equipix.noise import NoiseModel
 
-    Progress = Callable[[int, int, str], object]
-
-Method = Literal["multiscale", "coordinate-descent"]
 
 _MISFIT = 4.0
 """A reduced χ² this large has a cause other than variances that are a little off."""

@@ -13,23 +13,28 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from equipix._measurements import FluxModel
 from equipix._native import __version__
-from equipix._terminal import check_output, progress_bars, say, show_result, show_warning
-from equipix.calibration import Calibration, Method
+from equipix._types import Flagged, FluxModel, Method
+from equipix.calibration.calibrate import Calibration
+from equipix.cli.terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.comparison import compare as compare_calibrations
-from equipix.correct_files import correct_files, is_folder
-from equipix.correction import Flagged
+from equipix.correction.files import correct_files, is_folder
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError, EquipixWarning, InputError
-from equipix.experiment import Experiment
+from equipix.experiment.run import Experiment
+from equipix.flags import Flag
 from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
 from equipix.io import SUFFIXES, find_files, refuse_inputs
-from equipix.load import load
+from equipix.loading import load
+from equipix.pictures.report import (
+    check_picture,
+    draw_comparison,
+    draw_demo,
+    draw_plans,
+    save_figure,
+)
 from equipix.plan import ErrorBudget, advise_order, error_budget, identify, suggest, trend_told
-from equipix.report import check_picture, draw_comparison, draw_demo, draw_plans, save_figure
-from equipix.results import Flag
 
 app = typer.Typer(
     name="equipix",

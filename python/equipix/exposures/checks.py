@@ -5,21 +5,21 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._arrays import as_array, as_floats, check_count, number, per_exposure
+from equipix._check import as_array, as_floats, check_count, number, per_exposure
+from equipix._types import FluxModel
 from equipix.errors import IdentifiabilityWarning, InputError
+from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel, fit_frames, models_of_means
-from equipix.results import FrameStatistics
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
-FluxModel = Literal["fit", "linear"]
 
 _HARDLY_TOLD = 0.1
 """A share of a trend's variance that leaves its error three times larger."""

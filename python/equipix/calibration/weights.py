@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.calibration.robust import Evidence, check_count_for_rejection, rejected
 from equipix.noise import modelled_variances
 from equipix.prediction import positions, predictions
-from equipix.robust import Evidence, check_count_for_rejection, rejected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -8,7 +8,7 @@ import numpy as np
 
 from equipix.errors import EquipixError, InputError
 from equipix.io import write_whole
-from equipix.simulate.accuracy import BLOCK, block_means
+from equipix.maps import BLOCK, block_means, rms
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from equipix.calibration import Calibration
+    from equipix.calibration.calibrate import Calibration
     from equipix.comparison import Comparison
     from equipix.demo import Demo
     from equipix.plan import ErrorBudget
@@ -100,7 +100,7 @@ def draw_demo(demo: Demo) -> Figure:
     limit = float(np.nanmax(np.abs(errors[1])))
     _map(
         rows[1, 0],
-        f"Error of shift calibration, %\n(16×16 means, rms {_rms(errors[0]):.1g})",
+        f"Error of shift calibration, %\n(16×16 means, rms {rms(errors[0]):.1g})",
         errors[0],
         (-limit, limit),
         "RdBu_r",
@@ -108,7 +108,7 @@ def draw_demo(demo: Demo) -> Figure:
     )
     _map(
         rows[1, 1],
-        f"Error of flat field, %\n(16×16 means, rms {_rms(errors[1]):.1g})",
+        f"Error of flat field, %\n(16×16 means, rms {rms(errors[1]):.1g})",
         errors[1],
         (-limit, limit),
         "RdBu_r",
@@ -228,18 +228,18 @@ def draw_comparison(comparison: Comparison, names: Sequence[str]) -> Figure:
     rows[0, 1].legend(fontsize="small")
     scatter = 100 * comparison.agreement
     high = float(np.nanpercentile(scatter, 99.9))
-    title = f"Scatter of a pixel, %\n(rms {_rms(scatter):.2g})"
+    title = f"Scatter of a pixel, %\n(rms {rms(scatter):.2g})"
     _map(rows[1, 0], title, scatter, (0, high), "gray")
     worst = int(np.argmax(comparison.block_rms))
     limit = float(np.nanmax(np.abs(blocks[worst])))
-    title = f"{labels[worst]}, %\n(16×16 means, rms {_rms(blocks[worst]):.2g})"
+    title = f"{labels[worst]}, %\n(16×16 means, rms {rms(blocks[worst]):.2g})"
     _map(rows[1, 1], title, blocks[worst], (-limit, limit), "RdBu_r", BLOCK)
     for axes, title, errors, predicted in (
         (rows[2, 0], "Differences of pixels", differences, comparison.predicted_rms),
         (rows[2, 1], "Differences of 16×16 means", blocks, comparison.predicted_block_rms),
     ):
         known = predicted is not None and np.isfinite(predicted).all()
-        expected = 100 * float(_rms(np.asarray(predicted))) if known else None
+        expected = 100 * float(rms(np.asarray(predicted))) if known else None
         _densities(axes, title, dict(zip(labels, errors, strict=True)), expected)
     return figure
 
@@ -266,7 +266,7 @@ def _densities(
     for label, each in values.items():
         density = np.histogram(each, edges)[0] / np.isfinite(each).sum() / np.diff(edges)
         highest = max(highest, float(density.max()))
-        axes.stairs(density, edges, label=f"{label}: rms {_rms(each):.2g}")
+        axes.stairs(density, edges, label=f"{label}: rms {rms(each):.2g}")
     if predicted is not None:
         normal = np.exp(-0.5 * (edges / predicted) ** 2) / (predicted * np.sqrt(2 * np.pi))
         label = f"uncertainties predict {predicted:.2g}"
@@ -280,10 +280,6 @@ def _densities(
         ylim=(0.5 / count / width, 30 * highest),
     )
     axes.legend(loc="upper right", fontsize="small")
-
-
-def _rms(values: NDArray[Any]) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def _map(

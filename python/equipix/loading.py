@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.calibration import FORMAT, Calibration, History
+from equipix.calibration.calibrate import FORMAT, Calibration, History
 from equipix.errors import FileError
 from equipix.io import check_format, check_pages, load_pages
 

@@ -1,0 +1,25 @@
+"""Type aliases, each once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[Any]
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+Progress: TypeAlias = Callable[[int, int, str], object]
+"""Called as ``progress(done, total, stage)``; what it raises stops the work."""
+
+Rng: TypeAlias = np.random.Generator | int
+"""A generator of random numbers, or its seed."""
+
+Method = Literal["multiscale", "coordinate-descent"]
+FluxModel = Literal["fit", "linear"]
+ShiftSign = Literal["confirmed", "contradicted", "undetermined"]
+Flagged = Literal["nan", "keep", "replace"]
+"""What becomes of pixels flagged ``DO_NOT_USE`` when frames are corrected."""

@@ -1,0 +1,1 @@
+"""Corrections: the protocol, how they are applied to arrays, and to files."""

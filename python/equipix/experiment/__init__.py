@@ -1,0 +1,1 @@
+"""A calibration experiment on disk: its description and its evaluation."""

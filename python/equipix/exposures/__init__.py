@@ -1,0 +1,1 @@
+"""Exposures of one beam, and all that is known of them."""
