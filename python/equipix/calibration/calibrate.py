@@ -19,7 +19,7 @@ from equipix._check import (
     positive_count,
     positive_workers,
 )
-from equipix._types import Flagged, Method, Progress, ShiftSign
+from equipix._types import Flagged, FluxModel, Method, Progress, ShiftSign
 from equipix.calibration.sign import shift_sign
 from equipix.calibration.weights import Problem, modelled, solve_robustly
 from equipix.correction.apply import apply_gain
