@@ -228,7 +228,7 @@ class TestFiles:
         assert list(tmp_path.iterdir()) == []
 
     def test_a_newer_format_is_refused(self, calibration, tmp_path, monkeypatch):
-        monkeypatch.setattr("equipix.calibration.calibrate.FORMAT", 2)
+        monkeypatch.setattr("equipix.calibration.result.FORMAT", 2)
         calibration.save(tmp_path / "cal.npz")
         with pytest.raises(FileError, match="format 2"):
             equipix.load(tmp_path / "cal.npz")

@@ -149,8 +149,7 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
 
 def test_turned_exposures_are_placed_by_the_aperture():
     """Numbers of the rotation formula: the same hole before and after a turn."""
-    from equipix.experiment.run import _in_beam
-    from equipix.shifts import Spot
+    from equipix.exposures.positions import in_beam, variance_in_beam
 
     shape, hole, shift = (30, 40), np.array([20.0, 25.0]), np.array([3.0, 5.0])
     for turns in range(4):
@@ -160,9 +159,8 @@ def test_turned_exposures_are_placed_by_the_aperture():
         seen = np.rot90(beam[3 : 3 + window[0], 5 : 5 + window[1]], turns)
         assert seen.shape == shape
         position = np.argwhere(seen)[0].astype(float)
-        spot = Spot(position, np.array([0.1, 0.2]))
-        u, variance = _in_beam(spot, 90 * turns, shape)
-        np.testing.assert_array_equal(u + shift, hole)
+        np.testing.assert_array_equal(in_beam(position, 90 * turns, shape) + shift, hole)
+        variance = variance_in_beam(np.array([0.01, 0.04]), 90 * turns)
         expected = [0.04, 0.01] if turns % 2 else [0.01, 0.04]
         np.testing.assert_allclose(variance, expected)
 

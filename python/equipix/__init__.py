@@ -12,7 +12,8 @@ from equipix._native import __version__
 
 if TYPE_CHECKING:
     from equipix import errors, plan, simulate, uncertainty
-    from equipix.calibration.calibrate import Calibration, History, calibrate
+    from equipix.calibration.calibrate import calibrate
+    from equipix.calibration.result import Calibration, History
     from equipix.comparison import Comparison, compare
     from equipix.correction.protocol import Correction
     from equipix.experiment.run import Experiment
@@ -23,13 +24,13 @@ if TYPE_CHECKING:
     from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
 
 _HOMES = {
-    "Calibration": "calibration.calibrate",
+    "Calibration": "calibration.result",
     "Comparison": "comparison",
     "Correction": "correction.protocol",
     "Experiment": "experiment.run",
     "Flag": "flags",
     "FrameStatistics": "frames",
-    "History": "calibration.calibrate",
+    "History": "calibration.result",
     "NoiseModel": "noise",
     "ShiftMeasurement": "shifts",
     "Spot": "shifts",

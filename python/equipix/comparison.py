@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.calibration.calibrate import Calibration
+    from equipix.calibration.result import Calibration
 
 _MOST_BLOCKS = 16
 """Blocks whose uncertainty stands for all: each takes about as long as a calibration."""
@@ -160,9 +160,7 @@ def _expected(calibrations: Sequence[Calibration]) -> NDArray[Any] | None:
             relative = each.sensitivity_std / each.sensitivity
         pixels = rms(relative[np.isfinite(relative) & ((each.flags & Flag.DO_NOT_USE) == 0)])
         blocks = (
-            np.nan
-            if each.measurements is None
-            else rms(np.asarray(each.std_of(_some_blocks(each))))
+            np.nan if each.weighted is None else rms(np.asarray(each.std_of(_some_blocks(each))))
         )
         expected.append((pixels, blocks))
     return np.array(expected)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.flags import Flag
 from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from equipix._types import Bools
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
 
@@ -28,6 +29,28 @@ DEAD_RESPONSE = 0.5
 """Response relative to the neighbours below which a pixel is dead."""
 
 _BLOCK = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the frames show of the pixels before any fit: maps (rows, cols) of bool, or None.
+
+    Attributes
+    ----------
+    saturated : ndarray of bool or None
+        A sample reaches the saturation level in some exposure.
+    dead : ndarray of bool or None
+        No answer to light: see `dead_pixels`.
+    hot : ndarray of bool or None
+        A high dark level or much dark noise: see `hot_pixels`.
+    noisy : ndarray of bool or None
+        More scatter from frame to frame than chance explains: see `noisy_pixels`.
+    """
+
+    saturated: Bools | None = None
+    dead: Bools | None = None
+    hot: Bools | None = None
+    noisy: Bools | None = None
 
 
 def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:
@@ -136,18 +159,6 @@ def odd_responses(
         suspects = np.flatnonzero(beyond > 0)
         found.flat[suspects] = beyond[suspects] > SIGMAS * std(suspects)
     return dead, hot
-
-
-def pixel_flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) -> NDArray[Any]:
-    """Set the bits of `Flag` for pixels of these kinds, shape (rows, cols), uint32.
-
-    What is clipped seems not to answer, so hot and saturated pixels do not count as dead.
-    """
-    flags = np.zeros(dead.shape, dtype=np.uint32)
-    dead = dead & ~hot & ~saturated
-    for pixels, flag in ((dead, Flag.DEAD), (hot, Flag.HOT), (saturated, Flag.SATURATED)):
-        flags[pixels] |= np.uint32(flag | Flag.DO_NOT_USE)
-    return flags
 
 
 def _block_medians(image: NDArray[Any]) -> NDArray[Any]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from equipix.calibration.calibrate import Calibration
+    from equipix.calibration.result import Calibration
     from equipix.simulate import Camera, VirtualExperiment
 
 

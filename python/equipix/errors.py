@@ -1,5 +1,10 @@
 """Errors and warnings: everything that equipix raises is one of these."""
 
+from __future__ import annotations
+
+import sys
+import warnings
+
 
 class EquipixError(Exception):
     """Base class of all errors of this package."""
@@ -55,3 +60,15 @@ class AlreadyCorrectedWarning(EquipixWarning):
 
 class MisfitWarning(EquipixWarning):
     """Residuals are larger than the variances given explain."""
+
+
+def warn(message: str, category: type[EquipixWarning]) -> None:
+    """Warn at the line outside of the package that led here."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and _is_own(frame.f_globals.get("__name__", "")):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
+
+
+def _is_own(module: str) -> bool:
+    return module == "equipix" or module.startswith("equipix.")

@@ -1,14 +1,14 @@
-"""What is wrong with a pixel."""
+"""What is wrong with a pixel, and which finding sets which bits."""
 
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from equipix._types import Array, Bools
 
 
 class Flag(IntFlag):
@@ -26,7 +26,29 @@ class Flag(IntFlag):
     UNRELIABLE_FLAT = 1 << 25
 
 
-def determined(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[np.bool_]:
+BITS = {
+    "saturated": Flag.SATURATED,
+    "dead": Flag.DEAD | Flag.DO_NOT_USE,
+    "hot": Flag.HOT | Flag.DO_NOT_USE,
+    "noisy": Flag.HOT | Flag.DO_NOT_USE,
+    "contradictory": Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE,
+}
+"""Bits that each finding sets; a saturated value is left out of its exposure, and the pixel keeps
+the sensitivity that the others determine."""
+
+
+def set_bits(flags: Array, finding: str, pixels: Bools | None) -> None:
+    """Set the bits of a finding in `flags` where `pixels` is true."""
+    if pixels is not None:
+        flags[pixels] |= np.uint32(BITS[finding])
+
+
+def usable(flags: Array) -> Bools:
+    """Pixels without ``DO_NOT_USE``."""
+    return np.asarray((flags & Flag.DO_NOT_USE) == 0)
+
+
+def determined(sensitivity: Array, flags: Array) -> Bools:
     """Where ln M is known: M is above 0, and its measurements carry weight."""
     weak = (flags & Flag.UNRELIABLE_FLAT) != 0
     return np.asarray((sensitivity > 0) & ~weak)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.calibration.calibrate import FORMAT, Calibration, History
+from equipix.calibration.result import FORMAT, Calibration, History
 from equipix.errors import FileError
 from equipix.io import check_format, check_pages, load_pages
 
@@ -62,6 +62,9 @@ def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Cal
         sensitivity=pages["sensitivity"],
         beam=pages["beam"],
         beam_origin=(row, col),
+        beam_coefficients=None,
+        rotation=np.array(content["metadata"]["options"]["rotation"]),
+        dark_is_fitted=content["metadata"]["options"]["dark"] == "fit",
         flags=pages["flags"],
         shifts=np.array(numbers["shifts"], dtype=np.float64),
         flux=np.array(numbers["flux"], dtype=np.float64),

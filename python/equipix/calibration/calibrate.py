@@ -2,540 +2,35 @@
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from equipix import _native
-from equipix._check import (
-    as_tolerance,
-    check_count,
-    check_progress,
-    naming_memory,
-    per_exposure,
-    positive_count,
-    positive_workers,
-)
-from equipix._types import Flagged, FluxModel, Method, Progress, ShiftSign
+from equipix.calibration import verdicts
+from equipix.calibration.error_bars import dark_std, error_bars
+from equipix.calibration.options import Options, is_to_be_fitted
+from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.result import Calibration, History
 from equipix.calibration.sign import shift_sign
-from equipix.calibration.weights import Problem, modelled, solve_robustly
-from equipix.correction.apply import apply_gain
-from equipix.defects import noisy_pixels, odd_responses
-from equipix.errors import (
-    ConvergenceWarning,
-    IdentifiabilityWarning,
-    InputError,
-    MisfitWarning,
-)
-from equipix.exposures.checks import (
-    Asked,
-    as_flux,
-    as_mask,
-    as_models,
-    as_rotation,
-    as_saturated,
-    as_shift_std,
-    as_statistics,
-    as_values,
-    as_variances,
-    moves,
-    union,
-    warn_of_order,
-)
-from equipix.flags import Flag, determined
-from equipix.frames import FrameStatistics
-from equipix.io import save_pages
-from equipix.maps import tilt, tilt_weights
-from equipix.noise import fit_frames
-from equipix.prediction import light, positions, predictions
-from equipix.shifts import as_positions, round_shifts
-from equipix.uncertainty import (
-    JointFit,
-    Measurements,
-    checked_weights,
-    error_map,
-    functional_std,
-    offset_std,
-    shift_std_left,
-)
+from equipix.calibration.weights import weighted_fit
+from equipix.exposures.front import exposures_of
+from equipix.exposures.options import FitOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from os import PathLike
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from equipix._types import Array, FluxModel, Method, Progress
+    from equipix.calibration.error_bars import DarkStd, ErrorBars
+    from equipix.calibration.sign import SignTest
+    from equipix.calibration.weights import Weighted
+    from equipix.exposures.compiled import Fit
+    from equipix.exposures.exposures import Exposures
+    from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
-
-
-_MISFIT = 4.0
-"""A reduced χ² this large has a cause other than variances that are a little off."""
-
-_NOT_FOUND = 0.1
-"""A joint fit that ends with so large an error of M has no errors that noise would make."""
-
-UNTOLD = 1e-4
-"""A Ritz value this small stands for a pattern that no measurement tells: noise in it is 100 times
-what it is elsewhere."""
-
-FORMAT = 1
-"""Number of the file format; a file with a higher one is refused."""
-
-
-@dataclass(frozen=True, eq=False)
-class History:
-    """How a calibration went, at some moments on its way.
-
-    Attributes
-    ----------
-    sweep : ndarray, shape (looks,), uint64
-        How many sweeps had been made.
-    objective : ndarray, shape (looks,), float64
-        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
-        and while such a fit still finds their weights.
-    error_estimate : ndarray, shape (looks,), float64
-        The estimated largest relative error of the sensitivity.
-    """
-
-    sweep: NDArray[Any]
-    objective: NDArray[Any]
-    error_estimate: NDArray[Any]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Calibration:
-    """Calibrated sensor: the result of `calibrate`.
-
-    Attributes
-    ----------
-    sensitivity : ndarray, shape (rows, cols)
-        Relative sensitivity M of mean 1 over valid pixels; NaN where undetermined. float32 for
-        float32 frames, else float64.
-    beam : ndarray, shape of the padded grid, float64
-        The beam L in the units of the frames; NaN where unobserved.
-    beam_origin : tuple of int
-        ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
-    flags : ndarray, shape (rows, cols), uint32
-        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
-        neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
-        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. What the
-        measurements do not determine is ``NO_FLAT_FIELD | DO_NOT_USE``, what they contradict
-        each other about, so that a robust calibration left out most of them,
-        ``UNRELIABLE_FLAT | DO_NOT_USE``.
-    shifts : ndarray, shape (n, 2), float64
-        The shifts (row, col) that were used, in pixels.
-    flux : ndarray, shape (n,), float64
-        The relative flux of each exposure.
-    objective : float
-        Objective F at the end.
-    reduced_chi2 : float
-        F over the degrees of freedom: 1 on average where the variances given are right, and the
-        variance of one value where none were given. NaN without any degree of freedom.
-    components : int
-        Number of connected components: parts of the sensor that the measurements do not compare.
-        A pixel that does not respond ties none together; nor does one whose measurements carry
-        next to no weight.
-    component_labels : ndarray, shape (rows, cols), int32
-        The component of each pixel, the largest being 0; −1 for a pixel without measurement.
-    sweeps : int
-        Sweeps of coordinate descent; of the multiscale method, passes over the data or its weights
-        of about a sweep's worth each.
-    converged : bool
-        Whether `error_estimate` is within the tolerance.
-    error_estimate : float
-        Estimated largest distance of `sensitivity` from the minimum of F, large scales included.
-        It says nothing of noise.
-    history : History
-        Objective and error estimate along the way.
-    dark : ndarray, shape (rows, cols), or None
-        The dark frame in DN, if it is part of the calibration.
-    metadata : dict
-        Versions, options and origin, as JSON values (``options["weights"]``: "equal" where no
-        variance was known, else "variances"); under ``uncertainty`` the draws that
-        `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
-        was fitted together with fluxes, the standard deviation of b in its error b·M, which
-        they hardly tell, and what the noise of its own measurements leaves of a pixel.
-    sensitivity_std : ndarray, shape (rows, cols), or None
-        Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
-        uncertain, large scales included, in the gauge mean 1, and slope 0 where free fluxes leave
-        a tilt undetermined; NaN where undetermined. In `sensitivity`'s dtype; None unless asked
-        for, or where a joint fit did not find M at all.
-    tilt_std : ndarray, shape (2,), or None
-        Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None unless
-        asked for.
-    shift_std : ndarray, shape (n, 2), or None
-        Standard deviation of `shifts`, in pixels, where they had one before: of those refined, less
-        their mean by the prior's weights, since what moves all exposures alike moves but the beam;
-        else that given. None unless asked for.
-    measurements : Measurements or None
-        References to what the calibration was made from, for `std_of`; None if read from a file.
-    rejected : ndarray of bool, shape (n, rows, cols), or None
-        The measurements that a robust calibration left out; `metadata` counts them.
-    shift_sign : {"confirmed", "contradicted", "undetermined"}
-        Whether the data confirm the sign of the shifts, contradict it, or do not tell it, as those
-        of a Gaussian beam, whatever its width; see `calibrate`.
-    """
-
-    sensitivity: NDArray[Any]
-    beam: NDArray[Any]
-    beam_origin: tuple[int, int]
-    flags: NDArray[Any]
-    shifts: NDArray[Any]
-    flux: NDArray[Any]
-    objective: float
-    reduced_chi2: float
-    components: int
-    component_labels: NDArray[Any]
-    sweeps: int
-    converged: bool
-    error_estimate: float
-    history: History
-    dark: NDArray[Any] | None = None
-    metadata: dict[str, Any] = field(default_factory=dict)
-    sensitivity_std: NDArray[Any] | None = None
-    tilt_std: NDArray[Any] | None = None
-    shift_std: NDArray[Any] | None = None
-    measurements: Measurements | None = None
-    rejected: NDArray[np.bool_] | None = None
-    shift_sign: ShiftSign = "undetermined"
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.sensitivity.shape
-        return rows, cols
-
-    def __repr__(self) -> str:
-        """Short form: sizes and how far the solver came."""
-        state = "converged" if self.converged else "not converged"
-        std = self.sensitivity_std
-        noise = "" if std is None else f", standard deviation {np.nanmedian(std):.1e}"
-        return (
-            f"<Calibration of {self.shape[0]} x {self.shape[1]} pixels from {len(self.shifts)} "
-            f"exposures: {state}, error estimate {self.error_estimate:.1e}{noise}>"
-        )
-
-    @property
-    def tilt(self) -> NDArray[Any]:
-        """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
-
-        Valid are pixels without ``DO_NOT_USE``; NaN where they tell no slope.
-        """
-        return tilt(self.sensitivity, self._valid)
-
-    @property
-    def _valid(self) -> NDArray[np.bool_]:
-        usable = (self.flags & Flag.DO_NOT_USE) == 0
-        return np.asarray(usable & determined(self.sensitivity, self.flags))
-
-    def std_of(
-        self,
-        weights: ArrayLike,
-        *,
-        workers: int | None = None,
-        progress: Progress | None = None,
-    ) -> float | NDArray[Any]:
-        """Standard deviation of Σ weights · ln M by noise, large scales included.
-
-        Parameters
-        ----------
-        weights : array_like, shape (rows, cols) or (m, rows, cols)
-            The weight of each pixel, or a stack of them; 0 where M is undetermined or not above 0.
-        workers : int, optional
-            Number of threads; unless given, as many as processors may be used.
-        progress : callable, optional
-            Called as ``progress(done, total, stage)`` now and then.
-
-        Returns
-        -------
-        float, or ndarray of shape (m,)
-            One for each image of weights, in the gauge mean(M) = 1; where free fluxes leave a tilt
-            undetermined, in that of slope 0, though a sum that sees the tilt is as uncertain as
-            `tilt_std`.
-
-        Raises
-        ------
-        InputError
-            If this calibration was read from a file, which holds no measurements; if the weights
-            do not fit; or if no variance was given and no residual tells it.
-        InsufficientMemoryError
-            If the memory that it takes cannot be had.
-
-        Notes
-        -----
-        Errors of pixels are correlated: the variance of a mean over many cannot be had from
-        `sensitivity_std`. With w the weights and g = w/M it is gᵀ S⁻¹ g, S being the reduced normal
-        matrix: one linear problem, about as much work as the calibration. Changes made since to the
-        arrays that were calibrated go unnoticed.
-
-        Examples
-        --------
-        The mean of ln M over the left half, less that over the right:
-
-        >>> import numpy as np
-        >>> import equipix
-        >>> shape = (48, 64)
-        >>> shifts = equipix.cross_pattern(5, 7)
-        >>> beam = equipix.simulate.gaussian_beam(shape)
-        >>> frames = equipix.simulate.exposures(np.ones(shape), beam, shifts)
-        >>> cal = equipix.calibrate(frames, shifts, variance=np.full(5, 1e-6))
-        >>> weights = np.where(np.arange(64) < 32, 1, -1) * np.ones(shape) / (48 * 32)
-        >>> print(f"{cal.std_of(weights):.1e}")
-        1.3e-04
-        """
-        measurements = self.measurements
-        if measurements is None:
-            raise InputError(
-                "this calibration was read from a file, which does not hold the measurements: "
-                "call std_of on the result of calibrate or Experiment.run"
-            )
-        check_progress(progress)
-        stack = checked_weights(weights, determined(self.sensitivity, self.flags))
-        with naming_memory("the standard deviation"):
-            std = functional_std(
-                measurements,
-                self.sensitivity,
-                self.beam,
-                self.reduced_chi2,
-                stack,
-                workers=workers,
-                progress=progress,
-            )
-        return float(std[0]) if np.ndim(weights) == 2 else std
-
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
-        flagged: Flagged = "nan",
-        out: NDArray[Any] | None = None,
-    ) -> NDArray[Any]:
-        """Frames as a sensor of equal pixels would have given them: (frame − dark) / M.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Raw frames, in DN.
-        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the one that is part of the calibration, another
-            (of averaged frames the mean), or none where it is already subtracted.
-        flagged : {"nan", "keep", "replace"}
-            What becomes of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
-            (NaN still where M is undetermined), or the mean of the nearest good pixels around.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64.
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `dark` is "stored" and none is stored, or `flagged` is
-            unknown.
-        """
-        if isinstance(dark, str):
-            if dark != "stored":
-                raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
-            if self.dark is None:
-                raise InputError(
-                    "'dark' is 'stored' but this calibration holds no dark frame: give one, or "
-                    "None if it is already subtracted"
-                )
-            dark = self.dark
-        return apply_gain(
-            frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
-        )
-
-    def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
-        """Frame that the sensor would give at another position: c · L(u) · M(p).
-
-        Parameters
-        ----------
-        shift : array_like, shape (2,)
-            Position (row, col) of the sensor in the beam, in pixels, as for `calibrate`.
-        rotation : {0, 90, 180, 270}
-            How far the sensor is turned, in degrees.
-        flux : float
-            Relative flux c of the exposure.
-
-        Returns
-        -------
-        ndarray, shape (rows, cols)
-            Noise-free signal in the units of the frames, the dark subtracted; NaN where the
-            sensitivity is undetermined, and where no exposure has observed the beam.
-
-        Raises
-        ------
-        InputError
-            If an argument has a wrong shape or value.
-
-        See Also
-        --------
-        residuals : How far frames are from it.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from equipix import calibrate, cross_pattern, simulate
-        >>> beam, truth = simulate.gaussian_beam((48, 64)), np.ones((48, 64))
-        >>> shifts = cross_pattern(5, 7)
-        >>> cal = calibrate(simulate.exposures(truth, beam, shifts), shifts)
-        >>> held_out = simulate.exposures(truth, beam, [(3, 4)])[0]
-        >>> bool(np.nanmax(np.abs(cal.predict((3, 4)) - held_out)) < 1e-6)
-        True
-        """
-        if np.shape(shift) != (2,):
-            raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
-        return self._predictions(np.reshape(shift, (1, 2)), [rotation], [flux])[0]
-
-    def residuals(
-        self,
-        frames: ArrayLike | Sequence[FrameStatistics],
-        *,
-        variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
-        shifts: ArrayLike | None = None,
-        rotation: ArrayLike | None = None,
-        flux: ArrayLike | None = None,
-    ) -> NDArray[Any]:
-        """How far frames are from what the calibration predicts: y − c · L(u) · M(p).
-
-        Parameters
-        ----------
-        frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
-            Exposures as they were calibrated, with the dark subtracted unless it was fitted: those
-            that the calibration was made from, or others, whose `shifts` are given then.
-        variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
-            Variance of the values given, as for `calibrate`.
-        shifts, rotation, flux : array_like, optional
-            Where and how bright the exposures were taken, as for `calibrate`; by default those
-            of the calibration.
-
-        Returns
-        -------
-        ndarray, shape (n, rows, cols)
-            Residuals in the units of the frames; where variances are known, in standard
-            deviations of a measurement. NaN where nothing is measured or predicted.
-
-        Raises
-        ------
-        InputError
-            If an argument has a wrong shape or value.
-
-        Notes
-        -----
-        Of the exposures that a calibration was made from M and L have followed some of the
-        noise: the mean square of residuals in standard deviations is `reduced_chi2` times the
-        degrees of freedom over the number of measurements. Of one held out it is above 1, by
-        the variance of the prediction.
-        """
-        statistics = as_statistics(frames)
-        values = as_values(cast("ArrayLike", frames), statistics)
-        if values.shape[1:] != self.shape:
-            raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
-        if shifts is None:
-            check_count("frames", len(values), len(self.shifts))
-        predicted = self._predictions(
-            self.shifts if shifts is None else shifts,
-            self._rotation if shifts is None and rotation is None else rotation,
-            self.flux if shifts is None and flux is None else flux,
-        )
-        check_count("shifts", len(predicted), len(values))
-        models = as_models(variance, statistics, len(values))
-        residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
-        if self.metadata["options"]["dark"] == "fit":
-            residuals -= self.dark
-        if models:
-            scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
-        elif variance is not None:
-            given = as_variances(cast("ArrayLike", variance), values)
-            scales = list(given if given.ndim == 3 else given[:, None, None])
-        else:
-            return residuals
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for residual, scale in zip(residuals, scales, strict=True):
-                residual /= np.sqrt(scale)
-        return residuals
-
-    @property
-    def _rotation(self) -> list[int]:
-        rotation: list[int] = self.metadata["options"]["rotation"]
-        return rotation
-
-    def _predictions(
-        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
-    ) -> list[NDArray[Any]]:
-        """Frames from these positions, each of shape (rows, cols)."""
-        exact = as_positions(shifts)
-        turns = as_rotation(rotation, len(exact))
-        fluxes = per_exposure("flux", flux, len(exact), default=1)
-        places = positions(self.beam_origin, exact, turns, fluxes)
-        frames = predictions(self.sensitivity, self.beam, places)
-        return [frame.astype(self.sensitivity.dtype) for frame in frames]
-
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.load` reads.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        InputError
-            If the suffix is unknown.
-        """
-        pages = {
-            "sensitivity": self.sensitivity,
-            "flags": self.flags,
-            "beam": self.beam,
-            "component_labels": self.component_labels,
-        }
-        if self.dark is not None:
-            pages["dark"] = self.dark
-        if self.sensitivity_std is not None:
-            pages["sensitivity_std"] = self.sensitivity_std
-        if self.rejected is not None:
-            pages["rejected"] = self.rejected.reshape(-1, self.shape[1]).astype(np.uint8)
-        numbers = {
-            "beam_origin": list(self.beam_origin),
-            "shifts": self.shifts.tolist(),
-            "flux": self.flux.tolist(),
-            "objective": self.objective,
-            "reduced_chi2": self.reduced_chi2 if np.isfinite(self.reduced_chi2) else None,
-            "components": self.components,
-            "sweeps": self.sweeps,
-            "converged": self.converged,
-            "error_estimate": self.error_estimate,
-            "shift_sign": self.shift_sign,
-            "tilt_std": None
-            if self.tilt_std is None
-            else [std if np.isfinite(std) else str(std) for std in self.tilt_std.tolist()],
-            "shift_std": None if self.shift_std is None else self.shift_std.tolist(),
-            "history": {
-                "sweep": self.history.sweep.tolist(),
-                "objective": self.history.objective.tolist(),
-                "error_estimate": self.history.error_estimate.tolist(),
-            },
-        }
-        content = {
-            "format": FORMAT,
-            "kind": "calibration",
-            "calibration": numbers,
-            "metadata": self.metadata,
-        }
-        save_pages(path, pages, content, force=force)
 
 
 def calibrate(
@@ -698,327 +193,116 @@ def calibrate(
     >>> bool(np.abs(cal.sensitivity / (truth / truth.mean()) - 1).max() < 1e-6)
     True
     """
+    fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
+    exposures = exposures_of(
+        frames,
+        shifts,
+        variance=variance,
+        mask=mask,
+        saturation=saturation,
+        flux=flux,
+        flux_std=flux_std,
+        time=time,
+        rotation=rotation,
+        shift_std=shift_std,
+        offset=is_to_be_fitted(dark),
+        whole=method == "coordinate-descent",
+    )
+    return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
+
+
+def calibrated(exposures: Exposures, options: Options, start: Fit | None = None) -> Calibration:
+    """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars."""
     started = datetime.now(UTC)
-    if method not in get_args(Method):
-        raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
-    check_progress(progress)
-    tolerance = as_tolerance(tolerance)
-    statistics = as_statistics(frames)
-    noise = fit_frames(statistics) if variance is None and statistics else None
-    noisy = noisy_pixels(statistics, noise) if noise is not None else None
-    with naming_memory("calibrating"):
-        values = as_values(cast("ArrayLike", frames), statistics)
-        count = len(values)
-        models = as_models(variance if noise is None else noise, statistics, count)
-        variances = None
-        if variance is not None and not models:
-            variances = as_variances(cast("ArrayLike", variance), values)
-        saturated = as_saturated(saturation, values, statistics)
-        given = None if mask is None else as_mask(mask, values.shape)
-        masked = union(given, saturated, noisy)
-    places = as_positions(shifts) if method == "multiscale" else round_shifts(shifts)
-    check_count("shifts", len(places), count)
-    turns = as_rotation(rotation, count)
-    fluxes, flux_model = as_flux(flux, flux_std, time, count)
-    warn_of_order(flux_model, places, turns)
-    shift_error = None if shift_std is None else as_shift_std(shift_std, count)
-    asked = Asked(
-        method=method,
-        flux=flux_model[0],
-        shifts_refined=shift_error is not None,
-        shifts_whole=bool((places == np.rint(places)).all()),
-        moves=moves(places, turns, values.shape[1:]),
-        dark=dark,
-        one_level=flux_model[0] in ("known", "prior") and len(set(fluxes.tolist())) == 1,
-        modelled=bool(models),
-        robust=robust,
-        uncertainty=uncertainty,
-    )
-    asked.check()
-
-    def solve(
-        variances: NDArray[Any] | None,
-        masked: NDArray[np.bool_] | None,
-        tolerance: float = tolerance,
-    ) -> _native.Solution:
-        return _native.calibrate_frames(
-            values,
-            places.astype(np.float64),
-            shift_std=shift_error,
-            rotation=turns.tolist(),
-            flux=fluxes.tolist(),
-            flux_model=flux_model,
-            offset=dark == "fit",
-            variance=variances,
-            mask=masked,
-            method=method,
-            tolerance=tolerance,
-            max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
-            workers=positive_workers(workers),
-            progress=progress,
-        )
-
-    data = Problem(values, masked, places, turns, fluxes, solve)
-    rejected = None
-    with naming_memory("calibrating"):
-        if models:
-            variances = modelled(data, models, tolerance)
-        if robust:
-            result, rejected = solve_robustly(data, models, variances, tolerance)
-        else:
-            result = solve(variances, masked)
-    freedom = result.degrees_of_freedom
-    reduced_chi2 = result.misfit / freedom if freedom > 0 else float("nan")
-    measurements = Measurements(
-        values,
-        np.rint(places).astype(np.int64),
-        turns.tolist(),
-        list(result.flux),
-        variances,
-        masked if rejected is None else ~data.usable() | rejected,
-        None
-        if result.coefficients is None
-        else JointFit(
-            measured=places.astype(np.float64),
-            shift_std=shift_error,
-            flux_model=flux_model,
-            offset=dark == "fit",
-            shifts=np.array(result.shifts),
-            refined=result.refinement == "refined",
-            leaves_tilt=result.leaves_tilt,
-            coefficients=result.coefficients,
-            unit=1.0 if variances is not None or np.isnan(reduced_chi2) else reduced_chi2,
-        ),
-    )
-    sign: ShiftSign = "undetermined"
-    if dark != "fit":
-        sign = shift_sign(measurements, places, workers=workers, progress=progress)
-    calibration = _wrapped(result, values.dtype, places, measurements, reduced_chi2, rejected, sign)
-    options: dict[str, Any] = {
-        "method": method,
-        "tolerance": tolerance,
-        "max_sweeps": max_sweeps,
-        "dark": dark,
-        "flux": flux_model[0],
-        "weights": "equal" if variances is None else "variances",
-    }
-    if result.refinement:
-        options["shifts"] = result.refinement
-    calibration.metadata.update(
-        versions={"equipix": _native.__version__, "numpy": np.__version__},
-        options=options | {"rotation": turns.tolist(), "robust": robust},
-        started=started.isoformat(timespec="seconds"),
-        finished=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
-    if dark == "fit" and flux_model[0] != "known":
-        calibration.metadata["dark"] = _dark_std(calibration, workers)
-    _flag(calibration, data, variances)
-    _flag_known(calibration, statistics, saturated, noisy)
-    _warn(calibration, tolerance, result)
-    if uncertainty:
-        calibration = _with_std(calibration, workers, progress)
-    return calibration
+    options.check(exposures)
+    verdicts.say(verdicts.on_plan(exposures))
+    weighted = weighted_fit(exposures, options, start)
+    test = shift_sign(weighted.exposures, weighted.fit, options.fit)
+    flags = pixel_flags(weighted, options.fit.tolerance)
+    dark = dark_std(weighted, options.fit)
+    verdicts.say(verdicts.on_fit(weighted, options, test, dark))
+    bars = None
+    if options.uncertainty:
+        unknown = verdicts.on_uncertainty(weighted.fit)
+        verdicts.say([] if unknown is None else [unknown])
+        bars = None if unknown else error_bars(weighted, flags, options.fit)
+    metadata = _metadata(weighted, options, started, dark, bars)
+    return _result(weighted, test, flags, bars, metadata)
 
 
-def _with_std(
-    calibration: Calibration, workers: int | None, progress: Progress | None
+def _result(
+    weighted: Weighted,
+    test: SignTest,
+    flags: Array,
+    bars: ErrorBars | None,
+    metadata: dict[str, Any],
 ) -> Calibration:
-    measurements = calibration.measurements
-    assert measurements is not None
-    if measurements.joint and calibration.error_estimate > _NOT_FOUND:
-        warnings.warn(
-            f"no standard deviations: with an estimated error of {calibration.error_estimate:.1e} "
-            "the sensitivity is not found",
-            ConvergenceWarning,
-            stacklevel=3,
-        )
-        return calibration
-    sensitivity = calibration.sensitivity
-    with naming_memory("the error map"):
-        std, exactness = error_map(
-            measurements,
-            sensitivity,
-            calibration.beam,
-            calibration.reduced_chi2,
-            workers=workers,
-            progress=progress,
-        )
-    left = shift_std_left(
-        measurements, sensitivity, calibration.beam, calibration.reduced_chi2, workers=workers
-    )
-    return replace(
-        calibration,
-        sensitivity_std=std.astype(sensitivity.dtype, copy=False),
-        tilt_std=_tilt_std(calibration, workers),
-        shift_std=left,
-        metadata=calibration.metadata | {"uncertainty": exactness},
-    )
-
-
-def _tilt_std(calibration: Calibration, workers: int | None) -> NDArray[Any]:
-    measurements = calibration.measurements
-    if measurements is not None and measurements.joint and measurements.joint.leaves_tilt:
-        return np.full(2, np.inf)
-    weights = tilt_weights(calibration._valid)
-    if not np.isfinite(weights).all():
-        return np.full(2, np.nan)
-    return np.asarray(calibration.std_of(weights, workers=workers))
-
-
-def _dark_std(calibration: Calibration, workers: int | None) -> dict[str, float | None]:
-    """How well a fitted dark is known; None where a fit did not converge or no noise is known."""
-    measurements = calibration.measurements
-    assert measurements is not None
-    if measurements.variance is None and not np.isfinite(calibration.reduced_chi2):
-        return {"std_along_sensitivity": None, "std_of_a_pixel": None}
-    with naming_memory("the standard deviation of the dark"):
-        along, alone = offset_std(
-            measurements,
-            calibration.sensitivity,
-            calibration.beam,
-            calibration.reduced_chi2,
-            workers=workers,
-        )
-    return {
-        "std_along_sensitivity": along if calibration.converged else None,
-        "std_of_a_pixel": alone,
-    }
-
-
-def _flag_known(
-    calibration: Calibration,
-    statistics: list[FrameStatistics],
-    saturated: NDArray[np.bool_] | None,
-    noisy: NDArray[np.bool_] | None,
-) -> None:
-    """Set the flags of pixels that were odd before any fit."""
-    flagged: list[tuple[NDArray[np.bool_], Flag]]
-    flagged = [(each.saturated > 0, Flag.SATURATED) for each in statistics]
-    if saturated is not None:
-        flagged.append((np.any(saturated, axis=0), Flag.SATURATED))
-    if noisy is not None:
-        flagged.append((noisy, Flag.HOT | Flag.DO_NOT_USE))
-    for pixels, flag in flagged:
-        calibration.flags[pixels] |= np.uint32(flag)
-
-
-def _flag(calibration: Calibration, data: Problem, variances: NDArray[Any] | None) -> None:
-    """Set the flags of pixels whose answer is odd, and of those whose measurements disagree."""
-    sensitivity, flags = calibration.sensitivity, calibration.flags
-    places = positions(calibration.beam_origin, calibration.shifts, data.rotation, calibration.flux)
-
-    def std(pixels: NDArray[Any]) -> NDArray[Any]:
-        """Standard deviation of M, that of the beam left out: 1/√(Σ w c²L²)."""
-        weight = np.zeros(len(pixels))
-        used = data.usable()
-        for k, place in enumerate(places):
-            seen = np.nan_to_num(light(calibration.beam, place, calibration.shape)).flat[pixels]
-            scale = calibration.reduced_chi2 if variances is None else variances[k]
-            scale = np.broadcast_to(scale, calibration.shape).flat[pixels]
-            weight += used[k].flat[pixels] * seen**2 / scale
-        with np.errstate(divide="ignore"):
-            return 1 / np.sqrt(weight)
-
-    dead, hot = odd_responses(sensitivity, std)
-    dead |= sensitivity <= calibration.metadata["options"]["tolerance"]
-    flags[dead] |= np.uint32(Flag.DEAD | Flag.DO_NOT_USE)
-    flags[hot] |= np.uint32(Flag.HOT | Flag.DO_NOT_USE)
-    if calibration.rejected is not None:
-        contradictory = 2 * calibration.rejected.sum(axis=0) > data.usable().sum(axis=0)
-        flags[contradictory] |= np.uint32(Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE)
-        calibration.metadata["rejected"] = calibration.rejected.sum(axis=(1, 2)).tolist()
-
-
-def _wrapped(
-    result: _native.Solution,
-    dtype: np.dtype[Any],
-    shifts: NDArray[Any],
-    measurements: Measurements,
-    reduced_chi2: float,
-    rejected: NDArray[np.bool_] | None,
-    sign: ShiftSign,
-) -> Calibration:
+    exposures, fit, rejected = weighted
+    dtype = exposures.values.dtype
+    freedom = fit.degrees_of_freedom
     return Calibration(
-        sensitivity=result.sensitivity.astype(dtype, copy=False),
-        beam=result.beam,
-        beam_origin=result.beam_origin,
-        flags=result.flags,
-        shifts=np.array(shifts if result.shifts is None else result.shifts, dtype=np.float64),
-        flux=np.array(result.flux),
-        objective=result.misfit,
-        reduced_chi2=reduced_chi2,
-        components=result.components,
-        component_labels=result.component_labels,
-        sweeps=int(result.sweeps[-1]),
-        converged=result.ended == "converged",
-        error_estimate=float(result.error_estimate[-1]),
-        history=History(result.sweeps, result.objective, result.error_estimate),
-        dark=None if result.offset is None else result.offset.astype(dtype, copy=False),
-        measurements=measurements,
+        sensitivity=fit.sensitivity.astype(dtype, copy=False),
+        beam=fit.beam.values,
+        beam_origin=fit.beam.origin,
+        beam_coefficients=fit.beam.coefficients,
+        flags=flags,
+        shifts=np.array(fit.shifts, dtype=np.float64),
+        rotation=exposures.positions.rotation,
+        flux=np.array(fit.flux),
+        objective=fit.misfit,
+        reduced_chi2=fit.misfit / freedom if freedom > 0 else float("nan"),
+        components=fit.components,
+        component_labels=fit.component_labels,
+        sweeps=int(fit.sweeps[-1]),
+        converged=fit.ended == "converged",
+        error_estimate=float(fit.error_estimate[-1]),
+        history=History(fit.sweeps, fit.objective, fit.error_estimate),
+        dark=None if fit.offset is None else fit.offset.astype(dtype, copy=False),
+        dark_is_fitted=exposures.offset,
+        metadata=metadata,
+        sensitivity_std=None if bars is None else bars.sensitivity,
+        tilt_std=None if bars is None else bars.tilt,
+        shift_std=None if bars is None else bars.shifts,
+        weighted=weighted,
         rejected=rejected,
-        shift_sign=sign,
+        shift_sign=test.sign,
     )
 
 
-def _warn(calibration: Calibration, tolerance: float, result: _native.Solution) -> None:
-    if calibration.components > 1:
-        left = int(np.count_nonzero(calibration.component_labels > 0))
-        warnings.warn(
-            f"the measurements leave {calibration.components} parts of the sensor uncompared: "
-            f"{left} pixels outside the largest part are NaN; choose other shifts",
-            IdentifiabilityWarning,
-            stacklevel=3,
-        )
-    if result.smallest_ritz is not None and result.smallest_ritz < UNTOLD:
-        warnings.warn(
-            f"the measurements hardly tell some pattern of the sensitivity (smallest Ritz value "
-            f"{result.smallest_ritz:.1e}, below {UNTOLD:g}): choose other shifts",
-            IdentifiabilityWarning,
-            stacklevel=3,
-        )
-    if result.leaves_tilt:
-        warnings.warn(
-            "free fluxes leave a tilt of the sensitivity undetermined: its slope is set to 0; turn "
-            "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp",
-            IdentifiabilityWarning,
-            stacklevel=3,
-        )
-    limited = calibration.metadata["options"]["max_sweeps"] is not None
-    used_up = result.ended == "sweeps used"
-    dark = calibration.metadata.get("dark")
-    if dark:
-        along, alone = dark["std_along_sensitivity"], dark["std_of_a_pixel"]
-        told = None
-        if along is not None and along > alone:
-            told = f"has the standard deviation {along:.1e}, where noise leaves a pixel {alone:.1e}"
-        elif not calibration.converged and not (used_up and limited):
-            told = "is not told at all"
-        if told is not None:
-            warnings.warn(
-                "offset and gain can hardly be told apart: with fitted fluxes the dark may hold "
-                f"any multiple b of the sensitivity, and b {told}; give the ratio of the levels as "
-                "'flux', or take larger shifts in a beam that varies more",
-                IdentifiabilityWarning,
-                stacklevel=3,
-            )
-    measurements = calibration.measurements
-    weighted = measurements is not None and measurements.variance is not None
-    if weighted and calibration.converged and calibration.reduced_chi2 > _MISFIT:
-        warnings.warn(
-            f"residuals are {calibration.reduced_chi2**0.5:.1f} times what the variances say: are "
-            "the shifts right, and their sign? does the lamp drift (flux='fit')? is there dust "
-            "(robust=True)?",
-            MisfitWarning,
-            stacklevel=3,
-        )
-    if not calibration.converged:
-        stuck = (
-            "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
-        )
-        remedy = "allow more sweeps" if used_up else stuck
-        warnings.warn(
-            f"stopped after {calibration.sweeps} sweeps with an estimated error of "
-            f"{calibration.error_estimate:.1e}, above the tolerance {tolerance:g}: {remedy}",
-            ConvergenceWarning,
-            stacklevel=3,
-        )
+def _metadata(
+    weighted: Weighted,
+    options: Options,
+    started: datetime,
+    dark: DarkStd | None,
+    bars: ErrorBars | None,
+) -> dict[str, Any]:
+    """Versions, options and times, as JSON values."""
+    exposures, fit, rejected = weighted
+    chosen: dict[str, Any] = {
+        "method": options.fit.method,
+        "tolerance": options.fit.tolerance,
+        "max_sweeps": options.fit.max_sweeps,
+        "dark": "fit" if exposures.offset else "subtracted",
+        "flux": exposures.flux.kind,
+        "weights": "equal" if exposures.variance is None else "variances",
+        "rotation": exposures.positions.rotation.tolist(),
+        "robust": options.robust,
+    }
+    if exposures.positions.std is not None:
+        chosen["shifts"] = fit.refinement
+    metadata: dict[str, Any] = {
+        "versions": {"equipix": _native.__version__, "numpy": np.__version__},
+        "options": chosen,
+        "started": started.isoformat(timespec="seconds"),
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    if dark is not None:
+        metadata["dark"] = {
+            "std_along_sensitivity": dark.along_sensitivity,
+            "std_of_a_pixel": dark.of_a_pixel,
+        }
+    if rejected is not None:
+        metadata["rejected"] = rejected.sum(axis=(1, 2)).tolist()
+    if bars is not None:
+        metadata["uncertainty"] = bars.exactness
+    return metadata

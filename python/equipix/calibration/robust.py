@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.errors import InputError
-from equipix.prediction import light, window
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from equipix.prediction import Position
-
-FEWEST = 3
-"""Exposures without which nothing tells which of two measurements is wrong."""
+    from equipix._types import Array, Bools
+    from equipix.exposures.compiled import Fit
+    from equipix.exposures.exposures import Exposures
 
 _BEYOND = 5.0
 """Standard deviations that honest noise exceeds in one of two million measurements."""
@@ -35,63 +30,24 @@ _ROBUST = 1.4826
 """Standard deviation over median absolute deviation, for normal noise."""
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """The measurements of a calibration and what became of them.
-
-    Attributes
-    ----------
-    values : ndarray, shape (n, rows, cols)
-        The measurements y.
-    variances : ndarray of shape (n, rows, cols) or (n,), or None
-        Their variances, of which only the ratios count.
-    usable : ndarray of bool, shape (n, rows, cols)
-        Which of them may be used.
-    places : list of Position
-        Where each exposure was taken.
-    floor : float
-        Relative deviation that the solver leaves: less is none.
-    """
-
-    values: NDArray[Any]
-    variances: NDArray[Any] | None
-    usable: NDArray[np.bool_]
-    places: list[Position]
-    floor: float
-
-
-def check_count_for_rejection(count: int) -> None:
-    """Refuse to look for the false one of two measurements."""
-    if count < FEWEST:
-        raise InputError(
-            f"'robust' needs at least {FEWEST} exposures to tell which measurement is false, "
-            f"got {count}"
-        )
-
-
-def rejected(
-    evidence: Evidence,
-    sensitivity: NDArray[Any],
-    beam: NDArray[Any],
-    before: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
+def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Bools:
     """Find the measurements to leave out next.
 
     Parameters
     ----------
-    evidence : Evidence
-        The measurements.
-    sensitivity : ndarray, shape (rows, cols)
-        M, fitted without those that were left out.
-    beam : ndarray, shape of the padded grid
-        L likewise.
+    exposures : Exposures
+        All measurements that may be used, and their variances, of which only the ratios count.
+    fit : Fit
+        The fit without those that were left out.
     before : ndarray of bool, shape (n, rows, cols)
         Which were left out.
+    floor : float
+        Relative deviation that the solver leaves: a smaller one is none.
 
     Returns
     -------
     ndarray of bool, shape (n, rows, cols)
-        Which to leave out: when it is `before`, all is said.
+        Which to leave out: when it is `before`, the search has ended.
 
     Notes
     -----
@@ -100,19 +56,19 @@ def rejected(
     what deviates most in its pixel and in its cell goes; the next fit shows what remains. What no
     longer deviates comes back, and so do those of a pixel that would be left without M.
     """
-    new, old = deviations(evidence, sensitivity, beam, before)
+    new, old = deviations(exposures, fit, before, floor)
     leading = np.where(before, 0, np.nan_to_num(new))
     by_pixel = leading.max(axis=0)
-    by_cell = np.zeros(beam.shape, leading.dtype)
-    shape = by_pixel.shape
-    for each, place in zip(leading, evidence.places, strict=True):
-        np.maximum(window(by_cell, place, shape), each, out=window(by_cell, place, shape))
+    by_cell = np.zeros(fit.beam.values.shape, leading.dtype)
+    for k, each in enumerate(leading):
+        seen = exposures.cells(by_cell, fit, k)
+        np.maximum(seen, each, out=seen)
     result = before & ~(old <= _NEAR)
     # A pixel that has lost its ties by mistake, while larger deviations hid the true ones, gets
     # its measurements back.
-    result[:, np.isnan(sensitivity)] = False
-    for k, place in enumerate(evidence.places):
-        rival = _LEADING * np.maximum(by_pixel, window(by_cell, place, shape))
+    result[:, np.isnan(fit.sensitivity)] = False
+    for k in range(len(exposures)):
+        rival = _LEADING * np.maximum(by_pixel, exposures.cells(by_cell, fit, k))
         suspect = (leading[k] > _NEAR) & (leading[k] >= rival)
         result[k] |= suspect & (leading[k] > _BEYOND)
         result[k] |= suspect & (_box(result[k]) > 0)
@@ -120,31 +76,28 @@ def rejected(
 
 
 def deviations(
-    evidence: Evidence,
-    sensitivity: NDArray[Any],
-    beam: NDArray[Any],
-    left_out: NDArray[np.bool_],
+    exposures: Exposures, fit: Fit, left_out: Bools, floor: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """How far each measurement, or the mean of the 3×3 pixels around it, is from the fit.
 
     Parameters
     ----------
-    evidence : Evidence
+    exposures : Exposures
         The measurements.
-    sensitivity : ndarray, shape (rows, cols)
-        Fitted M.
-    beam : ndarray, shape of the padded grid
-        Fitted L.
+    fit : Fit
+        Their fit.
     left_out : ndarray of bool, shape (n, rows, cols)
         Which were left out of the fit.
+    floor : float
+        Relative deviation that the solver leaves.
 
     Returns
     -------
     new, old : ndarray, shape (n, rows, cols), float32
-        The larger of both absolute deviations, in standard deviations; NaN where nothing tells.
-        `new` is for what was not left out: the mean is over such only, and does not count beside
-        one that is conspicuous by itself, whose pull on others would show in it. `old` is for
-        what was left out: the mean is over both, each deviation cut off at five.
+        The larger of both absolute deviations, in standard deviations; NaN where the residual
+        carries no information. `new` is for what was not left out: the mean is over such only, and
+        does not count beside one that is conspicuous by itself, whose pull on others would show in
+        it. `old` is for what was left out: the mean is over both, each deviation cut off at five.
 
     Notes
     -----
@@ -155,36 +108,47 @@ def deviations(
     scale of these is the residuals' own, in each exposure, from their median absolute value; so it
     matters little whether the variances given are right by a factor.
     """
-    shape = evidence.values.shape[1:]
-    response = np.nan_to_num(sensitivity).astype(np.float64)
-    on_pixels, on_cells = np.zeros(shape), np.zeros(beam.shape)
-    seen = [np.nan_to_num(light(beam, place, shape)) for place in evidence.places]
-    weights = [_weights(evidence, k, seen[k] * response != 0) for k in range(len(seen))]
-    for k, place in enumerate(evidence.places):
+    shape, flux = exposures.shape, fit.flux
+    response = np.nan_to_num(fit.sensitivity).astype(np.float64)
+    usable = exposures.usable()
+    on_pixels, on_cells = np.zeros(shape), np.zeros(fit.beam.values.shape)
+    seen = [np.nan_to_num(exposures.light(fit, k)) for k in range(len(exposures))]
+    weights = [
+        _weights(exposures.variance, k, usable[k] & (seen[k] * response != 0))
+        for k in range(len(exposures))
+    ]
+    for k, light in enumerate(seen):
         weight = np.where(left_out[k], 0, weights[k])
-        on_pixels += weight * seen[k] ** 2
-        window(on_cells, place, shape)[:] += weight * (place.flux * response) ** 2
-    new, old = (np.empty(evidence.values.shape, np.float32) for _ in range(2))
-    for k, place in enumerate(evidence.places):
+        on_pixels += weight * light**2
+        exposures.cells(on_cells, fit, k)[:] += weight * (flux[k] * response) ** 2
+    new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
+    for k, light in enumerate(seen):
         shares = (
-            _share(weights[k] * seen[k] ** 2, on_pixels),
-            _share(weights[k] * (place.flux * response) ** 2, window(on_cells, place, shape)),
+            _share(weights[k] * light**2, on_pixels),
+            _share(weights[k] * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
         )
         sign = np.where(left_out[k], 1, -1)
         spread = (1 + sign * shares[0]) * (1 + sign * shares[1])
         known = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
-        root = np.sqrt(weights[k])
-        expected = seen[k] * response
+        expected = light * response
         residual = np.full(shape, np.nan)
-        residual[known] = (root * (evidence.values[k] - expected))[known] / np.sqrt(spread[known])
+        root = np.sqrt(weights[k])
+        scaled = (root * (exposures.values[k] - expected))[known] / np.sqrt(spread[known])
+        residual[known] = scaled
         used = known & ~left_out[k]
-        floor = evidence.floor * _median(root * expected, known)
-        residual /= max(_ROBUST * _median(residual, used), floor, np.finfo(float).tiny)
-        own = np.abs(residual)
-        quiet = _box(used & (own > _BEYOND)) == 0
-        new[k] = np.fmax(own, np.where(known & quiet, np.abs(_around(residual, used)), np.nan))
-        old[k] = np.fmax(own, np.abs(_around(np.clip(residual, -_BEYOND, _BEYOND), known)))
-        new[k][~known] = old[k][~known] = np.nan
+        least = floor * _median(root * expected, known)
+        residual /= max(_ROBUST * _median(residual, used), least, np.finfo(float).tiny)
+        new[k], old[k] = _conspicuous(residual, used, known)
+    return new, old
+
+
+def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
+    """Deviations alone or of the 3×3 means around, of what was used and of what was left out."""
+    own = np.abs(residual)
+    quiet = _box(used & (own > _BEYOND)) == 0
+    new = np.fmax(own, np.where(known & quiet, np.abs(_around(residual, used)), np.nan))
+    old = np.fmax(own, np.abs(_around(np.clip(residual, -_BEYOND, _BEYOND), known)))
+    new[~known] = old[~known] = np.nan
     return new, old
 
 
@@ -195,12 +159,10 @@ def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     return scaled
 
 
-def _weights(evidence: Evidence, exposure: int, expected: NDArray[np.bool_]) -> NDArray[Any]:
-    """Weights 1/σ² of an exposure; 0 where nothing is measured or no light expected."""
-    variance = 1.0 if evidence.variances is None else evidence.variances[exposure]
-    weights: NDArray[Any] = np.divide(
-        1.0, variance, where=evidence.usable[exposure] & expected, out=np.zeros(expected.shape)
-    )
+def _weights(variance: Array | None, exposure: int, used: Bools) -> Array:
+    """Weights 1/σ² of an exposure; 0 where nothing is used."""
+    scale = 1.0 if variance is None else variance[exposure]
+    weights: Array = np.divide(1.0, scale, where=used, out=np.zeros(used.shape))
     return weights
 
 

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from equipix._native import __version__
 from equipix._types import Flagged, FluxModel, Method
-from equipix.calibration.calibrate import Calibration
+from equipix.calibration.result import Calibration
 from equipix.cli.terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.comparison import compare as compare_calibrations
 from equipix.correction.files import correct_files, is_folder

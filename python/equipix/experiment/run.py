@@ -14,10 +14,11 @@ import numpy as np
 from equipix._check import as_tolerance, naming_memory, positive_count, positive_workers
 from equipix._types import Progress
 from equipix.calibration.calibrate import calibrate
-from equipix.defects import dead_pixels, hot_pixels, pixel_flags
+from equipix.defects import dead_pixels, hot_pixels
 from equipix.errors import FileError, InputError
 from equipix.experiment.manifest import find_files, read_manifest
-from equipix.flags import Flag
+from equipix.exposures.positions import in_beam, variance_in_beam
+from equipix.flags import Flag, set_bits
 from equipix.frames import average
 from equipix.io import as_path, frame_format, read_frames
 from equipix.noise import NoiseModel, photon_transfer
@@ -30,11 +31,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix._types import FluxModel, Method
-    from equipix.calibration.calibrate import Calibration
+    from equipix.calibration.result import Calibration
     from equipix.experiment.manifest import Exposure, Manifest
     from equipix.frames import FrameStatistics
     from equipix.shifts import ShiftMeasurement, Spot
-    from equipix.uncertainty import Measurements
 
 
 _AROUND = 8
@@ -170,11 +170,12 @@ class Experiment:
                 variances.append(np.square(new.shift_std or [0.0, 0.0]))
                 continue
             spots, shape = self._aperture(new, calibration)
-            u_before, variance_before = _in_beam(spots.before, old.rotation, shape)
-            u_after, variance_after = _in_beam(spots.after, new.rotation, shape)
-            shifts.append(shifts[-1] + u_before - u_after)
-            uneven = sum(_uneven_pixels(spot, calibration) for spot in (spots.before, spots.after))
-            variances.append(variances[-1] + variance_before + variance_after + uneven)
+            ends = ((spots.before, old.rotation), (spots.after, new.rotation))
+            before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
+            shifts.append(shifts[-1] + before - after)
+            noise = [variance_in_beam(np.square(spot.std), turn) for spot, turn in ends]
+            uneven = sum(_uneven_pixels(spot, calibration) for spot, _ in ends)
+            variances.append(variances[-1] + noise[0] + noise[1] + uneven)
         return np.array(shifts), np.sqrt(variances)
 
     def run(
@@ -240,7 +241,7 @@ class Experiment:
             measured = self._average(workers, progress)
             noise = self._noise(measured)
             models = _models(measured, noise)
-            flags = pixel_flags(
+            flags = _flags(
                 dead_pixels(measured.signals, models),
                 hot_pixels(measured.dark, noise),
                 measured.saturated,
@@ -414,19 +415,13 @@ def _models(measured: _Measured, noise: NoiseModel | None) -> list[NoiseModel] |
     return [noise.of_mean(frames, dark_variance=dark) for frames in measured.frames]
 
 
-def _in_beam(
-    spot: Spot, rotation: int, shape: tuple[int, int]
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Position A p + t of a spot on the sensor, at shift 0, and its variance."""
-    (row, col), (last_row, last_col) = spot.position, np.array(shape) - 1
-    position = {
-        0: (row, col),
-        90: (col, last_row - row),
-        180: (last_row - row, last_col - col),
-        270: (last_col - col, row),
-    }[rotation]
-    variance = np.square(spot.std)
-    return np.array(position), variance[::-1] if rotation in (90, 270) else variance
+def _flags(dead: NDArray[Any], hot: NDArray[Any], saturated: NDArray[Any]) -> NDArray[Any]:
+    """Flag pixels; what is clipped seems not to answer, and does not count as dead."""
+    flags = np.zeros(dead.shape, np.uint32)
+    set_bits(flags, "dead", dead & ~hot & ~saturated)
+    set_bits(flags, "hot", hot)
+    flags[saturated] |= np.uint32(Flag.SATURATED | Flag.DO_NOT_USE)
+    return flags
 
 
 def _equalised(frames: NDArray[Any], calibration: Calibration) -> NDArray[Any]:
@@ -443,15 +438,6 @@ def _equalised(frames: NDArray[Any], calibration: Calibration) -> NDArray[Any]:
     return np.asarray((frames - calibration.dark) / gain)
 
 
-def _measurements_of(calibration: Calibration) -> Measurements:
-    if calibration.measurements is None:
-        raise InputError(
-            "'calibration' was read from a file, which does not hold the measurements: give the "
-            "result of Experiment.run"
-        )
-    return calibration.measurements
-
-
 def _uneven_pixels(spot: Spot, calibration: Calibration | None) -> float:
     """Variance of a centroid by unequal pixels under the spot: s²/4π for a disc of any size.
 
@@ -460,21 +446,26 @@ def _uneven_pixels(spot: Spot, calibration: Calibration | None) -> float:
     """
     if calibration is None:
         return _UNEVEN_PIXELS**2
-    measurements = _measurements_of(calibration)
-    count = len(measurements.frames)
+    if calibration.weighted is None:
+        raise InputError(
+            "'calibration' was read from a file, which does not hold the measurements: give the "
+            "result of Experiment.run"
+        )
+    exposures = calibration.weighted.exposures
+    count = len(exposures)
     row, col = np.rint(spot.position).astype(int)
     around = (
         ...,
         slice(max(row - _AROUND, 0), row + _AROUND),
         slice(max(col - _AROUND, 0), col + _AROUND),
     )
-    known = np.square(measurements.frames[around], dtype=np.float64)
-    if measurements.variance is None:
+    known = np.square(exposures.values[around], dtype=np.float64)
+    if exposures.variance is None:
         known /= calibration.reduced_chi2
-    elif measurements.variance.ndim == 3:
-        known /= measurements.variance[around]
+    elif exposures.variance.ndim == 3:
+        known /= exposures.variance[around]
     else:
-        known /= measurements.variance[:, None, None]
+        known /= exposures.variance[:, None, None]
     told = float(np.median(np.nan_to_num(known).sum(axis=0)))
     if not told > 0:  # no light around the spot, or no noise known
         return _UNEVEN_PIXELS**2

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from equipix.calibration.calibrate import Calibration
+    from equipix.calibration.result import Calibration
     from equipix.comparison import Comparison
     from equipix.demo import Demo
     from equipix.plan import ErrorBudget

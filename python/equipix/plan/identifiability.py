@@ -10,7 +10,7 @@ import numpy as np
 from equipix import _native
 from equipix._check import as_shifts, check_shape, naming_memory, per_exposure
 from equipix.errors import InputError
-from equipix.exposures.checks import as_mask
+from equipix.exposures.front import as_mask
 from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:

@@ -1,0 +1,64 @@
+"""What may be asked of a calibration, and what excludes what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from equipix.exposures.exposures import Exposures
+    from equipix.exposures.options import FitOptions
+
+_FEWEST_FOR_REJECTION = 3
+"""Exposures without which no residual shows which of two measurements is wrong."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a calibration is made.
+
+    Attributes
+    ----------
+    fit : FitOptions
+        How each fit is made.
+    robust : bool
+        Whether to leave out measurements that disagree with the others.
+    uncertainty : bool
+        Whether to find standard deviations.
+    """
+
+    fit: FitOptions
+    robust: bool = False
+    uncertainty: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is neither true nor false."""
+        for name in ("robust", "uncertainty"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected True or False")
+
+    def check(self, exposures: Exposures) -> None:
+        """Refuse what such exposures exclude."""
+        if exposures.offset and (self.robust or exposures.noise):
+            raise InputError(
+                "'dark' is 'fit', but 'robust' and noise models expect the signal alone: subtract "
+                "a dark, or give variances as numbers and leave 'robust' out"
+            )
+        if self.robust and len(exposures) < _FEWEST_FOR_REJECTION:
+            raise InputError(
+                f"'robust' needs at least {_FEWEST_FOR_REJECTION} exposures to tell which "
+                f"measurement is false, got {len(exposures)}"
+            )
+
+
+def is_to_be_fitted(dark: object) -> bool:
+    """Whether the dark is an unknown of the fit; refuses what is no choice."""
+    if not isinstance(dark, str):
+        raise InputError(
+            "'dark' holds values: subtract it from the frames, or give it to equipix.average"
+        )
+    if dark not in ("subtracted", "fit"):
+        raise InputError(f"'dark' is {dark!r}, expected 'subtracted' or 'fit'")
+    return dark == "fit"

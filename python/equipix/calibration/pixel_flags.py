@@ -1,0 +1,44 @@
+"""Flags of the pixels of a calibrated sensor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.defects import odd_responses
+from equipix.flags import set_bits
+
+if TYPE_CHECKING:
+    from equipix._types import Array
+    from equipix.calibration.weights import Weighted
+
+
+def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
+    """Bits of `equipix.Flag` of each pixel, shape (rows, cols), uint32.
+
+    They tell what the solver left undetermined, what was odd before the fit, whose response is
+    odd, and whose measurements contradict each other.
+    """
+    exposures, fit, rejected = weighted
+    flags: Array = fit.flags.copy()
+    sensitivity = fit.sensitivity.astype(exposures.values.dtype, copy=False)
+    dead, hot = odd_responses(sensitivity, lambda pixels: _std(weighted, pixels))
+    set_bits(flags, "dead", dead | (sensitivity <= tolerance))
+    set_bits(flags, "hot", hot)
+    for finding, pixels in vars(exposures.findings).items():
+        set_bits(flags, finding, pixels)
+    if rejected is not None:
+        kept = exposures.usable().sum(axis=0)
+        set_bits(flags, "contradictory", rejected.sum(axis=0) > kept)
+    return flags
+
+
+def _std(weighted: Weighted, pixels: Array) -> Array:
+    """Standard deviation of M in pixels by flat indices, that of the beam left out: 1/√D."""
+    fit = weighted.fit
+    information = fit.information().flat[pixels]
+    if weighted.exposures.variance is None:
+        information = information / (fit.misfit / fit.degrees_of_freedom)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1 / np.sqrt(information))

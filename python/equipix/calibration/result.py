@@ -1,0 +1,490 @@
+"""The result of a shift calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+
+from equipix._check import check_count, check_progress, per_exposure
+from equipix.calibration.error_bars import checked_weights, functional_std
+from equipix.correction.apply import apply_gain
+from equipix.errors import InputError
+from equipix.exposures.compiled import Beam
+from equipix.exposures.front import as_models, as_statistics, as_values, as_variances
+from equipix.exposures.positions import Positions
+from equipix.flags import determined, usable
+from equipix.io import save_pages
+from equipix.maps import tilt
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from os import PathLike
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from equipix._types import Flagged, Progress, ShiftSign
+    from equipix.calibration.weights import Weighted
+    from equipix.frames import FrameStatistics
+    from equipix.noise import NoiseModel
+
+FORMAT = 1
+"""Number of the file format; a file with a higher one is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """How a calibration went, at some moments on its way.
+
+    Attributes
+    ----------
+    sweep : ndarray, shape (looks,), uint64
+        How many sweeps had been made.
+    objective : ndarray, shape (looks,), float64
+        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
+        and while such a fit still finds their weights.
+    error_estimate : ndarray, shape (looks,), float64
+        The estimated largest relative error of the sensitivity.
+    """
+
+    sweep: NDArray[Any]
+    objective: NDArray[Any]
+    error_estimate: NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration:
+    """Calibrated sensor: the result of `calibrate`.
+
+    Attributes
+    ----------
+    sensitivity : ndarray, shape (rows, cols)
+        Relative sensitivity M of mean 1 over valid pixels; NaN where undetermined. float32 for
+        float32 frames, else float64.
+    beam : ndarray, shape of the padded grid, float64
+        The beam L in the units of the frames; NaN where unobserved.
+    beam_origin : tuple of int
+        ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
+    beam_coefficients : ndarray, shape of the padded grid, float64, or None
+        Coefficients of the cubic B-spline that the beam is where shifts are no whole numbers; None
+        where it is known at the cells alone.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
+        neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
+        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. What the
+        measurements do not determine is ``NO_FLAT_FIELD | DO_NOT_USE``, what they contradict
+        each other about, so that a robust calibration left out most of them,
+        ``UNRELIABLE_FLAT | DO_NOT_USE``.
+    shifts : ndarray, shape (n, 2), float64
+        The shifts (row, col) that were used, in pixels.
+    rotation : ndarray, shape (n,), int64
+        How far the sensor was turned in each exposure, in degrees.
+    flux : ndarray, shape (n,), float64
+        The relative flux of each exposure.
+    objective : float
+        Objective F at the end.
+    reduced_chi2 : float
+        F over the degrees of freedom: 1 on average where the variances given are right, and the
+        variance of one value where none were given. NaN without any degree of freedom.
+    components : int
+        Number of connected components: parts of the sensor that the measurements do not compare.
+        A pixel that does not respond ties none together; nor does one whose measurements carry
+        next to no weight.
+    component_labels : ndarray, shape (rows, cols), int32
+        The component of each pixel, the largest being 0; −1 for a pixel without measurement.
+    sweeps : int
+        Sweeps of coordinate descent; of the multiscale method, passes over the data or its weights
+        of about a sweep's worth each.
+    converged : bool
+        Whether `error_estimate` is within the tolerance.
+    error_estimate : float
+        Estimated largest distance of `sensitivity` from the minimum of F, large scales included.
+        It says nothing of noise.
+    history : History
+        Objective and error estimate along the way.
+    dark : ndarray, shape (rows, cols), or None
+        The dark frame in DN, if it is part of the calibration.
+    dark_is_fitted : bool
+        Whether `dark` was fitted, and so is part of the exposures.
+    metadata : dict
+        Versions, options and origin, as JSON values (``options["weights"]``: "equal" where no
+        variance was known, else "variances"); under ``uncertainty`` the draws that
+        `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
+        was fitted together with fluxes, the standard deviation of b in its error b·M, which
+        they hardly tell, and what the noise of its own measurements leaves of a pixel.
+    sensitivity_std : ndarray, shape (rows, cols), or None
+        Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
+        uncertain, large scales included, in the gauge mean 1, and slope 0 where free fluxes leave
+        a tilt undetermined; NaN where undetermined. In `sensitivity`'s dtype; None unless asked
+        for, or where a joint fit did not find M at all.
+    tilt_std : ndarray, shape (2,), or None
+        Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None unless
+        asked for.
+    shift_std : ndarray, shape (n, 2), or None
+        Standard deviation of `shifts`, in pixels, where they had one before: of those refined, less
+        their mean by the prior's weights, since what moves all exposures alike moves but the beam;
+        else that given. None unless asked for.
+    weighted : Weighted or None
+        The exposures with their weights and the fit, for `std_of`; None if read from a file or
+        unpickled.
+    rejected : ndarray of bool, shape (n, rows, cols), or None
+        The measurements that a robust calibration left out; `metadata` counts them.
+    shift_sign : {"confirmed", "contradicted", "undetermined"}
+        Whether the data confirm the sign of the shifts, contradict it, or do not tell it, as those
+        of a Gaussian beam, whatever its width; see `calibrate`.
+    """
+
+    sensitivity: NDArray[Any]
+    beam: NDArray[Any]
+    beam_origin: tuple[int, int]
+    beam_coefficients: NDArray[Any] | None
+    flags: NDArray[Any]
+    shifts: NDArray[Any]
+    rotation: NDArray[Any]
+    flux: NDArray[Any]
+    objective: float
+    reduced_chi2: float
+    components: int
+    component_labels: NDArray[Any]
+    sweeps: int
+    converged: bool
+    error_estimate: float
+    history: History
+    dark: NDArray[Any] | None = None
+    dark_is_fitted: bool = False
+    metadata: dict[str, Any] = field(default_factory=dict)
+    sensitivity_std: NDArray[Any] | None = None
+    tilt_std: NDArray[Any] | None = None
+    shift_std: NDArray[Any] | None = None
+    weighted: Weighted | None = field(default=None, compare=False)
+    rejected: NDArray[np.bool_] | None = None
+    shift_sign: ShiftSign = "undetermined"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.sensitivity.shape
+        return rows, cols
+
+    def __repr__(self) -> str:
+        """Short form: sizes and how far the solver came."""
+        state = "converged" if self.converged else "not converged"
+        std = self.sensitivity_std
+        noise = "" if std is None else f", standard deviation {np.nanmedian(std):.1e}"
+        return (
+            f"<Calibration of {self.shape[0]} x {self.shape[1]} pixels from {len(self.shifts)} "
+            f"exposures: {state}, error estimate {self.error_estimate:.1e}{noise}>"
+        )
+
+    @property
+    def tilt(self) -> NDArray[Any]:
+        """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
+
+        Valid are pixels without ``DO_NOT_USE``; NaN where they tell no slope.
+        """
+        valid = usable(self.flags) & determined(self.sensitivity, self.flags)
+        return tilt(self.sensitivity, valid)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the compiled fit, which cannot be pickled."""
+        return {**vars(self), "weighted": None}
+
+    def std_of(
+        self,
+        weights: ArrayLike,
+        *,
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> float | NDArray[Any]:
+        """Standard deviation of Σ weights · ln M by noise, large scales included.
+
+        Parameters
+        ----------
+        weights : array_like, shape (rows, cols) or (m, rows, cols)
+            The weight of each pixel, or a stack of them; 0 where M is undetermined or not above 0.
+        workers : int, optional
+            Number of threads; unless given, as many as processors may be used.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` now and then.
+
+        Returns
+        -------
+        float, or ndarray of shape (m,)
+            One for each image of weights, in the gauge mean(M) = 1; where free fluxes leave a tilt
+            undetermined, in that of slope 0, though a sum that sees the tilt is as uncertain as
+            `tilt_std`.
+
+        Raises
+        ------
+        InputError
+            If this calibration was read from a file, which holds no measurements; if the weights
+            do not fit; or if no variance was given and no residual tells it.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
+
+        Notes
+        -----
+        Errors of pixels are correlated: the variance of a mean over many cannot be had from
+        `sensitivity_std`. With w the weights and g = w/M it is gᵀ S⁻¹ g, S being the reduced normal
+        matrix: one linear problem, about as much work as the calibration. Changes made since to the
+        arrays that were calibrated go unnoticed.
+
+        Examples
+        --------
+        The mean of ln M over the left half, less that over the right:
+
+        >>> import numpy as np
+        >>> import equipix
+        >>> shape = (48, 64)
+        >>> shifts = equipix.cross_pattern(5, 7)
+        >>> beam = equipix.simulate.gaussian_beam(shape)
+        >>> frames = equipix.simulate.exposures(np.ones(shape), beam, shifts)
+        >>> cal = equipix.calibrate(frames, shifts, variance=np.full(5, 1e-6))
+        >>> weights = np.where(np.arange(64) < 32, 1, -1) * np.ones(shape) / (48 * 32)
+        >>> print(f"{cal.std_of(weights):.1e}")
+        1.3e-04
+        """
+        if self.weighted is None:
+            raise InputError(
+                "this calibration was read from a file, which does not hold the measurements: "
+                "call std_of on the result of calibrate or Experiment.run"
+            )
+        check_progress(progress)
+        stack = checked_weights(weights, determined(self.sensitivity, self.flags))
+        std = functional_std(self.weighted, stack, workers=workers, progress=progress)
+        return float(std[0]) if np.ndim(weights) == 2 else std
+
+    def correct(
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
+        flagged: Flagged = "nan",
+        out: NDArray[Any] | None = None,
+    ) -> NDArray[Any]:
+        """Frames as a sensor of equal pixels would have given them: (frame − dark) / M.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames, in DN.
+        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+            The dark frame to subtract, in DN: the one that is part of the calibration, another
+            (of averaged frames the mean), or none where it is already subtracted.
+        flagged : {"nan", "keep", "replace"}
+            What becomes of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
+            (NaN still where M is undetermined), or the mean of the nearest good pixels around.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32 or float64.
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of dtype float64 for float64 frames, else float32; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, `dark` is "stored" and none is stored, or `flagged` is
+            unknown.
+        """
+        if isinstance(dark, str):
+            if dark != "stored":
+                raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+            if self.dark is None:
+                raise InputError(
+                    "'dark' is 'stored' but this calibration holds no dark frame: give one, or "
+                    "None if it is already subtracted"
+                )
+            dark = self.dark
+        return apply_gain(
+            frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
+        )
+
+    def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
+        """Frame that the sensor would give at another position: c · L(u) · M(p).
+
+        Parameters
+        ----------
+        shift : array_like, shape (2,)
+            Position (row, col) of the sensor in the beam, in pixels, as for `calibrate`.
+        rotation : {0, 90, 180, 270}
+            How far the sensor is turned, in degrees.
+        flux : float
+            Relative flux c of the exposure.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols)
+            Noise-free signal in the units of the frames, the dark subtracted; NaN where the
+            sensitivity is undetermined, and where no exposure has observed the beam.
+
+        Raises
+        ------
+        InputError
+            If an argument has a wrong shape or value.
+
+        See Also
+        --------
+        residuals : How far frames are from it.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from equipix import calibrate, cross_pattern, simulate
+        >>> beam, truth = simulate.gaussian_beam((48, 64)), np.ones((48, 64))
+        >>> shifts = cross_pattern(5, 7)
+        >>> cal = calibrate(simulate.exposures(truth, beam, shifts), shifts)
+        >>> held_out = simulate.exposures(truth, beam, [(3, 4)])[0]
+        >>> bool(np.nanmax(np.abs(cal.predict((3, 4)) - held_out)) < 1e-6)
+        True
+        """
+        if np.shape(shift) != (2,):
+            raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
+        return self._predictions(np.reshape(shift, (1, 2)), [rotation], [flux])[0]
+
+    def residuals(
+        self,
+        frames: ArrayLike | Sequence[FrameStatistics],
+        *,
+        variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+        shifts: ArrayLike | None = None,
+        rotation: ArrayLike | None = None,
+        flux: ArrayLike | None = None,
+    ) -> NDArray[Any]:
+        """How far frames are from what the calibration predicts: y − c · L(u) · M(p).
+
+        Parameters
+        ----------
+        frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
+            Exposures as they were calibrated, with the dark subtracted unless it was fitted: those
+            that the calibration was made from, or others, whose `shifts` are given then.
+        variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
+            Variance of the values given, as for `calibrate`.
+        shifts, rotation, flux : array_like, optional
+            Where and how bright the exposures were taken, as for `calibrate`; by default those
+            of the calibration.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, cols)
+            Residuals in the units of the frames; where variances are known, in standard
+            deviations of a measurement. NaN where nothing is measured or predicted.
+
+        Raises
+        ------
+        InputError
+            If an argument has a wrong shape or value.
+
+        Notes
+        -----
+        Of the exposures that a calibration was made from M and L have followed some of the
+        noise: the mean square of residuals in standard deviations is `reduced_chi2` times the
+        degrees of freedom over the number of measurements. Of one held out it is above 1, by
+        the variance of the prediction.
+        """
+        statistics = as_statistics(frames)
+        values = as_values(cast("ArrayLike", frames), statistics)
+        if values.shape[1:] != self.shape:
+            raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
+        if shifts is None:
+            check_count("frames", len(values), len(self.shifts))
+        predicted = self._predictions(
+            self.shifts if shifts is None else shifts,
+            self.rotation if shifts is None and rotation is None else rotation,
+            self.flux if shifts is None and flux is None else flux,
+        )
+        check_count("shifts", len(predicted), len(values))
+        models = as_models(variance, statistics, len(values))
+        residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
+        if self.dark_is_fitted:
+            residuals -= self.dark
+        if models:
+            scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
+        elif variance is not None:
+            given = as_variances(cast("ArrayLike", variance), values)
+            scales = list(given if given.ndim == 3 else given[:, None, None])
+        else:
+            return residuals
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for residual, scale in zip(residuals, scales, strict=True):
+                residual /= np.sqrt(scale)
+        return residuals
+
+    def _predictions(
+        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
+    ) -> list[NDArray[Any]]:
+        """Frames from these positions, each of shape (rows, cols)."""
+        positions = Positions.of(shifts, rotation=rotation)
+        fluxes = per_exposure("flux", flux, len(positions), default=1)
+        beam = self._beam
+        frames = []
+        for (row, col), turn, c in zip(
+            positions.shifts.tolist(), positions.rotation.tolist(), fluxes, strict=True
+        ):
+            frame = c * beam.light(self.shape, (row, col), turn) * self.sensitivity
+            frames.append(frame.astype(self.sensitivity.dtype))
+        return frames
+
+    @property
+    def _beam(self) -> Beam:
+        return Beam(self.beam, self.beam_coefficients, self.beam_origin)
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        InputError
+            If the suffix is unknown.
+        """
+        pages = {
+            "sensitivity": self.sensitivity,
+            "flags": self.flags,
+            "beam": self.beam,
+            "component_labels": self.component_labels,
+        }
+        if self.dark is not None:
+            pages["dark"] = self.dark
+        if self.sensitivity_std is not None:
+            pages["sensitivity_std"] = self.sensitivity_std
+        if self.rejected is not None:
+            pages["rejected"] = self.rejected.reshape(-1, self.shape[1]).astype(np.uint8)
+        numbers = {
+            "beam_origin": list(self.beam_origin),
+            "shifts": self.shifts.tolist(),
+            "flux": self.flux.tolist(),
+            "objective": self.objective,
+            "reduced_chi2": self.reduced_chi2 if np.isfinite(self.reduced_chi2) else None,
+            "components": self.components,
+            "sweeps": self.sweeps,
+            "converged": self.converged,
+            "error_estimate": self.error_estimate,
+            "shift_sign": self.shift_sign,
+            "tilt_std": None
+            if self.tilt_std is None
+            else [std if np.isfinite(std) else str(std) for std in self.tilt_std.tolist()],
+            "shift_std": None if self.shift_std is None else self.shift_std.tolist(),
+            "history": {
+                "sweep": self.history.sweep.tolist(),
+                "objective": self.history.objective.tolist(),
+                "error_estimate": self.history.error_estimate.tolist(),
+            },
+        }
+        content = {
+            "format": FORMAT,
+            "kind": "calibration",
+            "calibration": numbers,
+            "metadata": self.metadata,
+        }
+        save_pages(path, pages, content, force=force)

@@ -1,0 +1,210 @@
+"""What to say of a fit, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.errors import (
+    ConvergenceWarning,
+    EquipixWarning,
+    IdentifiabilityWarning,
+    MisfitWarning,
+    ShiftSignWarning,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from equipix.calibration.error_bars import DarkStd
+    from equipix.calibration.options import Options
+    from equipix.calibration.sign import SignTest
+    from equipix.calibration.weights import Weighted
+    from equipix.exposures.compiled import Fit
+    from equipix.exposures.exposures import Exposures
+
+_UNDETERMINED = 1e-4
+"""A Ritz value this small belongs to a pattern that the measurements do not determine: its noise is
+100 times that of others."""
+
+_MISFIT = 4.0
+"""A reduced χ² this large has a cause other than variances that are a little off."""
+
+_NOT_FOUND = 0.1
+"""A joint fit that ends with so large an error of M has no errors that noise would make."""
+
+_HARDLY_TOLD = 0.1
+"""A share of a trend's variance that leaves its error three times larger."""
+
+_CATEGORIES: dict[str, type[EquipixWarning]] = {
+    "order": IdentifiabilityWarning,
+    "sign": ShiftSignWarning,
+    "components": IdentifiabilityWarning,
+    "pattern": IdentifiabilityWarning,
+    "tilt": IdentifiabilityWarning,
+    "dark": IdentifiabilityWarning,
+    "misfit": MisfitWarning,
+    "convergence": ConvergenceWarning,
+    "uncertainty": ConvergenceWarning,
+}
+"""The warning of each kind of verdict."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Something that the user of a result must know.
+
+    Attributes
+    ----------
+    kind : str
+        What it is about: one of the keys above.
+    message : str
+        What is wrong, the value, the limit, and what to do.
+    """
+
+    kind: str
+    message: str
+
+
+def say(verdicts: Iterable[Verdict]) -> None:
+    """Warn of each; the only place where a calibration warns."""
+    for verdict in verdicts:
+        warn(verdict.message, _CATEGORIES[verdict.kind])
+
+
+def on_plan(exposures: Exposures) -> list[Verdict]:
+    """Judge what is known before any fit: whether a drift in time looks like a tilt."""
+    times, positions = exposures.flux.time, exposures.positions
+    if times is None or len(set(positions.rotation.tolist())) > 1:
+        return []
+    affine = np.column_stack([np.ones(len(positions)), positions.shifts])
+    left = times - affine @ np.linalg.lstsq(affine, times)[0]
+    share = float(np.sum(left**2) / np.sum((times - times.mean()) ** 2))
+    if share >= _HARDLY_TOLD:
+        return []
+    text = (
+        f"of a drift linear in time only {share:.1%} of the variance can be told from a tilt "
+        "of the sensitivity in this order of exposures: take another "
+        "(equipix.plan.advise_order)"
+    )
+    return [Verdict("order", text)]
+
+
+def on_fit(
+    weighted: Weighted, options: Options, test: SignTest, dark: DarkStd | None
+) -> list[Verdict]:
+    """Judge a fit, in the order of what one must know first."""
+    found = [
+        _on_sign(test),
+        _on_components(weighted.fit),
+        _on_patterns(weighted.fit),
+        _on_tilt(weighted.fit),
+        _on_dark(weighted.fit, options, dark),
+        _on_misfit(weighted),
+        _on_convergence(weighted.fit, options),
+    ]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def on_uncertainty(fit: Fit) -> Verdict | None:
+    """Judge whether the fit is near enough to its minimum for standard deviations."""
+    error = float(fit.error_estimate[-1])
+    if not fit.is_joint or error <= _NOT_FOUND:
+        return None
+    return Verdict(
+        "uncertainty",
+        f"no standard deviations: with an estimated error of {error:.1e} "
+        "the sensitivity is not found",
+    )
+
+
+def _on_sign(test: SignTest) -> Verdict | None:
+    if test.sign != "contradicted":
+        return None
+    return Verdict(
+        "sign",
+        "the data contradict the sign of the shifts: reversed, with free fluxes, they leave "
+        f"{1 / test.ratio:.2g} times the squared residuals; a shift grows when the "
+        "sensor moves towards larger rows and columns: give 'shifts' of the other sign, or "
+        "exchange the images of the aperture before and after the moves",
+    )
+
+
+def _on_components(fit: Fit) -> Verdict | None:
+    if fit.components <= 1:
+        return None
+    left = int(np.count_nonzero(fit.component_labels > 0))
+    return Verdict(
+        "components",
+        f"the measurements leave {fit.components} parts of the sensor uncompared: "
+        f"{left} pixels outside the largest part are NaN; choose other shifts",
+    )
+
+
+def _on_patterns(fit: Fit) -> Verdict | None:
+    if fit.smallest_ritz is None or fit.smallest_ritz >= _UNDETERMINED:
+        return None
+    return Verdict(
+        "pattern",
+        f"the measurements hardly tell some pattern of the sensitivity (smallest Ritz value "
+        f"{fit.smallest_ritz:.1e}, below {_UNDETERMINED:g}): choose other shifts",
+    )
+
+
+def _on_tilt(fit: Fit) -> Verdict | None:
+    if not fit.leaves_tilt:
+        return None
+    return Verdict(
+        "tilt",
+        "free fluxes leave a tilt of the sensitivity undetermined: its slope is set to 0; turn "
+        "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp",
+    )
+
+
+def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None:
+    if dark is None:
+        return None
+    along, alone = dark.along_sensitivity, dark.of_a_pixel
+    limited = fit.ended == "sweeps used" and options.fit.max_sweeps is not None
+    if along is not None and alone is not None and along > alone:
+        told = f"has the standard deviation {along:.1e}, where noise leaves a pixel {alone:.1e}"
+    elif fit.ended != "converged" and not limited:
+        told = "is not told at all"
+    else:
+        return None
+    return Verdict(
+        "dark",
+        "offset and gain can hardly be told apart: with fitted fluxes the dark may hold "
+        f"any multiple b of the sensitivity, and b {told}; give the ratio of the levels as "
+        "'flux', or take larger shifts in a beam that varies more",
+    )
+
+
+def _on_misfit(weighted: Weighted) -> Verdict | None:
+    exposures, fit, _ = weighted
+    chi2 = fit.misfit / fit.degrees_of_freedom if fit.degrees_of_freedom > 0 else np.nan
+    known = exposures.variance is not None and fit.ended == "converged"
+    if not (known and chi2 > _MISFIT):
+        return None
+    return Verdict(
+        "misfit",
+        f"residuals are {chi2**0.5:.1f} times what the variances say: are "
+        "the shifts right, and their sign? does the lamp drift (flux='fit')? is there dust "
+        "(robust=True)?",
+    )
+
+
+def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
+    if fit.ended == "converged":
+        return None
+    stuck = "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
+    remedy = "allow more sweeps" if fit.ended == "sweeps used" else stuck
+    return Verdict(
+        "convergence",
+        f"stopped after {int(fit.sweeps[-1])} sweeps with an estimated error of "
+        f"{float(fit.error_estimate[-1]):.1e}, above the tolerance {options.fit.tolerance:g}: "
+        f"{remedy}",
+    )

@@ -1,0 +1,219 @@
+"""Mean frames of one beam at several positions, and all that is known of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix._check import naming_memory
+from equipix.defects import Findings
+from equipix.exposures.compiled import Exposures as Compiled
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from numpy.typing import NDArray
+
+    from equipix._types import Array, Bools, Floats
+    from equipix.exposures.compiled import Fit
+    from equipix.exposures.flux import Flux
+    from equipix.exposures.options import FitOptions
+    from equipix.exposures.positions import Positions
+    from equipix.noise import NoiseModel
+
+_BLOCK = 64
+"""Rows that medians are taken of at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """Exposures of one beam.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, rows, cols), float32 or float64
+        Mean frames, the dark subtracted unless an offset is sought, in DN; what is not finite is
+        not used.
+    positions : Positions
+        Where the sensor stood.
+    flux : Flux
+        Relative flux of each exposure, and what is known of it.
+    mask : ndarray of bool, shape (rows, cols) or (n, rows, cols), or None
+        True = do not use.
+    variance : ndarray, shape (n,) or (n, rows, cols), or None
+        Variance of the values, in DN²; None: all weights are 1.
+    noise : tuple of NoiseModel
+        Noise model of each mean frame, where the variance is to be evaluated at what a fit expects.
+    offset : bool
+        Whether the values hold an offset of each pixel, to be fitted.
+    findings : Findings
+        Pixels that were odd before any fit.
+    """
+
+    values: Array
+    positions: Positions
+    flux: Flux
+    mask: Bools | None = None
+    variance: Array | None = None
+    noise: tuple[NoiseModel, ...] = ()
+    offset: bool = False
+    findings: Findings = field(default_factory=Findings)
+
+    def __len__(self) -> int:
+        """Return the number of exposures."""
+        return len(self.values)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.values.shape[1:]
+        return rows, cols
+
+    def usable(self) -> Bools:
+        """Return which measurements may be used, shape (n, rows, cols)."""
+        usable: Bools = np.isfinite(self.values)
+        if self.mask is not None:
+            usable &= ~self.mask
+        return usable
+
+    def weighted(self, variance: Array | None) -> Self:
+        """Return the exposures with other variances."""
+        return dataclasses.replace(self, variance=variance)
+
+    def without(self, mask: Bools) -> Self:
+        """Return the exposures without some measurements, besides those masked before."""
+        return dataclasses.replace(self, mask=mask if self.mask is None else mask | self.mask)
+
+    def chosen(self, exposures: NDArray[np.int64]) -> Self:
+        """Return some of the exposures."""
+        variance, mask = self.variance, self.mask
+        return dataclasses.replace(
+            self,
+            values=self.values[exposures],
+            positions=self.positions.chosen(exposures),
+            flux=self.flux.chosen(exposures),
+            variance=None if variance is None else variance[exposures],
+            mask=mask[exposures] if mask is not None and mask.ndim == 3 else mask,
+            noise=tuple(self.noise[k] for k in exposures) if self.noise else (),
+        )
+
+    def window(self, side: int) -> Self:
+        """Return the central part of the sensor, at most `side` pixels along each axis."""
+        shape = np.array(self.shape)
+        sizes = np.minimum(shape, side)
+        first = (shape - sizes) // 2
+        rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
+        part = (..., rows, cols)
+        variance, mask = self.variance, self.mask
+        return dataclasses.replace(
+            self,
+            values=np.ascontiguousarray(self.values[part]),
+            positions=self.positions.of_window(first, sizes, self.shape),
+            variance=variance[part].copy()
+            if variance is not None and variance.ndim == 3
+            else variance,
+            mask=None if mask is None else np.ascontiguousarray(mask[part]),
+            findings=Findings(),
+        )
+
+    def reversed(self) -> Self:
+        """Return the exposures with all shifts of the other sign."""
+        return dataclasses.replace(self, positions=self.positions.reversed())
+
+    def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
+        """Fit sensitivity, beam and what else is sought, from `start` if there is one.
+
+        Raises
+        ------
+        InputError
+            If a value is out of range, an exposure shows no light, or what is sought cannot be
+            determined by such exposures or by such a method.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
+        """
+        with naming_memory("calibrating"):
+            return self._compiled(options).fit(
+                method=options.method,
+                tolerance=options.tolerance,
+                max_sweeps=options.max_sweeps,
+                start=start,
+                workers=options.workers,
+                progress=options.progress,
+            )
+
+    def light(self, fit: Fit, exposure: int) -> Floats:
+        """Return c · L(u) on each pixel in an exposure; NaN where the beam was not observed."""
+        row, col = fit.shifts[exposure]
+        turn = int(self.positions.rotation[exposure])
+        return fit.flux[exposure] * fit.beam.light(self.shape, (row, col), turn)
+
+    def residuals(self, fit: Fit) -> Floats:
+        """Return y − c · L(u) · M(p) − O(p), (n, rows, cols); NaN where nothing is predicted."""
+        residuals = np.empty(self.values.shape)
+        for k, residual in enumerate(residuals):
+            np.subtract(self.values[k], self.light(fit, k) * fit.sensitivity, out=residual)
+            if fit.offset is not None:
+                residual -= fit.offset
+        return residuals
+
+    def weighted_squares(self, squares: Array) -> Floats:
+        """Return squares over variances; NaN where nothing is measured."""
+        used = np.isfinite(squares)
+        if self.mask is not None:
+            used &= ~self.mask
+        scale = np.ones(1) if self.variance is None else self.variance
+        weighted = np.full(squares.shape, np.nan)
+        scale = scale if scale.ndim == 3 else scale[:, None, None]
+        np.divide(squares, scale, out=weighted, where=used)
+        return weighted
+
+    def cells(self, grid: Array, fit: Fit, exposure: int) -> Array:
+        """Return a view of the cells of the beam's grid that are nearest to each pixel."""
+        turn = int(self.positions.rotation[exposure])
+        rows, cols = self.shape if turn % 180 == 0 else self.shape[::-1]
+        shift = np.array(fit.shifts[exposure])
+        floor = np.floor(shift)
+        row, col = np.array(fit.beam.origin) + (floor + np.rint(shift - floor)).astype(int)
+        return np.rot90(grid[row : row + rows, col : col + cols], turn // 90)
+
+    def _compiled(self, options: FitOptions) -> Compiled:
+        return Compiled(
+            self.values,
+            self.positions.shifts,
+            shift_std=self.positions.std,
+            rotation=self.positions.rotation.tolist(),
+            flux=self.flux.values.tolist(),
+            flux_model=self.flux.model,
+            offset=self.offset,
+            variance=self.variance,
+            mask=self.mask,
+            workers=options.workers,
+            progress=options.progress,
+        )
+
+    @cached_property
+    def medians(self) -> Floats:
+        """Median over the exposures of value/flux in each pixel; NaN where nothing is measured."""
+        result = np.empty(self.shape)
+        for start in range(0, len(result), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            values = self.values[:, rows] / self.flux.values[:, None, None]
+            usable = np.isfinite(values)
+            if self.mask is not None:
+                usable &= ~self.mask[..., rows, :]
+            values[~usable] = np.nan
+            result[rows] = _medians(values)
+        return result
+
+
+def _medians(values: Array) -> Array:
+    """Medians along the first axis of the values that are no NaN."""
+    values.sort(axis=0)  # NaN last
+    count = np.isfinite(values).sum(axis=0)
+    middle = [np.maximum(index, 0)[None] for index in ((count - 1) // 2, count // 2)]
+    medians: Array = np.mean([np.take_along_axis(values, i, axis=0)[0] for i in middle], axis=0)
+    return medians

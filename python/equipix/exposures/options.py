@@ -1,0 +1,61 @@
+"""How a fit is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, get_args
+
+from equipix._check import as_tolerance, check_progress, positive_count, positive_workers
+from equipix._types import Method
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from equipix._types import Progress
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to minimise the objective, and how far.
+
+    Attributes
+    ----------
+    method : {"multiscale", "coordinate-descent"}
+        The solver at whole shifts.
+    tolerance : float
+        Largest relative error of the sensitivity at which the solver stops.
+    max_sweeps : int or None
+        Most passes over the data or its weights.
+    workers : int or None
+        Number of threads; None: as many as processors may be used.
+    progress : callable or None
+        Called as ``progress(done, total, stage)`` now and then.
+    """
+
+    method: Method = "multiscale"
+    tolerance: float = 1e-6
+    max_sweeps: int | None = None
+    workers: int | None = None
+    progress: Progress | None = None
+
+    @classmethod
+    def of(
+        cls,
+        method: Method,
+        tolerance: float,
+        max_sweeps: int | None,
+        workers: int | None,
+        progress: Progress | None,
+    ) -> Self:
+        """Check what the caller gave."""
+        if method not in get_args(Method):
+            raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
+        check_progress(progress)
+        return cls(
+            method=method,
+            tolerance=as_tolerance(tolerance),
+            max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
+            workers=positive_workers(workers),
+            progress=progress,
+        )
