@@ -128,7 +128,7 @@ def test_samples_that_are_not_finite_do_not_count() -> None:
 
 def same_bytes(a: FrameStatistics, b: FrameStatistics) -> bool:
     return all(
-        x.tobytes() == y.tobytes() for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
+        x.tobytes() == y.tobytes() for x, y in zip(a.maps.values(), b.maps.values(), strict=True)
     )
 
 

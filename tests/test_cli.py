@@ -149,7 +149,7 @@ def test_average_writes_statistics(run, experiment, tmp_path):
     assert json.loads(out)["frames"] == 12
     expected = average([frames / "p0.tif", frames / "p1.tif"], dark=average(dark), saturation=4095)
     saved = load_statistics(output)
-    for name, values in vars(expected).items():
+    for name, values in expected.maps.items():
         np.testing.assert_array_equal(getattr(saved, name), values)
 
 

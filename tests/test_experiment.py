@@ -8,9 +8,11 @@ import re
 import numpy as np
 import pytest
 
-from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
+from equipix import Experiment, Flag, FrameStatistics, calibrate, errors, load, simulate
 from equipix.defects import dead_pixels, hot_pixels
-from equipix.noise import NoiseModel, fit_frames, models_of_means, photon_transfer, scatter_limit
+from equipix.experiment import run as experiment_run
+from equipix.exposures.averaged import Averaged
+from equipix.noise import NoiseModel, photon_transfer, scatter_limit
 
 SHAPE = (64, 80)
 SHIFTS = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
@@ -116,7 +118,11 @@ def test_measured_shifts_are_the_stage_s(manifest, virtual):
 
 def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     """Six sensors in a narrow beam; calibrated with the shifts as measured once, and twice."""
-    once = Experiment.measure_shifts
+    measured = experiment_run.measured_shifts
+
+    def once(path, manifest, *_):
+        return measured(path, manifest)
+
     errors_of, scores, blocks = ([], []), [], ([], [], [])
     for seed in range(6):
         truth = simulate.paper_sensitivity(SHAPE, rng=seed)
@@ -128,7 +134,7 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
         for k in (0, 1):
             with monkeypatch.context() as patch:
                 if k == 0:
-                    patch.setattr(Experiment, "measure_shifts", lambda self, *_: once(self))
+                    patch.setattr(experiment_run, "measured_shifts", once)
                 found = experiment.run(tolerance=1e-4)
             error = np.array(found.metadata["measured_shifts"]) - virtual.truth.shifts
             errors_of[k].append(error[1:])
@@ -387,7 +393,8 @@ def test_variances_are_a_smooth_function_of_the_mean():
     rng = np.random.default_rng(1)
     levels = np.tile(np.linspace(500, 3000, 100), (100, 1))
     exposures = [statistics(rng, levels, gain=0.3, read_noise=2.0, frames=8) for _ in range(3)]
-    models = models_of_means(exposures, fit_frames(exposures))
+    averaged = Averaged.of(exposures)
+    models = averaged.models(averaged.noise)
     variances = np.stack([model.variance(levels) for model in models])
     expected = np.broadcast_to((0.3 * levels + 4 + 1 / 12) / 8, variances.shape)
     # Standard errors as above, for 30 000 pixels and 7 degrees of freedom; twice for two
@@ -399,7 +406,7 @@ def test_single_frames_have_no_variance():
     ones, none = np.ones((4, 4)), np.full((4, 4), np.nan)
     single = FrameStatistics(ones, none, none, ones.astype(np.uint32), np.zeros((4, 4), np.uint32))
     with pytest.raises(errors.InputError, match="single frames"):
-        fit_frames([single, single])
+        calibrate([single, single], [(0, 0), (0, 1)])
 
 
 @pytest.mark.parametrize("frames", [2, 3, 10, 100])

@@ -34,7 +34,7 @@ NARROW = RNG.integers(0, 256, (5, 23, 37), dtype=np.uint8)
 def assert_averages(source: object, frames: np.ndarray) -> None:
     """The average of files is, to the bit, that of the frames that were written."""
     result, wanted = equipix.average(source), equipix.average(frames)  # type: ignore[arg-type]
-    for name, values in vars(wanted).items():
+    for name, values in wanted.maps.items():
         np.testing.assert_array_equal(getattr(result, name), values, err_msg=name)
 
 
@@ -442,7 +442,7 @@ def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"dark{suffix}"
     wanted = equipix.average(WIDE)
     save_statistics(path, wanted)
-    for name, values in vars(load_statistics(path)).items():
+    for name, values in load_statistics(path).maps.items():
         np.testing.assert_array_equal(values, getattr(wanted, name))
         assert values.dtype == getattr(wanted, name).dtype
 
@@ -450,7 +450,7 @@ def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
-    pages = vars(equipix.average(WIDE))
+    pages = equipix.average(WIDE).maps
     good = {"kind": "frame statistics", "format": 1}
     for changed, metadata, message in (
         ({}, good | {"format": "2"}, "format is '2'"),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from equipix._types import Bools
+    from equipix._types import Array, Bools
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
 
@@ -103,13 +103,15 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     return hot
 
 
-def noisy_pixels(frames: Sequence[FrameStatistics], noise: NoiseModel) -> NDArray[Any]:
+def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: NoiseModel) -> Bools:
     """Find pixels that scatter from frame to frame by more than chance explains.
 
     Parameters
     ----------
-    frames : sequence of FrameStatistics
-        The exposures, dark subtracted.
+    means, variances : ndarray, shape (n, rows, cols)
+        Dark-subtracted mean and sample variance of each exposure, in DN and DN².
+    frames : sequence of int
+        Number of frames of each exposure.
     noise : NoiseModel
         That of one frame of a good pixel.
 
@@ -118,15 +120,15 @@ def noisy_pixels(frames: Sequence[FrameStatistics], noise: NoiseModel) -> NDArra
     ndarray of bool, shape (rows, cols)
         True where this holds in every exposure that shows a scatter.
     """
-    noisy = np.ones(frames[0].mean.shape, dtype=bool)
+    noisy = np.ones(means.shape[1:], dtype=bool)
     seen = np.zeros_like(noisy)
-    for each in frames:
-        count = int(each.count.max())
+    for mean, variance, count in zip(means, variances, frames, strict=True):
         if count < 2:
             continue
-        limit = scatter_limit(count, sigmas=SIGMAS) * noise.variance(each.mean)
-        noisy &= ~(each.variance <= limit)
-        seen |= np.isfinite(each.variance)
+        limit = scatter_limit(count, sigmas=SIGMAS) * noise.variance(mean)
+        known = np.isfinite(variance) & np.isfinite(mean)
+        noisy &= ~known | (variance > limit)
+        seen |= known
     return noisy & seen
 
 

@@ -31,6 +31,7 @@ _PAGES = {
     "count": np.uint32,
     "saturated": np.uint32,
 }
+_DARK = "dark_"  # before the names of the dark's pages
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
@@ -50,6 +51,9 @@ class FrameStatistics:
         Number of samples that went into the mean.
     saturated : ndarray, shape (rows, cols), uint32
         Number of samples at or above the saturation level.
+    dark : FrameStatistics or None
+        The dark frames whose mean was subtracted, where they were given as statistics. They show
+        which pixels are hot, and how noisy a frame without light is.
     """
 
     mean: NDArray[Any]
@@ -57,6 +61,12 @@ class FrameStatistics:
     variance_of_mean: NDArray[Any]
     count: NDArray[Any]
     saturated: NDArray[Any]
+    dark: FrameStatistics | None = None
+
+    @property
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """The five maps by their names."""
+        return {name: getattr(self, name) for name in _PAGES}
 
 
 def average(
@@ -160,7 +170,10 @@ def save_statistics(
     FileError
         If the file exists and `force` is not set, or cannot be written.
     """
-    io.save_pages(path, vars(statistics), {"format": _FORMAT, "kind": _KIND}, force=force)
+    pages = dict(statistics.maps)
+    if statistics.dark is not None:
+        pages |= {_DARK + name: values for name, values in statistics.dark.maps.items()}
+    io.save_pages(path, pages, {"format": _FORMAT, "kind": _KIND}, force=force)
 
 
 def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
@@ -184,7 +197,11 @@ def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
     pages, metadata = io.load_pages(path)
     io.check_format(path, metadata, _KIND, _FORMAT)
     io.check_pages(path, pages, _PAGES)
-    return FrameStatistics(**{name: pages[name] for name in _PAGES})
+    dark = None
+    if _DARK + "mean" in pages:
+        io.check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
+        dark = FrameStatistics(*(pages[_DARK + name] for name in _PAGES))
+    return FrameStatistics(*(pages[name] for name in _PAGES), dark=dark)
 
 
 def _level(saturation: float | None) -> float | None:
@@ -314,4 +331,5 @@ def _subtract(
         statistics.variance_of_mean + variance,
         statistics.count,
         statistics.saturated,
+        dark if isinstance(dark, FrameStatistics) else None,
     )

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix.frames import FrameStatistics
 
 _BINS = 64
 
@@ -156,61 +155,6 @@ def photon_transfer(
             mean = (signal.ravel()[bin_].mean(), variance.ravel()[bin_].mean())
             points.append((*mean, len(bin_) * (frames - 1)))
     return np.array(points).reshape(-1, 3)
-
-
-def fit_frames(frames: Sequence[FrameStatistics]) -> NoiseModel:
-    """Noise model of one frame, fitted over all pixels of all exposures.
-
-    Parameters
-    ----------
-    frames : sequence of FrameStatistics
-        The exposures, dark subtracted.
-
-    Returns
-    -------
-    NoiseModel
-        That of a single frame.
-
-    Raises
-    ------
-    InputError
-        If no exposure has two frames, so that nothing shows the scatter.
-    """
-    points = [
-        photon_transfer(each.mean, each.variance, each.saturated == 0, int(each.count.max()))
-        for each in frames
-    ]
-    if not any(map(len, points)):
-        raise InputError(
-            "'frames' are single frames, which show no scatter: give their 'variance', or the "
-            "means alone for unit weights"
-        )
-    return NoiseModel.fit(np.concatenate(points))
-
-
-def models_of_means(frames: Sequence[FrameStatistics], model: NoiseModel) -> list[NoiseModel]:
-    """Noise model of each mean.
-
-    Parameters
-    ----------
-    frames : sequence of FrameStatistics
-        The exposures, dark subtracted. What the dark adds to `variance_of_mean` is taken as the
-        same in all pixels of an exposure: its median.
-    model : NoiseModel
-        That of a single frame.
-
-    Returns
-    -------
-    list of NoiseModel
-        One for each exposure.
-    """
-    models = []
-    for each in frames:
-        count = int(each.count.max())
-        added = each.variance_of_mean - each.variance / count
-        dark = float(np.nanmedian(added)) if count > 1 else 0.0
-        models.append(model.of_mean(count, dark_variance=max(0.0, dark)))
-    return models
 
 
 def modelled_variances(

@@ -211,8 +211,17 @@ def calibrate(
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 
-def calibrated(exposures: Exposures, options: Options, start: Fit | None = None) -> Calibration:
-    """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars."""
+def calibrated(
+    exposures: Exposures,
+    options: Options,
+    *,
+    start: Fit | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> Calibration:
+    """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars.
+
+    The fit begins from `start`; `provenance` is added to the metadata.
+    """
     started = datetime.now(UTC)
     options.check(exposures)
     verdicts.say(verdicts.on_plan(exposures))
@@ -227,7 +236,7 @@ def calibrated(exposures: Exposures, options: Options, start: Fit | None = None)
         verdicts.say([] if unknown is None else [unknown])
         bars = None if unknown else error_bars(weighted, flags, options.fit)
     metadata = _metadata(weighted, options, started, dark, bars)
-    return _result(weighted, test, flags, bars, metadata)
+    return _result(weighted, test, flags, bars, metadata | (provenance or {}))
 
 
 def _result(
@@ -239,7 +248,6 @@ def _result(
 ) -> Calibration:
     exposures, fit, rejected = weighted
     dtype = exposures.values.dtype
-    freedom = fit.degrees_of_freedom
     return Calibration(
         sensitivity=fit.sensitivity.astype(dtype, copy=False),
         beam=fit.beam.values,
@@ -250,14 +258,14 @@ def _result(
         rotation=exposures.positions.rotation,
         flux=np.array(fit.flux),
         objective=fit.misfit,
-        reduced_chi2=fit.misfit / freedom if freedom > 0 else float("nan"),
+        reduced_chi2=weighted.reduced_chi2,
         components=fit.components,
         component_labels=fit.component_labels,
         sweeps=int(fit.sweeps[-1]),
         converged=fit.ended == "converged",
         error_estimate=float(fit.error_estimate[-1]),
         history=History(fit.sweeps, fit.objective, fit.error_estimate),
-        dark=None if fit.offset is None else fit.offset.astype(dtype, copy=False),
+        dark=exposures.dark if fit.offset is None else fit.offset.astype(dtype, copy=False),
         dark_is_fitted=exposures.offset,
         metadata=metadata,
         sensitivity_std=None if bars is None else bars.sensitivity,

@@ -82,7 +82,7 @@ def dark_std(weighted: Weighted, options: FitOptions) -> DarkStd | None:
     exposures, fit, _ = weighted
     if not exposures.offset or exposures.flux.kind == "known":
         return None
-    if exposures.variance is None and fit.degrees_of_freedom <= 0:
+    if not np.isfinite(weighted.noise_variance):
         return DarkStd(None, None)
     with naming_memory("the standard deviation of the dark"):
         answer = fit.uncertainty(
@@ -105,15 +105,13 @@ def noise_scale(weighted: Weighted) -> float:
     InputError
         If no variance was given and the residuals cannot determine it.
     """
-    exposures, fit, _ = weighted
-    if exposures.variance is not None:
-        return 1.0
-    if fit.degrees_of_freedom <= 0:
+    variance = weighted.noise_variance
+    if not np.isfinite(variance):
         raise InputError(
             "'variance' is None and no residual tells the noise, since there are no more "
             "measurements than unknowns: give the variance of the values"
         )
-    return float(np.sqrt(fit.misfit / fit.degrees_of_freedom))
+    return float(np.sqrt(variance))
 
 
 def of_logarithm(weights: Floats, fit: Fit) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.compiled import Beam
-from equipix.exposures.front import as_models, as_statistics, as_values, as_variances
+from equipix.exposures.front import measured_of
 from equipix.exposures.positions import Positions
 from equipix.flags import determined, usable
 from equipix.io import save_pages
@@ -384,8 +384,8 @@ class Calibration:
         degrees of freedom over the number of measurements. Of one held out it is above 1, by
         the variance of the prediction.
         """
-        statistics = as_statistics(frames)
-        values = as_values(cast("ArrayLike", frames), statistics)
+        measured = measured_of(frames, variance)
+        values = measured.values
         if values.shape[1:] != self.shape:
             raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
         if shifts is None:
@@ -396,14 +396,14 @@ class Calibration:
             self.flux if shifts is None and flux is None else flux,
         )
         check_count("shifts", len(predicted), len(values))
-        models = as_models(variance, statistics, len(values))
         residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
         if self.dark_is_fitted:
             residuals -= self.dark
-        if models:
-            scales = [model.variance(each) for model, each in zip(models, predicted, strict=True)]
-        elif variance is not None:
-            given = as_variances(cast("ArrayLike", variance), values)
+        if measured.models:
+            pairs = zip(measured.models, predicted, strict=True)
+            scales = [model.variance(each) for model, each in pairs]
+        elif measured.variance is not None:
+            given = measured.variance
             scales = list(given if given.ndim == 3 else given[:, None, None])
         else:
             return residuals

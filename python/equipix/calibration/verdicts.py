@@ -184,9 +184,8 @@ def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None
 
 
 def _on_misfit(weighted: Weighted) -> Verdict | None:
-    exposures, fit, _ = weighted
-    chi2 = fit.misfit / fit.degrees_of_freedom if fit.degrees_of_freedom > 0 else np.nan
-    known = exposures.variance is not None and fit.ended == "converged"
+    chi2 = weighted.reduced_chi2
+    known = weighted.exposures.variance is not None and weighted.fit.ended == "converged"
     if not (known and chi2 > _MISFIT):
         return None
     return Verdict(

@@ -33,28 +33,40 @@ class Weighted(NamedTuple):
     fit: Fit
     rejected: Bools | None
 
+    @property
+    def reduced_chi2(self) -> float:
+        """F over the degrees of freedom; NaN without any."""
+        freedom = self.fit.degrees_of_freedom
+        return self.fit.misfit / freedom if freedom > 0 else float("nan")
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance of a value of weight 1: 1 where variances are known, else reduced χ²."""
+        return 1.0 if self.exposures.variance is not None else self.reduced_chi2
+
 
 def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:
     """Fit exposures whose weights may depend on the fit.
 
     Variances by a noise model are evaluated at what a first fit expects. That fit has the variances
-    at the medians over the exposures, pixel by pixel, which no single false value moves far.
+    at the medians over the exposures, pixel by pixel, which no single false value moves far. Each
+    fit begins from the one before, the first from `start`.
     """
     if exposures.noise:
         tolerance = max(options.fit.tolerance, _ROUGH)
         rough = dataclasses.replace(options.fit, tolerance=tolerance)
-        first = modelled(exposures, _at_medians(exposures)).fit(rough, start)
-        exposures = modelled(exposures, expected(exposures, first))
+        start = modelled(exposures, _at_medians(exposures)).fit(rough, start)
+        exposures = modelled(exposures, expected(exposures, start))
     if options.robust:
-        return _robust_fit(exposures, options.fit)
-    return Weighted(exposures, exposures.fit(options.fit), None)
+        return _robust_fit(exposures, options.fit, start)
+    return Weighted(exposures, exposures.fit(options.fit, start), None)
 
 
-def _robust_fit(exposures: Exposures, options: FitOptions) -> Weighted:
+def _robust_fit(exposures: Exposures, options: FitOptions, start: Fit | None) -> Weighted:
     """Fit, leave out what disagrees, and so on until nothing changes."""
     usable = exposures.usable()
     out = np.zeros_like(usable)
-    fit = exposures.fit(options)
+    fit = exposures.fit(options, start)
     kept = exposures
     for _ in range(_MOST_ROUNDS):
         former, out = out, rejected(exposures, fit, out, options.tolerance)
@@ -63,7 +75,7 @@ def _robust_fit(exposures: Exposures, options: FitOptions) -> Weighted:
         if exposures.noise:
             exposures = modelled(exposures, expected(exposures, fit))
         kept = exposures.without(~usable | out)
-        fit = kept.fit(options)
+        fit = kept.fit(options, fit)
     return Weighted(kept, fit, out)
 
 

@@ -52,6 +52,8 @@ class Exposures:
         Whether the values hold an offset of each pixel, to be fitted.
     findings : Findings
         Pixels that were odd before any fit.
+    dark : ndarray, shape (rows, cols), or None
+        The dark frame that was subtracted, in DN, where it is known.
     """
 
     values: Array
@@ -62,6 +64,7 @@ class Exposures:
     noise: tuple[NoiseModel, ...] = ()
     offset: bool = False
     findings: Findings = field(default_factory=Findings)
+    dark: Array | None = None
 
     def __len__(self) -> int:
         """Return the number of exposures."""

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
 from equipix._check import as_array, as_floats, check_count, naming_memory, number
-from equipix.defects import Findings, noisy_pixels
+from equipix.defects import Findings
 from equipix.errors import InputError
+from equipix.exposures.averaged import Averaged
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.frames import FrameStatistics
-from equipix.noise import NoiseModel, fit_frames, models_of_means
+from equipix.noise import NoiseModel
 from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def exposures_of(
-    frames: ArrayLike | Sequence[FrameStatistics],
+    frames: ArrayLike | Sequence[FrameStatistics] | Averaged,
     shifts: ArrayLike,
     *,
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
@@ -44,82 +45,122 @@ def exposures_of(
 
     With `whole` the shifts are rounded to whole pixels, with a warning where that matters.
     """
-    statistics = as_statistics(frames)
-    noise = fit_frames(statistics) if variance is None and statistics else None
-    noisy = noisy_pixels(statistics, noise) if noise is not None else None
     with naming_memory("calibrating"):
-        values = as_values(cast("ArrayLike", frames), statistics)
-        models = as_models(variance if noise is None else noise, statistics, len(values))
-        saturated = as_saturated(saturation, values, statistics)
-        given = None if mask is None else as_mask(mask, values.shape)
+        measured = measured_of(frames, variance, saturation)
+        count = len(measured.values)
+        given = None if mask is None else as_mask(mask, measured.values.shape)
         return Exposures(
-            values=values,
+            values=measured.values,
             positions=Positions.of(
                 round_shifts(shifts) if whole else shifts,
                 rotation=rotation,
                 std=shift_std,
-                count=len(values),
+                count=count,
             ),
-            flux=Flux.of(flux, flux_std, time, len(values)),
-            mask=union(given, saturated, noisy),
-            variance=None
-            if variance is None or models
-            else as_variances(cast("ArrayLike", variance), values),
-            noise=tuple(models),
+            flux=Flux.of(flux, flux_std, time, count),
+            mask=union(given, measured.mask),
+            variance=measured.variance,
+            noise=tuple(measured.models),
             offset=offset,
-            findings=Findings(saturated=_ever(statistics, saturated), noisy=noisy),
+            findings=measured.findings,
+            dark=measured.dark,
         )
 
 
-def _ever(statistics: Sequence[FrameStatistics], saturated: Bools | None) -> Bools | None:
-    """Which pixels saturate in any exposure."""
-    maps: list[Bools] = [np.asarray(each.saturated > 0) for each in statistics]
-    if saturated is not None:
-        maps.append(saturated.any(axis=0))
-    return union(*maps)
+class Measured(NamedTuple):
+    """Mean frames and what is known of them, whatever they were given as."""
+
+    values: Array
+    mask: Bools | None
+    variance: Array | None
+    models: Sequence[NoiseModel]
+    findings: Findings
+    dark: Array | None = None
 
 
-def as_statistics(frames: object) -> list[FrameStatistics]:
-    """The frames as a list, if that is what they are; an empty one for arrays."""
-    if not isinstance(frames, list | tuple):
-        return []
-    statistics = [each for each in frames if isinstance(each, FrameStatistics)]
-    if statistics and len(statistics) != len(frames):
-        raise InputError("'frames' mixes FrameStatistics and arrays, expected either")
-    shapes = [each.mean.shape for each in statistics]
-    if len(set(shapes)) > 1:
-        raise InputError(f"'frames' holds means of shapes {shapes}, expected one shape")
-    for k, each in enumerate(statistics):
-        if each.saturated.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {k} saturates: expose less, or correct the "
-                "'saturation' that they were averaged with"
-            )
-    return statistics
+def measured_of(
+    frames: ArrayLike | Sequence[FrameStatistics] | Averaged,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+    saturation: float | None = None,
+) -> Measured:
+    """Check frames and what is known of their noise."""
+    averaged = frames if isinstance(frames, Averaged) else _averaged(frames)
+    if averaged is None:
+        return _of_arrays(cast("ArrayLike", frames), variance, saturation)
+    if averaged is not frames and variance is None and averaged.noise is None:
+        raise InputError(
+            "'frames' are single frames, which show no scatter: give their 'variance', or the "
+            "means alone for unit weights"
+        )
+    return _of_averaged(averaged, variance, saturation)
 
 
-def as_values(frames: ArrayLike, statistics: Sequence[FrameStatistics]) -> Array:
-    """Frames as (n, rows, cols); NaN, which counts as masked, where averaged samples saturated."""
-    if statistics:
-        frames = np.stack([np.where(f.saturated > 0, np.nan, f.mean) for f in statistics])
+def _of_averaged(
+    averaged: Averaged,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
+    saturation: float | None,
+) -> Measured:
+    """Averaged frames: their noise model, or what the caller knows of it."""
+    if saturation is not None:
+        raise InputError(
+            "'saturation' is for arrays, but 'frames' are averages: their saturated samples are "
+            "counted where equipix.average is given the level"
+        )
+    noise = averaged.noise if variance is None else variance
+    models = as_models(noise, averaged.count)
+    if isinstance(noise, NoiseModel):
+        models = averaged.models(noise)
+    variances = None
+    if variance is not None and not models:
+        variances = as_variances(cast("ArrayLike", variance), averaged.values)
+    findings = averaged.findings(noise if isinstance(noise, NoiseModel) else None)
+    dark = averaged.dark
+    return Measured(
+        averaged.values,
+        union(findings.dead, findings.hot, findings.noisy),
+        variances,
+        models,
+        findings,
+        None if dark is None else dark.mean.astype(averaged.values.dtype),
+    )
+
+
+def _of_arrays(
+    frames: ArrayLike,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
+    saturation: float | None,
+) -> Measured:
+    """Arrays, of which nothing is known but what the caller says."""
     values = as_floats("frames", frames, ndim=3)
     if 0 in values.shape:
         raise InputError(
             f"'frames' has shape {values.shape}, expected at least one exposure and one pixel"
         )
-    return values
+    models = as_models(variance, len(values))
+    variances = None
+    if variance is not None and not models:
+        variances = as_variances(cast("ArrayLike", variance), values)
+    if saturation is None:
+        return Measured(values, None, variances, models, Findings())
+    saturated = _saturated(values, saturation)
+    findings = Findings(saturated=np.any(saturated, axis=0))
+    return Measured(values, saturated, variances, models, findings)
 
 
-def as_models(
-    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
-    statistics: Sequence[FrameStatistics],
-    count: int,
-) -> list[NoiseModel]:
-    """Noise model of each of the values given; none if variances are given as numbers, or not."""
-    if variance is None and statistics:
-        variance = fit_frames(statistics)
+def _averaged(frames: object) -> Averaged | None:
+    """Statistics of all exposures, reduced; None for arrays."""
+    if not isinstance(frames, list | tuple):
+        return None
+    statistics = [each for each in frames if isinstance(each, FrameStatistics)]
+    if statistics and len(statistics) != len(frames):
+        raise InputError("'frames' mixes FrameStatistics and arrays, expected either")
+    return Averaged.of(statistics) if statistics else None
+
+
+def as_models(variance: object, count: int) -> list[NoiseModel]:
+    """Noise model of each of the values; none if variances are given as numbers, or not."""
     if isinstance(variance, NoiseModel):
-        return models_of_means(statistics, variance) if statistics else [variance] * count
+        return [variance] * count
     if not isinstance(variance, list | tuple):
         return []
     models = [each for each in variance if isinstance(each, NoiseModel)]
@@ -130,17 +171,8 @@ def as_models(
     return models
 
 
-def as_saturated(
-    saturation: float | None, values: Array, statistics: Sequence[FrameStatistics]
-) -> Bools | None:
+def _saturated(values: Array, saturation: float) -> Bools:
     """Which values reach the level `saturation`."""
-    if saturation is None:
-        return None
-    if statistics:
-        raise InputError(
-            "'saturation' is for arrays, but 'frames' are averages: their saturated samples are "
-            "counted where equipix.average is given the level"
-        )
     level = number("saturation", saturation)
     if not level > 0:
         raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")

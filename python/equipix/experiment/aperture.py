@@ -1,0 +1,135 @@
+"""Moves of the sensor, measured from images of a small aperture in the beam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.calibration.pixel_flags import pixel_flags
+from equipix.errors import InputError
+from equipix.experiment.manifest import find_files
+from equipix.exposures.positions import in_beam, variance_in_beam
+from equipix.flags import usable
+from equipix.io import read_frames
+from equipix.shifts import measure_shift
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Self
+
+    from equipix._types import Array, Floats
+    from equipix.calibration.weights import Weighted
+    from equipix.experiment.manifest import Exposure, Manifest
+    from equipix.shifts import ShiftMeasurement, Spot
+
+_AROUND = 8
+"""Pixels to each side of a spot's middle that stand for those under it."""
+
+_UNEQUAL_PIXELS = 0.008
+"""Error of a centroid by unequal pixels under the spot, in pixels: s/(2√π) for a disc of any size
+and pixels of relative spread s, here that of a uniform ±5 % as it is usual before a calibration."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equalisation:
+    """What a first calibration tells of the pixels under a spot.
+
+    Attributes
+    ----------
+    gain : ndarray, shape (rows, cols)
+        Sensitivity; 1 in pixels that are not to be used, which the centroid mends.
+    dark : ndarray, shape (rows, cols)
+        The dark frame, in DN.
+    variance : ndarray, shape (rows, cols)
+        Relative variance of the sensitivity by noise, the beam being known: 1/(M² Σ w c²L²), times
+        n/(n − 2) since a pixel's n measurements determine the beam too. NaN where unknown.
+    """
+
+    gain: Array
+    dark: Array
+    variance: Array
+
+    @classmethod
+    def of(cls, weighted: Weighted, tolerance: float) -> Self:
+        """Take it from the fit of exposures whose dark is known."""
+        exposures, fit, _ = weighted
+        if exposures.dark is None:
+            raise InputError(
+                "'calibration' holds no dark frame: give one that Experiment.run has made"
+            )
+        good = usable(pixel_flags(weighted, tolerance))
+        count = len(exposures)
+        known = fit.information() * np.square(fit.sensitivity)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = weighted.noise_variance * count / max(count - 2, 1) / known
+        gain = np.where(good, fit.sensitivity, 1).astype(exposures.values.dtype)
+        return cls(gain, exposures.dark, np.where(good, variance, np.nan))
+
+    def apply(self, frames: Array) -> Array:
+        """Images of the aperture as equal pixels would have given them."""
+        if frames.shape[-2:] != self.gain.shape:
+            raise InputError(
+                f"'calibration' is of a sensor of {self.gain.shape}, the images of the aperture "
+                f"have {frames.shape[-2:]} pixels"
+            )
+        return np.asarray((frames - self.dark) / self.gain)
+
+    def unequal_pixels(self, spot: Spot) -> float:
+        """Variance of a centroid by the pixels that are left unequal: s²/4π."""
+        row, col = np.rint(spot.position).astype(int)
+        around = self.variance[
+            max(row - _AROUND, 0) : row + _AROUND, max(col - _AROUND, 0) : col + _AROUND
+        ]
+        known = around[np.isfinite(around)]
+        if not known.size:  # no light around the spot, or no noise known
+            return _UNEQUAL_PIXELS**2
+        return float(min(np.median(known) / (4 * np.pi), _UNEQUAL_PIXELS**2))
+
+
+def measured_shifts(
+    path: Path, manifest: Manifest, equalisation: Equalisation | None = None
+) -> tuple[Floats, Floats]:
+    """Shift of each exposure and its standard error; see `Experiment.measure_shifts`."""
+    shifts, variances = [np.zeros(2)], [np.zeros(2)]
+    first, *others = manifest.exposure
+    if first.shift is not None:
+        shifts[0] = np.array(first.shift)
+        variances[0] = np.square(first.shift_std or [0.0, 0.0])
+    for old, new in zip(manifest.exposure, others, strict=False):
+        if new.shift is not None:
+            shifts.append(np.array(new.shift))
+            variances.append(np.square(new.shift_std or [0.0, 0.0]))
+            continue
+        spots, shape = _spots(path, manifest, new, equalisation)
+        ends = ((spots.before, old.rotation), (spots.after, new.rotation))
+        before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
+        shifts.append(shifts[-1] + before - after)
+        noise = sum(variance_in_beam(np.square(spot.std), turn) for spot, turn in ends)
+        unequal = sum(
+            _UNEQUAL_PIXELS**2 if equalisation is None else equalisation.unequal_pixels(spot)
+            for spot, _ in ends
+        )
+        variances.append(variances[-1] + noise + unequal)
+    return np.array(shifts), np.sqrt(variances)
+
+
+def _spots(
+    path: Path, manifest: Manifest, exposure: Exposure, equalisation: Equalisation | None
+) -> tuple[ShiftMeasurement, tuple[int, int]]:
+    """Find the spots of the move to `exposure`, and the shape of the sensor."""
+    before, after = (
+        read_frames(find_files(path, entry))
+        for entry in (exposure.aperture_before, exposure.aperture_after)
+        if entry is not None
+    )
+    try:
+        level = manifest.sensor.saturation_level
+        if equalisation is not None:
+            # In other units; the first measurement has seen that nothing saturates.
+            before, after = equalisation.apply(before), equalisation.apply(after)
+            level = None
+        return measure_shift(before, after, saturation=level), before.shape[-2:]
+    except InputError as error:
+        raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error

@@ -1,0 +1,41 @@
+"""Where a calibration comes from."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from equipix._types import Floats
+    from equipix.experiment.manifest import Manifest
+    from equipix.noise import NoiseModel
+
+
+def provenance(
+    path: Path,
+    manifest: Manifest,
+    files: list[Path],
+    shifts: Floats,
+    std: Floats,
+    noise: NoiseModel | None,
+) -> dict[str, Any]:
+    """Names, measured shifts, noise and the hashes of the files, as JSON values."""
+    folder = path.parent
+    return {
+        "experiment": str(path),
+        "sensor": manifest.sensor.model_dump(),
+        "exposures": [exposure.name for exposure in manifest.exposure],
+        "measured_shifts": shifts.tolist(),
+        "measured_shift_std": std.tolist(),
+        "noise": None if noise is None else asdict(noise),
+        "inputs": {os.path.relpath(file, folder): _sha256(file) for file in [path, *files]},
+    }
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,150 @@
+"""Averaged frames of the exposures of one experiment, reduced as they come."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.defects import Findings, dead_pixels, hot_pixels, noisy_pixels
+from equipix.errors import InputError
+from equipix.noise import NoiseModel, photon_transfer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Self
+
+    from numpy.typing import DTypeLike
+
+    from equipix._types import Array, Bools
+    from equipix.frames import FrameStatistics
+
+
+class Averaged:
+    """What a calibration needs of the `FrameStatistics` of each exposure, and no more.
+
+    Parameters
+    ----------
+    count : int
+        Number of exposures.
+    dtype : dtype
+        Of the mean frames that are kept.
+    gain : float, optional
+        Gain of the camera where it is known, in DN per electron.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, rows, cols)
+        Mean frames, the dark subtracted; NaN where a sample saturates, which is left out of that
+        exposure alone.
+    dark : FrameStatistics or None
+        The dark frames that were subtracted.
+    """
+
+    def __init__(
+        self, count: int, *, dtype: DTypeLike = np.float64, gain: float | None = None
+    ) -> None:
+        self.count, self.gain = count, gain
+        self.dark: FrameStatistics | None = None
+        self._dtype = np.dtype(dtype)
+        self._frames: list[int] = []
+        self._of_dark: list[float] = []
+        self._points: list[Array] = []
+
+    @classmethod
+    def of(cls, frames: Sequence[FrameStatistics]) -> Self:
+        """Reduce the statistics of all exposures."""
+        averaged = cls(len(frames))
+        for each in frames:
+            averaged.add(each)
+        return averaged
+
+    def add(self, frames: FrameStatistics) -> None:
+        """Add the next exposure.
+
+        Raises
+        ------
+        InputError
+            If it has another shape than the first, another dark, or saturates in every pixel.
+        """
+        exposure, shape = len(self._frames), frames.mean.shape
+        if exposure == 0:
+            self.values = np.empty((self.count, *shape), self._dtype)
+            self.variances = np.empty((self.count, *shape), np.float32)
+            self.saturated = np.zeros(shape, bool)
+            self.dark = frames.dark
+        if shape != self.saturated.shape:
+            raise InputError(
+                f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
+            )
+        if frames.dark is not self.dark:
+            raise InputError(
+                f"'frames': exposure {exposure} has another dark than the first: average all with "
+                "one 'dark'"
+            )
+        saturates = frames.saturated > 0
+        if saturates.all():
+            raise InputError(
+                f"'frames': every pixel of exposure {exposure} saturates: expose less, or correct "
+                "the 'saturation' that they were averaged with"
+            )
+        self.values[exposure] = np.where(saturates, np.nan, frames.mean)
+        self.variances[exposure] = frames.variance
+        self.saturated |= saturates
+        count = int(frames.count.max())
+        self._frames.append(count)
+        self._of_dark.append(_added_by_dark(frames, count))
+        self._points.append(photon_transfer(frames.mean, frames.variance, ~saturates, count))
+
+    @cached_property
+    def noise(self) -> NoiseModel | None:
+        """Noise model of one frame, fitted over all pixels of all frames; None without scatter."""
+        points = list(self._points)
+        known = any(map(len, points))
+        if self.dark is not None:
+            points.append(_dark_points(self.dark))
+            known |= self.gain is not None and len(points[-1]) > 0
+        return NoiseModel.fit(np.concatenate(points), gain=self.gain) if known else None
+
+    def models(self, noise: NoiseModel) -> list[NoiseModel]:
+        """Noise model of each mean frame, from that of one frame."""
+        of_dark = self._of_dark
+        if self.dark is not None:
+            of_dark = [float(noise.variance(0.0)) / int(self.dark.count.max())] * self.count
+        pairs = zip(self._frames, of_dark, strict=True)
+        return [noise.of_mean(frames, dark_variance=variance) for frames, variance in pairs]
+
+    def findings(self, noise: NoiseModel | None) -> Findings:
+        """Pixels that are odd before any fit; `noise` is the model of one frame, if known."""
+        noisy = None
+        if noise is not None:
+            noisy = noisy_pixels(self.values, self.variances, self._frames, noise)
+        hot = np.zeros(self.saturated.shape, bool)
+        if self.dark is not None:
+            hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
+        dead = None
+        if noise is not None or self.dark is not None:
+            dead = self._dead(noise) & ~hot
+        return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
+
+    def _dead(self, noise: NoiseModel | None) -> Bools:
+        """Pixels that are dead in every exposure in which they do not saturate."""
+        models = None if noise is None else self.models(noise)
+        measured = np.isfinite(self.values).any(axis=0)
+        dead: Bools = dead_pixels(self.values, models) & measured
+        return dead
+
+
+def _added_by_dark(frames: FrameStatistics, count: int) -> float:
+    """Variance that a dark adds to the mean, as `variance_of_mean` has it: its median."""
+    if count < 2:
+        return 0.0
+    return max(0.0, float(np.nanmedian(frames.variance_of_mean - frames.variance / count)))
+
+
+def _dark_points(dark: FrameStatistics) -> Array:
+    """Points of the photon-transfer curve at signal 0."""
+    usable: Bools = np.asarray(dark.saturated == 0)
+    frames = int(dark.count.max())
+    return photon_transfer(np.zeros(dark.mean.shape), dark.variance, usable, frames)
