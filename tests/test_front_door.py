@@ -48,7 +48,7 @@ def doors(request, tmp_path_factory):
     virtual = virtual_experiment(
         3,
         bit_depth=8 if bright else 12,
-        exposure_e=16_500.0 if bright else 14_000.0,
+        exposure_e=18_000.0 if bright else 14_000.0,
         stage_error=0.0,
     )
     level = virtual.camera.full_scale
