@@ -353,6 +353,19 @@ class Calibration:
             frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
         )
 
+    @property
+    def coefficients(self) -> NDArray[Any]:
+        """Coefficients of the corrected frame Σ c_j y^j, shape (2, rows, cols).
+
+        c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
+        Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
+            gain = 1 / self.sensitivity
+            offset = np.zeros_like(gain) if self.dark is None else -self.dark * gain
+        offset[np.isnan(gain)] = np.nan
+        return np.stack([offset, gain]).astype(self.sensitivity.dtype)
+
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).
 
