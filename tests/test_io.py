@@ -515,7 +515,8 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cal{suffix}"
     frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), [(0, 0), (0, 1)])
     cal = equipix.calibrate(np.concatenate([frames, frames]), [(0, 0), (0, 1), (1, 0), (0, 0)])
-    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32)).save(path)
+    left_out = np.zeros((4, 8, 9), bool)
+    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out).save(path)
     pages, content = io.load_pages(path)
     for name, page in (
         ("sensitivity", pages["sensitivity"].astype(np.int32)),
@@ -523,6 +524,9 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
         ("flags", pages["flags"][1:]),
         ("component_labels", pages["component_labels"][:, 1:]),
         ("dark", pages["dark"][1:]),
+        ("rejected", pages["rejected"][:, 1:]),
+        ("rejected", pages["rejected"][0]),
+        ("rejected", pages["rejected"].astype(np.int8)),
     ):
         io.save_pages(path, pages | {name: page}, content, force=True)
         with pytest.raises(FileError, match=f"is damaged: page '{name}' is"):
@@ -533,6 +537,11 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
             equipix.load(path)
     io.save_pages(path, pages, content, force=True)
     assert equipix.load(path).dark is not None
+    # A page of format 1 whose height is no multiple of the sensor's.
+    odd = pages | {"rejected": np.zeros((31, 9), np.uint8)}
+    io.save_pages(path, odd, content | {"format": 1}, force=True)
+    with pytest.raises(FileError, match="damaged or incomplete calibration"):
+        equipix.load(path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])

@@ -20,6 +20,7 @@ from equipix._check import (
     positive_workers,
 )
 from equipix._types import Flagged, FluxModel, Method, Progress, ShiftSign
+from equipix.calibration.saved import read_fields, save_fields
 from equipix.calibration.sign import shift_sign
 from equipix.calibration.weights import Problem, modelled, solve_robustly
 from equipix.correction.apply import apply_gain
@@ -47,7 +48,6 @@ from equipix.exposures.checks import (
 )
 from equipix.flags import Flag, determined
 from equipix.frames import FrameStatistics
-from equipix.io import save_pages
 from equipix.maps import tilt, tilt_weights
 from equipix.noise import fit_frames
 from equipix.prediction import light, positions, predictions
@@ -63,7 +63,7 @@ from equipix.uncertainty import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
@@ -80,9 +80,6 @@ _NOT_FOUND = 0.1
 UNTOLD = 1e-4
 """A Ritz value this small stands for a pattern that no measurement tells: noise in it is 100 times
 what it is elsewhere."""
-
-FORMAT = 1
-"""Number of the file format; a file with a higher one is refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -509,46 +506,15 @@ class Calibration:
         InputError
             If the suffix is unknown.
         """
-        pages = {
-            "sensitivity": self.sensitivity,
-            "flags": self.flags,
-            "beam": self.beam,
-            "component_labels": self.component_labels,
-        }
-        if self.dark is not None:
-            pages["dark"] = self.dark
-        if self.sensitivity_std is not None:
-            pages["sensitivity_std"] = self.sensitivity_std
-        if self.rejected is not None:
-            pages["rejected"] = self.rejected.reshape(-1, self.shape[1]).astype(np.uint8)
-        numbers = {
-            "beam_origin": list(self.beam_origin),
-            "shifts": self.shifts.tolist(),
-            "flux": self.flux.tolist(),
-            "objective": self.objective,
-            "reduced_chi2": self.reduced_chi2 if np.isfinite(self.reduced_chi2) else None,
-            "components": self.components,
-            "sweeps": self.sweeps,
-            "converged": self.converged,
-            "error_estimate": self.error_estimate,
-            "shift_sign": self.shift_sign,
-            "tilt_std": None
-            if self.tilt_std is None
-            else [std if np.isfinite(std) else str(std) for std in self.tilt_std.tolist()],
-            "shift_std": None if self.shift_std is None else self.shift_std.tolist(),
-            "history": {
-                "sweep": self.history.sweep.tolist(),
-                "objective": self.history.objective.tolist(),
-                "error_estimate": self.history.error_estimate.tolist(),
-            },
-        }
-        content = {
-            "format": FORMAT,
-            "kind": "calibration",
-            "calibration": numbers,
-            "metadata": self.metadata,
-        }
-        save_pages(path, pages, content, force=force)
+        save_fields(path, vars(self), force=force)
+
+
+def read_calibration(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> Calibration:
+    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
+    fields = read_fields(path, pages, content)
+    return Calibration(**{**fields, "history": History(**fields["history"])})
 
 
 def calibrate(

@@ -19,6 +19,7 @@ from equipix.calibration.calibrate import Calibration
 from equipix.cli.terminal import check_output, progress_bars, say, show_result, show_warning
 from equipix.comparison import compare as compare_calibrations
 from equipix.correction.files import correct_files, is_folder
+from equipix.correction.protocol import Correction
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError, EquipixWarning, InputError
 from equipix.experiment.run import Experiment
@@ -26,7 +27,7 @@ from equipix.flags import Flag
 from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
 from equipix.io import SUFFIXES, find_files, refuse_inputs
-from equipix.loading import load
+from equipix.loading import load, load_calibration
 from equipix.pictures.report import (
     check_picture,
     draw_comparison,
@@ -141,21 +142,33 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Show what a calibration file holds."""
-    calibration = load(file)
-    result = {"file": str(file), **_summary(calibration)}
+    correction = load(file)
+    result: dict[str, Any] = {"file": str(file)}
+    if isinstance(correction, Calibration):
+        result |= _summary(correction)
+    else:
+        result |= {
+            "shape": list(correction.shape),
+            "order": len(correction.coefficients) - 1,
+            "flagged_pixels": _flagged(correction),
+        }
     if as_json:
-        result["metadata"] = calibration.metadata
+        result["metadata"] = correction.metadata
     show_result(result, as_json=as_json)
+
+
+def _flagged(correction: Correction) -> dict[str, int]:
+    """Count the pixels that have each flag."""
+    return {
+        flag.name or "": int(np.count_nonzero(correction.flags & flag))
+        for flag in Flag
+        if (correction.flags & flag).any()
+    }
 
 
 def _summary(calibration: Calibration) -> dict[str, Any]:
     """Collect what one wants to know first of a calibration."""
     sensitivity = calibration.sensitivity
-    flagged = {
-        flag.name or "": int(np.count_nonzero(calibration.flags & flag))
-        for flag in Flag
-        if (calibration.flags & flag).any()
-    }
     options = calibration.metadata.get("options", {})
     return {
         "shape": list(calibration.shape),
@@ -169,7 +182,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         "components": calibration.components,
         "shift_sign": calibration.shift_sign,
         "fluxes": options.get("flux", "known"),
-        "flagged_pixels": flagged,
+        "flagged_pixels": _flagged(calibration),
     }
 
 
@@ -206,7 +219,7 @@ def compare(
         check_picture(output)
         check_output(output, force=force)
         refuse_inputs([output], calibrations)
-    result = compare_calibrations([load(file) for file in calibrations])
+    result = compare_calibrations([load_calibration(file) for file in calibrations])
     if output is not None:
         names = [file.stem for file in calibrations]
         save_figure(draw_comparison(result, names), output, force=force)

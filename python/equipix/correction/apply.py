@@ -37,8 +37,10 @@ def apply(
         argument, a float32 or float64 array.
     flags : ndarray, shape (rows, cols)
         Bits of `Flag` per pixel.
-    flagged, out
-        As for `equipix.Calibration.correct`.
+    flagged : {"nan", "keep", "replace"}
+        What becomes of pixels flagged ``DO_NOT_USE``.
+    out : ndarray or None
+        Array for the result, of the frames' shape, float32 or float64.
 
     Returns
     -------
