@@ -28,13 +28,10 @@ from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
 from equipix.io import SUFFIXES, find_files, refuse_inputs
 from equipix.loading import load, load_calibration
-from equipix.pictures.report import (
-    check_picture,
-    draw_comparison,
-    draw_demo,
-    draw_plans,
-    save_figure,
-)
+from equipix.pictures.canvas import check_picture, save_figure
+from equipix.pictures.comparison import draw_comparison
+from equipix.pictures.demo import draw_demo
+from equipix.pictures.plans import draw_plans
 from equipix.plan import ErrorBudget, advise_order, error_budget, identify, suggest, trend_told
 
 app = typer.Typer(
