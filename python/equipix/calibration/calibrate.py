@@ -12,7 +12,7 @@ from equipix.calibration import verdicts
 from equipix.calibration.error_bars import dark_std, error_bars
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.pixel_flags import pixel_flags
-from equipix.calibration.result import Calibration, History
+from equipix.calibration.result import Calibration
 from equipix.calibration.sign import shift_sign
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
@@ -23,9 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array, FluxModel, Method, Progress
+    from equipix._types import FluxModel, Method, Progress
     from equipix.calibration.error_bars import DarkStd, ErrorBars
-    from equipix.calibration.sign import SignTest
     from equipix.calibration.weights import Weighted
     from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
@@ -224,56 +223,24 @@ def calibrated(
     """
     started = datetime.now(UTC)
     options.check(exposures)
-    verdicts.say(verdicts.on_plan(exposures))
+    advice = verdicts.on_plan(exposures)
+    verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit.tolerance)
     dark = dark_std(weighted, options.fit)
-    verdicts.say(verdicts.on_fit(weighted, options, test, dark))
-    bars = None
-    if options.uncertainty:
-        unknown = verdicts.on_uncertainty(weighted.fit)
-        verdicts.say([] if unknown is None else [unknown])
-        bars = None if unknown else error_bars(weighted, flags, options.fit)
+    found = verdicts.on_fit(weighted, options, test, dark)
+    verdicts.say(found)
+    wanted = options.uncertainty and all(verdict.kind != "uncertainty" for verdict in found)
+    bars = error_bars(weighted, flags, options.fit) if wanted else None
     metadata = _metadata(weighted, options, started, dark, bars)
-    return _result(weighted, test, flags, bars, metadata | (provenance or {}))
-
-
-def _result(
-    weighted: Weighted,
-    test: SignTest,
-    flags: Array,
-    bars: ErrorBars | None,
-    metadata: dict[str, Any],
-) -> Calibration:
-    exposures, fit, rejected = weighted
-    dtype = exposures.values.dtype
-    return Calibration(
-        sensitivity=fit.sensitivity.astype(dtype, copy=False),
-        beam=fit.beam.values,
-        beam_origin=fit.beam.origin,
-        beam_coefficients=fit.beam.coefficients,
+    return Calibration.of(
+        weighted,
         flags=flags,
-        shifts=np.array(fit.shifts, dtype=np.float64),
-        rotation=exposures.positions.rotation,
-        flux=np.array(fit.flux),
-        objective=fit.misfit,
-        reduced_chi2=weighted.reduced_chi2,
-        components=fit.components,
-        component_labels=fit.component_labels,
-        sweeps=int(fit.sweeps[-1]),
-        converged=fit.ended == "converged",
-        error_estimate=float(fit.error_estimate[-1]),
-        history=History(fit.sweeps, fit.objective, fit.error_estimate),
-        dark=exposures.dark if fit.offset is None else fit.offset.astype(dtype, copy=False),
-        dark_is_fitted=exposures.offset,
-        metadata=metadata,
-        sensitivity_std=None if bars is None else bars.sensitivity,
-        tilt_std=None if bars is None else bars.tilt,
-        shift_std=None if bars is None else bars.shifts,
-        weighted=weighted,
-        rejected=rejected,
-        shift_sign=test.sign,
+        sign=test.sign,
+        verdicts=(*advice, *found),
+        bars=bars,
+        metadata=metadata | (provenance or {}),
     )
 
 

@@ -105,14 +105,15 @@ def on_fit(
         _on_dark(weighted.fit, options, dark),
         _on_misfit(weighted),
         _on_convergence(weighted.fit, options),
+        _on_uncertainty(weighted.fit, options),
     ]
     return [verdict for verdict in found if verdict is not None]
 
 
-def on_uncertainty(fit: Fit) -> Verdict | None:
-    """Judge whether the fit is near enough to its minimum for standard deviations."""
+def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
+    """Judge whether the fit is near enough to its minimum for the standard deviations asked for."""
     error = float(fit.error_estimate[-1])
-    if not fit.is_joint or error <= _NOT_FOUND:
+    if not options.uncertainty or not fit.is_joint or error <= _NOT_FOUND:
         return None
     return Verdict(
         "uncertainty",
