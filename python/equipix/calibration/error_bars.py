@@ -108,8 +108,8 @@ def noise_scale(weighted: Weighted) -> float:
     variance = weighted.noise_variance
     if not np.isfinite(variance):
         raise InputError(
-            "'variance' is None and no residual tells the noise, since there are no more "
-            "measurements than unknowns: give the variance of the values"
+            "'variance' is None and the residuals do not determine the noise, since there are no "
+            "more measurements than unknowns: give the variance of the values"
         )
     return float(np.sqrt(variance))
 

@@ -53,10 +53,9 @@ class Calibration:
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
         neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
-        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. What the
-        measurements do not determine is ``NO_FLAT_FIELD | DO_NOT_USE``, what they contradict
-        each other about, so that a robust calibration left out most of them,
-        ``UNRELIABLE_FLAT | DO_NOT_USE``.
+        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. An undetermined
+        pixel is ``NO_FLAT_FIELD | DO_NOT_USE``, one most of whose measurements a robust
+        calibration left out ``UNRELIABLE_FLAT | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     rotation : ndarray, shape (n,), int64
@@ -93,7 +92,7 @@ class Calibration:
         variance was known, else "variances"); under ``uncertainty`` the draws that
         `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
         was fitted together with fluxes, the standard deviation of b in its error b·M, which
-        they hardly tell, and what the noise of its own measurements leaves of a pixel.
+        with which it is nearly degenerate, and that of a pixel by the noise of its own values.
     sensitivity_std : ndarray, shape (rows, cols), or None
         Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
         uncertain, large scales included, in the gauge mean 1, and slope 0 where free fluxes leave
@@ -114,7 +113,7 @@ class Calibration:
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
-        Whether the data confirm the sign of the shifts, contradict it, or do not tell it, as those
+        Whether the data confirm the sign of the shifts, contradict it, or do neither, as those
         of a Gaussian beam, whatever its width; see `calibrate`.
     """
 
@@ -208,7 +207,7 @@ class Calibration:
     def tilt(self) -> NDArray[Any]:
         """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
 
-        Valid are pixels without ``DO_NOT_USE``; NaN where they tell no slope.
+        Valid are pixels without ``DO_NOT_USE``; NaN where they determine no slope.
         """
         valid = usable(self.flags) & determined(self.sensitivity, self.flags)
         return tilt(self.sensitivity, valid)
@@ -246,7 +245,7 @@ class Calibration:
         ------
         InputError
             If this calibration was read from a file, which holds no measurements; if the weights
-            do not fit; or if no variance was given and no residual tells it.
+            do not fit; or if no variance was given and the residuals do not determine it.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 

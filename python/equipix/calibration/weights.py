@@ -89,7 +89,7 @@ def _at_medians(exposures: Exposures) -> Iterator[Array]:
 
 
 def expected(exposures: Exposures, fit: Fit) -> Iterator[Array]:
-    """Signals c · L · M; where the fit knows none, outside the largest part, the medians."""
+    """Signals c · L · M; the medians where the fit determines none."""
     for k, flux in enumerate(exposures.flux.values):
         signal = exposures.light(fit, k) * fit.sensitivity
         yield np.where(np.isfinite(signal), signal, flux * exposures.medians)

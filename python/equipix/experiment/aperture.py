@@ -34,7 +34,7 @@ and pixels of relative spread s, here that of a uniform ±5 % as it is usual bef
 
 @dataclass(frozen=True, eq=False)
 class Equalisation:
-    """What a first calibration tells of the pixels under a spot.
+    """What a first fit determines of the pixels under a spot.
 
     Attributes
     ----------
