@@ -11,6 +11,7 @@ import numpy as np
 
 from equipix._check import as_array, as_floats, check_count, number, per_exposure
 from equipix._types import FluxModel
+from equipix.drift import trend_told
 from equipix.errors import IdentifiabilityWarning, InputError
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel, fit_frames, models_of_means
@@ -184,10 +185,7 @@ def warn_of_order(
     kind, values = flux_model
     if kind != "linear" or len(set(rotation.tolist())) > 1:
         return
-    times = np.array(values)
-    affine = np.column_stack([np.ones(len(shifts)), shifts])
-    left = times - affine @ np.linalg.lstsq(affine, times)[0]
-    share = float(np.sum(left**2) / np.sum((times - times.mean()) ** 2))
+    share = trend_told(shifts, np.array(values))
     if share < _HARDLY_TOLD:
         warnings.warn(
             f"of a drift linear in time only {share:.1%} of the variance can be told from a tilt "
