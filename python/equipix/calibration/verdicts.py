@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.drift import trend_told
 from equipix.errors import (
     ConvergenceWarning,
     EquipixWarning,
@@ -80,9 +81,7 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
         return []
-    affine = np.column_stack([np.ones(len(positions)), positions.shifts])
-    left = times - affine @ np.linalg.lstsq(affine, times)[0]
-    share = float(np.sum(left**2) / np.sum((times - times.mean()) ** 2))
+    share = trend_told(positions.shifts, times)
     if share >= _DEGENERATE:
         return []
     text = (

@@ -1,49 +1,19 @@
-"""What lamp drift and shift errors do: large-scale errors that leave next to no residual."""
+"""What errors of shifts do: large-scale errors that leave next to no residual."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from equipix._types import Floats
 
-if TYPE_CHECKING:
-    pass
-
-
 _DEGREE = 6
 """Of the polynomials: 3 leaves 0.3 % of the error, measured against `calibrate`; 6, 0.1 %."""
 
 _NODES = 10
 """Of the quadrature along an axis: exact for products of two such polynomials and more."""
-
-
-def drift_tilt(shape: tuple[int, int], shifts: Floats, drift: float) -> tuple[float, float]:
-    """Tilt of ln M, edge to edge along rows and columns, that independent fluxes leave.
-
-    Of ln c what is affine in d hides. Regressed on n shifts of covariance Σ, independent ln c of
-    standard deviation ε have a slope of covariance (ε²/n)·Σ⁻¹. Edge to edge that is
-    ε·N/(√n·std·√(1 − ρ²)) along each axis.
-    """
-    covariance = np.cov(shifts.T, bias=True)
-    determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
-    determined = determinant > 1e-12 * covariance[0, 0] * covariance[1, 1]
-    tilts = []
-    for size, own, other in zip(shape, np.diag(covariance), np.diag(covariance)[::-1], strict=True):
-        # Where nothing moves along the other axis ρ does not count; along a slanting line the
-        # tilts of the two axes cannot be told apart.
-        rest = determinant / other if determined else own if other == 0 else 0.0
-        slope = np.inf if rest <= 0 else drift / np.sqrt(len(shifts) * rest)
-        tilts.append(0.0 if size == 1 or drift == 0 else float(size * slope))
-    return tilts[0], tilts[1]
-
-
-def tilt_rms(tilt: tuple[float, float]) -> float:
-    """Root mean square over the sensor of a tilt given edge to edge: both over √12."""
-    return float(np.hypot(*tilt) / np.sqrt(12))
 
 
 @dataclass(frozen=True, eq=False)
