@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from equipix._native import Fit
     from equipix._types import FluxModel, Method, Progress
     from equipix.calibration.error_bars import DarkStd, ErrorBars
     from equipix.calibration.weights import Weighted
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel

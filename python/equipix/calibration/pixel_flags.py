@@ -36,6 +36,6 @@ def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
 
 def _std(weighted: Weighted, pixels: Array) -> Array:
     """Standard deviation of M in pixels by flat indices, that of the beam left out: 1/√D."""
-    information = weighted.fit.information().flat[pixels]
+    information = weighted.fit.information(workers=None).flat[pixels]
     with np.errstate(divide="ignore"):
         return np.asarray(1 / np.sqrt(information / weighted.noise_variance))

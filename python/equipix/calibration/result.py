@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix._check import check_count, check_progress, per_exposure
+from equipix._native import Beam
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
 from equipix.calibration.saved import read_fields, save_fields
 from equipix.calibration.verdicts import Verdict
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
-from equipix.exposures.compiled import Beam
 from equipix.exposures.front import measured_of
 from equipix.exposures.positions import Positions
 from equipix.flags import determined, usable
@@ -462,7 +462,7 @@ class Calibration:
         for (row, col), turn, c in zip(
             positions.shifts.tolist(), positions.rotation.tolist(), fluxes, strict=True
         ):
-            frame = c * beam.light(self.shape, (row, col), turn) * self.sensitivity
+            frame = c * beam.light(self.shape, (row, col), turn, workers=None) * self.sensitivity
             frames.append(frame.astype(self.sensitivity.dtype))
         return frames
 

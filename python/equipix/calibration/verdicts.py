@@ -20,11 +20,11 @@ from equipix.errors import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from equipix._native import Fit
     from equipix.calibration.error_bars import DarkStd
     from equipix.calibration.options import Options
     from equipix.calibration.sign import SignTest
     from equipix.calibration.weights import Weighted
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
 
 _UNDETERMINED = 1e-4

@@ -13,9 +13,9 @@ from equipix.noise import modelled_variances
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from equipix._native import Fit
     from equipix._types import Array, Bools
     from equipix.calibration.options import Options
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 

@@ -61,7 +61,7 @@ class Equalisation:
             )
         good = usable(pixel_flags(weighted, tolerance))
         count = len(exposures)
-        known = fit.information() * np.square(fit.sensitivity)
+        known = fit.information(workers=None) * np.square(fit.sensitivity)
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = weighted.noise_variance * count / max(count - 2, 1) / known
         gain = np.where(good, fit.sensitivity, 1).astype(exposures.values.dtype)

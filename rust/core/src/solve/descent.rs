@@ -41,14 +41,14 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
     loop {
-        let objective = estimate.sweep(control)?;
+        estimate.sweep(control)?;
         sweep += 1;
         if sweep < next_look {
             continue;
         }
-        let error = look(&mut estimate, scale, &mut search, control)?;
-        looks.push(Look { sweep, objective, error });
-        let ended = if error <= options.tolerance {
+        let look = look(sweep, &mut estimate, scale, &mut search, control)?;
+        looks.push(look);
+        let ended = if look.error <= options.tolerance {
             Ended::Converged
         } else if stalled(&looks) {
             Ended::Stalled
@@ -67,18 +67,19 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     }
 }
 
-/// The estimated error after a sweep.
+/// F and the estimated error after a sweep, with L at its closed form for the M of that sweep.
 fn look<T: Real>(
+    sweep: u64,
     estimate: &mut Estimate<'_, '_, T>,
     scale: Scale,
     search: &mut Search<'_, '_, T>,
     control: &Control,
-) -> Result<f64> {
-    estimate.slopes(scale.slope(), &mut search.residual, control)?;
+) -> Result<Look> {
+    let objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
     search.start(&estimate.sensitivity, estimate.beams(), control)?;
     let mut smallest = Smallest::default();
     while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}
-    Ok(smallest.error(search))
+    Ok(Look { sweep, objective, error: smallest.error(search) })
 }
 
 /// Whether the estimate is tiny and no smaller than it was at half the sweeps.
