@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, TypeAlias, final
+from typing import Any, Protocol, TypeAlias, final
 
 from numpy.typing import NDArray
-
-from equipix.uncertainty import Measurements
 
 __all__ = [
     "Accumulator",
@@ -108,8 +106,45 @@ def calibrate_frames(
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
 ) -> Solution: ...
+
+class _JointFit(Protocol):
+    """Attributes that are read of a joint fit."""
+
+    @property
+    def measured(self) -> NDArray[Any]: ...
+    @property
+    def shift_std(self) -> NDArray[Any] | None: ...
+    @property
+    def flux_model(self) -> tuple[str, list[float]]: ...
+    @property
+    def offset(self) -> bool: ...
+    @property
+    def shifts(self) -> NDArray[Any]: ...
+    @property
+    def refined(self) -> bool: ...
+    @property
+    def unit(self) -> float: ...
+
+class _Measurements(Protocol):
+    """Attributes that are read of the measurements behind a calibration."""
+
+    @property
+    def frames(self) -> NDArray[Any]: ...
+    @property
+    def shifts(self) -> NDArray[Any]: ...
+    @property
+    def rotation(self) -> list[int]: ...
+    @property
+    def flux(self) -> list[float]: ...
+    @property
+    def variance(self) -> NDArray[Any] | None: ...
+    @property
+    def mask(self) -> NDArray[Any] | None: ...
+    @property
+    def joint(self) -> _JointFit | None: ...
+
 def error_map(
-    measurements: Measurements,
+    measurements: _Measurements,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
@@ -117,7 +152,7 @@ def error_map(
     progress: Callable[[int, int, str], object] | None,
 ) -> tuple[NDArray[Any], int, float]: ...
 def functional_variances(
-    measurements: Measurements,
+    measurements: _Measurements,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
@@ -126,7 +161,7 @@ def functional_variances(
     progress: Callable[[int, int, str], object] | None,
 ) -> NDArray[Any]: ...
 def shift_variances(
-    measurements: Measurements,
+    measurements: _Measurements,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
@@ -134,7 +169,7 @@ def shift_variances(
     progress: Callable[[int, int, str], object] | None,
 ) -> list[list[float]]: ...
 def offset_variances(
-    measurements: Measurements,
+    measurements: _Measurements,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
