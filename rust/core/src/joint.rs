@@ -11,6 +11,7 @@
 //! (`joint/precondition.rs`). The penalty (`joint/penalty.rs`) is slight: τ is 1e-5 of the mean
 //! weight of a cell.
 
+mod bands;
 mod covariance;
 mod flux;
 mod freedom;
@@ -20,6 +21,7 @@ mod kernel;
 mod pass;
 mod penalty;
 mod precondition;
+mod problem;
 mod rim;
 mod survey;
 mod system;

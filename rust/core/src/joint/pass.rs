@@ -10,7 +10,7 @@ use std::borrow::Cow;
 
 use super::grid::{TAPS, Taps, Window};
 use super::kernel::{AROUND, Combine, Lines, Row};
-use super::system::System;
+use super::problem::System;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -18,73 +18,8 @@ use crate::geometry::{Rotation, View};
 use crate::model::Stretch;
 use crate::parallel::{Add, dot};
 
-/// Rows of pixels in a band, at least: a band adds to as many rows of cells and those that shifts reach.
-const FEWEST_ROWS: usize = 32;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 16;
-
-/// How the sensor is cut into bands, and where their sums lie.
-#[derive(Default)]
-pub(super) struct Bands {
-    /// Rows of pixels.
-    pub(super) height: usize,
-    strips: Vec<Strip>,
-    /// Values of one band's sums.
-    length: usize,
-}
-
-/// The sums of a band in one view.
-#[derive(Clone, Copy)]
-struct Strip {
-    /// The row of the view that the first one of band 0 is.
-    first: usize,
-    rows: usize,
-    cols: usize,
-    /// Where they begin among the sums of the band.
-    start: usize,
-}
-
-impl Bands {
-    pub(super) fn new(windows: &[Window], views: &[View], width: usize) -> Self {
-        let reach = |view: usize| {
-            let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);
-            let first = rows.clone().min().unwrap_or(0);
-            (first, rows.max().unwrap_or(0) - first)
-        };
-        let reaches: Vec<_> = (0..views.len()).map(reach).collect();
-        let furthest = reaches.iter().map(|reach| reach.1).max().unwrap_or(0);
-        let height = FEWEST_ROWS.max(furthest);
-        let mut length = 0;
-        let strips = views.iter().zip(reaches).map(|(view, (first, reach))| {
-            let (rows, cols, start) = (height + reach + width - 1, view.shape.cols, length);
-            length += rows * cols;
-            Strip { first, rows, cols, start }
-        });
-        let strips = strips.collect();
-        Self { height, strips, length }
-    }
-
-    /// Values of all bands of a sensor of so many rows.
-    pub(super) fn size(&self, rows: usize) -> usize {
-        rows.div_ceil(self.height) * self.length
-    }
-
-    /// The bands that see a row of a view, each with that row of its sums.
-    fn seeing<'s>(
-        &self,
-        sums: &'s [f64],
-        view: usize,
-        row: usize,
-    ) -> impl Iterator<Item = &'s [f64]> + use<'s> {
-        let (height, length, strip) = (self.height, self.length, self.strips[view]);
-        let before = (row + height).saturating_sub(strip.first + strip.rows) / height;
-        let bands = before..sums.len() / length;
-        bands.map_while(move |band| {
-            let at = row.checked_sub(strip.first + band * height)?;
-            Some(&sums[band * length + strip.start + at * strip.cols..][..strip.cols])
-        })
-    }
-}
 
 /// Room of one thread for a row of pixels.
 pub(super) struct Room {
