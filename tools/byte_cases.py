@@ -72,6 +72,26 @@ def simulated() -> Arrays:
     return {name: truth[name] for name in truth.files} | content
 
 
+def applied() -> Arrays:
+    """What a calibration makes of frames: corrected, predicted, residuals, a mean's deviation."""
+    frames = with_odd_pixels(SPLINE)
+    found = SPLINE.fit(frames, variance=VARIANCES)
+    ways = ("nan", "keep", "replace")
+    weights = np.where(found.flags == 0, 1 / frames[0].size, 0)
+    return {way: found.correct(frames, dark=None, flagged=way) for way in ways} | {
+        "predicted": found.predict((1.5, 2.25), rotation=180, flux=0.9),
+        "residuals": found.residuals(frames, variance=VARIANCES),
+        "std_of": np.asarray(found.std_of(weights)),
+        "tilt": found.tilt,
+    }
+
+
+def saved() -> Any:
+    """A calibration that was written to a file and read again."""
+    SPLINE.fit(shift_std=0.02, flux_std=1e-3, robust=True, uncertainty=True).save("saved.tif")
+    return equipix.load("saved.tif")
+
+
 def descent(**options: Any) -> dict[str, Any]:
     """Options of the paper's method."""
     return {"method": "coordinate-descent", "tolerance": 1e-4} | options
@@ -157,6 +177,8 @@ CASES: dict[str, Callable[[], Any]] = {
     "reversed shifts": lambda: SPLINE.fit(
         Scene(shifts=REVERSED, contrast=0.1).frames, variance=VARIANCES
     ),
+    "applied": applied,
+    "saved and loaded": saved,
     "average": averages,
     "simulate": simulated,
     "experiment, measured shifts": lambda: measured_experiment().run(),
