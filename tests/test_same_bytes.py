@@ -141,6 +141,11 @@ def test_a_folder_without_a_package_is_refused(tmp_path, capsys):
     assert "expected a folder that holds python/equipix" in capsys.readouterr().err
 
 
+def test_an_unknown_commit_is_refused_before_anything_is_built(capsys):
+    assert same_bytes.main(["HEAD", "no-such-commit"]) == 2
+    assert capsys.readouterr().err == "'no-such-commit' is no commit of this repository\n"
+
+
 def test_help_names_the_options():
     command = [sys.executable, same_bytes.__file__, "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -172,6 +172,15 @@ def table(found: dict[str, dict[str, str]], ignored: Sequence[str]) -> tuple[str
     return "\n".join(lines), faults
 
 
+def resolved(commit: str) -> str:
+    """The hash of a commit, since a branch may move while the first one is built."""
+    command = ("git", "rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}")
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if found.returncode:
+        raise BuildError(f"'{commit}' is no commit of this repository")
+    return found.stdout.strip()
+
+
 def made(commit: str, folder: Path, target: Path) -> Build:
     """Build a commit in a worktree at `folder`."""
     call("git", "worktree", "add", "--detach", folder, commit, folder=ROOT)
@@ -188,6 +197,7 @@ def made(commit: str, folder: Path, target: Path) -> Build:
 @contextmanager
 def builds_of(commits: Sequence[str]) -> Iterator[list[Build]]:
     """Build commits in a temporary folder, which goes when they have been used."""
+    commits = [resolved(commit) for commit in commits]
     with tempfile.TemporaryDirectory() as name:
         folders = [Path(name) / place for place in ("old", "new")]
         target = Path(os.environ.get("CARGO_TARGET_DIR", f"{name}/target")).absolute()
