@@ -142,7 +142,7 @@ def test_a_folder_without_a_package_is_refused(tmp_path, capsys):
 
 
 def test_an_unknown_commit_is_refused_before_anything_is_built(capsys):
-    assert same_bytes.main(["HEAD", "no-such-commit"]) == 2
+    assert same_bytes.main(["no-such-commit", "HEAD"]) == 2
     assert capsys.readouterr().err == "'no-such-commit' is no commit of this repository\n"
 
 
