@@ -222,7 +222,6 @@ def calibrated(
     The fit begins from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    options.check(exposures)
     advice = verdicts.on_plan(exposures)
     verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)

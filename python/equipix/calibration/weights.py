@@ -52,6 +52,7 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
     at the medians over the exposures, pixel by pixel, which no single false value moves far. Each
     fit begins from the one before, the first from `start`.
     """
+    options.check(exposures)
     if exposures.noise:
         tolerance = max(options.fit.tolerance, _ROUGH)
         rough = dataclasses.replace(options.fit, tolerance=tolerance)

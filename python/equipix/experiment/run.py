@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from equipix.experiment.manifest import Manifest
     from equipix.exposures.exposures import Exposures
     from equipix.frames import FrameStatistics
+    from equipix.noise import NoiseModel
 
 _ROUGH = 1e-4
 """Tolerance of the fit that the aperture's images are corrected by: 3e-5 pixel."""
@@ -220,33 +221,26 @@ class Experiment:
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
         self.check_formats()
         shifts, std = self.measure_shifts()
-        averaged = self._average(fit_options)
+        exposures, noise = self._exposures(shifts, std, flux, fit_options)
         start = None
         moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
         if moved and method == "multiscale":
-            tolerance = max(tolerance, _ROUGH)
-            rough = Options(replace(fit_options, tolerance=tolerance), robust=robust)
-            exposures = self._exposures(averaged, shifts, std, flux, method)
-            rough.check(exposures)
-            first = weighted_fit(exposures, rough)
-            equalisation = Equalisation.of(first, tolerance)
+            rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
+            first = weighted_fit(exposures, replace(options, fit=rough))
+            equalisation = Equalisation.of(first, rough.tolerance)
             shifts, std = measured_shifts(self.path, self.manifest, equalisation)
+            exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
-        exposures = self._exposures(averaged, shifts, std, flux, method)
-        origin = provenance(self.path, self.manifest, self.files(), shifts, std, averaged.noise)
+        origin = provenance(self.path, self.manifest, self.files(), shifts, std, noise)
         return calibrated(exposures, options, start=start, provenance=origin)
 
     def _exposures(
-        self,
-        averaged: Averaged,
-        shifts: Floats,
-        std: Floats,
-        flux: FluxModel | None,
-        method: Method,
-    ) -> Exposures:
-        """The averaged frames with what the file says of them."""
-        whole = method == "coordinate-descent"
-        return exposures_of(
+        self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
+    ) -> tuple[Exposures, NoiseModel | None]:
+        """The averaged frames with what the file says of them, and the noise of one frame."""
+        whole = options.method == "coordinate-descent"
+        averaged = self._average(options)
+        exposures = exposures_of(
             averaged,
             round_shifts(shifts, std) if whole else shifts,
             shift_std=std if std.any() and not whole else None,
@@ -256,6 +250,7 @@ class Experiment:
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
             whole=whole,
         )
+        return exposures, averaged.noise
 
     def _average(self, options: FitOptions) -> Averaged:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""

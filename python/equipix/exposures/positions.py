@@ -93,6 +93,10 @@ class Positions:
         """Return the positions with all shifts of the other sign."""
         return dataclasses.replace(self, shifts=-self.shifts)
 
+    def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
+        """Return the same exposures at other shifts, measured with standard deviations `std`."""
+        return type(self).of(shifts, rotation=self.rotation, std=std, count=len(self))
+
     def chosen(self, exposures: Sequence[int] | NDArray[Any]) -> Self:
         """Return the positions of some exposures."""
         std = None if self.std is None else self.std[exposures]
