@@ -165,6 +165,17 @@ def test_links_lead_somewhere(page):
     assert [link for link in links if not (path.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_links_to_sections_lead_to_headings(page):
+    path = ROOT / page
+    for target, section in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", path.read_text()):
+        headings = re.findall(
+            r"^#+ (.*)", (path.parent / target if target else path).read_text(), re.MULTILINE
+        )
+        slugs = [re.sub(r"[^\w\- ]", "", each).lower().replace(" ", "-") for each in headings]
+        assert section in slugs
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_the_examples_of_docstrings_run(module):
     result = doctest.testmod(importlib.import_module(module))
