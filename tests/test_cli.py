@@ -386,7 +386,8 @@ def test_ctrl_c_stops_the_solver_at_once(tmp_path_factory, tmp_path):
 
 def interrupted(command):
     """Seconds from Ctrl-C to the end of a process that is past its start."""
-    command[2] = command[2].replace("main()", "print(flush=True); main()")
+    loaded = "import equipix.cli.calibrate; print(flush=True); main()"
+    command[2] = command[2].replace("main()", loaded)
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         process.stdout.readline()

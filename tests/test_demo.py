@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from equipix import cli, demo, errors, measure_shift
-from equipix.pictures import report
+from equipix.pictures.canvas import new_figure
+from equipix.pictures.demo import draw_demo
 
 pytest.importorskip("matplotlib")
 
@@ -47,7 +48,7 @@ def test_an_error_beyond_the_noise_fails(result):
 
 
 def test_picture_shows_all(result):
-    figure = report.draw_demo(result)
+    figure = draw_demo(result)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == 9
     shown = figure.axes[0].images[0].get_array()
@@ -112,4 +113,4 @@ def test_command_replaces_what_it_kept(tmp_path, monkeypatch):
 def test_without_matplotlib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     with pytest.raises(errors.EquipixError, match=r"pip install 'equipix\[plot\]'"):
-        report.new_figure(1, 1)
+        new_figure(1, 1)

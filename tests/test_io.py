@@ -373,6 +373,9 @@ PAGES = {
     "labels": RNG.integers(-5, 5, (4, 5), dtype=np.int32),
     "other shape": RNG.random((2, 3), dtype=np.float32),
     "count": RNG.integers(0, 2**32, (4, 5), dtype=np.uint32),
+    "stack": RNG.integers(0, 2, (3, 4, 5), dtype=np.uint8),
+    "stack of one": RNG.normal(size=(1, 4, 5)),
+    "after it": RNG.normal(size=(4, 5)).astype(np.float32),
 }
 
 
@@ -385,12 +388,52 @@ def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: st
     assert found == metadata
     assert list(pages) == list(PAGES)
     for name, array in PAGES.items():
-        assert pages[name].dtype == array.dtype
+        assert (pages[name].dtype, pages[name].shape) == (array.dtype, array.shape)
         np.testing.assert_array_equal(pages[name], array)
     if suffix != ".npz":
         with tifffile.TiffFile(path) as file:
             assert file.pages[1].tags["PageName"].value == "labels"
             assert json.loads(file.pages[0].description) == metadata
+            # Any viewer shows the images of a stack one by one.
+            stack = [page for page in file.pages if page.tags["PageName"].value == "stack"]
+            assert [page.tags["PageNumber"].value for page in stack] == [(0, 3), (1, 3), (2, 3)]
+            assert not any("PageNumber" in page.tags for page in file.pages[:4])
+
+
+@pytest.mark.parametrize("shape", [(4,), (0, 5), (0, 4, 5), (2, 0, 5), (1, 2, 4, 5)])
+def test_pages_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    for suffix in (".tif", ".npz"):
+        with pytest.raises(InputError, match="page 'bad' is float64 of shape .* a stack"):
+            io.save_pages(tmp_path / f"a{suffix}", {"bad": np.zeros(shape)}, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [[(0, 3), (1, 3)], [(1, 2), (0, 2)], [(0, 2), (0, 2)], [(0, 1), None], [None, None]],
+)
+def test_a_stack_that_lacks_an_image_is_refused(
+    tmp_path: Path, numbers: list[tuple[int, int] | None]
+) -> None:
+    path = tmp_path / "stack.tif"
+    with tifffile.TiffWriter(path) as file:
+        for number in numbers:
+            tags = [(285, "s", 0, "stack", True)]
+            tags += [] if number is None else [(297, "H", 2, number, True)]
+            file.write(np.ones((4, 5)), metadata=None, description="{}", extratags=tags)
+    with pytest.raises(FileError, match="is damaged: the pages named 'stack' are numbered"):
+        io.load_pages(path)
+
+
+def test_stacks_are_checked_against_the_maps() -> None:
+    pages = {"map": np.ones((4, 5)), "stack": np.ones((3, 4, 5))}
+    io.check_pages("a.tif", pages, {"map": np.floating}, {"stack": np.floating})
+    for stack in (np.ones((3, 4, 6)), np.ones((4, 5)), np.ones((3, 4, 5), np.uint8)):
+        changed = pages | {"stack": stack}
+        with pytest.raises(FileError, match=r"'stack' is .* in three dimensions, as large as 'm"):
+            io.check_pages("a.tif", changed, {"map": np.floating}, {"stack": np.floating})
+    with pytest.raises(FileError, match="lacks the page 'other'"):
+        io.check_pages("a.tif", pages, {"map": np.floating}, {"other": np.floating})
 
 
 def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -472,7 +515,8 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cal{suffix}"
     frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), [(0, 0), (0, 1)])
     cal = equipix.calibrate(np.concatenate([frames, frames]), [(0, 0), (0, 1), (1, 0), (0, 0)])
-    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32)).save(path)
+    left_out = np.zeros((4, 8, 9), bool)
+    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out).save(path)
     pages, content = io.load_pages(path)
     for name, page in (
         ("sensitivity", pages["sensitivity"].astype(np.int32)),
@@ -480,6 +524,9 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
         ("flags", pages["flags"][1:]),
         ("component_labels", pages["component_labels"][:, 1:]),
         ("dark", pages["dark"][1:]),
+        ("rejected", pages["rejected"][:, 1:]),
+        ("rejected", pages["rejected"][0]),
+        ("rejected", pages["rejected"].astype(np.int8)),
     ):
         io.save_pages(path, pages | {name: page}, content, force=True)
         with pytest.raises(FileError, match=f"is damaged: page '{name}' is"):
@@ -490,6 +537,11 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
             equipix.load(path)
     io.save_pages(path, pages, content, force=True)
     assert equipix.load(path).dark is not None
+    # A page of format 1 whose height is no multiple of the sensor's.
+    odd = pages | {"rejected": np.zeros((31, 9), np.uint8)}
+    io.save_pages(path, odd, content | {"format": 1}, force=True)
+    with pytest.raises(FileError, match="damaged or incomplete calibration"):
+        equipix.load(path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])

@@ -119,7 +119,11 @@ def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
     experiment = tmp_path / "experiment.toml"
     experiment.write_text("\n".join(lines))
     before = sorted(tmp_path.rglob("*"))
-    command = "from equipix import cli; limit(60 * 10**6); cli.main(sys.argv[1:])"
+    # The limit counts from a process that has loaded what the command imports.
+    command = (
+        "from equipix import cli; import equipix.cli.calibrate; limit(60 * 10**6); "
+        "cli.main(sys.argv[1:])"
+    )
     done = run(command, "calibrate", experiment, "-o", tmp_path / "cal.tif", "--workers", 2)
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import equipix
 from equipix import plan, reference, simulate
+from equipix.drift import tilt_rms, tilt_std
 from equipix.errors import (
     DriftWarning,
     IdentifiabilityWarning,
@@ -18,7 +19,6 @@ from equipix.errors import (
     ShiftRoundingWarning,
 )
 from equipix.plan.noise import local_variance
-from equipix.plan.smooth import drift_tilt, tilt_rms
 
 WITHIN = 0.1
 """The claim: predictions agree with simulation within 10 %."""
@@ -232,7 +232,7 @@ class TestDrift:
     @pytest.mark.parametrize(("arms", "wanted"), [((11, 19), 2.0e-3), ((97, 160), 2.4e-4)])
     def test_of_the_cross(self, arms, wanted):
         # Measured at 782×582, in two figures.
-        tilt = drift_tilt(CCD, equipix.cross_pattern(*arms).astype(float), 1e-4)
+        tilt = tilt_std(CCD, equipix.cross_pattern(*arms).astype(float), 1e-4)
         assert tilt_rms(tilt) == pytest.approx(wanted, abs=0.05 * 10 ** np.floor(np.log10(wanted)))
 
     def test_is_loud_when_it_exceeds_the_noise(self):

@@ -77,7 +77,7 @@ def test_a_structured_beam_contradicts_reversed_shifts(whole):
     for seed in range(6):
         noise, drift = (1e-2, 1e-3, 1e-5)[seed % 3], (0, 1e-2)[seed % 2]
         frames, shifts = experiment(seed, wavy(seed), noise=noise, drift=drift, whole=whole)
-        with pytest.warns(ShiftSignWarning, match="give 'shifts' of the other sign"):
+        with pytest.warns(ShiftSignWarning, match="give 'shifts' with the other sign"):
             assert sign_of(frames, -shifts) == "contradicted"
         assert sign_of(frames, shifts) == "confirmed"
 

@@ -13,7 +13,8 @@ from equipix._native import __version__
 if TYPE_CHECKING:
     from equipix import errors, plan, simulate, uncertainty
     from equipix.calibration.calibrate import calibrate
-    from equipix.calibration.result import Calibration, History
+    from equipix.calibration.history import History
+    from equipix.calibration.result import Calibration
     from equipix.comparison import Comparison, compare
     from equipix.correction.protocol import Correction
     from equipix.experiment.run import Experiment
@@ -30,7 +31,7 @@ _HOMES = {
     "Experiment": "experiment.run",
     "Flag": "flags",
     "FrameStatistics": "frames",
-    "History": "calibration.result",
+    "History": "calibration.history",
     "NoiseModel": "noise",
     "ShiftMeasurement": "shifts",
     "Spot": "shifts",

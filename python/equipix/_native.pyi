@@ -6,11 +6,13 @@ from typing import Any, TypeAlias, final
 
 from numpy.typing import NDArray
 
-from equipix.uncertainty import Measurements
-
 __all__ = [
     "Accumulator",
+    "Beam",
+    "Exposures",
+    "Fit",
     "Solution",
+    "Uncertainty",
     "__version__",
     "average_files",
     "calibrate_frames",
@@ -25,6 +27,7 @@ __all__ = [
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
+_Progress: TypeAlias = Callable[[int, int, str], object]
 _Statistics: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 __version__: str
@@ -45,10 +48,138 @@ def average_files(
     paths: Sequence[str | PathLike[str]],
     saturation: float | None,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: _Progress | None,
 ) -> _Statistics: ...
 def file_format(path: str | PathLike[str]) -> tuple[int, int, int, int]: ...
 def read_file(path: str | PathLike[str], workers: int | None) -> NDArray[Any]: ...
+
+@final
+class Exposures:
+    """Mean frames of one beam, checked once; it keeps references to the arrays."""
+
+    def __new__(
+        cls,
+        frames: NDArray[Any],
+        shifts: NDArray[Any],
+        *,
+        shift_std: NDArray[Any] | None,
+        rotation: list[int],
+        flux: list[float],
+        flux_model: tuple[str, list[float]],
+        offset: bool,
+        variance: NDArray[Any] | None,
+        mask: NDArray[Any] | None,
+        workers: int | None,
+        progress: _Progress | None,
+    ) -> Exposures: ...
+    def fit(
+        self,
+        *,
+        method: str,
+        tolerance: float,
+        max_sweeps: int | None,
+        start: Fit | None,
+        workers: int | None,
+        progress: _Progress | None,
+    ) -> Fit: ...
+
+@final
+class Beam:
+    """The beam on its grid; a spline if there are coefficients. NaN where it was not seen."""
+
+    def __new__(
+        cls,
+        values: NDArray[Any],
+        coefficients: NDArray[Any] | None,
+        origin: tuple[int, int],
+    ) -> Beam: ...
+    @property
+    def values(self) -> NDArray[Any]: ...
+    @property
+    def coefficients(self) -> NDArray[Any] | None: ...
+    @property
+    def origin(self) -> tuple[int, int]: ...
+    def light(
+        self,
+        shape: tuple[int, int],
+        shift: tuple[float, float],
+        rotation: int,
+        *,
+        workers: int | None,
+    ) -> NDArray[Any]: ...
+
+@final
+class Fit:
+    """What was found. `refinement` is "none", "not tried", "untold" or "refined"."""
+
+    @property
+    def exposures(self) -> Exposures: ...
+    @property
+    def sensitivity(self) -> NDArray[Any]: ...
+    @property
+    def beam(self) -> Beam: ...
+    @property
+    def flags(self) -> NDArray[Any]: ...
+    @property
+    def component_labels(self) -> NDArray[Any]: ...
+    @property
+    def components(self) -> int: ...
+    @property
+    def flux(self) -> list[float]: ...
+    @property
+    def shifts(self) -> list[list[float]]: ...
+    @property
+    def offset(self) -> NDArray[Any] | None: ...
+    @property
+    def sweeps(self) -> NDArray[Any]: ...
+    @property
+    def objective(self) -> NDArray[Any]: ...
+    @property
+    def error_estimate(self) -> NDArray[Any]: ...
+    @property
+    def ended(self) -> str: ...
+    @property
+    def misfit(self) -> float: ...
+    @property
+    def degrees_of_freedom(self) -> int: ...
+    @property
+    def unit(self) -> float: ...
+    @property
+    def smallest_ritz(self) -> float | None: ...
+    @property
+    def leaves_tilt(self) -> bool: ...
+    @property
+    def refinement(self) -> str: ...
+    @property
+    def is_joint(self) -> bool: ...
+    def information(self, *, workers: int | None) -> NDArray[Any]: ...
+    def uncertainty(
+        self,
+        *,
+        error_map: bool,
+        functionals: NDArray[Any] | None,
+        shifts: bool,
+        offset: bool,
+        workers: int | None,
+        progress: _Progress | None,
+    ) -> Uncertainty: ...
+
+@final
+class Uncertainty:
+    """Answers in units of the variance of a value of weight 1, which is the fit's `unit`."""
+
+    @property
+    def std(self) -> NDArray[Any] | None: ...
+    @property
+    def draws(self) -> int: ...
+    @property
+    def exactness(self) -> float: ...
+    @property
+    def variances(self) -> NDArray[Any] | None: ...
+    @property
+    def shift_variances(self) -> list[list[float]] | None: ...
+    @property
+    def offset_variances(self) -> tuple[float, float] | None: ...
 
 @final
 class Solution:
@@ -106,40 +237,40 @@ def calibrate_frames(
     tolerance: float,
     max_sweeps: int | None,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: _Progress | None,
 ) -> Solution: ...
 def error_map(
-    measurements: Measurements,
+    measurements: Any,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: _Progress | None,
 ) -> tuple[NDArray[Any], int, float]: ...
 def functional_variances(
-    measurements: Measurements,
+    measurements: Any,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
     functionals: NDArray[Any],
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: _Progress | None,
 ) -> NDArray[Any]: ...
 def shift_variances(
-    measurements: Measurements,
+    measurements: Any,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: _Progress | None,
 ) -> list[list[float]]: ...
 def offset_variances(
-    measurements: Measurements,
+    measurements: Any,
     sensitivity: NDArray[Any],
     beam: NDArray[Any],
     *,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: _Progress | None,
 ) -> list[float]: ...
 def locate_spots(
     before: NDArray[Any],

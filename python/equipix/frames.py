@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import os
@@ -200,8 +201,13 @@ def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
     dark = None
     if _DARK + "mean" in pages:
         io.check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
-        dark = FrameStatistics(*(pages[_DARK + name] for name in _PAGES))
-    return FrameStatistics(*(pages[name] for name in _PAGES), dark=dark)
+        dark = _of_pages(pages, _DARK)
+    return dataclasses.replace(_of_pages(pages), dark=dark)
+
+
+def _of_pages(pages: dict[str, NDArray[Any]], before: str = "") -> FrameStatistics:
+    mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
+    return FrameStatistics(mean, variance, of_mean, count, saturated)
 
 
 def _level(saturation: float | None) -> float | None:

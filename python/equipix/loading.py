@@ -1,30 +1,35 @@
-"""Reading back what equipix has saved."""
+"""Corrections read back from the files that they were saved to, whatever their kind."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from equipix.calibration.result import FORMAT, Calibration, History
 from equipix.errors import FileError
-from equipix.io import check_format, check_pages, load_pages
+from equipix.io import load_pages
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
     from os import PathLike
 
-    from numpy.typing import NDArray
+    from equipix.calibration.result import Calibration
+    from equipix.correction.protocol import Correction
 
-_MAPS: dict[str, type] = {
-    "sensitivity": np.floating,
-    "flags": np.uint32,
-    "component_labels": np.integer,
+READERS = {
+    "calibration": ("equipix.calibration.result", "read_calibration"),
 }
-_OPTIONAL = {"dark", "sensitivity_std"}
+"""By the kind in a file's metadata, the module, imported on first use, and the function that makes
+a correction of ``(path, pages, metadata)``."""
+
+_NO_CORRECTIONS = {
+    "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
+    "themselves: equipix correct subtracts them as --dark",
+}
+"""Other kinds of files that equipix writes, and what they are."""
 
 
-def load(path: str | PathLike[str]) -> Calibration:
-    """Read a calibration that `Calibration.save` wrote.
+def load(path: str | PathLike[str]) -> Correction:
+    """Read a correction from the file that its `save` wrote.
 
     Parameters
     ----------
@@ -33,60 +38,41 @@ def load(path: str | PathLike[str]) -> Calibration:
 
     Returns
     -------
-    Calibration
-        As it was saved, bit by bit.
+    Correction
+        As it was saved, bit by bit: from a file that `Calibration.save` wrote a `Calibration`.
 
     Raises
     ------
     FileError
         If the file cannot be read, holds something else, or was written in a newer format.
     """
+    correction: Correction = _load(path, READERS)
+    return correction
+
+
+def load_calibration(path: str | PathLike[str]) -> Calibration:
+    """Read a calibration from the file that `Calibration.save` wrote, and refuse other corrections.
+
+    The parameters and errors are those of `load`.
+    """
+    calibration: Calibration = _load(path, {"calibration": READERS["calibration"]})
+    return calibration
+
+
+def _load(path: str | PathLike[str], readers: Mapping[str, tuple[str, str]]) -> Any:
     pages, content = load_pages(path)
-    check_format(path, content, "calibration", FORMAT)
-    check_pages(path, pages, _MAPS | dict.fromkeys(_OPTIONAL & pages.keys(), np.floating))
-    check_pages(path, pages, {"beam": np.floating})
+    kind = content.get("kind") if isinstance(content, dict) else None
+    if not isinstance(kind, str) or kind not in readers:
+        raise FileError(f"{path}: holds {_what(kind, readers)}")
+    module, function = readers[kind]
     try:
-        return _calibration(pages, content)
+        return getattr(import_module(module), function)(path, pages, content)
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(f"{path}: damaged or incomplete calibration: {error!r}") from error
+        raise FileError(f"{path}: damaged or incomplete {kind}: {error!r}") from error
 
 
-def _calibration(pages: dict[str, NDArray[Any]], content: dict[str, Any]) -> Calibration:
-    numbers = content["calibration"]
-    history = numbers["history"]
-    row, col = numbers["beam_origin"]
-    chi2 = numbers["reduced_chi2"]
-    tilt_std, shift_std = numbers.get("tilt_std"), numbers.get("shift_std")
-    rejected = pages.get("rejected")
-    return Calibration(
-        sensitivity=pages["sensitivity"],
-        beam=pages["beam"],
-        beam_origin=(row, col),
-        beam_coefficients=None,
-        rotation=np.array(content["metadata"]["options"]["rotation"]),
-        dark_is_fitted=content["metadata"]["options"]["dark"] == "fit",
-        flags=pages["flags"],
-        shifts=np.array(numbers["shifts"], dtype=np.float64),
-        flux=np.array(numbers["flux"], dtype=np.float64),
-        objective=numbers["objective"],
-        reduced_chi2=float("nan") if chi2 is None else chi2,
-        components=numbers["components"],
-        component_labels=pages["component_labels"],
-        sweeps=numbers["sweeps"],
-        converged=numbers["converged"],
-        error_estimate=numbers["error_estimate"],
-        shift_sign=numbers.get("shift_sign", "undetermined"),
-        history=History(
-            np.array(history["sweep"], dtype=np.uint64),
-            np.array(history["objective"]),
-            np.array(history["error_estimate"]),
-        ),
-        dark=pages.get("dark"),
-        metadata=content["metadata"],
-        sensitivity_std=pages.get("sensitivity_std"),
-        tilt_std=None if tilt_std is None else np.array(tilt_std, dtype=np.float64),
-        shift_std=None if shift_std is None else np.array(shift_std, dtype=np.float64),
-        rejected=None
-        if rejected is None
-        else rejected.reshape(-1, *pages["sensitivity"].shape).astype(bool),
-    )
+def _what(kind: object, readers: Iterable[str]) -> str:
+    """Say what a file holds that is not wanted, or not known."""
+    words = _NO_CORRECTIONS.get(str(kind))
+    wanted = f"expected {' or '.join(readers)} that equipix has saved"
+    return f"{kind or 'something else'}, {wanted}{f' ({words})' if words else ''}"

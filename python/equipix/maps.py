@@ -103,7 +103,7 @@ def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
     -------
     ndarray, shape (2, rows, cols), float64
         For the slopes along rows and columns, each times the size of the sensor along it. NaN
-        where the valid pixels tell no slope.
+        where the valid pixels determine no slope.
     """
     count = max(int(np.count_nonzero(valid)), 1)
     coordinates = np.indices(valid.shape) / np.reshape(valid.shape, (2, 1, 1))

@@ -8,6 +8,7 @@ import numpy as np
 
 from equipix._check import as_array, per_exposure
 from equipix._types import Floats
+from equipix.drift import slope_std
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -71,11 +72,9 @@ def tilt_std(
     if shift_std is not None:
         slope = per_exposure("beam_slope", beam_slope, 2, default=0)
         variance += np.square(_each("shift_std", shift_std, (count, 2)) * slope).sum(axis=1)
-    centred = positions - positions.mean(axis=0)
-    if np.linalg.matrix_rank(centred) < 2:
+    if np.linalg.matrix_rank(positions - positions.mean(axis=0)) < 2:
         return np.full(2, np.inf)
-    fit = np.linalg.pinv(centred)
-    return np.asarray(np.sqrt(np.square(fit) @ variance) * shape)
+    return np.asarray(slope_std(positions, np.sqrt(variance)) * shape)
 
 
 def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:

@@ -12,7 +12,7 @@ from equipix.calibration import verdicts
 from equipix.calibration.error_bars import dark_std, error_bars
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.pixel_flags import pixel_flags
-from equipix.calibration.result import Calibration, History
+from equipix.calibration.result import Calibration
 from equipix.calibration.sign import shift_sign
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
@@ -23,11 +23,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array, FluxModel, Method, Progress
+    from equipix._native import Fit
+    from equipix._types import FluxModel, Method, Progress
     from equipix.calibration.error_bars import DarkStd, ErrorBars
-    from equipix.calibration.sign import SignTest
     from equipix.calibration.weights import Weighted
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
@@ -60,21 +59,21 @@ def calibrate(
     ----------
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
-        `FrameStatistics` bring their variances along: a noise model fitted over all pixels, not
-        each pixel's own sample variance, gives the weights. A mean with saturated samples counts
-        as masked, and its pixel is flagged; a pixel that scatters more than chance explains in
-        every exposure is masked and flagged ``HOT``.
+        `FrameStatistics` bring their noise along: a noise model fitted over all pixels, not each
+        pixel's own sample variance, gives the weights. A mean with saturated samples is left out of
+        its exposure, and the pixel is flagged ``SATURATED``; it keeps the sensitivity that the
+        other exposures determine. Dead, hot and noisy pixels are masked and flagged, the hot ones
+        where `equipix.average` was given the dark frames as `FrameStatistics`.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
-        unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result, in a smooth
-        beam without any residual to show it; `Calibration.shift_sign` says whether the data confirm
-        it. Where they are not whole numbers the beam is a cubic spline;
-        coordinate descent rounds them.
+        unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result, and in a
+        smooth beam no residual shows it: see `Calibration.shift_sign`. If shifts are not whole
+        numbers the beam is a cubic spline; coordinate descent rounds them.
     variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
         Variance of the values given; without it all weights are 1. A noise model, or one for each
-        exposure, is evaluated at what a first fit expects, since with variances taken at the noisy
-        values themselves those that happen to be low would weigh more. With `FrameStatistics` it
-        is the model of one frame.
+        exposure, is evaluated at the signal of a first fit: evaluated at the noisy values, it
+        would give more weight to those that are low by chance. With `FrameStatistics` it is the
+        model of one frame.
     mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
         True = do not use.
     saturation : float, optional
@@ -92,17 +91,18 @@ def calibrate(
         the beam's window; 0 unless given.
     shift_std : float or array_like, shape (n,) or (n, 2), optional
         Standard deviations of `shifts`, in pixels: the shifts are then refined, with this prior.
-        What moves all exposures alike stays as given, and so do all where the beam has no
-        structure that tells them (``metadata["options"]["shifts"]`` says which).
+        A displacement common to all exposures stays as given. All shifts stay as given where the
+        beam has no structure that determines them: ``metadata["options"]["shifts"]`` is "refined",
+        "untold" or "not tried".
     dark : {"subtracted", "fit"}
         Whether the dark is already subtracted, or to be found as an offset of each pixel: for
         exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.
     robust : bool
-        Whether to leave out measurements that disagree with the others, such as of a particle or
-        a reflection that is there in one exposure only: those more than five standard deviations
-        from the fit, or whose 3×3 surroundings are, found in rounds of fitting. The scale is that
-        of the residuals, so variances need be right but for a factor. Needs three exposures. Give
-        variances as a noise model, not as computed from values that a grain has darkened.
+        Whether to leave out measurements that disagree with the others, such as a particle or a
+        reflection in one exposure only. Left out is what is more than five standard deviations
+        from the fit, or whose 3×3 mean is, in rounds of fitting. The scale is that of the
+        residuals, so variances may be wrong by a common factor. At least three exposures. Give
+        variances as a noise model, not computed from values that a grain of dust has darkened.
     method : {"multiscale", "coordinate-descent"}
         How to minimise the objective: by Gauss-Newton steps on all scales at once, in a number of
         passes that does not depend on the size of the sensor; or by the paper's method, which
@@ -111,18 +111,18 @@ def calibrate(
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops; below 1. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Most passes over the data or its weights, but for a few where a step turns out too long;
-        unless given, as many as it takes. It also ends where rounding keeps the error estimate
-        from falling. Passes that only estimate the error
-        of coordinate descent are not counted.
+        Upper limit on passes over the data or its weights; a few more are made where a step is too
+        long. By default there is no limit. The fit also ends where rounding keeps the error
+        estimate from decreasing. Passes that only estimate the error of coordinate descent are not
+        counted.
     uncertainty : bool
-        Whether to find `Calibration.sensitivity_std`, `Calibration.tilt_std` and, of shifts that
-        were refined, `Calibration.shift_std`: what noise leaves uncertain, and what priors on
-        fluxes and shifts do. Takes some ten times as long as the calibration, after a joint fit
-        some hundred times. Without `variance` the scatter of the residuals tells the noise.
+        Whether to compute `Calibration.sensitivity_std`, `Calibration.tilt_std` and, for refined
+        shifts, `Calibration.shift_std`: the effect of noise and of the priors on fluxes and
+        shifts. Takes some ten times as long as the calibration, after a joint fit some hundred
+        times. Without `variance` the noise is that of the residuals.
     workers : int, optional
-        Number of threads; unless given, as many as processors may be used. The result is the
-        same to the last bit.
+        Number of threads; by default as many as processors may be used. It changes no bit of the
+        result.
     progress : callable, optional
         Called as ``progress(done, total, stage)`` now and then; what it raises stops the work.
 
@@ -136,17 +136,16 @@ def calibrate(
     InputError
         If an argument has a wrong shape or value, or an exposure shows no light.
     InsufficientMemoryError
-        If the memory that it takes cannot be had; where the system tells (Linux), before the
-        work starts.
+        If there is not enough memory; on Linux this is checked before the work starts.
 
     Warns
     -----
     ShiftRoundingWarning
         If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
-        If the measurements leave parts of the sensor uncompared or hardly tell some pattern; if
-        free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark can hardly be
-        told from the sensitivity.
+        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if free
+        fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly degenerate
+        with the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
     MisfitWarning
@@ -160,7 +159,7 @@ def calibrate(
     M and the beam L, with weights w = 1/variance, fluxes c and the position u of pixel p in the
     beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
     mean(M) = 1 over valid pixels. With fitted fluxes the mean of ln c is 0; then a tilt of ln M
-    can be told only if exposures are turned against each other (or by `flux_std`, or by `time`):
+    is determined only if exposures are turned against each other, or by `flux_std` or `time`:
     else its least-squares slope over valid pixels is set to 0, and a warning says so.
 
     With shifts between pixels L is a cubic B-spline on the padded grid, with a penalty of 1e-5 of a
@@ -224,56 +223,24 @@ def calibrated(
     """
     started = datetime.now(UTC)
     options.check(exposures)
-    verdicts.say(verdicts.on_plan(exposures))
+    advice = verdicts.on_plan(exposures)
+    verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit.tolerance)
     dark = dark_std(weighted, options.fit)
-    verdicts.say(verdicts.on_fit(weighted, options, test, dark))
-    bars = None
-    if options.uncertainty:
-        unknown = verdicts.on_uncertainty(weighted.fit)
-        verdicts.say([] if unknown is None else [unknown])
-        bars = None if unknown else error_bars(weighted, flags, options.fit)
+    found = verdicts.on_fit(weighted, options, test, dark)
+    verdicts.say(found)
+    wanted = options.uncertainty and all(verdict.kind != "uncertainty" for verdict in found)
+    bars = error_bars(weighted, flags, options.fit) if wanted else None
     metadata = _metadata(weighted, options, started, dark, bars)
-    return _result(weighted, test, flags, bars, metadata | (provenance or {}))
-
-
-def _result(
-    weighted: Weighted,
-    test: SignTest,
-    flags: Array,
-    bars: ErrorBars | None,
-    metadata: dict[str, Any],
-) -> Calibration:
-    exposures, fit, rejected = weighted
-    dtype = exposures.values.dtype
-    return Calibration(
-        sensitivity=fit.sensitivity.astype(dtype, copy=False),
-        beam=fit.beam.values,
-        beam_origin=fit.beam.origin,
-        beam_coefficients=fit.beam.coefficients,
+    return Calibration.of(
+        weighted,
         flags=flags,
-        shifts=np.array(fit.shifts, dtype=np.float64),
-        rotation=exposures.positions.rotation,
-        flux=np.array(fit.flux),
-        objective=fit.misfit,
-        reduced_chi2=weighted.reduced_chi2,
-        components=fit.components,
-        component_labels=fit.component_labels,
-        sweeps=int(fit.sweeps[-1]),
-        converged=fit.ended == "converged",
-        error_estimate=float(fit.error_estimate[-1]),
-        history=History(fit.sweeps, fit.objective, fit.error_estimate),
-        dark=exposures.dark if fit.offset is None else fit.offset.astype(dtype, copy=False),
-        dark_is_fitted=exposures.offset,
-        metadata=metadata,
-        sensitivity_std=None if bars is None else bars.sensitivity,
-        tilt_std=None if bars is None else bars.tilt,
-        shift_std=None if bars is None else bars.shifts,
-        weighted=weighted,
-        rejected=rejected,
-        shift_sign=test.sign,
+        sign=test.sign,
+        verdicts=(*advice, *found),
+        bars=bars,
+        metadata=metadata | (provenance or {}),
     )
 
 

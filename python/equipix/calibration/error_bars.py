@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from equipix.maps import tilt_weights
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from equipix._native import Fit
     from equipix._types import Array, Bools, Floats, Progress
     from equipix.calibration.weights import Weighted
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.options import FitOptions
 
 
@@ -63,15 +63,12 @@ def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBa
             workers=options.workers,
             progress=options.progress,
         )
-    tilt = np.full(2, np.inf if fit.leaves_tilt else np.nan)
-    if answer.variances is not None:
-        tilt = scale * np.sqrt(answer.variances)
-    shifts = exposures.positions.std
-    if answer.shift_variances is not None:
-        shifts = scale * np.sqrt(answer.shift_variances)
+    std = scale * cast("Floats", answer.std)
+    tilt = _std(scale, answer.variances) if asks_tilt else None
+    shifts = _std(scale, answer.shift_variances) if refined else exposures.positions.std
     return ErrorBars(
-        sensitivity=(scale * answer.std).astype(exposures.values.dtype, copy=False),
-        tilt=tilt,
+        sensitivity=np.asarray(std, exposures.values.dtype),
+        tilt=np.full(2, np.inf if fit.leaves_tilt else np.nan) if tilt is None else tilt,
         shifts=shifts,
         exactness={"draws": answer.draws, "relative_standard_error": answer.exactness},
     )
@@ -93,7 +90,7 @@ def dark_std(weighted: Weighted, options: FitOptions) -> DarkStd | None:
             workers=options.workers,
             progress=None,
         )
-    along, alone = (float(std) for std in noise_scale(weighted) * np.sqrt(answer.offset_variances))
+    along, alone = _std(noise_scale(weighted), answer.offset_variances).tolist()
     return DarkStd(along if fit.ended == "converged" else None, alone)
 
 
@@ -108,8 +105,8 @@ def noise_scale(weighted: Weighted) -> float:
     variance = weighted.noise_variance
     if not np.isfinite(variance):
         raise InputError(
-            "'variance' is None and no residual tells the noise, since there are no more "
-            "measurements than unknowns: give the variance of the values"
+            "'variance' is None and the residuals do not determine the noise, since there are no "
+            "more measurements than unknowns: give the variance of the values"
         )
     return float(np.sqrt(variance))
 
@@ -117,7 +114,12 @@ def noise_scale(weighted: Weighted) -> float:
 def of_logarithm(weights: Floats, fit: Fit) -> Floats:
     """Weights g of M whose sums vary as those of ln M with `weights`: g = w/M."""
     none = np.zeros(weights.shape)
-    return np.divide(weights, fit.sensitivity, where=weights != 0, out=none)
+    return np.asarray(np.divide(weights, fit.sensitivity, where=weights != 0, out=none))
+
+
+def _std(scale: float, variances: ArrayLike | None) -> Floats:
+    """Standard deviations of variances that were asked for."""
+    return np.asarray(scale * np.sqrt(np.asarray(cast("ArrayLike", variances))))
 
 
 def functional_std(
@@ -142,7 +144,7 @@ def functional_std(
             workers=positive_workers(workers),
             progress=progress,
         )
-    return np.asarray(scale * np.sqrt(answer.variances))
+    return _std(scale, answer.variances)
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
     """Bits of `equipix.Flag` of each pixel, shape (rows, cols), uint32.
 
-    They tell what the solver left undetermined, what was odd before the fit, whose response is
-    odd, and whose measurements contradict each other.
+    Flagged is what the solver left undetermined, what was odd before the fit, an odd response, and
+    a pixel whose measurements contradict each other.
     """
     exposures, fit, rejected = weighted
     flags: Array = fit.flags.copy()
@@ -36,6 +36,6 @@ def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
 
 def _std(weighted: Weighted, pixels: Array) -> Array:
     """Standard deviation of M in pixels by flat indices, that of the beam left out: 1/√D."""
-    information = weighted.fit.information().flat[pixels]
+    information = weighted.fit.information(workers=None).flat[pixels]
     with np.errstate(divide="ignore"):
         return np.asarray(1 / np.sqrt(information / weighted.noise_variance))

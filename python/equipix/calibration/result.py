@@ -8,49 +8,30 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix._check import check_count, check_progress, per_exposure
+from equipix._native import Beam
 from equipix.calibration.error_bars import checked_weights, functional_std
+from equipix.calibration.history import History
+from equipix.calibration.saved import read_fields, save_fields
+from equipix.calibration.verdicts import Verdict
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
-from equipix.exposures.compiled import Beam
 from equipix.exposures.front import measured_of
 from equipix.exposures.positions import Positions
 from equipix.flags import determined, usable
-from equipix.io import save_pages
 from equipix.maps import tilt
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from os import PathLike
+    from typing import Self
 
     from numpy.typing import ArrayLike, NDArray
 
     from equipix._types import Flagged, Progress, ShiftSign
+    from equipix.calibration.error_bars import ErrorBars
     from equipix.calibration.weights import Weighted
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
-
-FORMAT = 1
-"""Number of the file format; a file with a higher one is refused."""
-
-
-@dataclass(frozen=True, eq=False)
-class History:
-    """How a calibration went, at some moments on its way.
-
-    Attributes
-    ----------
-    sweep : ndarray, shape (looks,), uint64
-        How many sweeps had been made.
-    objective : ndarray, shape (looks,), float64
-        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
-        and while such a fit still finds their weights.
-    error_estimate : ndarray, shape (looks,), float64
-        The estimated largest relative error of the sensitivity.
-    """
-
-    sweep: NDArray[Any]
-    objective: NDArray[Any]
-    error_estimate: NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,10 +53,9 @@ class Calibration:
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
         neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
-        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. What the
-        measurements do not determine is ``NO_FLAT_FIELD | DO_NOT_USE``, what they contradict
-        each other about, so that a robust calibration left out most of them,
-        ``UNRELIABLE_FLAT | DO_NOT_USE``.
+        DO_NOT_USE``; their sensitivity is the median of a block of 16×16 pixels. An undetermined
+        pixel is ``NO_FLAT_FIELD | DO_NOT_USE``, one most of whose measurements a robust
+        calibration left out ``UNRELIABLE_FLAT | DO_NOT_USE``.
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) that were used, in pixels.
     rotation : ndarray, shape (n,), int64
@@ -112,7 +92,7 @@ class Calibration:
         variance was known, else "variances"); under ``uncertainty`` the draws that
         `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
         was fitted together with fluxes, the standard deviation of b in its error b·M, which
-        they hardly tell, and what the noise of its own measurements leaves of a pixel.
+        with which it is nearly degenerate, and that of a pixel by the noise of its own values.
     sensitivity_std : ndarray, shape (rows, cols), or None
         Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
         uncertain, large scales included, in the gauge mean 1, and slope 0 where free fluxes leave
@@ -128,10 +108,12 @@ class Calibration:
     weighted : Weighted or None
         The exposures with their weights and the fit, for `std_of`; None if read from a file or
         unpickled.
+    verdicts : tuple of Verdict
+        What one must know of the result: what `calibrate` warned of.
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
-        Whether the data confirm the sign of the shifts, contradict it, or do not tell it, as those
+        Whether the data confirm the sign of the shifts, contradict it, or do neither, as those
         of a Gaussian beam, whatever its width; see `calibrate`.
     """
 
@@ -160,6 +142,50 @@ class Calibration:
     weighted: Weighted | None = field(default=None, compare=False)
     rejected: NDArray[np.bool_] | None = None
     shift_sign: ShiftSign = "undetermined"
+    verdicts: tuple[Verdict, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        weighted: Weighted,
+        *,
+        flags: NDArray[Any],
+        sign: ShiftSign,
+        verdicts: tuple[Verdict, ...],
+        bars: ErrorBars | None,
+        metadata: dict[str, Any],
+    ) -> Self:
+        """Make the result of a fit and what was found out about it."""
+        exposures, fit, rejected = weighted
+        dtype = exposures.values.dtype
+        return cls(
+            sensitivity=fit.sensitivity.astype(dtype, copy=False),
+            beam=fit.beam.values,
+            beam_origin=fit.beam.origin,
+            beam_coefficients=fit.beam.coefficients,
+            flags=flags,
+            shifts=np.array(fit.shifts, dtype=np.float64),
+            rotation=exposures.positions.rotation,
+            flux=np.array(fit.flux),
+            objective=fit.misfit,
+            reduced_chi2=weighted.reduced_chi2,
+            components=fit.components,
+            component_labels=fit.component_labels,
+            sweeps=int(fit.sweeps[-1]),
+            converged=fit.ended == "converged",
+            error_estimate=float(fit.error_estimate[-1]),
+            history=History(fit.sweeps, fit.objective, fit.error_estimate),
+            dark=exposures.dark if fit.offset is None else fit.offset.astype(dtype, copy=False),
+            dark_is_fitted=exposures.offset,
+            metadata=metadata,
+            sensitivity_std=None if bars is None else bars.sensitivity,
+            tilt_std=None if bars is None else bars.tilt,
+            shift_std=None if bars is None else bars.shifts,
+            weighted=weighted,
+            rejected=rejected,
+            shift_sign=sign,
+            verdicts=verdicts,
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -181,7 +207,7 @@ class Calibration:
     def tilt(self) -> NDArray[Any]:
         """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
 
-        Valid are pixels without ``DO_NOT_USE``; NaN where they tell no slope.
+        Valid are pixels without ``DO_NOT_USE``; NaN where they determine no slope.
         """
         valid = usable(self.flags) & determined(self.sensitivity, self.flags)
         return tilt(self.sensitivity, valid)
@@ -219,7 +245,7 @@ class Calibration:
         ------
         InputError
             If this calibration was read from a file, which holds no measurements; if the weights
-            do not fit; or if no variance was given and no residual tells it.
+            do not fit; or if no variance was given and the residuals do not determine it.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 
@@ -301,6 +327,19 @@ class Calibration:
         return apply_gain(
             frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
         )
+
+    @property
+    def coefficients(self) -> NDArray[Any]:
+        """Coefficients of the corrected frame Σ c_j y^j, shape (2, rows, cols).
+
+        c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
+        Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
+            gain = 1 / self.sensitivity
+            offset = np.zeros_like(gain) if self.dark is None else -self.dark * gain
+        offset[np.isnan(gain)] = np.nan
+        return np.stack([offset, gain]).astype(self.sensitivity.dtype)
 
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).
@@ -423,7 +462,7 @@ class Calibration:
         for (row, col), turn, c in zip(
             positions.shifts.tolist(), positions.rotation.tolist(), fluxes, strict=True
         ):
-            frame = c * beam.light(self.shape, (row, col), turn) * self.sensitivity
+            frame = c * beam.light(self.shape, (row, col), turn, workers=None) * self.sensitivity
             frames.append(frame.astype(self.sensitivity.dtype))
         return frames
 
@@ -448,43 +487,13 @@ class Calibration:
         InputError
             If the suffix is unknown.
         """
-        pages = {
-            "sensitivity": self.sensitivity,
-            "flags": self.flags,
-            "beam": self.beam,
-            "component_labels": self.component_labels,
-        }
-        if self.dark is not None:
-            pages["dark"] = self.dark
-        if self.sensitivity_std is not None:
-            pages["sensitivity_std"] = self.sensitivity_std
-        if self.rejected is not None:
-            pages["rejected"] = self.rejected.reshape(-1, self.shape[1]).astype(np.uint8)
-        numbers = {
-            "beam_origin": list(self.beam_origin),
-            "shifts": self.shifts.tolist(),
-            "flux": self.flux.tolist(),
-            "objective": self.objective,
-            "reduced_chi2": self.reduced_chi2 if np.isfinite(self.reduced_chi2) else None,
-            "components": self.components,
-            "sweeps": self.sweeps,
-            "converged": self.converged,
-            "error_estimate": self.error_estimate,
-            "shift_sign": self.shift_sign,
-            "tilt_std": None
-            if self.tilt_std is None
-            else [std if np.isfinite(std) else str(std) for std in self.tilt_std.tolist()],
-            "shift_std": None if self.shift_std is None else self.shift_std.tolist(),
-            "history": {
-                "sweep": self.history.sweep.tolist(),
-                "objective": self.history.objective.tolist(),
-                "error_estimate": self.history.error_estimate.tolist(),
-            },
-        }
-        content = {
-            "format": FORMAT,
-            "kind": "calibration",
-            "calibration": numbers,
-            "metadata": self.metadata,
-        }
-        save_pages(path, pages, content, force=force)
+        save_fields(path, vars(self), force=force)
+
+
+def read_calibration(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> Calibration:
+    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
+    fields = read_fields(path, pages, content)
+    verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
+    return Calibration(**{**fields, "history": History(**fields["history"]), "verdicts": verdicts})

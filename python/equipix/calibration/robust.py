@@ -9,8 +9,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from equipix._native import Fit
     from equipix._types import Array, Bools
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
 
 _BEYOND = 5.0

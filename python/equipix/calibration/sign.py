@@ -11,8 +11,8 @@ from equipix.errors import InputError, InsufficientMemoryError
 from equipix.exposures.options import FitOptions
 
 if TYPE_CHECKING:
+    from equipix._native import Fit
     from equipix._types import Array, Bools, Progress, ShiftSign
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
 
 _MOST_EXPOSURES = 12

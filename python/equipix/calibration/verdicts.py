@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.drift import trend_told
 from equipix.errors import (
     ConvergenceWarning,
     EquipixWarning,
@@ -19,11 +20,11 @@ from equipix.errors import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from equipix._native import Fit
     from equipix.calibration.error_bars import DarkStd
     from equipix.calibration.options import Options
     from equipix.calibration.sign import SignTest
     from equipix.calibration.weights import Weighted
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
 
 _UNDETERMINED = 1e-4
@@ -36,8 +37,8 @@ _MISFIT = 4.0
 _NOT_FOUND = 0.1
 """A joint fit that ends with so large an error of M has no errors that noise would make."""
 
-_HARDLY_TOLD = 0.1
-"""A share of a trend's variance that leaves its error three times larger."""
+_DEGENERATE = 0.1
+"""A share of a drift's variance below which the error of its size is over three times larger."""
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "order": IdentifiabilityWarning,
@@ -80,15 +81,13 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
         return []
-    affine = np.column_stack([np.ones(len(positions)), positions.shifts])
-    left = times - affine @ np.linalg.lstsq(affine, times)[0]
-    share = float(np.sum(left**2) / np.sum((times - times.mean()) ** 2))
-    if share >= _HARDLY_TOLD:
+    share = trend_told(positions.shifts, times)
+    if share >= _DEGENERATE:
         return []
     text = (
-        f"of a drift linear in time only {share:.1%} of the variance can be told from a tilt "
-        "of the sensitivity in this order of exposures: take another "
-        "(equipix.plan.advise_order)"
+        f"in this order of exposures only {share:.1%} of the variance of a drift linear in time is "
+        f"distinguishable from a tilt of the sensitivity (limit {_DEGENERATE:.0%}): take the "
+        "exposures in another order, see equipix.plan.advise_order"
     )
     return [Verdict("order", text)]
 
@@ -105,19 +104,20 @@ def on_fit(
         _on_dark(weighted.fit, options, dark),
         _on_misfit(weighted),
         _on_convergence(weighted.fit, options),
+        _on_uncertainty(weighted.fit, options),
     ]
     return [verdict for verdict in found if verdict is not None]
 
 
-def on_uncertainty(fit: Fit) -> Verdict | None:
-    """Judge whether the fit is near enough to its minimum for standard deviations."""
+def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
+    """Judge whether the fit is near enough to its minimum for the standard deviations asked for."""
     error = float(fit.error_estimate[-1])
-    if not fit.is_joint or error <= _NOT_FOUND:
+    if not options.uncertainty or not fit.is_joint or error <= _NOT_FOUND:
         return None
     return Verdict(
         "uncertainty",
-        f"no standard deviations: with an estimated error of {error:.1e} "
-        "the sensitivity is not found",
+        "no standard deviations: the fit is too far from its minimum (estimated error "
+        f"{error:.1e}, limit {_NOT_FOUND:g})",
     )
 
 
@@ -126,10 +126,10 @@ def _on_sign(test: SignTest) -> Verdict | None:
         return None
     return Verdict(
         "sign",
-        "the data contradict the sign of the shifts: reversed, with free fluxes, they leave "
-        f"{1 / test.ratio:.2g} times the squared residuals; a shift grows when the "
-        "sensor moves towards larger rows and columns: give 'shifts' of the other sign, or "
-        "exchange the images of the aperture before and after the moves",
+        "the data contradict the sign of the shifts: with all shifts reversed and free fluxes the "
+        f"squared residuals are {1 / test.ratio:.2g} times as large. A shift grows when the sensor "
+        "moves towards larger rows and columns: give 'shifts' with the other sign, or exchange the "
+        "aperture images before and after the moves",
     )
 
 
@@ -139,8 +139,9 @@ def _on_components(fit: Fit) -> Verdict | None:
     left = int(np.count_nonzero(fit.component_labels > 0))
     return Verdict(
         "components",
-        f"the measurements leave {fit.components} parts of the sensor uncompared: "
-        f"{left} pixels outside the largest part are NaN; choose other shifts",
+        f"the shifts leave {fit.components} parts of the sensor unconnected: the sensitivity of "
+        f"{left} pixels outside the largest part is undetermined (NaN): choose other shifts, see "
+        "equipix.plan.identify",
     )
 
 
@@ -149,8 +150,9 @@ def _on_patterns(fit: Fit) -> Verdict | None:
         return None
     return Verdict(
         "pattern",
-        f"the measurements hardly tell some pattern of the sensitivity (smallest Ritz value "
-        f"{fit.smallest_ritz:.1e}, below {_UNDETERMINED:g}): choose other shifts",
+        "the shifts barely constrain a spatial pattern of the sensitivity (smallest Ritz value "
+        f"{fit.smallest_ritz:.1e}, limit {_UNDETERMINED:g}): choose less regular shifts, see "
+        "equipix.plan.error_budget",
     )
 
 
@@ -159,7 +161,7 @@ def _on_tilt(fit: Fit) -> Verdict | None:
         return None
     return Verdict(
         "tilt",
-        "free fluxes leave a tilt of the sensitivity undetermined: its slope is set to 0; turn "
+        "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: turn "
         "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp",
     )
 
@@ -170,16 +172,16 @@ def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None
     along, alone = dark.along_sensitivity, dark.of_a_pixel
     limited = fit.ended == "sweeps used" and options.fit.max_sweeps is not None
     if along is not None and alone is not None and along > alone:
-        told = f"has the standard deviation {along:.1e}, where noise leaves a pixel {alone:.1e}"
+        known = f"its standard deviation is {along:.1e}, that of a pixel by noise {alone:.1e}"
     elif fit.ended != "converged" and not limited:
-        told = "is not told at all"
+        known = "the fit did not determine it"
     else:
         return None
     return Verdict(
         "dark",
-        "offset and gain can hardly be told apart: with fitted fluxes the dark may hold "
-        f"any multiple b of the sensitivity, and b {told}; give the ratio of the levels as "
-        "'flux', or take larger shifts in a beam that varies more",
+        "the fitted dark is nearly degenerate with the sensitivity: with fitted fluxes it may "
+        f"contain any multiple b of the sensitivity, and {known}: give the ratio of the levels as "
+        "'flux', or use larger shifts in a beam with more structure",
     )
 
 
@@ -190,20 +192,24 @@ def _on_misfit(weighted: Weighted) -> Verdict | None:
         return None
     return Verdict(
         "misfit",
-        f"residuals are {chi2**0.5:.1f} times what the variances say: are "
-        "the shifts right, and their sign? does the lamp drift (flux='fit')? is there dust "
-        "(robust=True)?",
+        f"the residuals are {chi2**0.5:.1f} times as large as the variances predict (limit "
+        f"{_MISFIT**0.5:g}): check the shifts and their sign; if the lamp drifts use flux='fit', "
+        "if there is dust use robust=True",
     )
 
 
 def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
     if fit.ended == "converged":
         return None
-    stuck = "it falls no further: ask for a larger one, or mask pixels that light hardly reaches"
-    remedy = "allow more sweeps" if fit.ended == "sweeps used" else stuck
+    remedy = ": allow more sweeps"
+    if fit.ended != "sweeps used":
+        remedy = (
+            ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
+            "almost no light"
+        )
     return Verdict(
         "convergence",
-        f"stopped after {int(fit.sweeps[-1])} sweeps with an estimated error of "
-        f"{float(fit.error_estimate[-1]):.1e}, above the tolerance {options.fit.tolerance:g}: "
+        f"not converged after {int(fit.sweeps[-1])} sweeps: the estimated error is "
+        f"{float(fit.error_estimate[-1]):.1e}, above the tolerance {options.fit.tolerance:g}"
         f"{remedy}",
     )

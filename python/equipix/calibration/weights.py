@@ -13,9 +13,9 @@ from equipix.noise import modelled_variances
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from equipix._native import Fit
     from equipix._types import Array, Bools
     from equipix.calibration.options import Options
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 
@@ -89,7 +89,7 @@ def _at_medians(exposures: Exposures) -> Iterator[Array]:
 
 
 def expected(exposures: Exposures, fit: Fit) -> Iterator[Array]:
-    """Signals c · L · M; where the fit knows none, outside the largest part, the medians."""
+    """Signals c · L · M; the medians where the fit determines none."""
     for k, flux in enumerate(exposures.flux.values):
         signal = exposures.light(fit, k) * fit.sensitivity
         yield np.where(np.isfinite(signal), signal, flux * exposures.medians)

@@ -9,13 +9,10 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
 from equipix.errors import FileError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     Report = Callable[[int, int, str], None]
@@ -30,6 +27,16 @@ def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
     if not sys.stderr.isatty():
         yield _Announcer() if announce else None
         return
+    # Imported where bars are drawn: it takes as long as the rest of `equipix --help`.
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     console = Console(stderr=True)
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bars:
@@ -74,6 +81,18 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
     width = max(map(len, result))
     for name, value in result.items():
         print(f"{name.replace('_', ' '):<{width}}  {_words(value)}")  # noqa: T201
+
+
+def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
+    """Print rows of words in columns under titles."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*titles, box=SIMPLE_HEAD)
+    for row in rows:
+        table.add_row(*row)
+    Console(soft_wrap=True).print(table)
 
 
 def check_output(

@@ -1,4 +1,4 @@
-"""Frames corrected by maps of offset and gain."""
+"""Frames corrected one by one by a formula, and what becomes of flagged pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,60 @@ from equipix.flags import Flag
 from equipix.frames import FrameStatistics
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import ArrayLike, NDArray
+
+
+def apply(
+    frames: ArrayLike,
+    formula: Callable[[NDArray[Any], NDArray[Any]], object],
+    *,
+    flags: NDArray[Any],
+    flagged: Flagged,
+    out: NDArray[Any] | None,
+) -> NDArray[Any]:
+    """Correct frames by a formula, and do with flagged pixels what `flagged` says.
+
+    Parameters
+    ----------
+    frames : array_like, shape (rows, cols) or (n, rows, cols)
+        Raw frames, in DN.
+    formula : callable
+        ``formula(frame, corrected)`` writes a corrected frame of shape (rows, cols) to its second
+        argument, a float32 or float64 array.
+    flags : ndarray, shape (rows, cols)
+        Bits of `Flag` per pixel.
+    flagged : {"nan", "keep", "replace"}
+        What becomes of pixels flagged ``DO_NOT_USE``.
+    out : ndarray or None
+        Array for the result, of the frames' shape, float32 or float64.
+
+    Returns
+    -------
+    ndarray, of the frames' shape
+        Of dtype float64 for float64 frames, else float32; or `out`.
+
+    Raises
+    ------
+    InputError
+        If a shape does not fit, or `flagged` is unknown.
+    """
+    raw = as_array("frames", frames, ndim=(2, 3))
+    if raw.shape[-2:] != flags.shape:
+        raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
+    if flagged not in get_args(Flagged):
+        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
+    dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
+    result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
+    bad = (flags & Flag.DO_NOT_USE) != 0
+    for source, target in zip(_each(raw), _each(result), strict=True):
+        formula(source, target)
+        if flagged == "nan":
+            target[bad] = np.nan
+        elif flagged == "replace":
+            replace_bad(target, bad)
+    return result
 
 
 def apply_gain(
@@ -29,28 +82,18 @@ def apply_gain(
 
     The parameters are those of `equipix.Calibration.correct`.
     """
-    raw = as_array("frames", frames, ndim=(2, 3))
-    if raw.shape[-2:] != gain.shape:
-        raise InputError(f"'frames' has shape {raw.shape}, the sensor {gain.shape}")
-    if flagged not in get_args(Flagged):
-        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
-    dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
     if isinstance(dark, FrameStatistics):
         dark = dark.mean
-    offset = np.zeros((), dtype) if dark is None else as_array("dark", dark, ndim=2)
+    offset = np.zeros((), np.float32) if dark is None else as_array("dark", dark, ndim=2)
     if dark is not None and offset.shape != gain.shape:
         raise InputError(f"'dark' has shape {offset.shape}, the sensor {gain.shape}")
-    result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
-    bad = (flags & Flag.DO_NOT_USE) != 0
-    for source, target in zip(_each(raw), _each(result), strict=True):
-        np.subtract(source, offset, out=target, dtype=target.dtype, casting="same_kind")
+
+    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
+        np.subtract(frame, offset, out=corrected, dtype=corrected.dtype, casting="same_kind")
         with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
-            np.divide(target, gain, out=target, casting="same_kind")
-        if flagged == "nan":
-            target[bad] = np.nan
-        elif flagged == "replace":
-            replace_bad(target, bad)
-    return result
+            np.divide(corrected, gain, out=corrected, casting="same_kind")
+
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
 
 
 def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> None:

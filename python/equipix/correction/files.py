@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,12 +23,13 @@ from equipix.io import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
+    from typing import TypeGuard
 
     from numpy.typing import NDArray
 
-    from equipix.correction.protocol import Correction
+    from equipix.correction.protocol import Correction, DarkCorrection
 
 
 _MARK = "corrected by equipix"
@@ -56,7 +58,8 @@ def correct_files(
         A name that ends in .tif: one file of all frames. Another: a folder to make, with a TIFF
         for each input file.
     dark : str
-        "stored", "none", a file or glob of dark frames, or one of their saved statistics.
+        "stored", "none", a file or glob of dark frames, or one of their saved statistics. Only a
+        correction that subtracts a dark frame takes another than "stored".
     flagged : {"nan", "keep", "replace"}
         What becomes of flagged pixels.
     force : bool
@@ -75,7 +78,7 @@ def correct_files(
         If a file cannot be read or written, two outputs would have the same name, or one would
         replace an input.
     InputError
-        If the frames have another shape than the correction.
+        If the frames have another shape than the correction, or it takes no other dark frame.
 
     Warns
     -----
@@ -87,13 +90,13 @@ def correct_files(
     refuse_inputs(outputs, files)
     counts = {file: _count(file, correction) for file in files}
     _warn_of_corrected(files)
-    level = _dark_frame(dark)
+    correct = _with_dark(correction, dark)
     total, done = sum(counts.values()), 0
 
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
         nonlocal done
         for _, frames in stream_frames(inputs):
-            yield from correction.correct(frames, dark=level, flagged=flagged)
+            yield from correct(frames, flagged=flagged)
             done += len(frames)
             if progress is not None:
                 progress(done, total, "correcting")
@@ -151,13 +154,26 @@ def _count(file: Path, correction: Correction) -> int:
     return count
 
 
-def _dark_frame(dark: str) -> Literal["stored"] | NDArray[Any] | None:
+def _with_dark(correction: Correction, dark: str) -> Callable[..., NDArray[Any]]:
+    """Give the method that corrects frames, with this dark frame in place of that stored."""
     if dark == "stored":
-        return "stored"
-    if dark == "none":
-        return None
+        return correction.correct
+    if not _takes_dark(correction):
+        raise InputError(
+            f"'dark' is '{dark}', but the offsets of this correction are part of it and no dark "
+            "frame can take their place: expected 'stored'"
+        )
+    return partial(correction.correct, dark=None if dark == "none" else _dark_frame(dark))
+
+
+def _takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
+    return hasattr(correction, "dark")
+
+
+def _dark_frame(source: str) -> NDArray[Any]:
+    """Read the mean of dark frames, averaged already or not."""
     try:
-        mean = load_statistics(dark).mean
+        mean = load_statistics(source).mean
     except (FileError, InputError):  # not averaged yet
-        mean = average(dark).mean
+        mean = average(source).mean
     return mean.astype(np.float32)

@@ -29,6 +29,33 @@ class Correction(Protocol):
     def metadata(self) -> dict[str, Any]:
         """Versions, options and origin, as JSON values."""
 
+    @property
+    def coefficients(self) -> NDArray[Any]:
+        """Coefficients c of the corrected frame Σ c_j y^j, shape (order + 1, rows, cols).
+
+        y is the raw frame in DN. NaN in a pixel that the correction does not determine.
+        """
+
+    def correct(
+        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: NDArray[Any] | None = None
+    ) -> NDArray[Any]:
+        """Frames as a sensor of equal pixels would have given them.
+
+        Of the frames' shape, (rows, cols) or (n, rows, cols); float64 for float64 frames, else
+        float32; or in `out`. Pixels flagged ``DO_NOT_USE`` become what `flagged` says.
+        """
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads; its suffix names the format."""
+
+
+class DarkCorrection(Correction, Protocol):
+    """A correction that subtracts a dark frame, in whose place another may be given."""
+
+    @property
+    def dark(self) -> NDArray[Any] | None:
+        """The dark frame in DN, shape (rows, cols), if it is part of the correction."""
+
     def correct(
         self,
         frames: ArrayLike,
@@ -37,7 +64,4 @@ class Correction(Protocol):
         flagged: Flagged = "nan",
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
-        """Frames as a sensor of equal pixels would have given them."""
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file whose suffix names the format."""
+        """Frames as `Correction.correct` gives them, after `dark` is subtracted."""

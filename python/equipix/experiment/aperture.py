@@ -34,7 +34,7 @@ and pixels of relative spread s, here that of a uniform ±5 % as it is usual bef
 
 @dataclass(frozen=True, eq=False)
 class Equalisation:
-    """What a first calibration tells of the pixels under a spot.
+    """What a first fit determines of the pixels under a spot.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Equalisation:
             )
         good = usable(pixel_flags(weighted, tolerance))
         count = len(exposures)
-        known = fit.information() * np.square(fit.sensitivity)
+        known = fit.information(workers=None) * np.square(fit.sensitivity)
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = weighted.noise_variance * count / max(count - 2, 1) / known
         gain = np.where(good, fit.sensitivity, 1).astype(exposures.values.dtype)

@@ -213,8 +213,8 @@ class Experiment:
         Notes
         -----
         Shifts with a standard error are refined, with it as their prior: see `calibrate`. Those
-        that images of an aperture tell are measured twice, the second time on images corrected by
-        a first calibration.
+        measured from images of an aperture are measured twice, the second time on images corrected
+        by a first calibration.
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)

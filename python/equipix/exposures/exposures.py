@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix import _native
 from equipix._check import naming_memory
 from equipix.defects import Findings
-from equipix.exposures.compiled import Exposures as Compiled
 
 if TYPE_CHECKING:
     from typing import Self
 
     from numpy.typing import NDArray
 
+    from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
-    from equipix.exposures.compiled import Fit
     from equipix.exposures.flux import Flux
     from equipix.exposures.options import FitOptions
     from equipix.exposures.positions import Positions
@@ -152,7 +152,8 @@ class Exposures:
         """Return c · L(u) on each pixel in an exposure; NaN where the beam was not observed."""
         row, col = fit.shifts[exposure]
         turn = int(self.positions.rotation[exposure])
-        return fit.flux[exposure] * fit.beam.light(self.shape, (row, col), turn)
+        light = fit.beam.light(self.shape, (row, col), turn, workers=None)
+        return np.asarray(fit.flux[exposure] * light)
 
     def residuals(self, fit: Fit) -> Floats:
         """Return y − c · L(u) · M(p) − O(p), (n, rows, cols); NaN where nothing is predicted."""
@@ -183,8 +184,8 @@ class Exposures:
         row, col = np.array(fit.beam.origin) + (floor + np.rint(shift - floor)).astype(int)
         return np.rot90(grid[row : row + rows, col : col + cols], turn // 90)
 
-    def _compiled(self, options: FitOptions) -> Compiled:
-        return Compiled(
+    def _compiled(self, options: FitOptions) -> _native.Exposures:
+        return _native.Exposures(
             self.values,
             self.positions.shifts,
             shift_std=self.positions.std,

@@ -100,7 +100,7 @@ def _of_averaged(
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
     saturation: float | None,
 ) -> Measured:
-    """Averaged frames: their noise model, or what the caller knows of it."""
+    """Averaged frames: their noise model, or the variances that the caller gives."""
     if saturation is not None:
         raise InputError(
             "'saturation' is for arrays, but 'frames' are averages: their saturated samples are "

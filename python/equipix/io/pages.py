@@ -36,7 +36,8 @@ def save_pages(
     path : path
         Output; its suffix names the format.
     pages : mapping of str to ndarray
-        Arrays by name, each kept in its own dtype; of shape (rows, cols) in a TIFF.
+        Arrays by name, each kept in its own dtype: of shape (rows, cols), or a stack of shape
+        (n, rows, cols), whose images are pages of their own in a TIFF.
     metadata : mapping
         JSON values; in a TIFF they are the first page's description.
     force : bool, optional
@@ -47,16 +48,16 @@ def save_pages(
     FileError
         If the file exists and `force` is not set, or cannot be written.
     InputError
-        If the suffix is unknown or a page is not an array of numbers in two dimensions.
+        If the suffix is unknown or a page is not an array of numbers in two or three dimensions.
     """
     write = _WRITERS.get(as_path("path", path).suffix.lower())
     if write is None:
         raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
     for name, array in pages.items():
-        if array.ndim != 2 or array.dtype.kind not in "iuf":
+        if array.ndim not in (2, 3) or array.dtype.kind not in "iuf" or array.size == 0:
             raise InputError(
                 f"page '{name}' is {array.dtype} of shape {array.shape}, expected numbers in two"
-                " dimensions"
+                " dimensions or a stack of such images"
             )
     description = json.dumps(dict(metadata))
     with write_whole(path, force=force) as temporary:
@@ -124,7 +125,10 @@ def check_format(path: str | PathLike[str], content: object, kind: str, newest: 
 
 
 def check_pages(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], wanted: Mapping[str, type]
+    path: str | PathLike[str],
+    pages: Mapping[str, NDArray[Any]],
+    wanted: Mapping[str, type],
+    stacks: Mapping[str, type] | None = None,
 ) -> None:
     """Refuse pages that lack one of those wanted, or are not all maps of one sensor.
 
@@ -135,23 +139,25 @@ def check_pages(
     pages : mapping of str to ndarray
         Arrays by name.
     wanted : mapping of str to type
-        Dtype, or kind of dtype, of each page that must be there.
+        Dtype, or kind of dtype, of each page of shape (rows, cols) that must be there.
+    stacks : mapping of str to type, optional
+        The same of pages of shape (n, rows, cols).
 
     Raises
     ------
     FileError
         If a page is missing, or has another dtype, rank or shape.
     """
-    shape = None
-    for name, dtype in wanted.items():
+    first = next(iter(wanted))
+    for name, dtype in {**wanted, **(stacks or {})}.items():
         if name not in pages:
             raise FileError(f"{path}: is damaged: lacks the page '{name}'")
-        page = pages[name]
-        shape = shape or page.shape
-        if page.ndim != 2 or page.shape != shape or not np.issubdtype(page.dtype, dtype):
+        page, (ndim, word) = pages[name], (2, "two") if name in wanted else (3, "three")
+        fits = page.ndim == ndim and page.shape[-2:] == pages[first].shape
+        if not (fits and np.issubdtype(page.dtype, dtype)):
             raise FileError(
                 f"{path}: is damaged: page '{name}' is {page.dtype} of shape {page.shape},"
-                f" expected {dtype.__name__} in two dimensions, as large as '{next(iter(wanted))}'"
+                f" expected {dtype.__name__} in {word} dimensions, as large as '{first}'"
             )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tifffile
 
 from equipix.errors import FileError
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
     from os import PathLike
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
 _PAGE_NAME = 285  # TIFF tag
+_PAGE_NUMBER = 297  # TIFF tag: number from 0, and how many there are
 _SUBFILE_TYPE = 255  # TIFF tag
 _PHOTOMETRIC = 262  # TIFF tag
 _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
@@ -103,18 +104,25 @@ def write_frames(
 
 
 def write_pages(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
-    """Write named arrays as pages, with a description of the first."""
+    """Write named arrays as pages, with a description of the first.
+
+    The images of a stack have the stack's name and are numbered; a single image has no number.
+    """
     big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
     with tifffile.TiffWriter(path, bigtiff=big) as file:
         for name, array in pages.items():
-            file.write(
-                array,
-                photometric="minisblack",
-                metadata=None,
-                description=description,
-                extratags=[(_PAGE_NAME, "s", 0, name, True)],
-            )
-            description = ""
+            named = (_PAGE_NAME, "s", 0, name, True)
+            images = [array] if array.ndim == 2 else array
+            for number, image in enumerate(images):
+                numbered = (_PAGE_NUMBER, "H", 2, (number, len(array)), True)
+                file.write(
+                    image,
+                    photometric="minisblack",
+                    metadata=None,
+                    description=description,
+                    extratags=[named] if array.ndim == 2 else [named, numbered],
+                )
+                description = ""
 
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
@@ -123,8 +131,24 @@ def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         every: Sequence[Any] = file.pages
         if any(_PAGE_NAME not in page.tags for page in every):
             return {}, ""
-        pages = {page.tags[_PAGE_NAME].value: page.asarray() for page in every}
+        images: dict[str, list[Any]] = {}
+        for page in every:
+            images.setdefault(page.tags[_PAGE_NAME].value, []).append(page)
+        pages = {name: _image_or_stack(path, name, found) for name, found in images.items()}
         return pages, every[0].description
+
+
+def _image_or_stack(path: Path, name: str, images: Sequence[Any]) -> NDArray[Any]:
+    """Read one array: an image without a number, or all images of a stack, in order."""
+    numbers = [image.tags.valueof(_PAGE_NUMBER) for image in images]
+    if numbers == [None]:
+        return np.asarray(images[0].asarray())
+    if numbers != [(number, len(images)) for number in range(len(images))]:
+        raise FileError(
+            f"{path}: is damaged: the pages named '{name}' are numbered {numbers}, expected each"
+            f" number from 0 with their count {len(images)}"
+        )
+    return np.stack([image.asarray() for image in images])
 
 
 def description(path: Path) -> str:

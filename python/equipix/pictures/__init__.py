@@ -1,1 +1,1 @@
-"""Pictures of results, by matplotlib."""
+"""Pictures of calibrations and plans; they need matplotlib, the extra ``plot``."""

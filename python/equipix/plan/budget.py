@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix._check import as_shifts, check_shape, number, per_exposure
+from equipix.drift import tilt_rms, tilt_std
 from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError
 from equipix.plan.identifiability import identify, is_connected
 from equipix.plan.noise import factor, local_variance
 from equipix.plan.order import trend_told
-from equipix.plan.smooth import drift_tilt, shift_error_effect, tilt_rms
+from equipix.plan.shift_errors import shift_error_effect
 from equipix.plan.spectrum import Spectrum, spectrum
 
 if TYPE_CHECKING:
@@ -185,13 +186,13 @@ def error_budget(
     components = _components(sizes, positions)
     scale = noise**2 * factor(sizes, positions, powers)
     predicted = _Noise(sizes, positions, powers, beam_width, scale)
-    drift_tilts = drift_tilt(sizes, exact, drift)
+    drift_tilt = tilt_std(sizes, exact, drift)
     moved: tuple[float, tuple[float, float]] = (0.0, (0.0, 0.0))
     if beam_width is not None and shift_error:
         moved = shift_error_effect(sizes, exact, powers, beam_width, shift_error)
     causes = {
         "noise": predicted.rms(),
-        "drift": tilt_rms(drift_tilts),
+        "drift": float(tilt_rms(drift_tilt)),
         "shift_error": moved[0],
     }
     warn_of_drift(causes)
@@ -200,7 +201,10 @@ def error_budget(
         shifts=exact,
         rms=float(np.linalg.norm(list(causes.values()))),
         rms_by_cause=causes,
-        tilt_by_cause={"drift": drift_tilts, "shift_error": moved[1]},
+        tilt_by_cause={
+            "drift": (float(drift_tilt[0]), float(drift_tilt[1])),
+            "shift_error": moved[1],
+        },
         spectrum=spectrum(exact, powers),
         trend_told=trend_told(exact),
         components=components,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix import drift
 from equipix._check import as_shifts
 from equipix.errors import InputError
 
@@ -46,8 +47,8 @@ def trend_told(shifts: ArrayLike) -> float:
     >>> print(f"{plan.trend_told(cross_pattern(11, 19)):.3f}")
     0.035
     """
-    basis, times = _hidden(as_shifts(shifts)), _times(len(as_shifts(shifts)))
-    return float(1 - np.sum((times @ basis) ** 2))
+    positions = as_shifts(shifts)
+    return drift.trend_told(positions, np.arange(len(positions)))
 
 
 def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
@@ -83,7 +84,7 @@ def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
     count = len(positions)
     if count == 0:
         raise InputError("'shifts' is empty, expected one (row, col) an exposure")
-    basis, times = _hidden(positions), _times(count)
+    basis, times = drift.tilt_basis(positions), drift.unit_times(np.arange(count))
     if count <= _ALL:
         ranks = np.array(list(permutations(range(count))))
     else:
@@ -102,18 +103,6 @@ def _hidden_share(
 ) -> NDArray[np.float64]:
     """Share of a trend that hides, in orders (m, n); what differs by rounding only is a tie."""
     return np.asarray(np.round(np.sum((times[ranks] @ basis) ** 2, axis=1), _TIE))
-
-
-def _hidden(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Orthonormal basis of what is linear in the shifts, their mean removed."""
-    axes, lengths, _ = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)
-    return np.asarray(axes[:, lengths > 1e-9 * max(lengths.max(initial=0), 1e-300)])
-
-
-def _times(count: int) -> NDArray[np.float64]:
-    """Equally spaced times of mean 0 and norm 1."""
-    times = np.arange(count) - (count - 1) / 2
-    return np.asarray(times / max(float(np.linalg.norm(times)), 1e-300))
 
 
 def _exchanged(

@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix._check import as_array, check_progress, check_shape, positive_count
 from equipix._types import Floats, Progress
+from equipix.drift import tilt_rms, tilt_std
 from equipix.errors import DriftWarning, InputError
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
 from equipix.plan.identifiability import is_connected
@@ -216,8 +217,8 @@ class _Score:
         spans = np.ptp(patterns, axis=1)
         rest = count / (count - self._cells(spans, count))
         noise = self._noise**2 * self._mean_of_inverse(others, places) * (1 - 1 / count) * rest
-        drift = self._drift**2 * self._tilt(patterns) if self._drift else 0.0
-        return np.asarray(np.sqrt(noise + drift))
+        drift = tilt_rms(tilt_std(self._shape, patterns, self._drift))
+        return np.asarray(np.sqrt(noise + drift**2))
 
     def _cells(self, spans: Points, count: int) -> Floats:
         """Beam cells over pixels: the trace of K of `local_variance`, times n."""
@@ -234,24 +235,6 @@ class _Score:
     def _waves(self, places: Points) -> NDArray[np.complex64]:
         down, right = self._phases
         return np.asarray(down[:, places[:, 0]] * right[:, places[:, 1]])
-
-    def _tilt(self, patterns: Points) -> Floats:
-        """Mean square tilt for drift 1: `drift_tilt` and `tilt_rms` of many patterns."""
-        away = patterns - patterns.mean(axis=1, keepdims=True)
-        variances = np.mean(away**2, axis=1)
-        determinant = np.prod(variances, axis=1) - np.mean(np.prod(away, axis=2), axis=1) ** 2
-        sides = np.where(np.array(self._shape) > 1, self._shape, 0)
-        if 0 in sides:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                slopes = np.where(sides > 0, sides**2 / variances, 0).sum(axis=1)
-        else:
-            slopes = np.divide(
-                (sides**2 * variances[:, ::-1]).sum(axis=1),
-                determinant,
-                where=determinant > 1e-9,
-                out=np.full(len(patterns), np.inf),
-            )
-        return np.asarray(slopes / (12 * patterns.shape[1]))
 
 
 def _starts(count: int, travel: Points, rng: np.random.Generator) -> list[Points]:

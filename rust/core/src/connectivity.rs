@@ -9,10 +9,10 @@ use std::collections::BTreeMap;
 
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::{Exposures, Mask};
 use crate::frames::{Real, Shape};
 use crate::geometry::Geometry;
 use crate::memory;
-use crate::model::{Mask, Model};
 
 /// Pixels or cells between two looks at whether to stop.
 const CHECK_EVERY: usize = 1 << 20;
@@ -109,16 +109,21 @@ impl Components {
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
-    pub fn of<T: Real>(model: &Model<'_, T>, ties: &[Tie], control: &Control) -> Result<Self> {
-        let mut edges = Edges::new(model.geometry.sensor.len(), model.geometry.beam.len());
-        model.for_each_used(control, |pixel, cell| {
+    pub fn of<T: Real>(
+        exposures: &Exposures<'_, T>,
+        ties: &[Tie],
+        control: &Control,
+    ) -> Result<Self> {
+        let mut edges =
+            Edges::new(exposures.geometry().sensor.len(), exposures.geometry().beam.len());
+        exposures.for_each_used(control, |pixel, cell| {
             if ties[pixel] == Tie::Firm {
                 edges.add(pixel, cell);
             }
         })?;
         let mut components = edges.components(control)?;
         if ties.iter().any(|&tie| tie != Tie::Firm) {
-            components.attach(model, ties, control)?;
+            components.attach(exposures, ties, control)?;
         }
         Ok(components)
     }
@@ -130,13 +135,13 @@ impl Components {
     /// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had;
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
     pub fn planned(geometry: &Geometry, mask: Mask<'_>, control: &Control) -> Result<Self> {
-        mask.check(geometry.exposures.len(), geometry.sensor)?;
+        mask.check(geometry.placements.len(), geometry.sensor)?;
         memory::check(bytes_needed(geometry), || {
             format!("comparing the pixels of {}", geometry.sensor)
         })?;
         let mut edges = Edges::new(geometry.sensor.len(), geometry.beam.len());
         let cols = geometry.sensor.cols;
-        for (exposure, place) in geometry.exposures.iter().enumerate() {
+        for (exposure, place) in geometry.placements.iter().enumerate() {
             let cells = geometry.views[place.view].cells;
             for row in 0..geometry.sensor.rows {
                 control.check()?;
@@ -155,13 +160,13 @@ impl Components {
     /// these differ; and cells that only loose ones see the label of those.
     fn attach<T: Real>(
         &mut self,
-        model: &Model<'_, T>,
+        exposures: &Exposures<'_, T>,
         ties: &[Tie],
         control: &Control,
     ) -> Result<()> {
         // The lowest and the highest label seen: few pixels are in it, so it is small.
         let mut labels = BTreeMap::new();
-        model.for_each_used(control, |pixel, cell| {
+        exposures.for_each_used(control, |pixel, cell| {
             if ties[pixel] != Tie::Firm {
                 let range = labels.entry(pixel).or_insert((i32::MAX, NONE));
                 if self.cells[cell] != NONE {
@@ -175,7 +180,7 @@ impl Components {
                 self.pixels[pixel] = lowest;
             }
         }
-        model.for_each_used(control, |pixel, cell| {
+        exposures.for_each_used(control, |pixel, cell| {
             if ties[pixel] == Tie::Loose && self.cells[cell] == NONE {
                 self.cells[cell] = self.pixels[pixel];
             }

@@ -120,30 +120,44 @@
 //! - T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance", The
 //!   American Statistician 37 (1983) 242–247: merging of partial sums.
 
-pub mod calibrate;
+pub mod beam;
 pub mod centroid;
-mod conjugate;
+mod coarse;
 pub mod connectivity;
 pub mod control;
-pub mod descent;
+pub mod convergence;
 pub mod error;
-pub mod estimate;
+pub mod exposures;
+pub mod fit;
 pub mod frames;
+mod gauge;
 pub mod geometry;
 #[cfg(feature = "io")]
 pub mod io;
-pub mod joint;
+mod joint;
 mod linalg;
+mod median;
 pub mod memory;
-pub mod model;
-pub mod multiscale;
+mod padded;
 pub mod parallel;
 #[doc(hidden)]
 pub mod parts;
-mod precondition;
 mod random;
 mod reduced;
+mod ritz;
+pub mod solve;
 pub mod statistics;
+pub mod sweep;
 pub mod uncertainty;
 
+pub use beam::Beam;
+pub use control::Control;
+pub use convergence::{Ended, History, Look};
 pub use error::{Error, Result};
+pub use exposures::{Checked, Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
+pub use fit::{Fit, Refinement, Solution};
+pub use frames::{Real, Shape, Stack};
+pub use geometry::Rotation;
+pub use parallel::Workers;
+pub use solve::{Method, Options, calibrate};
+pub use uncertainty::{ErrorMap, Uncertainty};

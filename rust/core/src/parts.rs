@@ -2,17 +2,16 @@
 //! what assembling and factorising cost in products. No interface to rely on.
 
 use crate::control::Control;
-use crate::descent::Descent;
 use crate::error::Result;
+use crate::exposures::Exposures;
 use crate::frames::Real;
-use crate::model::Model;
 use crate::parallel::Workers;
-use crate::precondition::TwoLevel;
-use crate::reduced::Reduced;
+use crate::reduced::{Reduced, TwoLevel};
+use crate::sweep::Estimate;
 
 /// The linear problem of a step.
 pub struct Parts<'m, 'a, T> {
-    model: &'m Model<'a, T>,
+    exposures: &'m Exposures<'a, T>,
     workers: &'m Workers,
     reduced: Reduced<'m, 'a, T>,
     x: Vec<f32>,
@@ -21,21 +20,21 @@ pub struct Parts<'m, 'a, T> {
 
 impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     /// Room for it.
-    pub fn new(model: &'m Model<'a, T>, workers: &'m Workers) -> Self {
+    pub fn new(exposures: &'m Exposures<'a, T>, workers: &'m Workers) -> Self {
         let control = Control::new();
-        let reduced = Reduced::new(model, workers, &control);
+        let reduced = Reduced::new(exposures, workers, &control);
         let [mut x, product] =
-            [(); 2].map(|()| reduced.padding.zeros(model.sensor().rows, workers, &control));
+            [(); 2].map(|()| reduced.padding.zeros(exposures.sensor().rows, workers, &control));
         workers.fill(reduced.padding.body_mut(&mut x), 1.0, &control);
-        Self { model, workers, reduced, x, product }
+        Self { exposures, workers, reduced, x, product }
     }
 
     /// Assembles S at an estimate of M and L.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
-    pub fn assemble(&mut self, descent: &Descent<'_, '_, T>, control: &Control) -> Result<()> {
-        self.reduced.linearise(&descent.sensitivity, descent.beams(), control)
+    pub fn assemble(&mut self, estimate: &Estimate<'_, '_, T>, control: &Control) -> Result<()> {
+        self.reduced.linearise(&estimate.sensitivity, estimate.beams(), control)
     }
 
     /// Assembles and factorises the coarse matrix.
@@ -43,7 +42,7 @@ impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     /// # Errors
     /// As [`assemble`](Self::assemble).
     pub fn factorise(&self, control: &Control) -> Result<()> {
-        let mut two_level = TwoLevel::new(self.model, self.reduced.padding, self.workers);
+        let mut two_level = TwoLevel::new(self.exposures, self.reduced.padding, self.workers);
         two_level.prepare(&self.reduced, control)
     }
 

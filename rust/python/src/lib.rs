@@ -6,13 +6,16 @@
 //!
 //! Callers must not change an array from another thread while a call reads it.
 
+mod arrays;
 mod average;
-mod calibrate;
 mod centroid;
 mod errors;
+mod exposures;
+mod fit;
+mod old_calibrate;
+mod old_uncertainty;
 mod plan;
 mod run;
-mod uncertainty;
 
 use pyo3::prelude::*;
 
@@ -25,13 +28,19 @@ mod _native {
     #[pymodule_export]
     use crate::average::{Accumulator, average_files, file_format, read_file};
     #[pymodule_export]
-    use crate::calibrate::{PySolution, calibrate_frames};
-    #[pymodule_export]
     use crate::centroid::locate_spots;
     #[pymodule_export]
-    use crate::plan::planned_components;
+    use crate::exposures::PyExposures;
     #[pymodule_export]
-    use crate::uncertainty::{error_map, functional_variances, offset_variances, shift_variances};
+    use crate::fit::{PyBeam, PyFit, PyUncertainty};
+    #[pymodule_export]
+    use crate::old_calibrate::{PySolution, calibrate_frames};
+    #[pymodule_export]
+    use crate::old_uncertainty::{
+        error_map, functional_variances, offset_variances, shift_variances,
+    };
+    #[pymodule_export]
+    use crate::plan::planned_components;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -6,15 +6,13 @@
 //! | rotation | int64, 1 | `Vec` | copy of a few numbers |
 //! | mask | bool, 2 or 3 | `Mask` | view |
 
+use equipix_core::Shape;
 use equipix_core::connectivity::{Components, NONE};
-use equipix_core::error::Result;
-use equipix_core::frames::Shape;
 use equipix_core::geometry::Geometry;
-use equipix_core::model::Mask;
 use numpy::{PyArray2, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use crate::calibrate::{PyMask, image, rotation as from_degrees, view_mask};
+use crate::arrays::{PyMask, image, rotations, view_mask};
 use crate::run;
 
 /// The component of each pixel, the sizes of the components, and how many beam cells are seen.
@@ -28,12 +26,10 @@ pub(crate) fn planned_components(
     mask: Option<PyMask<'_>>,
 ) -> PyResult<(Py<PyArray2<i32>>, Vec<usize>, usize)> {
     let shifts: Vec<_> = shifts.as_slice()?.chunks_exact(2).map(|d| [d[0], d[1]]).collect();
-    let mask = mask.as_ref().map_or(Ok(Mask::None), view_mask)?;
+    let mask = view_mask(mask.as_ref())?;
     let sensor = Shape::new(shape.0, shape.1);
     let (components, seen) = run::interruptible(py, None, |control| {
-        let rotations = rotation.iter().map(|&degrees| from_degrees(degrees));
-        let rotations = rotations.collect::<Result<Vec<_>>>()?;
-        let geometry = Geometry::new(sensor, &shifts, &rotations)?;
+        let geometry = Geometry::new(sensor, &shifts, &rotations(&rotation)?)?;
         let components = Components::planned(&geometry, mask, control)?;
         let seen = components.cells.iter().filter(|&&label| label != NONE).count();
         Ok((components, seen))

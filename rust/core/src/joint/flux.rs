@@ -6,46 +6,42 @@
 //! remains undetermined is left to the gauge. With a prior of weights π the same is done with
 //! Σ π a b in place of Σ a b: then the best of the parts that no measurement tells is the given one.
 
-use super::gauge::inverse;
+use crate::exposures::FluxKind;
+use crate::gauge::inverse;
 use crate::geometry::Rotation;
 
-/// What is known of the fluxes.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Flux {
-    /// They are as given.
-    Known,
-    /// Nothing, but that the mean of ln c is 0.
-    Free,
-    /// ln c is linear in time: the times of the exposures.
-    Linear(Vec<f64>),
-    /// They are as given up to relative errors of these standard deviations.
-    Prior(Vec<f64>),
-}
-
 /// ln c = ln c₀ + T θ.
-pub(super) struct Fluxes {
+pub(crate) struct Fluxes {
+    /// c₀.
+    values: Vec<f64>,
     /// The columns of T.
-    pub(super) columns: Vec<Vec<f64>>,
+    pub(crate) columns: Vec<Vec<f64>>,
     /// T is orthonormal by Σ w a b of these.
     weights: Vec<f64>,
     /// The weight of θ² in F, for each column, where the noise is known.
-    pub(super) precisions: Vec<f64>,
+    pub(crate) precisions: Vec<f64>,
     /// The slope of ln L, a cell, that stands for what a drift linear in time has affine in the shifts,
     /// for θ = 1.
-    pub(super) slope: [f64; 2],
+    pub(crate) slope: [f64; 2],
     /// The covariance of the slope along the shifts, a cell, of the part of ln c that hides in a tilt,
     /// by the prior of each.
-    pub(super) hidden_slope: [[f64; 2]; 2],
+    pub(crate) hidden_slope: [[f64; 2]; 2],
     /// The directions in the beam, of length 1 and across each other, along which a tilt is left
     /// undetermined.
-    pub(super) open: Vec<[f64; 2]>,
+    pub(crate) open: Vec<[f64; 2]>,
 }
 
 /// What rounding leaves of a vector of length 1.
 const NOTHING: f64 = 1e-9;
 
 impl Fluxes {
-    pub(super) fn new(flux: &Flux, shifts: &[[f64; 2]], rotations: &[Rotation]) -> Self {
+    /// Fluxes of these values at θ = 0.
+    pub(crate) fn new(
+        values: &[f64],
+        flux: &FluxKind,
+        shifts: &[[f64; 2]],
+        rotations: &[Rotation],
+    ) -> Self {
         let count = shifts.len();
         let turned = rotations.iter().any(|rotation| *rotation != rotations[0]);
         let unit = |k| (0..count).map(|i| if i == k { 1.0 } else { 0.0 }).collect::<Vec<_>>();
@@ -58,17 +54,17 @@ impl Fluxes {
         };
         let (mut slope, mut hidden_slope) = ([0.0; 2], [[0.0; 2]; 2]);
         let weights: Vec<f64> = match flux {
-            Flux::Prior(std) => std.iter().map(|std| 1.0 / (std * std)).collect(),
+            FluxKind::Prior(std) => std.iter().map(|std| 1.0 / (std * std)).collect(),
             _ => vec![1.0; count],
         };
         let (columns, precisions, open) = match flux {
-            Flux::Known => (Vec::new(), Vec::new(), Vec::new()),
-            Flux::Free => {
+            FluxKind::Known => (Vec::new(), Vec::new(), Vec::new()),
+            FluxKind::Free => {
                 let free = complement(&hidden(turned), (0..count).map(unit), &weights);
                 let open = if turned { Vec::new() } else { vec![[1.0, 0.0], [0.0, 1.0]] };
                 (free, Vec::new(), open)
             }
-            Flux::Linear(times) => {
+            FluxKind::Linear(times) => {
                 // What of the times is affine in the shifts no measurement tells from a tilt: it
                 // follows from the rest.
                 let told = complement(&hidden(turned), std::iter::once(times.clone()), &weights);
@@ -78,7 +74,7 @@ impl Fluxes {
                 let open = if told.is_empty() { vec![growth(times, shifts)] } else { Vec::new() };
                 (told, Vec::new(), open)
             }
-            Flux::Prior(_) => {
+            FluxKind::Prior(_) => {
                 let free = complement(&hidden(turned), (0..count).map(unit), &weights);
                 let precisions = vec![1.0; free.len()];
                 if !turned {
@@ -88,12 +84,36 @@ impl Fluxes {
             }
         };
         let precisions = if precisions.is_empty() { vec![0.0; columns.len()] } else { precisions };
-        Self { columns, weights, precisions, slope, hidden_slope, open }
+        Self { values: values.to_vec(), columns, weights, precisions, slope, hidden_slope, open }
+    }
+
+    /// c at θ.
+    pub(crate) fn at(&self, theta: &[f64]) -> Vec<f64> {
+        let logs = self.spread(theta);
+        self.values.iter().zip(&logs).map(|(c, log)| c * log.exp()).collect()
+    }
+
+    /// θ, and a + γ·d, the part of ln c affine in the shifts that is not in T θ: that of fluxes which
+    /// were brought into a gauge.
+    pub(crate) fn split(&self, flux: &[f64], shifts: &[[f64; 2]]) -> (Vec<f64>, f64, [f64; 2]) {
+        let logs: Vec<f64> = flux.iter().zip(&self.values).map(|(c, c0)| (c / c0).ln()).collect();
+        let theta = self.sought(&logs);
+        let rest: Vec<f64> =
+            logs.iter().zip(self.spread(&theta)).map(|(log, told)| log - told).collect();
+        let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / logs.len() as f64;
+        let level = mean(&mut rest.iter().copied());
+        let centre = [0, 1].map(|axis| mean(&mut shifts.iter().map(|d| d[axis])));
+        let along = [0, 1].map(|axis| {
+            rest.iter().zip(shifts).map(|(rest, d)| rest * (d[axis] - centre[axis])).sum::<f64>()
+        });
+        let slope = slope_covariance(&vec![1.0; shifts.len()], shifts)
+            .map(|row| row[0] * along[0] + row[1] * along[1]);
+        (theta, level - slope[0] * centre[0] - slope[1] * centre[1], slope)
     }
 
     /// T θ.
-    pub(super) fn spread(&self, theta: &[f64], count: usize) -> Vec<f64> {
-        let mut logs = vec![0.0; count];
+    pub(crate) fn spread(&self, theta: &[f64]) -> Vec<f64> {
+        let mut logs = vec![0.0; self.values.len()];
         for (column, value) in self.columns.iter().zip(theta) {
             logs.iter_mut().zip(column).for_each(|(log, t)| *log += t * value);
         }
@@ -101,13 +121,13 @@ impl Fluxes {
     }
 
     /// The θ whose T θ is nearest to logs, by the weights that T is orthonormal by.
-    pub(super) fn sought(&self, logs: &[f64]) -> Vec<f64> {
+    pub(crate) fn sought(&self, logs: &[f64]) -> Vec<f64> {
         let weighted: Vec<f64> = logs.iter().zip(&self.weights).map(|(log, w)| w * log).collect();
         self.gather(&weighted)
     }
 
     /// Tᵀ b.
-    pub(super) fn gather(&self, slopes: &[f64]) -> Vec<f64> {
+    pub(crate) fn gather(&self, slopes: &[f64]) -> Vec<f64> {
         let dot = |column: &Vec<f64>| column.iter().zip(slopes).map(|(t, b)| t * b).sum();
         self.columns.iter().map(dot).collect()
     }
@@ -198,7 +218,7 @@ mod tests {
 
     #[test]
     fn free_fluxes_have_no_part_that_looks_like_a_tilt() {
-        let fluxes = Fluxes::new(&Flux::Free, &CROSS, &[Rotation::None; 5]);
+        let fluxes = Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &[Rotation::None; 5]);
         assert_eq!(fluxes.open, [[1.0, 0.0], [0.0, 1.0]]);
         assert_eq!(fluxes.columns.len(), 2);
         for column in &fluxes.columns {
@@ -213,7 +233,7 @@ mod tests {
     fn a_turned_exposure_tells_all_but_the_mean() {
         let mut rotations = [Rotation::None; 5];
         rotations[4] = Rotation::Half;
-        let fluxes = Fluxes::new(&Flux::Free, &CROSS, &rotations);
+        let fluxes = Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &rotations);
         assert!(fluxes.open.is_empty());
         assert_eq!(fluxes.columns.len(), 4);
     }
@@ -221,19 +241,23 @@ mod tests {
     #[test]
     fn a_drift_that_is_linear_along_the_shifts_cannot_be_told() {
         let line = [[0.0, 0.0], [0.0, 3.0], [0.0, 6.0], [0.0, 9.0]];
-        let times = |scale: f64| Flux::Linear((0..4).map(|k| scale * f64::from(k)).collect());
-        let fluxes = Fluxes::new(&times(60.0), &line, &[Rotation::None; 4]);
+        let times = |scale: f64| FluxKind::Linear((0..4).map(|k| scale * f64::from(k)).collect());
+        let fluxes = Fluxes::new(&[1.0; 4], &times(60.0), &line, &[Rotation::None; 4]);
         assert!(fluxes.open == [[0.0, 1.0]] && fluxes.columns.is_empty());
-        let fluxes =
-            Fluxes::new(&Flux::Linear(vec![0.0, 3.0, 1.0, 2.0]), &line, &[Rotation::None; 4]);
+        let fluxes = Fluxes::new(
+            &[1.0; 4],
+            &FluxKind::Linear(vec![0.0, 3.0, 1.0, 2.0]),
+            &line,
+            &[Rotation::None; 4],
+        );
         assert!(fluxes.open.is_empty() && fluxes.columns.len() == 1);
     }
 
     #[test]
     fn a_linear_drift_is_what_is_told_and_its_affine_part() {
         let times = [3.0, 10.0, 21.0, 30.0, 47.0];
-        let flux = Flux::Linear(times.to_vec());
-        let fluxes = Fluxes::new(&flux, &CROSS, &[Rotation::None; 5]);
+        let flux = FluxKind::Linear(times.to_vec());
+        let fluxes = Fluxes::new(&[1.0; 5], &flux, &CROSS, &[Rotation::None; 5]);
         let told = &fluxes.columns[0];
         let [row, col] = fluxes.slope;
         let whole: Vec<f64> =

@@ -13,13 +13,14 @@
 
 use std::f64::consts::TAU;
 
-use super::grid::{Taps, Window};
+use super::layout::Window;
+use crate::geometry::Taps;
 
 /// Wave vectors along each axis.
 const WAVES: usize = 64;
 
 /// The mean of s/(s + τ g) over wave vectors, for exposures that weigh `shares` of all.
-pub(super) fn told(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
+pub(crate) fn told(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
     let mut sum = 0.0;
     for wave in 0..WAVES * WAVES {
         // Not at q = 0 itself, where both symbols are 0.
@@ -56,7 +57,7 @@ mod tests {
     use super::*;
     use crate::frames::Shape;
     use crate::geometry::Rotation;
-    use crate::joint::grid::Grid;
+    use crate::joint::layout::Grid;
 
     #[test]
     fn without_a_penalty_all_is_told_and_with_a_stiff_one_nothing() {

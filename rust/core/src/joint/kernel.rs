@@ -1,9 +1,9 @@
 //! The arithmetic along one row of pixels, inlined into code for the CPU at hand.
 
-use super::grid::TAPS;
+use crate::geometry::TAPS;
 
 /// Zeros beside a row, which factors reach.
-pub(super) const AROUND: usize = TAPS - 1;
+pub(crate) const AROUND: usize = TAPS - 1;
 /// Values side by side, which vector registers hold.
 const LANES: usize = 16;
 
@@ -15,17 +15,17 @@ fn of(values: &[f64], exposure: usize, cols: usize) -> &[f64] {
 
 /// Adds Σ_ij t_i u_j a(i, col + j) of rows of values to a row of sums: what pixels see of coefficients, and,
 /// with the factors reversed, what cells get of the pixels' pulls.
-pub(super) struct Combine<'s> {
-    pub(super) rows: [&'s [f64]; TAPS],
-    pub(super) along_rows: [f64; TAPS],
-    pub(super) along_cols: [f64; TAPS],
+pub(crate) struct Combine<'s> {
+    pub(crate) rows: [&'s [f64]; TAPS],
+    pub(crate) along_rows: [f64; TAPS],
+    pub(crate) along_cols: [f64; TAPS],
     /// Room for a row of values.
-    pub(super) room: &'s mut [f64],
-    pub(super) sums: &'s mut [f64],
+    pub(crate) room: &'s mut [f64],
+    pub(crate) sums: &'s mut [f64],
 }
 
 impl Combine<'_> {
-    pub(super) fn dispatch(self) {
+    pub(crate) fn dispatch(self) {
         pulp::Arch::new().dispatch(self);
     }
 }
@@ -50,33 +50,33 @@ impl pulp::NullaryFnOnce for Combine<'_> {
 }
 
 /// A row of values for each exposure, with [`AROUND`] zeros on either side of each.
-pub(super) struct Lines {
+pub(crate) struct Lines {
     values: Vec<f64>,
     cols: usize,
 }
 
 impl Lines {
-    pub(super) fn new(exposures: usize, cols: usize) -> Self {
+    pub(crate) fn new(exposures: usize, cols: usize) -> Self {
         Self { values: vec![0.0; exposures * (cols + 2 * AROUND)], cols }
     }
 
-    pub(super) fn clear(&mut self) {
+    pub(crate) fn clear(&mut self) {
         self.values.fill(0.0);
     }
 
     /// The row of one exposure.
     #[inline(always)]
-    pub(super) fn of(&self, exposure: usize) -> &[f64] {
+    pub(crate) fn of(&self, exposure: usize) -> &[f64] {
         &self.values[exposure * (self.cols + 2 * AROUND) + AROUND..][..self.cols]
     }
 
     #[inline(always)]
-    pub(super) fn of_mut(&mut self, exposure: usize) -> &mut [f64] {
+    pub(crate) fn of_mut(&mut self, exposure: usize) -> &mut [f64] {
         &mut self.values[exposure * (self.cols + 2 * AROUND) + AROUND..][..self.cols]
     }
 
     /// That row with the zeros around.
-    pub(super) fn padded(&self, exposure: usize) -> &[f64] {
+    pub(crate) fn padded(&self, exposure: usize) -> &[f64] {
         let width = self.cols + 2 * AROUND;
         &self.values[exposure * width..][..width]
     }
@@ -85,22 +85,22 @@ impl Lines {
 /// What is kept of a row of pixels from one linearisation on: the light c L that each exposure shows, M,
 /// the first element of the inverse of the normal matrix, the last change of M, and, where it is sought,
 /// the offset O with the other two elements.
-pub(super) struct Row<'s> {
-    pub(super) light: &'s mut [f64],
-    pub(super) sensitivity: &'s mut [f64],
-    pub(super) inverse: &'s mut [f64],
-    pub(super) change: &'s mut [f64],
+pub(crate) struct Row<'s> {
+    pub(crate) light: &'s mut [f64],
+    pub(crate) sensitivity: &'s mut [f64],
+    pub(crate) inverse: &'s mut [f64],
+    pub(crate) change: &'s mut [f64],
     /// O, the element beside and the last one; empty unless O is sought.
-    pub(super) offset: [&'s mut [f64]; 3],
+    pub(crate) offset: [&'s mut [f64]; 3],
 }
 
 impl<'s> Row<'s> {
     /// Values that a row of `cols` pixels takes.
-    pub(super) fn length(exposures: usize, cols: usize, with_offset: bool) -> usize {
+    pub(crate) fn length(exposures: usize, cols: usize, with_offset: bool) -> usize {
         (exposures + if with_offset { 6 } else { 3 }) * cols
     }
 
-    pub(super) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
+    pub(crate) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
         let (light, rest) = values.split_at_mut(exposures * cols);
         let mut parts = rest.chunks_exact_mut(cols);
         let mut next = || parts.next().unwrap_or_default();
@@ -123,16 +123,16 @@ impl<'s> Row<'s> {
 /// ```
 ///
 /// Without an offset O = 0 and M = Σ w e y / Σ w e².
-pub(super) struct Solve<'s> {
-    pub(super) row: Row<'s>,
-    pub(super) fluxes: &'s [f64],
-    pub(super) weights: &'s [f64],
+pub(crate) struct Solve<'s> {
+    pub(crate) row: Row<'s>,
+    pub(crate) fluxes: &'s [f64],
+    pub(crate) weights: &'s [f64],
     /// y, then the pull.
-    pub(super) values: &'s mut Lines,
+    pub(crate) values: &'s mut Lines,
     /// Σ w e y, Σ w e, Σ w and Σ w y: room for four rows.
-    pub(super) sums: &'s mut [Vec<f64>; 4],
+    pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
-    pub(super) singular: f64,
+    pub(crate) singular: f64,
 }
 
 impl pulp::NullaryFnOnce for Solve<'_> {
@@ -214,16 +214,16 @@ fn sum(values: &[f64]) -> f64 {
 /// What a change of the light pulls at the beam once M and O have followed it: v → c M w (u − α e − β)
 /// with u = c M v, and the change −α of M; returns the largest size of that less a share of the change
 /// before.
-pub(super) struct Follow<'s> {
-    pub(super) row: Row<'s>,
-    pub(super) fluxes: &'s [f64],
-    pub(super) weights: &'s [f64],
+pub(crate) struct Follow<'s> {
+    pub(crate) row: Row<'s>,
+    pub(crate) fluxes: &'s [f64],
+    pub(crate) weights: &'s [f64],
     /// v, then the pull.
-    pub(super) values: &'s mut Lines,
+    pub(crate) values: &'s mut Lines,
     /// Room for rows.
-    pub(super) sums: &'s mut [Vec<f64>; 4],
+    pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// The share of the change before.
-    pub(super) share: f64,
+    pub(crate) share: f64,
 }
 
 impl pulp::NullaryFnOnce for Follow<'_> {

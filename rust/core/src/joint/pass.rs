@@ -8,154 +8,103 @@
 
 use std::borrow::Cow;
 
-use super::grid::{TAPS, Taps, Window};
+use super::bands::Bands;
 use super::kernel::{AROUND, Combine, Lines, Row};
-use super::system::System;
+use super::layout::{Grid, Window};
+use super::room::{Room, Sums};
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::{Exposures, Stretch};
 use crate::frames::Real;
-use crate::geometry::{Rotation, View};
-use crate::model::Stretch;
-use crate::parallel::{Add, dot};
+use crate::geometry::{Rotation, TAPS, Taps, View};
+use crate::parallel::dot;
+use crate::parallel::{Add, Workers};
 
-/// Rows of pixels in a band, at least: a band adds to as many rows of cells and those that shifts reach.
-const FEWEST_ROWS: usize = 32;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 16;
 
-/// How the sensor is cut into bands, and where their sums lie.
-#[derive(Default)]
-pub(super) struct Bands {
-    /// Rows of pixels.
-    pub(super) height: usize,
-    strips: Vec<Strip>,
-    /// Values of one band's sums.
-    length: usize,
-}
-
-/// The sums of a band in one view.
-#[derive(Clone, Copy)]
-struct Strip {
-    /// The row of the view that the first one of band 0 is.
-    first: usize,
-    rows: usize,
-    cols: usize,
-    /// Where they begin among the sums of the band.
-    start: usize,
-}
-
-impl Bands {
-    pub(super) fn new(windows: &[Window], views: &[View], width: usize) -> Self {
-        let reach = |view: usize| {
-            let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);
-            let first = rows.clone().min().unwrap_or(0);
-            (first, rows.max().unwrap_or(0) - first)
-        };
-        let reaches: Vec<_> = (0..views.len()).map(reach).collect();
-        let furthest = reaches.iter().map(|reach| reach.1).max().unwrap_or(0);
-        let height = FEWEST_ROWS.max(furthest);
-        let mut length = 0;
-        let strips = views.iter().zip(reaches).map(|(view, (first, reach))| {
-            let (rows, cols, start) = (height + reach + width - 1, view.shape.cols, length);
-            length += rows * cols;
-            Strip { first, rows, cols, start }
-        });
-        let strips = strips.collect();
-        Self { height, strips, length }
-    }
-
-    /// Values of all bands of a sensor of so many rows.
-    pub(super) fn size(&self, rows: usize) -> usize {
-        rows.div_ceil(self.height) * self.length
-    }
-
-    /// The bands that see a row of a view, each with that row of its sums.
-    fn seeing<'s>(
-        &self,
-        sums: &'s [f64],
-        view: usize,
-        row: usize,
-    ) -> impl Iterator<Item = &'s [f64]> + use<'s> {
-        let (height, length, strip) = (self.height, self.length, self.strips[view]);
-        let before = (row + height).saturating_sub(strip.first + strip.rows) / height;
-        let bands = before..sums.len() / length;
-        bands.map_while(move |band| {
-            let at = row.checked_sub(strip.first + band * height)?;
-            Some(&sums[band * length + strip.start + at * strip.cols..][..strip.cols])
-        })
-    }
-}
-
-/// Room of one thread for a row of pixels.
-pub(super) struct Room {
-    pub(super) weights: Vec<f64>,
-    /// Values of the row, then its pulls; before them the pulls of the rows before.
-    lines: [Lines; TAPS],
-    line: Vec<f64>,
-    pub(super) sums: [Vec<f64>; 4],
-    /// ∂L/∂d of the row, by axis and exposure, where shifts are sought.
-    pub(super) slopes: [Vec<f64>; 2],
-}
-
-impl Room {
-    /// Values of the row.
-    pub(super) fn values(&mut self) -> &mut Lines {
-        &mut self.lines[TAPS - 1]
-    }
-
-    /// Begins a row with what changes of ln c, divided by c, and of d make of the light.
-    pub(super) fn begin(&mut self, light: &[f64], shares: &[f64], moves: &[[f64; 2]]) {
-        let cols = light.len() / shares.len();
-        let values = &mut self.lines[TAPS - 1];
-        values.clear();
-        for (k, (light, share)) in light.chunks_exact(cols).zip(shares).enumerate() {
-            let values = values.of_mut(k);
-            if *share != 0.0 {
-                Add { factor: *share, values: light, sums: &mut *values }.dispatch();
-            }
-            for (slopes, &factor) in self.slopes.iter().zip(moves.get(k).into_iter().flatten()) {
-                Add { factor, values: &slopes[k * cols..][..cols], sums: &mut *values }.dispatch();
-            }
-        }
-    }
-
-    /// What the kernels need beside the row: the weights, the values, and room for sums.
-    pub(super) fn parts(&mut self) -> (&[f64], &mut Lines, &mut [Vec<f64>; 4]) {
-        (&self.weights, &mut self.lines[TAPS - 1], &mut self.sums)
-    }
-}
-
-/// What one pass gathers besides the pulls: F, the largest change of M, and the slopes of ln c and d of
-/// each exposure.
-#[derive(Clone, Default)]
-pub(super) struct Sums {
-    pub(super) objective: f64,
-    pub(super) largest: f64,
-    pub(super) flux: Vec<f64>,
-    pub(super) shifts: Vec<[f64; 2]>,
+/// A pass over the measurements: where the exposures lie on the grid, and what is kept of each row of
+/// pixels from one pass to the next.
+pub(crate) struct Pass<'m, 'a, T> {
+    pub(crate) exposures: &'m Exposures<'a, T>,
+    pub(crate) workers: &'m Workers,
+    pub(crate) grid: Grid,
+    pub(crate) windows: Vec<Window>,
+    bands: Bands,
+    /// c of each exposure.
+    pub(crate) flux: Vec<f64>,
+    pub(crate) with_offset: bool,
+    /// Whether slopes of ln c are gathered.
+    pub(crate) with_flux: bool,
+    /// Whether slopes of the shifts are gathered.
+    pub(crate) with_shifts: bool,
+    /// [`Row`] by row.
+    rows: Vec<f64>,
+    /// What cells get of the pixels' pulls, by band.
+    sums: Vec<f64>,
+    /// Passes made.
+    pub(crate) count: u64,
 }
 
 /// Values on cells in the order of each view.
-pub(super) type Views<'v> = [Cow<'v, [f64]>];
+pub(crate) type Views<'v> = [Cow<'v, [f64]>];
 
-impl<T: Real> System<'_, '_, T> {
+impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
+    /// Exposures on a grid, before they are placed.
+    pub(crate) fn new(
+        exposures: &'m Exposures<'a, T>,
+        grid: Grid,
+        with_flux: bool,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Self {
+        let (sensor, with_offset) = (exposures.sensor(), exposures.offset());
+        let length = Row::length(exposures.count(), sensor.cols, with_offset);
+        Self {
+            exposures,
+            workers,
+            grid,
+            windows: Vec::new(),
+            bands: Bands::default(),
+            flux: Vec::new(),
+            with_offset,
+            with_flux,
+            with_shifts: false,
+            rows: workers.filled(sensor.rows * length, 0.0, control),
+            sums: Vec::new(),
+            count: 0,
+        }
+    }
+
+    /// Where the exposures lie, and the sums that this takes.
+    pub(crate) fn place(&mut self, shifts: &[[f64; 2]], control: &Control) {
+        let Grid { geometry, width, sensor, .. } = &self.grid;
+        self.windows = self.grid.windows(shifts);
+        self.bands = Bands::new(&self.windows, &geometry.views, *width);
+        let size = self.bands.size(sensor.rows);
+        if self.sums.len() != size {
+            self.sums = Vec::new();
+            self.sums = self.workers.filled(size, 0.0, control);
+        }
+    }
+
     /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's values,
     /// and the slopes of the beam if shifts are sought; finds what `cells` get of them.
-    pub(super) fn pass(
+    pub(crate) fn run(
         &mut self,
         cells: &mut [f64],
         control: &Control,
         work: impl Fn(&Self, usize, Row<'_>, &mut Room, &mut Sums) + Sync,
     ) -> Result<Sums> {
-        let (sensor, count) = (self.model.sensor(), self.model.count());
+        let (sensor, count) = (self.exposures.sensor(), self.exposures.count());
         let length = Row::length(count, sensor.cols, self.with_offset);
         let mut rows = std::mem::take(&mut self.rows);
         let mut sums = std::mem::take(&mut self.sums);
-        let (system, height) = (&*self, self.bands.height);
+        let (pass, height) = (&*self, self.bands.height);
         let sizes = [height * length, self.bands.length];
-        let bands = system.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
-            let mut room = system.room();
-            let mut found = system.no_sums();
+        let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
+            let mut room = pass.room();
+            let mut found = pass.no_sums();
             strips.fill(0.0);
             let rows = rows.chunks_exact_mut(length);
             let last = rows.len();
@@ -165,19 +114,19 @@ impl<T: Real> System<'_, '_, T> {
                 }
                 room.lines.rotate_left(1);
                 let parts = Row::of(row, count, sensor.cols);
-                work(system, band * height + index, parts, &mut room, &mut found);
-                system.gather(row, &mut room, &mut found);
-                system.spread(index, &mut room, strips);
+                work(pass, band * height + index, parts, &mut room, &mut found);
+                pass.gather(row, &mut room, &mut found);
+                pass.spread(index, &mut room, strips);
             }
-            for index in last..last + system.grid.width - 1 {
+            for index in last..last + pass.grid.width - 1 {
                 room.lines.rotate_left(1);
                 room.values().clear();
-                system.spread(index, &mut room, strips);
+                pass.spread(index, &mut room, strips);
             }
             found
         });
         (self.rows, self.sums) = (rows, sums);
-        self.passes += 1;
+        self.count += 1;
         control.check()?;
         self.fold(cells, control);
         control.check()?;
@@ -193,17 +142,17 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     fn no_sums(&self) -> Sums {
-        let count = self.model.count();
-        let moved = if self.shift_prior.is_some() { count } else { 0 };
+        let count = self.exposures.count();
+        let moved = if self.with_shifts { count } else { 0 };
         Sums { flux: vec![0.0; count], shifts: vec![[0.0; 2]; moved], ..Sums::default() }
     }
 
     /// The pulls of a row at fluxes and shifts.
     fn gather(&self, row: &[f64], room: &mut Room, found: &mut Sums) {
-        let cols = self.model.sensor().cols;
+        let cols = self.exposures.sensor().cols;
         for (k, flux) in self.flux.iter().enumerate() {
             let pull = room.lines[TAPS - 1].of(k);
-            if !self.fluxes.columns.is_empty() {
+            if self.with_flux {
                 found.flux[k] += dot(&row[k * cols..][..cols], pull) / flux;
             }
             if let Some(found) = found.shifts.get_mut(k) {
@@ -217,7 +166,7 @@ impl<T: Real> System<'_, '_, T> {
     /// Adds to a band's sums what the pulls of the last rows make of the row of cells that the first
     /// factors lead to.
     fn spread(&self, index: usize, room: &mut Room, strips: &mut [f64]) {
-        let wide = self.model.sensor().cols + self.grid.width - 1;
+        let wide = self.exposures.sensor().cols + self.grid.width - 1;
         for (k, window) in self.windows.iter().enumerate() {
             let strip = &self.bands.strips[window.view];
             let at = strip.start + (index + window.row - strip.first) * strip.cols + window.col;
@@ -273,7 +222,7 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// Values on cells in the order of each view.
-    pub(super) fn views_of<'v>(&self, cells: &'v [f64]) -> Vec<Cow<'v, [f64]>> {
+    pub(crate) fn views_of<'v>(&self, cells: &'v [f64]) -> Vec<Cow<'v, [f64]>> {
         let turned = |view: &View| {
             if view.rotation == Rotation::None {
                 return Cow::Borrowed(cells);
@@ -291,7 +240,7 @@ impl<T: Real> System<'_, '_, T> {
 
     /// Adds to `seen` what the pixels of one row of an exposure see of values on cells, by these factors
     /// along rows and columns.
-    pub(super) fn interpolate(
+    pub(crate) fn interpolate(
         &self,
         views: &Views<'_>,
         window: &Window,
@@ -312,7 +261,7 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// What the pixels of a row see of values on cells, added to the room's values.
-    pub(super) fn see(&self, views: &Views<'_>, row: usize, room: &mut Room) {
+    pub(crate) fn see(&self, views: &Views<'_>, row: usize, room: &mut Room) {
         for (k, window) in self.windows.iter().enumerate() {
             let taps = [window.along_rows.values, window.along_cols.values];
             let Room { lines: [.., values], line, .. } = room;
@@ -322,8 +271,8 @@ impl<T: Real> System<'_, '_, T> {
 
     /// The slopes along both axes of the beam that the pixels of a row see, left in the room, where shifts
     /// are sought.
-    pub(super) fn see_slopes(&self, views: &Views<'_>, row: usize, room: &mut Room) {
-        let cols = self.model.sensor().cols;
+    pub(crate) fn see_slopes(&self, views: &Views<'_>, row: usize, room: &mut Room) {
+        let cols = self.exposures.sensor().cols;
         for (axis, slopes) in room.slopes.iter_mut().enumerate() {
             slopes.fill(0.0);
             for (window, slopes) in self.windows.iter().zip(slopes.chunks_exact_mut(cols)) {
@@ -334,12 +283,12 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// The weights and values of one row of each exposure.
-    pub(super) fn measure(&self, row: usize, room: &mut Room) {
-        let cols = self.model.sensor().cols;
+    pub(crate) fn measure(&self, row: usize, room: &mut Room) {
+        let cols = self.exposures.sensor().cols;
         let Room { weights, lines: [.., values], .. } = room;
         for (k, weights) in weights.chunks_exact_mut(cols).enumerate() {
             let values = values.of_mut(k);
-            match self.model.stretch(k, row, 0..cols, weights) {
+            match self.exposures.stretch(k, row, 0..cols, weights) {
                 Stretch::Uniform(measured, _) => {
                     values.iter_mut().zip(measured).for_each(|(value, y)| *value = y.to_f64());
                 }
@@ -353,19 +302,19 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// The weights of one row of each exposure; those that are all the same stand in the room.
-    pub(super) fn weigh_row(&self, row: usize, room: &mut Room) {
-        let cols = self.model.sensor().cols;
+    pub(crate) fn weigh_row(&self, row: usize, room: &mut Room) {
+        let cols = self.exposures.sensor().cols;
         for (k, weights) in room.weights.chunks_exact_mut(cols).enumerate() {
-            if self.model.uniform_weight(k).is_none() {
-                let _ = self.model.stretch(k, row, 0..cols, weights);
+            if self.exposures.uniform_weight(k).is_none() {
+                let _ = self.exposures.stretch(k, row, 0..cols, weights);
             }
         }
     }
 
-    pub(super) fn room(&self) -> Room {
-        let (cols, count) = (self.model.sensor().cols, self.model.count());
-        let moved = if self.shift_prior.is_some() { count * cols } else { 0 };
-        let weight = |k| self.model.uniform_weight(k).unwrap_or(0.0);
+    pub(crate) fn room(&self) -> Room {
+        let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
+        let moved = if self.with_shifts { count * cols } else { 0 };
+        let weight = |k| self.exposures.uniform_weight(k).unwrap_or(0.0);
         Room {
             weights: (0..count).flat_map(|k| std::iter::repeat_n(weight(k), cols)).collect(),
             lines: [(); TAPS].map(|()| Lines::new(count, cols)),
@@ -374,10 +323,27 @@ impl<T: Real> System<'_, '_, T> {
             slopes: [(); 2].map(|()| vec![0.0; moved]),
         }
     }
+
+    /// Calls `visit([M, i₁₁, the last change of M, O, i₁₂, i₂₂])` for each row of pixels, i being the
+    /// inverse of their normal matrices; the last three are empty where no offset is sought.
+    pub(crate) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 6])) {
+        let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
+        for row in self.rows.chunks_exact(Row::length(count, cols, self.with_offset)) {
+            let part = |index: usize| row.chunks_exact(cols).nth(count + index).unwrap_or_default();
+            visit([0, 1, 2, 3, 4, 5].map(part));
+        }
+    }
+
+    /// What is kept of one row of pixels: the light of each exposure, then M and the rest.
+    pub(crate) fn row(&self, index: usize) -> &[f64] {
+        let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
+        let length = Row::length(count, cols, self.with_offset);
+        &self.rows[index * length..][..length]
+    }
 }
 
 /// The factors of ∂L/∂d along one axis of the beam.
-pub(super) fn slopes_along(window: &Window, axis: usize) -> [[f64; TAPS]; 2] {
+pub(crate) fn slopes_along(window: &Window, axis: usize) -> [[f64; TAPS]; 2] {
     let (rows, cols): (&Taps, &Taps) = (&window.along_rows, &window.along_cols);
     let along_rows = (axis == 0) != window.swaps_axes;
     if along_rows { [rows.slopes, cols.values] } else { [rows.values, cols.slopes] }

@@ -9,13 +9,15 @@ use crate::control::Control;
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
+/// The weight τ of the penalty, as a share of the mean weight of a cell.
+pub(crate) const SMOOTHING: f64 = 1e-5;
 const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
 const BAND: usize = 32;
 
-pub(super) struct Penalty {
+pub(crate) struct Penalty {
     shape: Shape,
-    pub(super) tau: f64,
+    pub(crate) tau: f64,
     /// 1 where the five cells from here on count, down a column and along a row; else 0.
     counted: [Vec<f64>; 2],
     /// D a and aᵀ D a.
@@ -28,7 +30,7 @@ pub(super) struct Penalty {
 
 impl Penalty {
     /// The penalty of weight τ on beams of weights D, seen where they are above 0.
-    pub(super) fn new(
+    pub(crate) fn new(
         shape: Shape,
         weights: &[f64],
         tau: f64,
@@ -55,7 +57,7 @@ impl Penalty {
     }
 
     /// Takes the beam a of weights D that its multiples are free of.
-    pub(super) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
+    pub(crate) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
         let cols = self.shape.cols;
         workers.map_blocks(&mut self.pull, cols, |row, pull| {
             let cells = weights[row * cols..].iter().zip(&beam[row * cols..]);
@@ -70,14 +72,14 @@ impl Penalty {
     }
 
     /// Takes τ Pᵀ GᵀG a from a slope; returns τ ‖G a‖².
-    pub(super) fn pull(&self, slope: &mut [f64], workers: &Workers) -> f64 {
+    pub(crate) fn pull(&self, slope: &mut [f64], workers: &Workers) -> f64 {
         workers.add_multiple(slope, -self.tau, &self.bent);
         workers.add_multiple(slope, self.tau * self.energy / self.norm, &self.pull);
         self.tau * self.energy
     }
 
     /// Adds τ Pᵀ GᵀG P x to `sums`.
-    pub(super) fn add_product(&self, x: &[f64], sums: &mut [f64], workers: &Workers) {
+    pub(crate) fn add_product(&self, x: &[f64], sums: &mut [f64], workers: &Workers) {
         let scale = workers.dot(&self.pull, x) / self.norm;
         let back = (workers.dot(&self.bent, x) - scale * self.energy) / self.norm;
         self.add_curvature(x, self.tau, sums, workers);
@@ -86,7 +88,7 @@ impl Penalty {
     }
 
     /// Adds √τ Pᵀ Gᵀ s, whose covariance is that of the penalty, for signs s.
-    pub(super) fn add_draw(
+    pub(crate) fn add_draw(
         &self,
         beam: &[f64],
         mut sign: impl FnMut() -> f64,
@@ -109,7 +111,7 @@ impl Penalty {
 
     /// Calls `visit(other, value)` for the elements of τ GᵀG in the row of a cell; the values of one
     /// place add up.
-    pub(super) fn for_row(&self, cell: usize, mut visit: impl FnMut(usize, f64)) {
+    pub(crate) fn for_row(&self, cell: usize, mut visit: impl FnMut(usize, f64)) {
         for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
             for (i, own) in FOURTH.iter().enumerate() {
                 let Some(first) = cell.checked_sub(i * step) else { continue };

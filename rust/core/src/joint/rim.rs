@@ -5,11 +5,12 @@
 //! the penalty, decides there. So there N + τ GᵀG, with N the sum of w c² M² over the pixels that see two
 //! cells, by their factors, is factorised as it is. The rim is a few cells wide, so its factor is small.
 
-use super::grid::{TAPS, Window};
+use super::layout::Window;
 use super::system::System;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::geometry::TAPS;
 use crate::linalg::Cholesky;
 use crate::parallel::Workers;
 
@@ -18,7 +19,7 @@ use crate::parallel::Workers;
 const NEAR: usize = 2;
 const SHARE: f64 = 1.0 / 6.0;
 /// A rim of more cells than these of each row and column fills the image: then its diagonal has to do.
-pub(super) const WIDEST: usize = 12;
+pub(crate) const WIDEST: usize = 12;
 /// What is added to the diagonal, as a share of it, for cells that rounding alone tells.
 const RIDGE: f64 = 1e-10;
 /// Cells that lie within a spline's reach of each other, along one axis.
@@ -27,7 +28,7 @@ const REACH: usize = 2 * TAPS - 1;
 /// each in some hundredths of a second, which nothing interrupts.
 const TILE: usize = 512;
 
-pub(super) struct Rim {
+pub(crate) struct Rim {
     parts: Vec<Part>,
 }
 
@@ -40,30 +41,30 @@ struct Part {
 }
 
 impl Rim {
-    pub(super) fn new<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Self> {
-        let mut cells = if system.grid.is_spline() { cells(system) } else { Vec::new() };
-        let (length, cols) = (system.state.beam.len(), system.grid.geometry.beam.cols);
+    pub(crate) fn new<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Self> {
+        let mut cells = if system.pass.grid.is_spline() { cells(system) } else { Vec::new() };
+        let (length, cols) = (system.state.beam.len(), system.pass.grid.geometry.beam.cols);
         let fits = cells.len() <= WIDEST * (length / cols + cols);
         let tile = |&cell: &u32| (cell as usize / cols / TILE, cell as usize % cols / TILE);
         cells.sort_by_key(tile);
         let parts: Vec<&[u32]> = cells.chunk_by(|a, b| tile(a) == tile(b)).collect();
-        let mut numbers = system.workers.filled(length, u32::MAX, control);
+        let mut numbers = system.pass.workers.filled(length, u32::MAX, control);
         for part in &parts {
             part.iter().zip(0..).for_each(|(&cell, number)| numbers[cell as usize] = number);
         }
-        let parts = system.workers.map(parts.len(), |index| {
+        let parts = system.pass.workers.map(parts.len(), |index| {
             control.check()?;
             Ok(Part::new(system, parts[index], &numbers, fits))
         });
         Ok(Self { parts: parts.into_iter().collect::<Result<_>>()? })
     }
 
-    pub(super) fn cells(&self) -> impl Iterator<Item = usize> {
+    pub(crate) fn cells(&self) -> impl Iterator<Item = usize> {
         self.parts.iter().flat_map(|part| &part.cells).map(|&cell| cell as usize)
     }
 
     /// Adds (N + τ GᵀG)⁻¹ r on the rim.
-    pub(super) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
+    pub(crate) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
         let found = workers.map(self.parts.len(), |index| self.parts[index].solve(r));
         self.cells().zip(found.into_iter().flatten()).for_each(|(cell, value)| z[cell] += value);
     }
@@ -114,8 +115,8 @@ impl Part {
 
 /// The cells of the rim.
 fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
-    let (weights, shape) = (&system.weights, system.grid.geometry.beam);
-    let rows = system.workers.map(shape.rows, |row| {
+    let (weights, shape) = (&system.weights, system.pass.grid.geometry.beam);
+    let rows = system.pass.workers.map(shape.rows, |row| {
         let mut found = Vec::new();
         for col in 0..shape.cols {
             let cell = row * shape.cols + col;
@@ -141,13 +142,13 @@ impl<T: Real> System<'_, '_, T> {
     /// Calls `visit(other, value)` for the elements of N + τ GᵀG in the row of a cell; the values of one
     /// place add up.
     fn for_neighbours(&self, cell: usize, mut visit: impl FnMut(usize, f64)) {
-        let geometry = &self.grid.geometry;
+        let geometry = &self.pass.grid.geometry;
         let (row, col) = (cell / geometry.beam.cols, cell % geometry.beam.cols);
         for (index, view) in geometry.views.iter().enumerate() {
             let place = view.places.at(row, col);
             let (row, col) = (place / view.shape.cols, place % view.shape.cols);
             let mut sums = [[0.0; REACH]; REACH];
-            let windows = self.windows.iter().enumerate();
+            let windows = self.pass.windows.iter().enumerate();
             for (k, window) in windows.filter(|(_, window)| window.view == index) {
                 self.add_exposure(k, window, [row, col], &mut sums);
             }
@@ -170,7 +171,7 @@ impl<T: Real> System<'_, '_, T> {
         [row, col]: [usize; 2],
         sums: &mut [[f64; REACH]; REACH],
     ) {
-        let sensor = self.model.sensor();
+        let sensor = self.pass.exposures.sensor();
         let (down, along) = (&window.along_rows.values, &window.along_cols.values);
         // The cell is the i-th that a pixel sees, down and along.
         let first = (col + 1).saturating_sub(window.col + TAPS);

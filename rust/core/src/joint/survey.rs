@@ -1,6 +1,5 @@
 //! What the exposures show of the beam, in sums: over blocks of pixels, and of its structure.
 
-use super::kernel::Row;
 use super::system::System;
 use crate::control::Control;
 use crate::error::Result;
@@ -14,29 +13,28 @@ const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 
 /// What one exposure shows in a block of pixels, with the light e = c L: Σ w (M e)², and with its
 /// slopes along the shift Σ w M² e ∂e and Σ w M² (∂e)².
 #[derive(Clone, Copy, Default)]
-pub(super) struct Block {
-    pub(super) weight: f64,
-    pub(super) slope: [f64; 2],
-    pub(super) square: [f64; 2],
+pub(crate) struct Block {
+    pub(crate) weight: f64,
+    pub(crate) slope: [f64; 2],
+    pub(crate) square: [f64; 2],
 }
 
 impl<T: Real> System<'_, '_, T> {
     /// Sums of each block of pixels and exposure, for blocks of `size`.
-    pub(super) fn blocks(&mut self, size: [usize; 2], control: &Control) -> Result<Vec<Block>> {
-        self.passes += 1;
-        let (sensor, count) = (self.model.sensor(), self.model.count());
+    pub(crate) fn blocks(&mut self, size: [usize; 2], control: &Control) -> Result<Vec<Block>> {
+        self.pass.count += 1;
+        let (sensor, count) = (self.pass.exposures.sensor(), self.pass.exposures.count());
         let (down, across) = (sensor.rows.div_ceil(size[0]), sensor.cols.div_ceil(size[1]));
-        let beams = self.views_of(&self.state.beam);
-        let length = Row::length(count, sensor.cols, self.with_offset);
-        let found = self.workers.map(down, |block_row| {
-            let mut room = self.room();
+        let beams = self.pass.views_of(&self.state.beam);
+        let found = self.pass.workers.map(down, |block_row| {
+            let mut room = self.pass.room();
             let mut found = vec![Block::default(); across * count];
             for row_index in block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]) {
                 control.check()?;
-                let row = &self.rows[row_index * length..][..length];
+                let row = self.pass.row(row_index);
                 let (light, rest) = row.split_at(count * sensor.cols);
-                self.weigh_row(row_index, &mut room);
-                self.see_slopes(&beams, row_index, &mut room);
+                self.pass.weigh_row(row_index, &mut room);
+                self.pass.see_slopes(&beams, row_index, &mut room);
                 for k in 0..count {
                     for col in 0..sensor.cols {
                         let at = k * sensor.cols + col;
@@ -45,7 +43,7 @@ impl<T: Real> System<'_, '_, T> {
                         block.weight += weight * light * light;
                         for (axis, slopes) in room.slopes.iter().enumerate() {
                             let Some(slope) = slopes.get(at) else { continue };
-                            let slope = self.flux[k] * slope;
+                            let slope = self.pass.flux[k] * slope;
                             block.slope[axis] += weight * light * slope;
                             block.square[axis] += weight * slope * slope;
                         }
@@ -62,8 +60,8 @@ impl<T: Real> System<'_, '_, T> {
     /// the smoothed slopes' second differences over [`APART`] cells, by that of what smoothing took
     /// away. A beam without structure, such as a Gaussian, has slopes of its own too, but by those
     /// shifts are hardly told from a bend of M.
-    pub(super) fn structure(&self) -> f64 {
-        let Shape { rows, cols } = self.grid.geometry.beam;
+    pub(crate) fn structure(&self) -> f64 {
+        let Shape { rows, cols } = self.pass.grid.geometry.beam;
         let beam = &self.state.beam;
         let seen = |cell: usize| self.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let [mut kept, mut lost] = [0.0, 0.0];

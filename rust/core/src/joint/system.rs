@@ -15,121 +15,124 @@
 use std::ops::Range;
 
 use super::flux::Fluxes;
-use super::grid::{Grid, TAPS, Window};
-use super::kernel::{Follow, Row, Solve};
-use super::pass::{Bands, Sums};
-use super::penalty::Penalty;
+use super::kernel::{Follow, Solve};
+use super::layout::Grid;
+use super::pass::Pass;
+use super::penalty::{Penalty, SMOOTHING};
+use super::room::Sums;
+use super::unknowns::{ShiftPrior, State};
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::Exposures;
 use crate::frames::Real;
-use crate::model::Model;
+use crate::geometry::TAPS;
 use crate::parallel::Workers;
 
 /// A determinant that is rounding alone, of two columns that a pixel cannot tell from each other.
 const SINGULAR: f64 = 1e-12;
 
-/// What is sought.
-#[derive(Clone)]
-pub(super) struct State {
-    /// The coefficients of the beam, cell by cell.
-    pub(super) beam: Vec<f64>,
-    /// θ of the fluxes.
-    pub(super) theta: Vec<f64>,
-    pub(super) shifts: Vec<[f64; 2]>,
-}
-
-/// Where shifts were measured, and the weights of their squared deviations where noise is known.
-pub(super) struct ShiftPrior {
-    pub(super) measured: Vec<[f64; 2]>,
-    pub(super) precisions: Vec<[f64; 2]>,
-}
-
 /// The problem at a state.
-pub(super) struct System<'m, 'a, T> {
-    pub(super) model: &'m Model<'a, T>,
-    pub(super) workers: &'m Workers,
-    pub(super) grid: Grid,
-    pub(super) fluxes: Fluxes,
-    pub(super) shift_prior: Option<ShiftPrior>,
-    pub(super) with_offset: bool,
+pub(crate) struct System<'m, 'a, T> {
+    pub(crate) pass: Pass<'m, 'a, T>,
+    pub(crate) fluxes: Fluxes,
+    shift_prior: Option<ShiftPrior>,
     /// F of the measurements alone, at the state last linearised.
-    pub(super) misfit: f64,
+    pub(crate) misfit: f64,
     /// The variance of a measurement of weight 1.
-    pub(super) unit: f64,
-    pub(super) state: State,
-    /// c of each exposure.
-    pub(super) flux: Vec<f64>,
+    pub(crate) unit: f64,
+    pub(crate) state: State,
     /// What the measurements pull at the unknowns there.
     pull: Vec<f64>,
     /// The mean M of the pixels with measurements.
-    pub(super) mean: f64,
-    pub(super) windows: Vec<Window>,
-    pub(super) bands: Bands,
-    /// [`Row`] by row.
-    pub(super) rows: Vec<f64>,
-    /// What cells get of the pixels' pulls, by band.
-    pub(super) sums: Vec<f64>,
-    /// Passes over the measurements.
-    pub(super) passes: u64,
+    pub(crate) mean: f64,
     /// Σ w c² M² of the pixels that see a cell, by their factors.
-    pub(super) weights: Vec<f64>,
+    pub(crate) weights: Vec<f64>,
     /// D a/(aᵀD a) with these weights D and the coefficients a.
     scale: Vec<f64>,
-    pub(super) penalty: Option<Penalty>,
+    pub(crate) penalty: Option<Penalty>,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
-    pub(super) fn new(
-        model: &'m Model<'a, T>,
+    pub(crate) fn new(
+        exposures: &'m Exposures<'a, T>,
         grid: Grid,
         fluxes: Fluxes,
-        with_offset: bool,
         state: State,
         workers: &'m Workers,
         control: &Control,
     ) -> Self {
-        let sensor = model.sensor();
-        let length = Row::length(model.count(), sensor.cols, with_offset);
+        let with_flux = !fluxes.columns.is_empty();
         Self {
-            model,
-            workers,
+            pass: Pass::new(exposures, grid, with_flux, workers, control),
             fluxes,
             shift_prior: None,
-            with_offset,
             misfit: 0.0,
             unit: 1.0,
-            flux: model.flux.clone(),
             pull: Vec::new(),
             mean: 1.0,
-            windows: Vec::new(),
-            bands: Bands::default(),
-            rows: workers.filled(sensor.rows * length, 0.0, control),
-            sums: Vec::new(),
-            passes: 0,
             weights: Vec::new(),
             scale: Vec::new(),
             penalty: None,
             state,
-            grid,
         }
     }
 
+    /// Seeks the shifts too, by what is known of them, or no longer; returns what was known before.
+    pub(crate) fn seek_shifts(&mut self, prior: Option<ShiftPrior>) -> Option<ShiftPrior> {
+        self.pass.with_shifts = prior.is_some();
+        std::mem::replace(&mut self.shift_prior, prior)
+    }
+
+    /// Whether shifts are sought.
+    pub(crate) const fn seeks_shifts(&self) -> bool {
+        self.shift_prior.is_some()
+    }
+
     /// Values of a vector of unknowns: cells, θ, shifts.
-    pub(super) fn size(&self) -> usize {
-        let shifts = if self.shift_prior.is_some() { 2 * self.model.count() } else { 0 };
+    pub(crate) fn size(&self) -> usize {
+        let shifts = if self.seeks_shifts() { 2 * self.pass.exposures.count() } else { 0 };
         self.state.beam.len() + self.fluxes.columns.len() + shifts
+    }
+
+    /// Takes a share of a step.
+    pub(crate) fn advance(&mut self, x: &[f64], share: f64) {
+        let cells = self.state.beam.len();
+        self.pass.workers.add_multiple(&mut self.state.beam, share, &x[..cells]);
+        let params = self.state.theta.len();
+        for (theta, step) in self.state.theta.iter_mut().zip(&x[cells..]) {
+            *theta += share * step;
+        }
+        let moves = self.centred(&x[cells + params..]);
+        let shifts = self.state.shifts.as_flattened_mut().iter_mut();
+        shifts.zip(moves.as_flattened()).for_each(|(shift, step)| *shift += share * step);
+        if let Some(prior) = &self.shift_prior {
+            prior.keep_near(&mut self.state.shifts);
+        }
+    }
+
+    /// Changes of shifts as they count: less their mean, where they are sought.
+    pub(crate) fn centred(&self, shifts: &[f64]) -> Vec<[f64; 2]> {
+        let shifts = shifts.as_chunks().0;
+        self.shift_prior.as_ref().map_or_else(|| shifts.to_vec(), |prior| prior.centred(shifts))
+    }
+
+    /// What pulls at shifts, as [`centred`](Self::centred) passes it on.
+    pub(crate) fn centred_pulls(&self, pulls: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+        match &self.shift_prior {
+            Some(prior) => prior.centred_pulls(&pulls),
+            None => pulls,
+        }
     }
 
     /// Finds M at the state, F there, and half the slope of −F along the unknowns.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
-    pub(super) fn linearise(&mut self, tau: f64, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.place(control);
-        let logs = self.fluxes.spread(&self.state.theta, self.model.count());
-        self.flux = self.model.flux.iter().zip(&logs).map(|(c, log)| c * log.exp()).collect();
+    pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
+        self.pass.place(&self.state.shifts, control);
+        self.pass.flux = self.fluxes.at(&self.state.theta);
         let beam = std::mem::take(&mut self.state.beam);
-        let mut pull = self.workers.filled(beam.len(), 0.0, control);
+        let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
         let found = self.solve_pixels(&beam, &mut pull, control);
         self.state.beam = beam;
         let found = found?;
@@ -138,45 +141,33 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.mean = self.mean_sensitivity();
         // Cells come into sight where shifts move.
         if self.weights.is_empty() || self.shift_prior.is_some() {
-            self.weigh(tau, control)?;
+            self.weigh(control)?;
         }
         self.whole(control)
     }
 
     /// What [`linearise`](Self::linearise) gives, at weights D and a weight of the penalty of the state
     /// there.
-    pub(super) fn renew(&mut self, tau: f64, control: &Control) -> Result<(f64, Vec<f64>)> {
+    pub(crate) fn renew(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         self.penalty = None;
-        self.weigh(tau, control)?;
+        self.weigh(control)?;
         self.whole(control)
-    }
-
-    /// Where the exposures lie, and the sums that this takes.
-    fn place(&mut self, control: &Control) {
-        let Grid { geometry, width, sensor, .. } = &self.grid;
-        self.windows = self.grid.windows(&self.state.shifts);
-        self.bands = Bands::new(&self.windows, &geometry.views, *width);
-        let size = self.bands.size(sensor.rows);
-        if self.sums.len() != size {
-            self.sums = Vec::new();
-            self.sums = self.workers.filled(size, 0.0, control);
-        }
     }
 
     /// M and O at their closed forms, and what they leave pulls at the cells.
     fn solve_pixels(&mut self, beam: &[f64], pull: &mut [f64], control: &Control) -> Result<Sums> {
-        let views = self.views_of(beam);
-        self.pass(pull, control, |system, row_index, row, room, found| {
+        let views = self.pass.views_of(beam);
+        self.pass.run(pull, control, |pass, row_index, row, room, found| {
             room.values().clear();
-            system.see(&views, row_index, room);
-            let lights = row.light.chunks_exact_mut(system.model.sensor().cols);
-            for (k, (light, flux)) in lights.zip(&system.flux).enumerate() {
+            pass.see(&views, row_index, room);
+            let lights = row.light.chunks_exact_mut(pass.exposures.sensor().cols);
+            for (k, (light, flux)) in lights.zip(&pass.flux).enumerate() {
                 light.iter_mut().zip(room.values().of(k)).for_each(|(e, seen)| *e = flux * seen);
             }
-            system.measure(row_index, room);
-            system.see_slopes(&views, row_index, room);
+            pass.measure(row_index, room);
+            pass.see_slopes(&views, row_index, room);
             let (weights, values, sums) = room.parts();
-            let (fluxes, singular) = (&system.flux[..], SINGULAR);
+            let (fluxes, singular) = (&pass.flux[..], SINGULAR);
             let solve = Solve { row, fluxes, weights, values, sums, singular };
             found.objective += pulp::Arch::new().dispatch(solve);
         })
@@ -186,38 +177,38 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     fn whole(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         let mut scale = std::mem::take(&mut self.scale);
         scale.resize(self.weights.len(), 0.0);
-        let cols = self.grid.geometry.beam.cols;
-        self.workers.map_blocks(&mut scale, cols, |row, scale| {
+        let cols = self.pass.grid.geometry.beam.cols;
+        self.pass.workers.map_blocks(&mut scale, cols, |row, scale| {
             let cells = self.weights[row * cols..].iter().zip(&self.state.beam[row * cols..]);
             scale.iter_mut().zip(cells).for_each(|(scale, (d, a))| *scale = d * a);
         });
-        let norm = self.workers.dot(&scale, &self.state.beam);
-        self.workers.map_blocks(&mut scale, cols, |_, scale| {
+        let norm = self.pass.workers.dot(&scale, &self.state.beam);
+        self.pass.workers.map_blocks(&mut scale, cols, |_, scale| {
             scale.iter_mut().for_each(|scale| *scale /= norm);
         });
         self.scale = scale;
         if let Some(penalty) = &mut self.penalty {
-            penalty.turn_to(&self.state.beam, &self.weights, self.workers);
+            penalty.turn_to(&self.state.beam, &self.weights, self.pass.workers);
             control.check()?;
         }
-        let mut slope = self.workers.filled(self.pull.len(), 0.0, control);
+        let mut slope = self.pass.workers.filled(self.pull.len(), 0.0, control);
         slope.copy_from_slice(&self.pull);
         let mut objective = self.misfit + self.pull_by_priors(&mut slope);
         if let Some(penalty) = &self.penalty {
-            objective += penalty.pull(&mut slope[..self.state.beam.len()], self.workers);
+            objective += penalty.pull(&mut slope[..self.state.beam.len()], self.pass.workers);
         }
         control.check()?;
         Ok((objective, slope))
     }
 
     /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam that no measurement tells.
-    pub(super) fn take_scale_out(&self, x: &mut [f64]) {
-        let multiple = self.workers.dot(&self.scale, x);
-        self.workers.add_multiple(x, -multiple, &self.state.beam);
+    pub(crate) fn take_scale_out(&self, x: &mut [f64]) {
+        let multiple = self.pass.workers.dot(&self.scale, x);
+        self.pass.workers.add_multiple(x, -multiple, &self.state.beam);
     }
 
     /// What was gathered of fluxes and shifts, behind what cells got.
-    pub(super) fn append(&self, sums: &Sums, vector: &mut Vec<f64>) {
+    pub(crate) fn append(&self, sums: &Sums, vector: &mut Vec<f64>) {
         vector.extend(self.fluxes.gather(&sums.flux));
         vector.extend_from_slice(self.centred_pulls(sums.shifts.clone()).as_flattened());
     }
@@ -246,17 +237,18 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// How many pixels have a measurement.
-    pub(super) fn measured(&self) -> usize {
+    pub(crate) fn measured(&self) -> usize {
         let mut count = 0;
-        self.for_rows(|[_, inverse, ..]| count += inverse.iter().filter(|i| **i > 0.0).count());
+        self.pass
+            .for_rows(|[_, inverse, ..]| count += inverse.iter().filter(|i| **i > 0.0).count());
         count
     }
 
-    /// The pixels whose measurements do not tell an offset from a gain, where one is sought.
-    pub(super) fn untold(&self) -> Vec<usize> {
+    /// The pixels whose measurements do not distinguish an offset from a gain, where one is sought.
+    pub(crate) fn without_offset(&self) -> Vec<usize> {
         let (mut untold, mut first) = (Vec::new(), 0);
-        if self.with_offset {
-            self.for_rows(|[_, gain, _, _, beside, _]| {
+        if self.pass.with_offset {
+            self.pass.for_rows(|[_, gain, _, _, beside, _]| {
                 let pixels = gain.iter().zip(beside).enumerate();
                 let told = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
                 untold.extend(told.map(|(col, _)| first + col));
@@ -268,7 +260,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// S x, and the change of M that goes with x in each [`Row`]; returns the largest size of that less
     /// `share` of the change before.
-    pub(super) fn multiply(
+    pub(crate) fn multiply(
         &mut self,
         x: &[f64],
         product: &mut Vec<f64>,
@@ -285,7 +277,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let sums = sums?;
         self.append(&sums, product);
         if let Some(penalty) = &self.penalty {
-            penalty.add_product(&x[..cells], &mut product[..cells], self.workers);
+            penalty.add_product(&x[..cells], &mut product[..cells], self.pass.workers);
         }
         let found = x[cells..cells + params].iter().chain(moves.as_flattened());
         let priors = product[cells..].iter_mut().zip(found).zip(self.precisions());
@@ -304,71 +296,36 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         control: &Control,
     ) -> Result<Sums> {
         let (cells, params) = (beam.len(), self.fluxes.columns.len());
-        let logs = self.fluxes.spread(&x[cells..cells + params], self.model.count());
-        let shares: Vec<f64> = logs.iter().zip(&self.flux).map(|(log, flux)| log / flux).collect();
-        let (views, beams) = (self.views_of(&x[..cells]), self.views_of(beam));
-        self.pass(pull, control, |system, row_index, row, room, found| {
-            system.weigh_row(row_index, room);
-            system.see_slopes(&beams, row_index, room);
+        let logs = self.fluxes.spread(&x[cells..cells + params]);
+        let shares: Vec<f64> =
+            logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect();
+        let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(beam));
+        self.pass.run(pull, control, |pass, row_index, row, room, found| {
+            pass.weigh_row(row_index, room);
+            pass.see_slopes(&beams, row_index, room);
             room.begin(row.light, &shares, moves);
-            system.see(&views, row_index, room);
+            pass.see(&views, row_index, room);
             let (weights, values, sums) = room.parts();
-            let fluxes = &system.flux[..];
+            let fluxes = &pass.flux[..];
             let follow = Follow { row, fluxes, weights, values, sums, share };
             found.largest = found.largest.max(pulp::Arch::new().dispatch(follow));
         })
     }
 
-    /// Changes of shifts less their mean, by the weights of the prior: to move all exposures moves
-    /// but the beam, which no measurement tells.
-    ///
-    /// As Σ_j π_j (d_k − d_j)/Σ π: where one shift is all but exact, it is all but the mean, and what
-    /// rounding leaves of their difference would pull at it with all its weight.
-    pub(super) fn centred(&self, shifts: &[f64]) -> Vec<[f64; 2]> {
-        let shifts = shifts.as_chunks().0;
-        let Some(shares) = self.shares() else { return shifts.to_vec() };
-        let from_mean = |shift: &[f64; 2], axis: usize| -> f64 {
-            let others = shares.iter().zip(shifts);
-            others
-                .map(|(share, other): (_, &[f64; 2])| share[axis] * (shift[axis] - other[axis]))
-                .sum()
-        };
-        shifts.iter().map(|shift| [0, 1].map(|axis| from_mean(shift, axis))).collect()
-    }
-
-    /// What pulls at shifts pulls at them less their mean: the transpose of [`centred`](Self::centred).
-    pub(super) fn centred_pulls(&self, pulls: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
-        let Some(shares) = self.shares() else { return pulls };
-        let left = |k: usize, axis: usize| -> f64 {
-            let others = (0..pulls.len()).filter(|&j| j != k);
-            others
-                .map(|j| shares[j][axis] * pulls[k][axis] - shares[k][axis] * pulls[j][axis])
-                .sum()
-        };
-        (0..pulls.len()).map(|k| [0, 1].map(|axis| left(k, axis))).collect()
-    }
-
-    /// The share of each shift in their mean, if they are sought.
-    fn shares(&self) -> Option<Vec<[f64; 2]>> {
-        let precisions = &self.shift_prior.as_ref()?.precisions;
-        let sum = [0, 1].map(|axis| precisions.iter().map(|p| p[axis]).sum::<f64>());
-        Some(precisions.iter().map(|p| [p[0] / sum[0], p[1] / sum[1]]).collect())
-    }
-
     /// The priors' weights of the parameters.
-    pub(super) fn precisions(&self) -> Vec<f64> {
+    pub(crate) fn precisions(&self) -> Vec<f64> {
         let shifts = self.shift_prior.iter().flat_map(|prior| prior.precisions.as_flattened());
         self.fluxes.precisions.iter().chain(shifts).map(|precision| self.unit * precision).collect()
     }
 
     /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
-    fn weigh(&mut self, tau: f64, control: &Control) -> Result<()> {
-        let mut weights = self.workers.filled(self.state.beam.len(), 0.0, control);
-        self.pass(&mut weights, control, |system, row_index, row, room, _| {
-            let cols = system.model.sensor().cols;
-            system.weigh_row(row_index, room);
+    fn weigh(&mut self, control: &Control) -> Result<()> {
+        let mut weights = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
+        self.pass.run(&mut weights, control, |pass, row_index, row, room, _| {
+            let cols = pass.exposures.sensor().cols;
+            pass.weigh_row(row_index, room);
             let (weights, values, _) = room.parts();
-            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&system.flux).enumerate() {
+            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let pixels = weights.iter().zip(&*row.sensitivity);
                 for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
                     *value = weight * (flux * m) * (flux * m);
@@ -376,41 +333,41 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         })?;
         self.weights = weights;
-        if self.grid.is_spline() {
+        if self.pass.grid.is_spline() {
             let total: f64 = self.weights.iter().sum();
-            let typical = self.workers.dot(&self.weights, &self.weights) / total;
+            let typical = self.pass.workers.dot(&self.weights, &self.weights) / total;
             // τ stays until it is asked for anew, or F would not be one function.
-            let tau = self.penalty.as_ref().map_or(tau * typical, |penalty| penalty.tau);
-            let shape = self.grid.geometry.beam;
-            self.penalty = Some(Penalty::new(shape, &self.weights, tau, self.workers, control));
+            let tau = self.penalty.as_ref().map_or(SMOOTHING * typical, |penalty| penalty.tau);
+            let shape = self.pass.grid.geometry.beam;
+            self.penalty =
+                Some(Penalty::new(shape, &self.weights, tau, self.pass.workers, control));
         }
         control.check()
     }
 
     /// w (c M)² of up to four pixels of a row of an exposure.
-    pub(super) fn pixel_weights(
+    pub(crate) fn pixel_weights(
         &self,
         exposure: usize,
         row: usize,
         cols: Range<usize>,
     ) -> [f64; TAPS] {
-        let mut weights = [self.model.uniform_weight(exposure).unwrap_or(0.0); TAPS];
-        if self.model.uniform_weight(exposure).is_none() {
-            let _ = self.model.stretch(exposure, row, cols.clone(), &mut weights);
+        let mut weights = [self.pass.exposures.uniform_weight(exposure).unwrap_or(0.0); TAPS];
+        if self.pass.exposures.uniform_weight(exposure).is_none() {
+            let _ = self.pass.exposures.stretch(exposure, row, cols.clone(), &mut weights);
         }
-        let (sensor, count) = (self.model.sensor(), self.model.count());
-        let length = Row::length(count, sensor.cols, self.with_offset);
-        let sensitivity = &self.rows[row * length + count * sensor.cols..][..sensor.cols];
+        let (sensor, count) = (self.pass.exposures.sensor(), self.pass.exposures.count());
+        let sensitivity = &self.pass.row(row)[count * sensor.cols..][..sensor.cols];
         for (weight, m) in weights.iter_mut().zip(&sensitivity[cols]) {
-            *weight *= (self.flux[exposure] * m).powi(2);
+            *weight *= (self.pass.flux[exposure] * m).powi(2);
         }
         weights
     }
 
     /// M and O at the state, row by row.
-    pub(super) fn pixels(&self) -> [Vec<f64>; 2] {
+    pub(crate) fn pixels(&self) -> [Vec<f64>; 2] {
         let mut found = [Vec::new(), Vec::new()];
-        self.for_rows(|[sensitivity, _, _, offset, ..]| {
+        self.pass.for_rows(|[sensitivity, _, _, offset, ..]| {
             found[0].extend_from_slice(sensitivity);
             found[1].extend_from_slice(offset);
         });
@@ -420,7 +377,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// The mean M of the pixels with measurements.
     fn mean_sensitivity(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
-        self.for_rows(|[sensitivity, inverse, ..]| {
+        self.pass.for_rows(|[sensitivity, inverse, ..]| {
             for (m, inverse) in sensitivity.iter().zip(inverse) {
                 if *inverse > 0.0 {
                     sum += m;
@@ -429,15 +386,5 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         });
         sum / f64::from(count.max(1))
-    }
-
-    /// Calls `visit([M, i₁₁, the last change of M, O, i₁₂, i₂₂])` for each row of pixels, i being the
-    /// inverse of their normal matrices; the last three are empty where no offset is sought.
-    pub(super) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 6])) {
-        let (cols, count) = (self.model.sensor().cols, self.model.count());
-        for row in self.rows.chunks_exact(Row::length(count, cols, self.with_offset)) {
-            let part = |index: usize| row.chunks_exact(cols).nth(count + index).unwrap_or_default();
-            visit([0, 1, 2, 3, 4, 5].map(part));
-        }
     }
 }

@@ -5,16 +5,16 @@
 //! the beam is one.
 
 use super::system::System;
+use crate::coarse::Hats;
 use crate::control::Control;
 use crate::frames::{Real, Shape};
 use crate::parallel::Workers;
-use crate::precondition::hats::Hats;
 
 /// Rows of cells whose sums over hats a thread makes at a time.
 const SUMMED: usize = 32;
 
-pub(super) struct Wide {
-    pub(super) hats: Hats,
+pub(crate) struct Wide {
+    pub(crate) hats: Hats,
     cols: usize,
     /// a, and ∂a/3 along rows and columns where the beam is a spline, in single precision; 0 for cells
     /// that are not seen.
@@ -23,13 +23,13 @@ pub(super) struct Wide {
 }
 
 impl Wide {
-    pub(super) fn new<T: Real>(hats: Hats, system: &System<'_, '_, T>, control: &Control) -> Self {
-        let (beam, cols) = (&system.state.beam, system.grid.geometry.beam.cols);
+    pub(crate) fn new<T: Real>(hats: Hats, system: &System<'_, '_, T>, control: &Control) -> Self {
+        let (beam, cols) = (&system.state.beam, system.pass.grid.geometry.beam.cols);
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
         let slope = |cell: usize, step: usize| {
             let (place, length) = if step == 1 { (cell % cols, cols) } else { (cell, beam.len()) };
-            let inside = system.grid.is_spline() && place >= step && place + step < length;
+            let inside = system.pass.grid.is_spline() && place >= step && place + step < length;
             if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
                 ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
             } else {
@@ -42,7 +42,7 @@ impl Wide {
     }
 
     /// Φᵀ r.
-    pub(super) fn gather(&self, r: &[f64], workers: &Workers) -> Vec<f64> {
+    pub(crate) fn gather(&self, r: &[f64], workers: &Workers) -> Vec<f64> {
         let (hats, cols) = (&self.hats, self.cols);
         let rows = self.beam.len() / cols;
         let bands = workers.map(rows.div_ceil(SUMMED), |band| {
@@ -93,7 +93,7 @@ impl Wide {
     }
 
     /// Adds Φ y to rows of cells from `first` on.
-    pub(super) fn spread(&self, heights: &[f64], first: usize, z: &mut [f64]) {
+    pub(crate) fn spread(&self, heights: &[f64], first: usize, z: &mut [f64]) {
         let cols = self.cols;
         let mut last = usize::MAX;
         let mut lines = [(); 4].map(|()| vec![0.0; cols]);
@@ -136,9 +136,9 @@ fn on_cells<T: Real>(
     control: &Control,
     value: impl Fn(usize) -> f32 + Sync + Send,
 ) -> Vec<f32> {
-    let Shape { cols, .. } = system.grid.geometry.beam;
-    let mut values = system.workers.filled(system.state.beam.len(), 0.0, control);
-    system.workers.map_blocks(&mut values, cols, |row, values| {
+    let Shape { cols, .. } = system.pass.grid.geometry.beam;
+    let mut values = system.pass.workers.filled(system.state.beam.len(), 0.0, control);
+    system.pass.workers.map_blocks(&mut values, cols, |row, values| {
         let cells = values.iter_mut().zip(row * cols..);
         cells.for_each(|(each, cell)| *each = value(cell));
     });

@@ -1,8 +1,6 @@
 //! The arithmetic of a product with S: whole rows, side by side in vector registers.
 
-/// Neighbouring values that are worked on side by side: several registers full, so that what is done
-/// once a line and chunk does not count.
-pub(crate) const LANES: usize = 32;
+use crate::padded::{LANES, chunk};
 
 /// Weights w c² of one exposure along a row.
 #[derive(Clone, Copy)]
@@ -26,12 +24,6 @@ pub(super) struct Line<'s> {
     pub(super) weight: Weight<'s>,
     pub(super) first: &'s [f32],
     pub(super) second: &'s [f32],
-}
-
-/// Chunk number `index` of some values.
-#[inline(always)]
-pub(crate) fn chunk(values: &[f32], index: usize) -> &[f32; LANES] {
-    &values.as_chunks().0[index]
 }
 
 /// From pixels to cells: Σ w c² M x and Σ w c² M², from lines of M and x.

@@ -11,10 +11,11 @@
 //! standard deviation everywhere and only its signs are drawn: a bit for each measurement.
 
 use super::kernel::{NoiseSlope, Sign, TwoTerms};
-use super::{BAND, ExposureScratch, LANES, Reduced, RowWeight, Shown};
+use super::operator::{ExposureScratch, Reduced, RowWeight, Shown};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::padded::{BAND, LANES};
 use crate::random;
 
 impl<T: Real> Reduced<'_, '_, T> {
@@ -93,7 +94,7 @@ impl<T: Real> Reduced<'_, '_, T> {
         weight: RowWeight<'_>,
         noise: &'s mut Vec<f32>,
     ) -> &'s [f32] {
-        let (sensor, count) = (self.model.sensor(), self.model.count() as u64);
+        let (sensor, count) = (self.exposures.sensor(), self.exposures.count() as u64);
         let number = (draw * count + exposure) * sensor.rows as u64 + row as u64;
         let mut bits = random::bits(number);
         let signs: Vec<u32> = (0..sensor.cols.div_ceil(LANES)).map(|_| bits()).collect();

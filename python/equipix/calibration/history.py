@@ -1,0 +1,29 @@
+"""How a calibration went."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """How a calibration went, at some moments on its way.
+
+    Attributes
+    ----------
+    sweep : ndarray, shape (looks,), uint64
+        How many sweeps had been made.
+    objective : ndarray, shape (looks,), float64
+        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
+        and while such a fit still finds their weights.
+    error_estimate : ndarray, shape (looks,), float64
+        The estimated largest relative error of the sensitivity.
+    """
+
+    sweep: NDArray[Any]
+    objective: NDArray[Any]
+    error_estimate: NDArray[Any]

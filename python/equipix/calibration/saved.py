@@ -1,0 +1,175 @@
+"""The file of a calibration: from its fields to named arrays and JSON, and back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.io import check_format, check_pages, save_pages
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from os import PathLike
+
+    from numpy.typing import NDArray
+
+KIND = "calibration"
+"""What the metadata of the file call it."""
+
+FORMAT = 2
+"""Number of the file format; a file with a higher one is refused. Format 1 held no coefficients of
+the beam and no verdicts, rotations only among the options, and the images of ``rejected`` one below
+the other in one page."""
+
+_MAPS: dict[str, type] = {
+    "sensitivity": np.floating,
+    "flags": np.uint32,
+    "component_labels": np.integer,
+}
+_PLAIN = (
+    "objective",
+    "components",
+    "sweeps",
+    "converged",
+    "error_estimate",
+    "dark_is_fitted",
+)
+"""Fields that are JSON values as they are."""
+
+_MAYBE, _SPLINE = {"dark", "sensitivity_std"}, {"beam_coefficients"}
+_OPTIONAL = _MAYBE | _SPLINE
+
+
+def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
+    """Write the fields of a `Calibration` to a file that `read_fields` reads.
+
+    Parameters
+    ----------
+    path : path
+        The file; its suffix names the format.
+    fields : mapping
+        The attributes of a `Calibration` by name.
+    force : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or it cannot be written.
+    InputError
+        If the suffix is unknown.
+    """
+    content = {
+        "format": FORMAT,
+        "kind": KIND,
+        "calibration": _numbers(fields),
+        "metadata": fields["metadata"],
+    }
+    save_pages(path, _pages(fields), content, force=force)
+
+
+def read_fields(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> dict[str, Any]:
+    """Make the fields of a `Calibration` of what `save_fields` wrote.
+
+    Parameters
+    ----------
+    path : path
+        The file they are from.
+    pages : mapping of str to ndarray
+        Its arrays by name.
+    content : dict
+        Its metadata.
+
+    Returns
+    -------
+    dict
+        The attributes of a `Calibration` by name; ``history`` holds those of a `History`.
+
+    Raises
+    ------
+    FileError
+        If the format is newer than `FORMAT`, or a page is missing or does not fit.
+    KeyError, TypeError, ValueError
+        If a number is missing or is something else.
+    """
+    check_format(path, content, KIND, FORMAT)
+    check_pages(path, pages, _MAPS | dict.fromkeys(_MAYBE & pages.keys(), np.floating))
+    check_pages(
+        path, pages, {"beam": np.floating, **dict.fromkeys(_SPLINE & pages.keys(), np.floating)}
+    )
+    if content["format"] == 1 and "rejected" in pages:
+        images = pages["rejected"].reshape(-1, *pages["sensitivity"].shape)
+        pages = {**pages, "rejected": images}
+    stacks = dict.fromkeys({"rejected"} & pages.keys(), np.uint8)
+    check_pages(path, pages, {"sensitivity": np.floating}, stacks)
+    numbers = content["calibration"]
+    if content["format"] == 1:
+        options = content["metadata"]["options"]
+        former = {"rotation": options["rotation"], "dark_is_fitted": options["dark"] == "fit"}
+        numbers = {**numbers, **former, "verdicts": []}
+    chi2, rejected = numbers["reduced_chi2"], pages.get("rejected")
+    row, col = numbers["beam_origin"]
+    return {
+        **{name: pages[name] for name in ("sensitivity", "beam", "flags", "component_labels")},
+        **{name: pages.get(name) for name in _OPTIONAL},
+        **{name: numbers[name] for name in _PLAIN},
+        **{name: _array(numbers[name]) for name in ("shifts", "flux")},
+        **{name: _array(numbers.get(name)) for name in ("tilt_std", "shift_std")},
+        "beam_origin": (row, col),
+        "rotation": np.array(numbers["rotation"], dtype=np.int64),
+        "verdicts": numbers["verdicts"],
+        "reduced_chi2": float("nan") if chi2 is None else chi2,
+        "shift_sign": numbers.get("shift_sign", "undetermined"),
+        "history": _history(numbers["history"]),
+        "rejected": None if rejected is None else rejected.astype(bool),
+        "metadata": content["metadata"],
+    }
+
+
+def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Collect the arrays of the size of the sensor, and the beam."""
+    names = ("beam", *_MAPS, *sorted(_OPTIONAL))
+    pages = {name: fields[name] for name in names if fields[name] is not None}
+    if fields["rejected"] is not None:
+        pages["rejected"] = fields["rejected"].astype(np.uint8)
+    return pages
+
+
+def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect the rest as JSON values, which have neither NaN nor infinity."""
+    chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
+    history = fields["history"]
+    return {
+        "beam_origin": list(fields["beam_origin"]),
+        "shifts": fields["shifts"].tolist(),
+        "flux": fields["flux"].tolist(),
+        **{name: fields[name] for name in _PLAIN},
+        "rotation": fields["rotation"].tolist(),
+        "reduced_chi2": chi2 if np.isfinite(chi2) else None,
+        "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
+        "shift_sign": fields["shift_sign"],
+        "tilt_std": None
+        if tilt_std is None
+        else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],
+        "shift_std": None if shift_std is None else shift_std.tolist(),
+        "history": {
+            "sweep": history.sweep.tolist(),
+            "objective": history.objective.tolist(),
+            "error_estimate": history.error_estimate.tolist(),
+        },
+    }
+
+
+def _history(numbers: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    return {
+        "sweep": np.array(numbers["sweep"], dtype=np.uint64),
+        "objective": np.array(numbers["objective"]),
+        "error_estimate": np.array(numbers["error_estimate"]),
+    }
+
+
+def _array(values: Any) -> NDArray[np.float64] | None:
+    return None if values is None else np.array(values, dtype=np.float64)

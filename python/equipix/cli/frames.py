@@ -1,0 +1,82 @@
+"""Commands about frames: average, correct."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from equipix._types import Flagged
+from equipix.cli.options import Force, Json, Saturation, Workers
+from equipix.cli.terminal import check_output, progress_bars, show_result
+from equipix.correction.files import correct_files, is_folder
+from equipix.frames import average as average_frames
+from equipix.frames import save_statistics
+from equipix.io import SUFFIXES, find_files, refuse_inputs
+from equipix.loading import load
+
+commands = typer.Typer()
+
+
+@commands.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")
+def average(
+    source: Annotated[list[str], typer.Argument(help="Image files or globs.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Statistics: .tif or .npz.")],
+    dark: Annotated[list[str] | None, typer.Option(help="Dark frames, to be subtracted.")] = None,
+    saturation: Saturation = None,
+    workers: Workers = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Mean and variance of every pixel over many frames."""
+    check_output(output, force=force, suffixes=SUFFIXES)
+    refuse_inputs([output], find_files([*source, *(dark or [])]))
+    with progress_bars() as progress:
+        offset = None
+        if dark:
+            offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+        frames = average_frames(
+            source, dark=offset, saturation=saturation, workers=workers, progress=progress
+        )
+    save_statistics(output, frames, force=force)
+    result = {
+        "output": str(output),
+        "shape": list(frames.mean.shape),
+        "frames": int(frames.count.max()),
+        "mean": float(frames.mean.mean()),
+        "variance": float(frames.variance.mean()),
+        "saturated_pixels": int(np.count_nonzero(frames.saturated)),
+    }
+    show_result(result, as_json=as_json)
+
+
+@commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
+def correct(
+    calibration: Annotated[Path, typer.Argument(help="A calibration: .tif or .npz.")],
+    frames: Annotated[list[str], typer.Argument(help="Image files or globs.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="A .tif of all frames, or a folder of files.")
+    ],
+    dark: Annotated[
+        str, typer.Option(help="'stored', 'none', or a file: dark frames or their average.")
+    ] = "stored",
+    flagged: Annotated[Flagged, typer.Option(help="What flagged pixels become.")] = "nan",
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Divide frames by the sensitivity, their dark level subtracted."""
+    check_output(output, force=force, folder=is_folder(output))
+    refuse_inputs([output], [calibration])
+    with progress_bars() as progress:
+        done = correct_files(
+            load(calibration),
+            frames,
+            output,
+            dark=dark,
+            flagged=flagged,
+            force=force,
+            progress=progress,
+        )
+    show_result({"output": str(output), "frames": done}, as_json=as_json)

@@ -1,0 +1,27 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
+Tolerance = Annotated[float, typer.Option(help="Largest relative error of the sensitivity.")]
+MaxSweeps = Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")]
+Uncertainty = Annotated[
+    bool, typer.Option("--uncertainty", help="Find the standard deviation of every pixel.")
+]
+Saturation = Annotated[
+    float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
+]
+Picture = Annotated[
+    Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
+]
+Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
+Shape = Annotated[
+    tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
+]

@@ -1,0 +1,136 @@
+"""The command plan: what a pattern of shifts will leave, and better patterns."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from equipix.cli.options import Force, Json, Picture, Seed
+from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
+from equipix.errors import InputError
+from equipix.pictures.canvas import check_picture, save_figure
+from equipix.pictures.plans import draw_plans
+from equipix.plan import ErrorBudget, advise_order, error_budget, identify, suggest, trend_told
+
+commands = typer.Typer()
+
+
+@commands.command(
+    epilog="Example: equipix plan --shape 582 782 --shifts '0,0 0,11 0,19 11,0 19,0' --drift 1e-4. "
+    "To find one: equipix plan --shape 582 782 --exposures 5 --max-shift 80 80"
+)
+def plan(
+    shape: Annotated[tuple[int, int], typer.Option(min=1, help="Rows and columns of the sensor.")],
+    shifts: Annotated[
+        str | None, typer.Option(help="The pattern to judge: 'row,col row,col …' in pixels.")
+    ] = None,
+    max_shift: Annotated[
+        tuple[int, int] | None,
+        typer.Option(min=0, help="Find patterns within this travel (row, col), in pixels."),
+    ] = None,
+    exposures: Annotated[
+        int | None, typer.Option(min=2, help="Of the patterns to find; the fewest unless given.")
+    ] = None,
+    noise: Annotated[float, typer.Option(help="Noise of an exposure, over its signal.")] = 1e-3,
+    drift: Annotated[
+        float | None,
+        typer.Option(help="Unknown relative change of the lamp; noise/10 unless given."),
+    ] = None,
+    shift_error: Annotated[float, typer.Option(help="Error of a shift, in pixels.")] = 0,
+    beam_width: Annotated[
+        float | None, typer.Option(help="Width of a Gaussian beam in pixels; even unless given.")
+    ] = None,
+    rng: Seed = 0,
+    output: Picture = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Say what errors a pattern of shifts will leave, or find better patterns."""
+    if (shifts is None) == (max_shift is None):
+        raise InputError("give either --shifts, to judge a pattern, or --max-shift, to find some")
+    if output is not None:
+        check_picture(output)
+        check_output(output, force=force)
+    causes: dict[str, Any] = {
+        "noise": noise,
+        "shift_error": shift_error,
+        "beam_width": beam_width,
+    }
+    if shifts is not None:
+        assumed = noise / 10 if drift is None else drift
+        budgets = [error_budget(shape, _pairs(shifts), drift=assumed, **causes)]
+    elif max_shift is not None:
+        with progress_bars() as progress:
+            found = suggest(
+                shape, exposures, max_shift, drift=drift, rng=rng, progress=progress, **causes
+            )
+        budgets = [suggestion.budget for suggestion in found]
+    if output is not None:
+        save_figure(draw_plans(budgets), output, force=force)
+    plans = [_plan_summary(budget) for budget in budgets]
+    if as_json:
+        result = {"shape": list(shape), "patterns": plans}
+        show_result(result | ({"picture": str(output)} if output else {}), as_json=True)
+    else:
+        _show_plans(plans)
+
+
+def _pairs(text: str) -> list[list[float]]:
+    """Parse 'row,col row,col'."""
+    try:
+        pairs = [[float(part) for part in pair.split(",")] for pair in text.split()]
+    except ValueError:
+        pairs = []
+    if not pairs or any(len(pair) != 2 for pair in pairs):
+        raise InputError(f"'--shifts' is {text!r}, expected pairs such as '0,0 0,11 0,19'")
+    return pairs
+
+
+def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
+    """Collect the figures of a pattern."""
+    found = identify(budget.shape, budget.shifts)
+    order = advise_order(budget.shifts)
+    return {
+        "shifts": budget.shifts.tolist(),
+        "components": found.components,
+        "largest": found.largest,
+        "equations": found.equations,
+        "unknowns": found.unknowns,
+        "rms": budget.rms,
+        "rms_by_cause": budget.rms_by_cause,
+        "tilt_by_cause": {name: list(tilt) for name, tilt in budget.tilt_by_cause.items()},
+        "worst_wave": list(budget.spectrum.worst),
+        "smallest_eigenvalue": budget.spectrum.smallest,
+        "trend_told": budget.trend_told,
+        "order": order.tolist(),
+        "trend_told_in_order": trend_told(budget.shifts[order]),
+    }
+
+
+def _show_plans(plans: list[dict[str, Any]]) -> None:
+    """Print the patterns' figures side by side."""
+    rows = {
+        "all causes": lambda p: f"{p['rms']:.2e}",
+        "noise": lambda p: f"{p['rms_by_cause']['noise']:.2e}",
+        "tilt from lamp drift": lambda p: f"{p['rms_by_cause']['drift']:.2e}",
+        "shift errors": lambda p: f"{p['rms_by_cause']['shift_error']:.2e}",
+        "parts that nothing compares": lambda p: str(p["components"]),
+        "equations / unknowns": lambda p: f"{p['equations']} / {p['unknowns']}",
+        "worst wave, cycles per pixel": lambda p: "({:.3f}, {:.3f})".format(*p["worst_wave"]),
+        "λ of it": lambda p: f"{p['smallest_eigenvalue']:.3f}",
+        "linear trend told from tilt": lambda p: f"{p['trend_told']:.1%}",
+        "  in the order advised": lambda p: f"{p['trend_told_in_order']:.1%}",
+    }
+    patterns = [f"pattern {k + 1}" for k in range(len(plans))]
+    show_table(
+        ("rms error of the sensitivity", *patterns),
+        [(name, *map(words, plans)) for name, words in rows.items()],
+    )
+    for pattern, found in zip(patterns, plans, strict=True):
+        shifts = " ".join(f"{row:g},{col:g}" for row, col in _ordered(found))
+        print(f"{pattern}, in the order advised: {shifts}")  # noqa: T201
+
+
+def _ordered(found: dict[str, Any]) -> list[list[float]]:
+    return [found["shifts"][k] for k in found["order"]]

@@ -1,0 +1,214 @@
+//! What a calibration found.
+
+use crate::beam::Beam;
+use crate::connectivity::Components;
+use crate::control::Control;
+use crate::convergence::History;
+use crate::error::{Error, Result};
+use crate::exposures::{Exposures, Stretch};
+use crate::frames::{Real, Shape};
+use crate::geometry::Rotation;
+use crate::parallel::Workers;
+
+/// What became of shifts that were to be refined.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refinement {
+    /// They were not to be.
+    None,
+    /// The fit ended before: they are as given.
+    NotTried,
+    /// The beam has too little structure to determine them: they are as given.
+    Undetermined,
+    /// They are refined.
+    Done,
+}
+
+/// A calibrated sensor.
+#[derive(Clone, Debug)]
+pub struct Fit {
+    /// Relative sensitivity M, row by row, of mean 1; NaN outside the largest component.
+    pub sensitivity: Vec<f64>,
+    /// The beam L.
+    pub beam: Beam,
+    /// The flux c of each exposure.
+    pub flux: Vec<f64>,
+    /// The shift (row, column) of each exposure, as refined or as given.
+    pub shifts: Vec<[f64; 2]>,
+    /// The offset O of each pixel, if it was sought; NaN where undetermined.
+    pub offset: Option<Vec<f64>>,
+    /// Bits of [`flag`](crate::frames::flag) for each pixel.
+    pub flags: Vec<u32>,
+    /// What the measurements can compare.
+    pub components: Components,
+    /// F at the end, and along the way.
+    pub history: History,
+    /// F of the measurements at the end, without penalty and priors.
+    pub misfit: f64,
+    /// Measurements used less unknowns determined.
+    pub degrees_of_freedom: i64,
+    /// Whether the variance of the values was known.
+    pub variance_is_known: bool,
+    /// What became of shifts that were to be refined.
+    pub refinement: Refinement,
+    /// Whether free fluxes leave a tilt of ln M undetermined: then its slope is 0.
+    pub leaves_tilt: bool,
+    /// The smallest Ritz value of a joint fit: near 0 where the measurements barely constrain some
+    /// pattern.
+    pub smallest_ritz: Option<f64>,
+}
+
+impl Fit {
+    /// The part of it that questions and a later start need.
+    #[must_use]
+    pub fn solution(&self) -> Solution<'_> {
+        Solution {
+            sensitivity: &self.sensitivity,
+            beam: self.beam.view(),
+            flux: &self.flux,
+            shifts: &self.shifts,
+            refined: self.refinement == Refinement::Done,
+            joint: self.is_joint(),
+            unit: self.unit(),
+        }
+    }
+
+    /// Whether the pixels were eliminated, as for fractional shifts or where more than M and L was
+    /// sought.
+    #[must_use]
+    pub const fn is_joint(&self) -> bool {
+        self.smallest_ritz.is_some()
+    }
+
+    /// F of the measurements for each degree of freedom; NaN if there is none.
+    #[must_use]
+    pub fn reduced_chi2(&self) -> f64 {
+        if self.degrees_of_freedom > 0 {
+            self.misfit / self.degrees_of_freedom as f64
+        } else {
+            f64::NAN
+        }
+    }
+
+    /// The variance of a value of weight 1: 1 where variances were given, else reduced χ², or 1 where
+    /// no residual tells it.
+    #[must_use]
+    pub fn unit(&self) -> f64 {
+        let chi2 = self.reduced_chi2();
+        if self.variance_is_known || !chi2.is_finite() { 1.0 } else { chi2 }
+    }
+
+    /// The noise-free signal c L M of each pixel from a position; NaN where L or M is unknown.
+    #[must_use]
+    pub fn predict(
+        &self,
+        shift: [f64; 2],
+        rotation: Rotation,
+        flux: f64,
+        sensor: Shape,
+        workers: &Workers,
+    ) -> Vec<f64> {
+        let mut signal = self.beam.light(shift, rotation, sensor, workers);
+        signal.iter_mut().zip(&self.sensitivity).for_each(|(light, m)| *light = flux * *light * m);
+        signal
+    }
+
+    /// D = Σ w c² L² of each pixel, the weight of its M.
+    ///
+    /// # Errors
+    /// As [`Solution::information`].
+    pub fn information<T: Real>(
+        &self,
+        exposures: &Exposures<'_, T>,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        self.solution().information(exposures, workers, control)
+    }
+}
+
+/// A fit, borrowed: what error bars are asked of, and what another fit may start from.
+#[derive(Clone, Debug)]
+pub struct Solution<'s> {
+    /// M in the gauge mean(M) = 1, row by row; NaN where undetermined.
+    pub sensitivity: &'s [f64],
+    /// The beam L.
+    pub beam: Beam<&'s [f64]>,
+    /// The flux c of each exposure.
+    pub flux: &'s [f64],
+    /// The shifts as found.
+    pub shifts: &'s [[f64; 2]],
+    /// Whether they were refined.
+    pub refined: bool,
+    /// Whether it is that of a joint fit.
+    pub joint: bool,
+    /// The variance of a measurement of weight 1.
+    pub unit: f64,
+}
+
+impl Solution<'_> {
+    /// Checks that it is one of as many exposures of the same sensor.
+    pub(crate) fn check<T: Real>(&self, exposures: &Exposures<'_, T>) -> Result<()> {
+        let (count, pixels) = (exposures.count(), exposures.sensor().len());
+        if self.flux.len() == count
+            && self.shifts.len() == count
+            && self.sensitivity.len() == pixels
+        {
+            return Ok(());
+        }
+        Err(Error::Shape {
+            argument: "start",
+            got: format!("{} exposures of {} pixels", self.flux.len(), self.sensitivity.len()),
+            wanted: format!("{count} exposures of {pixels} pixels"),
+        })
+    }
+
+    /// D = Σ w c² L² of each pixel, over the measurements used; light that is not known counts for
+    /// nothing.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if it belongs to other exposures, [`Error::Cancelled`] if `control` asks to
+    /// stop.
+    pub fn information<T: Real>(
+        &self,
+        exposures: &Exposures<'_, T>,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        self.check(exposures)?;
+        let (sensor, cols) = (exposures.sensor(), exposures.sensor().cols);
+        let mut information = workers.filled(sensor.len(), 0.0, control);
+        for (k, rotation) in exposures.positions().rotations.iter().enumerate() {
+            control.check()?;
+            let light = self.beam.light(self.shifts[k], *rotation, sensor, workers);
+            workers.map_blocks(&mut information, cols, |row, sums| {
+                let light = &light[row * cols..][..cols];
+                add_information(exposures, k, [row, 0], self.flux[k], light, sums);
+            });
+        }
+        control.check()?;
+        Ok(information)
+    }
+}
+
+/// Adds w c² L² of the measurements of exposure `k` from a pixel on along its row, of light L.
+pub(crate) fn add_information<T: Real>(
+    exposures: &Exposures<'_, T>,
+    k: usize,
+    [row, col]: [usize; 2],
+    flux: f64,
+    light: &[f64],
+    sums: &mut [f64],
+) {
+    let mut scratch = vec![0.0; light.len()];
+    let weight = match exposures.stretch(k, row, col..col + light.len(), &mut scratch) {
+        Stretch::Uniform(_, weight) => Some(weight),
+        Stretch::Weighted(..) => None,
+    };
+    for (i, (sum, light)) in sums.iter_mut().zip(light).enumerate() {
+        let (weight, light) = (weight.unwrap_or(scratch[i]), flux * light);
+        // Light that is not known has no number, and a measurement that is not used no weight.
+        if weight > 0.0 && light.is_finite() {
+            *sum += weight * light * light;
+        }
+    }
+}

@@ -1,0 +1,186 @@
+//! The gauge: what no measurement fixes, and how it is fixed in a result.
+//!
+//! ```text
+//! M → s M,   L → L/s                                                       in each component
+//! M → M·exp(α·p),   L → L·exp(β·u),   ln c_k → ln c_k − β·d_k,   β = −A α   with free fluxes
+//! ```
+//!
+//! The mean of M is 1 in each component, the mean of ln c is 0, and the least-squares slope of ln M is
+//! 0 along the directions in the beam that free fluxes leave open.
+
+use crate::connectivity::Components;
+use crate::fit::Fit;
+use crate::frames::Shape;
+use crate::geometry::Rotation;
+use crate::parallel::Workers;
+
+/// What rounding leaves of a determinant.
+const SINGULAR: f64 = 1e-12;
+
+/// Brings M to mean 1, each component for itself, and M to NaN outside the largest, L to NaN outside
+/// all. The pixels `left_out` are not in the means unless nothing else is there.
+pub(crate) fn fix_means(fit: &mut Fit, left_out: &[usize], workers: &Workers) {
+    let Fit { sensitivity, beam, components, .. } = fit;
+    let means = component_means(sensitivity, components, left_out);
+    rescale(sensitivity, &components.pixels, workers, |value, label| {
+        if label == 0 { value / means[0] } else { f64::NAN }
+    });
+    rescale(&mut beam.values, &components.cells, workers, |value, label| {
+        usize::try_from(label).map_or(f64::NAN, |label| value * means[label])
+    });
+    let coefficients = beam.coefficients.iter_mut().flatten();
+    coefficients.for_each(|coefficient| *coefficient *= means[0]);
+    if let Some(offset) = &mut fit.offset {
+        rescale(
+            offset,
+            &components.pixels,
+            workers,
+            |value, label| {
+                if label == 0 { value } else { f64::NAN }
+            },
+        );
+    }
+}
+
+/// Gives L the slope `drift` that a lamp's drift has in the beam, brings the mean of ln c to 0, and the
+/// slope of ln M, least squares over the ordinary pixels of the largest component, along the
+/// directions in the beam that the fluxes leave `open`.
+pub(crate) fn fix_fluxes(
+    fit: &mut Fit,
+    drift: [f64; 2],
+    open: &[[f64; 2]],
+    rotation: Rotation,
+    sensor: Shape,
+) {
+    untilt(fit, rotation.in_sensor(drift), rotation, sensor);
+    if !open.is_empty() {
+        let slope = slopes(&fit.sensitivity, &fit.components.pixels, sensor).map(|weights| {
+            let pixels = weights.iter().zip(&fit.sensitivity).filter(|(w, _)| **w != 0.0);
+            pixels.map(|(weight, m)| weight * m.ln()).sum::<f64>()
+        });
+        for direction in open.iter().map(|direction| rotation.in_sensor(*direction)) {
+            let along = direction[0] * slope[0] + direction[1] * slope[1];
+            untilt(fit, direction.map(|part| along * part), rotation, sensor);
+        }
+    }
+    let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
+    fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
+    let coefficients = fit.beam.coefficients.iter_mut().flatten();
+    fit.beam.values.iter_mut().chain(coefficients).for_each(|value| *value *= mean.exp());
+}
+
+/// M → M·exp(−slope·p) and all that goes with it.
+fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
+    for (pixel, m) in fit.sensitivity.iter_mut().enumerate() {
+        let (row, col) = ((pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64);
+        *m *= (-slope[0] * row - slope[1] * col).exp();
+    }
+    // β·u = α·p less what lies between the first pixel and the corner of its turned window.
+    let [down, along] = rotation.direction(slope);
+    let last = [sensor.rows as f64 - 1.0, sensor.cols as f64 - 1.0];
+    let reversed = rotation.axes().map(|axis| axis.reversed);
+    let from_corner = |axis: usize| if reversed[axis] { slope[axis] * last[axis] } else { 0.0 };
+    let corner = from_corner(0) + from_corner(1);
+    let (shape, origin) = (fit.beam.shape, fit.beam.origin);
+    let factor = |cell: usize| {
+        let (row, col) = (cell / shape.cols, cell % shape.cols);
+        let u = [row as f64 - origin[0] as f64, col as f64 - origin[1] as f64];
+        (down * u[0] + along * u[1] + corner).exp()
+    };
+    for (cell, value) in fit.beam.values.iter_mut().enumerate() {
+        let factor = factor(cell);
+        *value *= factor;
+        if let Some(coefficients) = &mut fit.beam.coefficients {
+            coefficients[cell] *= factor;
+        }
+    }
+    for (c, d) in fit.flux.iter_mut().zip(&fit.shifts) {
+        *c *= (-down * d[0] - along * d[1]).exp();
+    }
+}
+
+/// Weights whose sums with ln M are its least-squares slopes along rows and columns, a pixel, over
+/// the pixels of label 0 from half to twice the mean: the logarithm of a dead one would weigh more
+/// than all others of its row.
+pub(crate) fn slopes(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [Vec<f64>; 2] {
+    let counted = || sensitivity.iter().zip(labels).filter(|(_, label)| **label == 0);
+    let mean = counted().map(|(m, _)| m).sum::<f64>() / counted().count() as f64;
+    let ordinary = 0.5 * mean..2.0 * mean;
+    let counts = |pixel: usize| labels[pixel] == 0 && ordinary.contains(&sensitivity[pixel]);
+    let place = |pixel: usize| [(pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64];
+    let pixels = || (0..sensitivity.len()).filter(|&pixel| counts(pixel)).map(place);
+    let sum = pixels().fold([0.0; 3], |s, [row, col]| [s[0] + row, s[1] + col, s[2] + 1.0]);
+    let mean = [sum[0] / sum[2], sum[1] / sum[2]];
+    let from_mean = |[row, col]: [f64; 2]| [row - mean[0], col - mean[1]];
+    let [rr, rc, cc] = pixels()
+        .map(from_mean)
+        .fold([0.0; 3], |sum, [r, c]| [sum[0] + r * r, sum[1] + r * c, sum[2] + c * c]);
+    let inverse = inverse([rr, rc, cc]);
+    let weight = |pixel: usize, [of_row, of_col]: [f64; 2]| {
+        let [r, c] = from_mean(place(pixel));
+        if counts(pixel) { of_row * r + of_col * c } else { 0.0 }
+    };
+    inverse.map(|axis| (0..sensitivity.len()).map(|pixel| weight(pixel, axis)).collect())
+}
+
+/// The inverse of a matrix [a b; b c] without negative eigenvalues; 0 along the direction that one of
+/// rank 1 does not tell, and the matrix over its trace squared along the other.
+pub(crate) fn inverse([a, b, c]: [f64; 3]) -> [[f64; 2]; 2] {
+    let determinant = a * c - b * b;
+    if determinant > SINGULAR * (a + c).powi(2) {
+        let mixed = -b / determinant;
+        [[c / determinant, mixed], [mixed, a / determinant]]
+    } else if a + c > 0.0 {
+        let square = (a + c).powi(2);
+        [[a / square, b / square], [b / square, c / square]]
+    } else {
+        [[0.0; 2]; 2]
+    }
+}
+
+/// Replaces each value by `scaled(value, label)`.
+fn rescale(
+    values: &mut [f64],
+    labels: &[i32],
+    workers: &Workers,
+    scaled: impl Fn(f64, i32) -> f64 + Send + Sync,
+) {
+    const PART: usize = 1 << 16;
+    workers.map_blocks(values, PART, |index, part| {
+        for (value, &label) in part.iter_mut().zip(&labels[index * PART..]) {
+            *value = scaled(*value, label);
+        }
+    });
+}
+
+/// The mean sensitivity of each component, without the pixels `left_out` unless nothing else is
+/// there.
+fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usize]) -> Vec<f64> {
+    let mut kept = vec![(0.0, 0_usize); components.sizes.len()];
+    let mut all = kept.clone();
+    let mut left_out = left_out.iter().peekable();
+    for (pixel, (&value, &label)) in sensitivity.iter().zip(&components.pixels).enumerate() {
+        let is_out = left_out.next_if_eq(&&pixel).is_some();
+        let Ok(label) = usize::try_from(label) else { continue };
+        all[label] = (all[label].0 + value, all[label].1 + 1);
+        if !is_out {
+            kept[label] = (kept[label].0 + value, kept[label].1 + 1);
+        }
+    }
+    let chosen = kept.iter().zip(&all).map(|(kept, all)| if kept.1 > 0 { kept } else { all });
+    chosen.map(|(sum, count)| sum / *count as f64).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_matrix_does_not_tell_is_left_out_of_its_inverse() {
+        assert_eq!(inverse([2.0, 1.0, 1.0]), [[1.0, -1.0], [-1.0, 2.0]]);
+        // 4 along (1, 1)/√2, nothing across.
+        assert_eq!(inverse([2.0, 2.0, 2.0]), [[0.125, 0.125], [0.125, 0.125]]);
+        assert_eq!(inverse([0.0, 0.0, 4.0]), [[0.0, 0.0], [0.0, 0.25]]);
+        assert_eq!(inverse([0.0; 3]), [[0.0; 2]; 2]);
+    }
+}

@@ -1,0 +1,95 @@
+//! Conjugate gradients for the joint problem S x = b, in double precision.
+
+use super::preconditioner::Preconditioner;
+use super::system::System;
+use crate::coarse::DAMPING;
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::ritz::Ritz;
+
+/// A solution in the making.
+#[derive(Default)]
+pub(crate) struct Search {
+    pub(crate) x: Vec<f64>,
+    residual: Vec<f64>,
+    direction: Vec<f64>,
+    /// S times the direction, then P⁻¹ r.
+    product: Vec<f64>,
+    pub(crate) square: f64,
+    keep: f64,
+    /// x · b, of which b − S x lacks some.
+    pub(crate) energy: f64,
+    ritz: Ritz,
+    /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
+    pub(crate) smallest: f64,
+    pub(crate) iterations: u64,
+    /// Whether the preconditioner does.
+    sees_large_scales: bool,
+}
+
+impl Search {
+    pub(crate) fn begin<T: Real>(
+        &mut self,
+        system: &System<'_, '_, T>,
+        preconditioner: &Preconditioner,
+        slope: Vec<f64>,
+        control: &Control,
+    ) -> Result<()> {
+        if self.iterations == 0 {
+            self.smallest = DAMPING;
+        }
+        self.sees_large_scales = preconditioner.sees_large_scales();
+        let zeros = || system.pass.workers.filled(slope.len(), 0.0, control);
+        self.x = zeros();
+        if self.direction.len() != slope.len() {
+            (self.direction, self.product) = (zeros(), zeros());
+        }
+        control.check()?;
+        preconditioner.apply(system, &slope, &mut self.direction);
+        self.square = system.pass.workers.dot(&slope, &self.direction);
+        self.residual = slope;
+        self.keep = 0.0;
+        self.energy = 0.0;
+        self.ritz = Ritz::default();
+        Ok(())
+    }
+
+    /// Multiplies S by the direction; returns the largest relative change of M that goes with P⁻¹ r.
+    pub(crate) fn product<T: Real>(
+        &mut self,
+        system: &mut System<'_, '_, T>,
+        control: &Control,
+    ) -> Result<f64> {
+        let Self { direction, product, keep, .. } = self;
+        let size = system.multiply(direction, product, *keep, control)? / system.mean;
+        let known = size.is_finite() && self.square.is_finite() && self.sees_large_scales;
+        Ok(if known { size } else { f64::INFINITY })
+    }
+
+    /// A step along the direction, and a new direction; `false` if there was none to go.
+    pub(crate) fn step<T: Real>(
+        &mut self,
+        system: &System<'_, '_, T>,
+        preconditioner: &Preconditioner,
+    ) -> bool {
+        let workers = system.pass.workers;
+        let step = self.square / workers.dot(&self.direction, &self.product);
+        if !(step > 0.0 && step.is_finite()) {
+            return false;
+        }
+        self.energy += step * self.square;
+        workers.add_multiple(&mut self.x, step, &self.direction);
+        workers.add_multiple(&mut self.residual, -step, &self.product);
+        preconditioner.apply(system, &self.residual, &mut self.product);
+        let square = workers.dot(&self.residual, &self.product);
+        self.keep = square / self.square;
+        workers.add_multiple(&mut self.product, self.keep, &self.direction);
+        std::mem::swap(&mut self.direction, &mut self.product);
+        self.ritz.push(step, self.keep);
+        self.square = square;
+        self.smallest = self.smallest.min(self.ritz.smallest());
+        self.iterations += 1;
+        square > 0.0
+    }
+}

@@ -1,0 +1,469 @@
+//! The operator S: products, its diagonal, and the pixels that leave it.
+
+use super::kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::frames::Real;
+use crate::geometry::{Placement, View};
+use crate::median::median;
+use crate::padded::{BAND, Padding};
+use crate::parallel::Workers;
+
+/// A pixel whose weight D is less than this share of the median has nothing to tell the others.
+const LEAST_WEIGHT: f64 = 1e-6;
+/// Pixels that the median is taken from.
+const SAMPLES: usize = 1024;
+
+/// The largest squared light and weight, in units of an ordinary one: products of several stay within
+/// single precision. Beyond, S is softer than it is, and steps are shortened.
+const LARGEST: f64 = 1e12;
+/// A weight D below which single precision has no inverse.
+const FAINTEST: f32 = 1e-30;
+
+/// The operator S at one M and L, scaled so that its elements are of order 1.
+pub(crate) struct Reduced<'m, 'a, T> {
+    pub(super) exposures: &'m Exposures<'a, T>,
+    pub(super) workers: &'m Workers,
+    pub(crate) scale: Scale,
+    pub(crate) padding: Padding,
+    /// M.
+    pub(crate) sensitivity: Vec<f32>,
+    /// 1/D; 0 at pixels without measurement and at those that have left the system.
+    pub(crate) inverse_diagonal: Vec<f32>,
+    /// Σ D over all pixels.
+    pub(crate) trace: f64,
+    /// The mean of M over the pixels of the system.
+    pub(crate) mean: f64,
+    left_out: Vec<LeftOut>,
+    /// (L/scale)² in each view; 0 where unobserved.
+    light: Vec<Vec<f32>>,
+    /// h in each view: room for the first half of a product.
+    hidden: Vec<Vec<f32>>,
+}
+
+/// A pixel that its measurements leave almost no weight.
+#[derive(Clone, Copy, Debug)]
+struct LeftOut {
+    /// Where it lies in an image, from the first row on.
+    place: usize,
+    /// 1/D.
+    inverse: f32,
+    /// The step to the closed form of its M.
+    step: f32,
+}
+
+/// The median of a sample of the values above 0: a few bright pixels do not move it.
+fn typical(values: &[f32]) -> f64 {
+    let step = values.len().div_ceil(SAMPLES);
+    let mut sample: Vec<f32> =
+        values.iter().copied().step_by(step | 1).filter(|&value| value > 0.0).collect();
+    median(&mut sample, f32::total_cmp).map_or(0.0, f64::from)
+}
+
+/// The units of the linear problem.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Scale {
+    /// The light that an ordinary pixel sees.
+    light: f64,
+    /// An ordinary w c².
+    weight: f64,
+}
+
+impl Scale {
+    pub(crate) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Self {
+        Self { light: exposures.typical_light(), weight: exposures.typical_weight() }
+    }
+
+    /// What half a slope of F is multiplied by to become a right-hand side.
+    pub(crate) fn slope(&self) -> f64 {
+        1.0 / (self.weight * self.light * self.light)
+    }
+
+    /// The standard deviation of an M where that of the linear problem is 1.
+    pub(crate) fn deviation(&self) -> f64 {
+        self.slope().sqrt()
+    }
+}
+
+impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
+    /// Room for the operator of `model`.
+    pub(crate) fn new(
+        exposures: &'m Exposures<'a, T>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Self {
+        let (padding, views) = (Padding::of(exposures.geometry()), &exposures.geometry().views);
+        let of_views =
+            || views.iter().map(|v| padding.zeros(v.shape.rows, workers, control)).collect();
+        let of_sensor = || padding.zeros(exposures.sensor().rows, workers, control);
+        Self {
+            exposures,
+            workers,
+            scale: Scale::of(exposures),
+            padding,
+            sensitivity: of_sensor(),
+            inverse_diagonal: of_sensor(),
+            trace: 0.0,
+            mean: 1.0,
+            left_out: Vec::new(),
+            light: of_views(),
+            hidden: of_views(),
+        }
+    }
+
+    /// Makes it the operator at M and L, the latter in each of the geometry's views.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn linearise(
+        &mut self,
+        sensitivity: &[f64],
+        beams: &[Vec<f64>],
+        control: &Control,
+    ) -> Result<()> {
+        let Self { exposures, workers, padding, scale, .. } = *self;
+        let cols = exposures.sensor().cols;
+        padding.copy(sensitivity, cols, workers, &mut self.sensitivity, |m| m as f32);
+        let views = exposures.geometry().views.iter().zip(beams).zip(&mut self.light);
+        for ((view, beam), light) in views {
+            let square = |l: f64| (l / scale.light).powi(2).min(LARGEST) as f32;
+            padding.copy(beam, view.shape.cols, workers, light, square);
+            control.check()?;
+        }
+        self.invert_diagonal(control)
+    }
+
+    /// Writes S x to `product` and returns x · S x.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled); the product is then no whole one.
+    pub(crate) fn multiply(
+        &mut self,
+        x: &[f32],
+        product: &mut [f32],
+        control: &Control,
+    ) -> Result<f64> {
+        self.hide(Shown::Step(x), control);
+        let (padding, rows) = (self.padding, self.exposures.sensor().rows);
+        let bands = self.workers.map_blocks(
+            padding.body_mut(product),
+            BAND * padding.width,
+            |band, products| {
+                let mut scratch = self.scratch();
+                let mut total = 0.0;
+                for (index, product) in products.chunks_exact_mut(padding.width).enumerate() {
+                    let row = band * BAND + index;
+                    if control.is_cancelled() {
+                        return total;
+                    }
+                    let lines = self.pixel_lines(row, &mut scratch);
+                    let sensitivity = padding.row(&self.sensitivity, row);
+                    let x = padding.row(x, row);
+                    let scatter = Scatter { lines: &lines, sensitivity, x, product };
+                    total += pulp::Arch::new().dispatch(scatter);
+                }
+                total
+            },
+        );
+        debug_assert!(bands.len() == rows.div_ceil(BAND));
+        control.check()?;
+        Ok(bands.into_iter().sum())
+    }
+
+    /// The first half of a product: h, in each view, of what the pixels show.
+    pub(super) fn hide(&mut self, shown: Shown<'_>, control: &Control) {
+        let mut hidden = std::mem::take(&mut self.hidden);
+        let padding = self.padding;
+        if let [hidden] = &mut hidden[..] {
+            let size = BAND * padding.width;
+            self.workers.map_blocks(padding.body_mut(hidden), size, |band, signals| {
+                let mut scratch = self.scratch();
+                let mut weight = vec![0.0; padding.width];
+                for (index, signal) in signals.chunks_exact_mut(padding.width).enumerate() {
+                    if control.is_cancelled() {
+                        return;
+                    }
+                    let lines = self.cell_lines(0, band * BAND + index, shown, &mut scratch);
+                    let arch = pulp::Arch::new();
+                    arch.dispatch(Gather { lines: &lines, signal, weight: &mut weight });
+                    if let Shown::Weight = shown {
+                        signal.fill(1.0);
+                    }
+                    arch.dispatch(Divide { signal, weight: &weight });
+                }
+            });
+        } else {
+            self.hide_turned(shown, &mut hidden, control);
+        }
+        self.hidden = hidden;
+    }
+
+    /// h where exposures are turned against each other: the sums of each view are brought together
+    /// on the beam grid and turned into each view.
+    fn hide_turned(&self, shown: Shown<'_>, hidden: &mut [Vec<f32>], control: &Control) {
+        let (padding, views) = (self.padding, &self.exposures.geometry().views);
+        let gathered = |(index, view): (usize, &View)| {
+            let mut signal = padding.zeros(view.shape.rows, self.workers, control);
+            let mut weight = padding.zeros(view.shape.rows, self.workers, control);
+            let (signals, weights) = (padding.body_mut(&mut signal), padding.body_mut(&mut weight));
+            let size = BAND * padding.width;
+            self.workers.map_pairs(signals, weights, [size; 2], |band, signals, weights| {
+                let mut scratch = self.scratch();
+                let signals = signals.chunks_exact_mut(padding.width);
+                let weights = weights.chunks_exact_mut(padding.width);
+                for (row, (signal, weight)) in signals.zip(weights).enumerate() {
+                    if control.is_cancelled() {
+                        return;
+                    }
+                    let lines = self.cell_lines(index, band * BAND + row, shown, &mut scratch);
+                    pulp::Arch::new().dispatch(Gather { lines: &lines, signal, weight });
+                }
+            });
+            (signal, weight)
+        };
+        let sums: Vec<_> = views.iter().enumerate().map(gathered).collect();
+        let beam_cols = self.exposures.geometry().beam.cols;
+        for (view, hidden) in views.iter().zip(hidden) {
+            let body = padding.body_mut(hidden);
+            self.workers.map_blocks(body, padding.width, |row, cells| {
+                for (col, cell) in cells[..view.shape.cols].iter_mut().enumerate() {
+                    let place = view.cells.at(row, col);
+                    let [mut signal, mut weight] = [0.0; 2];
+                    for (view, sums) in views.iter().zip(&sums) {
+                        let place = view.places.at(place / beam_cols, place % beam_cols);
+                        let (row, col) = (place / view.shape.cols, place % view.shape.cols);
+                        signal += padding.row(&sums.0, row)[col];
+                        weight += padding.row(&sums.1, row)[col];
+                    }
+                    if let Shown::Weight = shown {
+                        signal = 1.0;
+                    }
+                    *cell = if weight > 0.0 { signal / weight } else { 0.0 };
+                }
+            });
+        }
+    }
+
+    /// Finds 1/D, and takes pixels that have nothing to tell out of the system.
+    fn invert_diagonal(&mut self, control: &Control) -> Result<()> {
+        let (padding, cols) = (self.padding, self.exposures.sensor().cols);
+        let mut diagonal = std::mem::take(&mut self.inverse_diagonal);
+        let body = padding.body_mut(&mut diagonal);
+        let bands = self.workers.map_blocks(body, BAND * padding.width, |band, rows| {
+            let mut scratch = self.scratch();
+            let mut sum = 0.0;
+            for (index, diagonal) in rows.chunks_exact_mut(padding.width).enumerate() {
+                if control.is_cancelled() {
+                    break;
+                }
+                let lines = self.pixel_lines(band * BAND + index, &mut scratch);
+                pulp::Arch::new().dispatch(Diagonal { lines: &lines, diagonal });
+                diagonal[cols..].fill(0.0);
+                sum += diagonal.iter().map(|&d| f64::from(d)).sum::<f64>();
+            }
+            sum
+        });
+        control.check()?;
+        self.trace = bands.into_iter().sum();
+        let least = ((LEAST_WEIGHT * typical(body)) as f32).max(FAINTEST);
+        let sensitivity = padding.body_mut(&mut self.sensitivity);
+        let size = BAND * padding.width;
+        let bands =
+            self.workers.map_pairs(sensitivity, body, [size; 2], |band, sensitivity, rows| {
+                let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
+                for (index, (m, d)) in sensitivity.iter().zip(rows).enumerate() {
+                    if *d > least {
+                        *d = 1.0 / *d;
+                        sum += f64::from(*m);
+                        count += 1;
+                    } else if *d > 0.0 {
+                        let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
+                        left_out.push(LeftOut { place: band * size + index, inverse, step: 0.0 });
+                        *d = 0.0;
+                    }
+                }
+                (sum, count, left_out)
+            });
+        self.left_out.clear();
+        let (mut sum, mut count) = (0.0, 0);
+        for (of_band, in_band, left_out) in bands {
+            sum += of_band;
+            count += in_band;
+            self.left_out.extend(left_out);
+        }
+        self.mean = sum / count as f64;
+        self.inverse_diagonal = diagonal;
+        Ok(())
+    }
+
+    /// Takes the pixels that have left the system out of the right-hand side.
+    pub(crate) fn settle(&mut self, residual: &mut [f32]) {
+        let residual = self.padding.body_mut(residual);
+        for out in &mut self.left_out {
+            out.step = residual[out.place] * out.inverse;
+            residual[out.place] = 0.0;
+        }
+    }
+
+    /// The pixels that have left the system, each with its 1/D; 0 where that is none.
+    pub(crate) fn left_out_variances(&self) -> impl Iterator<Item = (usize, f64)> {
+        let (width, cols) = (self.padding.width, self.exposures.sensor().cols);
+        let pixel = move |place: usize| place / width * cols + place % width;
+        self.left_out.iter().map(move |out| (pixel(out.place), f64::from(out.inverse)))
+    }
+
+    /// The pixels that have left the system, with the step to the closed form of their M.
+    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
+        let (width, cols) = (self.padding.width, self.exposures.sensor().cols);
+        let pixel = move |place: usize| place / width * cols + place % width;
+        self.left_out.iter().map(move |out| (pixel(out.place), f64::from(out.step)))
+    }
+
+    /// Adds ω = w c² L² M² of one exposure along a row of cells of its view to `sums`.
+    pub(crate) fn weigh(
+        &self,
+        exposure: usize,
+        row: usize,
+        sums: &mut [f32],
+        scratch: &mut Scratch,
+    ) {
+        let place = &self.exposures.geometry().placements[exposure];
+        let Some(pixel_row) = self.row_seeing(place, row) else { return };
+        let scratch = &mut scratch.of_exposures[exposure].weight;
+        let weight = self.weight(exposure, pixel_row, scratch);
+        let line = Line {
+            weight: weight.before(&self.padding, place.col),
+            first: self.padding.row_before(&self.sensitivity, pixel_row, place.col),
+            second: self.padding.row(&self.light[place.view], row),
+        };
+        pulp::Arch::new().dispatch(Weigh { line, sums });
+    }
+
+    /// The row of pixels that sees a row of cells, if one does.
+    fn row_seeing(&self, place: &Placement, row: usize) -> Option<usize> {
+        row.checked_sub(place.row).filter(|&row| row < self.exposures.sensor().rows)
+    }
+
+    /// The exposures that see a row of cells, with M of the pixels that do and what they show.
+    fn cell_lines<'s>(
+        &'s self,
+        view: usize,
+        row: usize,
+        shown: Shown<'s>,
+        scratch: &'s mut Scratch,
+    ) -> Vec<Line<'s>> {
+        let places = self.exposures.geometry().placements.iter().enumerate();
+        places
+            .zip(&mut scratch.of_exposures)
+            .filter(|((_, place), _)| place.view == view)
+            .filter_map(|((exposure, place), scratch)| {
+                let pixel_row = self.row_seeing(place, row)?;
+                let ExposureScratch { weight, noise } = scratch;
+                let weight = self.weight(exposure, pixel_row, weight);
+                let first = self.padding.row_before(&self.sensitivity, pixel_row, place.col);
+                let second = match shown {
+                    Shown::Step(x) => self.padding.row_before(x, pixel_row, place.col),
+                    Shown::Noise(draw) => {
+                        let row = self.noise([draw, exposure as u64], pixel_row, weight, noise);
+                        &row[self.padding.lead - place.col..][..self.padding.width]
+                    }
+                    Shown::Weight => first,
+                };
+                Some(Line { weight: weight.before(&self.padding, place.col), first, second })
+            })
+            .collect()
+    }
+
+    /// The exposures of a row of pixels, with L² and h of the cells that they see.
+    pub(super) fn pixel_lines<'s>(&'s self, row: usize, scratch: &'s mut Scratch) -> Vec<Line<'s>> {
+        let places = self.exposures.geometry().placements.iter().enumerate();
+        places
+            .zip(&mut scratch.of_exposures)
+            .map(|((exposure, place), scratch)| {
+                let view_row = row + place.row;
+                Line {
+                    weight: self.weight(exposure, row, &mut scratch.weight).at(&self.padding),
+                    first: self.padding.row_from(&self.light[place.view], view_row, place.col),
+                    second: self.padding.row_from(&self.hidden[place.view], view_row, place.col),
+                }
+            })
+            .collect()
+    }
+
+    /// w c² of a row of an exposure's pixels.
+    pub(super) fn weight<'s>(
+        &self,
+        exposure: usize,
+        row: usize,
+        scratch: &'s mut WeightScratch,
+    ) -> RowWeight<'s> {
+        let factor = self.exposures.flux()[exposure].powi(2) / self.scale.weight;
+        if let Some(weight) = self.exposures.uniform_weight(exposure) {
+            return RowWeight::Same((weight * factor).min(LARGEST) as f32);
+        }
+        let cols = self.exposures.sensor().cols;
+        scratch.double.resize(cols, 1.0);
+        scratch.padded.resize(2 * self.padding.lead + self.padding.width, 0.0);
+        let padded = &mut scratch.padded[self.padding.lead..][..cols];
+        let _ = self.exposures.stretch(exposure, row, 0..cols, &mut scratch.double);
+        for (padded, weight) in padded.iter_mut().zip(&scratch.double) {
+            *padded = (weight * factor).min(LARGEST) as f32;
+        }
+        RowWeight::Padded(&scratch.padded)
+    }
+
+    pub(crate) fn scratch(&self) -> Scratch {
+        Scratch { of_exposures: vec![ExposureScratch::default(); self.exposures.count()] }
+    }
+}
+
+/// Room for the weights of one row of each exposure.
+pub(crate) struct Scratch {
+    pub(super) of_exposures: Vec<ExposureScratch>,
+}
+
+#[derive(Clone, Default)]
+pub(super) struct ExposureScratch {
+    pub(super) weight: WeightScratch,
+    pub(super) noise: Vec<f32>,
+}
+
+#[derive(Clone, Default)]
+pub(super) struct WeightScratch {
+    double: Vec<f64>,
+    padded: Vec<f32>,
+}
+
+/// What the pixels of each exposure show to the cells that they see.
+#[derive(Clone, Copy)]
+pub(super) enum Shown<'x> {
+    /// The step x.
+    Step(&'x [f32]),
+    /// The noise of a draw, in place of M h.
+    Noise(u64),
+    /// Nothing: in place of h stands 1/Σ w c² M².
+    Weight,
+}
+
+/// Weights of a row of pixels.
+#[derive(Clone, Copy)]
+pub(super) enum RowWeight<'s> {
+    Same(f32),
+    /// With zeros before and after.
+    Padded(&'s [f32]),
+}
+
+impl<'s> RowWeight<'s> {
+    pub(super) fn at(self, padding: &Padding) -> Weight<'s> {
+        self.before(padding, 0)
+    }
+
+    /// The weights from so many columns further left.
+    fn before(self, padding: &Padding, left: usize) -> Weight<'s> {
+        match self {
+            Self::Same(weight) => Weight::Same(weight),
+            Self::Padded(row) => Weight::Each(&row[padding.lead - left..][..padding.width]),
+        }
+    }
+}

@@ -1,0 +1,207 @@
+//! Preconditioned conjugate gradients for the linear problem S x = b.
+//!
+//! After Hestenes and Stiefel (1952). Their coefficients also make up the tridiagonal matrix of
+//! Lanczos, whose eigenvalues, the Ritz values, approach those of P⁻¹S from within; the smallest is
+//! what turns a residual into an estimate of the error (see [`convergence`](crate::convergence)).
+
+use super::operator::Reduced;
+use super::two_level::TwoLevel;
+use crate::coarse;
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::frames::Real;
+use crate::geometry::Geometry;
+use crate::padded::Padding;
+use crate::parallel::Workers;
+use crate::ritz::Ritz;
+
+/// Values that a thread takes at a time.
+const BLOCK: usize = 1 << 16;
+/// No eigenvalue that matters is smaller than 1/this: single precision could not tell it from 0.
+const LONGEST_STEP: f64 = 1e6;
+
+/// A relative error that is rounding alone.
+const ROUNDING: f64 = 4.0 * f64::EPSILON;
+
+/// What a search holds, in bytes, where a *place* is a pixel of an image padded to the width of the beam:
+///
+/// | array | in bytes |
+/// |---|---|
+/// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
+/// | L², h | 2 · 4 for each place of each view |
+/// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
+pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
+    let padding = Padding::of(geometry);
+    let places = |rows| padding.size(rows) as u64;
+    let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
+    24 * places(geometry.sensor.rows) + of_views + coarse::bytes_needed(geometry)
+}
+
+/// A solution in the making: all that it needs stays in one place from one problem to the next.
+pub(crate) struct Search<'m, 'a, T> {
+    workers: &'m Workers,
+    pub(crate) reduced: Reduced<'m, 'a, T>,
+    two_level: TwoLevel<'m>,
+    /// b − S x.
+    pub(crate) residual: Vec<f32>,
+    pub(crate) x: Vec<f32>,
+    direction: Vec<f32>,
+    product: Vec<f32>,
+    /// r · P⁻¹ r.
+    square: f64,
+    /// The largest size of P⁻¹ r, in the units of M.
+    largest: f64,
+    /// x · b, which rises to b · S⁻¹ b: the sum of a r · P⁻¹ r over the steps.
+    pub(crate) energy: f64,
+    pub(crate) ritz: Ritz,
+}
+
+impl<'m, 'a, T: Real> Search<'m, 'a, T> {
+    /// Room for a search.
+    pub(crate) fn new(
+        exposures: &'m Exposures<'a, T>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Self {
+        let reduced = Reduced::new(exposures, workers, control);
+        let [residual, x, direction, product] =
+            [(); 4].map(|()| reduced.padding.zeros(exposures.sensor().rows, workers, control));
+        Self {
+            workers,
+            two_level: TwoLevel::new(exposures, reduced.padding, workers),
+            reduced,
+            residual,
+            x,
+            direction,
+            product,
+            square: 0.0,
+            largest: 0.0,
+            energy: 0.0,
+            ritz: Ritz::default(),
+        }
+    }
+
+    /// Starts from x = 0, where the residual is b, with S at M and L. The preconditioner is that of
+    /// the first start: it need not be exact.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn start(
+        &mut self,
+        sensitivity: &[f64],
+        beams: &[Vec<f64>],
+        control: &Control,
+    ) -> Result<()> {
+        self.linearise(sensitivity, beams, control)?;
+        self.begin(control)
+    }
+
+    /// Takes S at M and L, and the preconditioner unless there is one.
+    ///
+    /// # Errors
+    /// As [`start`](Self::start).
+    pub(crate) fn linearise(
+        &mut self,
+        sensitivity: &[f64],
+        beams: &[Vec<f64>],
+        control: &Control,
+    ) -> Result<()> {
+        self.reduced.linearise(sensitivity, beams, control)?;
+        self.two_level.prepare(&self.reduced, control)
+    }
+
+    /// Starts from x = 0, where the residual is b, with the S that there is.
+    ///
+    /// # Errors
+    /// As [`start`](Self::start).
+    pub(crate) fn begin(&mut self, control: &Control) -> Result<()> {
+        self.workers.fill(&mut self.x, 0.0, control);
+        self.workers.fill(&mut self.direction, 0.0, control);
+        self.reduced.settle(&mut self.residual);
+        self.ritz = Ritz::default();
+        self.energy = 0.0;
+        self.square = self.descend(0.0);
+        control.check()?;
+        self.largest = self.turn(0.0, 0.0);
+        Ok(())
+    }
+
+    /// Forgets the step that was found.
+    pub(crate) fn forget(&mut self, control: &Control) {
+        self.workers.fill(&mut self.x, 0.0, control);
+    }
+
+    /// One iteration: a step along the direction, and a new direction. `false` if there was none to
+    /// go: the residual is 0, or nothing but rounding along which S does not change.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn iterate(&mut self, control: &Control) -> Result<bool> {
+        let curvature = self.reduced.multiply(&self.direction, &mut self.product, control)?;
+        let step = self.square / curvature;
+        if !(step > 0.0 && step < LONGEST_STEP) || self.is_settled() {
+            return Ok(false);
+        }
+        let square = self.descend(step);
+        control.check()?;
+        self.energy += step * self.square;
+        let keep = square / self.square;
+        self.square = square;
+        self.largest = self.turn(step, keep);
+        self.ritz.push(step, keep);
+        Ok(square > 0.0)
+    }
+
+    /// A size of M in units of its mean.
+    fn relative(&self, size: f64) -> f64 {
+        let known = self.reduced.mean > 0.0
+            && self.square.is_finite()
+            && size.is_finite()
+            && self.two_level.sees_large_scales();
+        if known { size / self.reduced.mean } else { f64::INFINITY }
+    }
+
+    /// Whether what is left is rounding alone.
+    pub(crate) fn is_settled(&self) -> bool {
+        self.largest() < ROUNDING
+    }
+
+    /// The largest relative size of P⁻¹ r.
+    pub(crate) fn largest(&self) -> f64 {
+        self.relative(self.largest)
+    }
+
+    /// The error of x, squared in the norm of S, is at most this over the smallest eigenvalue of
+    /// P⁻¹S: r · P⁻¹ r.
+    pub(crate) fn square(&self) -> f64 {
+        self.square.max(0.0)
+    }
+
+    /// The largest relative size of the step found so far.
+    pub(crate) fn found(&self) -> f64 {
+        let blocks: Vec<&[f32]> = self.x.chunks(BLOCK).collect();
+        let size = |largest: f32, value: &f32| largest.max(value.abs());
+        let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
+        self.relative(f64::from(tops.into_iter().fold(0.0, f32::max)))
+    }
+
+    /// The pixels that have left the system, with the step to the closed form of their M.
+    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
+        self.reduced.left_out()
+    }
+
+    /// The root mean square of the relative size of P⁻¹ r, weighted by D.
+    pub(crate) fn size(&self) -> f64 {
+        self.relative((self.square.max(0.0) / self.reduced.trace).sqrt())
+    }
+
+    fn descend(&mut self, step: f64) -> f64 {
+        self.two_level.descend(&self.reduced, &mut self.residual, step, &self.product)
+    }
+
+    fn turn(&mut self, step: f64, keep: f64) -> f64 {
+        let vectors = [&mut self.x[..], &mut self.direction[..]];
+        self.two_level.turn(&self.reduced, &self.residual, vectors, [step, keep])
+    }
+}

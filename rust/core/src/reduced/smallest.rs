@@ -1,0 +1,61 @@
+//! The smallest Ritz value of all searches so far, and the error of M that it implies.
+
+use super::search::Search;
+use crate::coarse::DAMPING;
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+
+/// The smallest Ritz value found so far, and in how many iterations.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Smallest {
+    value: f64,
+    pub(crate) iterations: u64,
+    /// Whether the last search found no direction to go at once: nothing is left but rounding, or
+    /// else rounding has spoilt the problem.
+    pub(crate) settled: bool,
+    pub(crate) stuck: bool,
+}
+
+impl Default for Smallest {
+    /// The eigenvalue of smooth errors, known beforehand.
+    fn default() -> Self {
+        Self { value: DAMPING, iterations: 0, settled: false, stuck: false }
+    }
+}
+
+impl Smallest {
+    /// One more iteration of `search`; `false` if there was none to make.
+    pub(crate) fn iterate<T: Real>(
+        &mut self,
+        search: &mut Search<'_, '_, T>,
+        control: &Control,
+    ) -> Result<bool> {
+        let went = search.iterate(control)?;
+        if went {
+            self.iterations += 1;
+            self.value = self.value.min(search.ritz.smallest());
+        } else {
+            self.settled = search.is_settled();
+            self.stuck = search.ritz.is_empty() && !self.settled;
+        }
+        Ok(went)
+    }
+
+    /// The largest error, before the step that `search` has found is made.
+    pub(crate) fn error<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+        search.found() + self.left(search)
+    }
+
+    /// The share of b · S⁻¹ b that x · b lacks, at most: what is left is e · S e with e = S⁻¹ r, no more
+    /// than r · P⁻¹ r over the smallest eigenvalue of P⁻¹S.
+    pub(crate) fn lack<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+        let left = search.square() / self.value;
+        left / (search.energy + left)
+    }
+
+    /// What is left of the error once the step that `search` has found is made.
+    pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+        search.largest() / self.value
+    }
+}

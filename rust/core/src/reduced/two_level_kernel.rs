@@ -1,0 +1,80 @@
+//! The arithmetic of the preconditioner and of the vectors of conjugate gradients, row by row.
+
+use crate::padded::{LANES, chunk};
+
+/// r ← r − a q; returns r · r/D, and adds M r to the sums of the two coarse rows around.
+pub(super) struct Descend<'l> {
+    pub(super) residual: &'l mut [f32],
+    pub(super) step: f32,
+    pub(super) product: &'l [f32],
+    pub(super) inverse_diagonal: &'l [f32],
+    pub(super) sensitivity: &'l [f32],
+    /// Height of the lower coarse row's hats along this row.
+    pub(super) height: f32,
+    pub(super) above: &'l mut [f32],
+    pub(super) below: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Descend<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn call(self) -> f64 {
+        let mut total = [0.0; LANES];
+        let above = self.above.as_chunks_mut::<LANES>().0;
+        let below = self.below.as_chunks_mut::<LANES>().0;
+        let rows = self.residual.as_chunks_mut::<LANES>().0.iter_mut().zip(above).zip(below);
+        for (index, ((residual, above), below)) in rows.enumerate() {
+            let (q, d) = (chunk(self.product, index), chunk(self.inverse_diagonal, index));
+            let m = chunk(self.sensitivity, index);
+            for i in 0..LANES {
+                // A pixel that is not in the system takes no part.
+                let r = if d[i] > 0.0 { residual[i] - self.step * q[i] } else { 0.0 };
+                residual[i] = r;
+                total[i] += r * (r * d[i]);
+                let part = self.height * (m[i] * r);
+                below[i] += part;
+                above[i] += m[i] * r - part;
+            }
+        }
+        total.iter().map(|&sum| f64::from(sum)).sum()
+    }
+}
+
+/// x ← x + a p, then p ← z + b p with z = r/D + Φ y; returns the largest |z|.
+pub(super) struct Direction<'l> {
+    pub(super) x: &'l mut [f32],
+    pub(super) direction: &'l mut [f32],
+    pub(super) step: f32,
+    pub(super) keep: f32,
+    pub(super) residual: &'l [f32],
+    pub(super) inverse_diagonal: &'l [f32],
+    pub(super) sensitivity: &'l [f32],
+    pub(super) height: f32,
+    pub(super) above: &'l [f32],
+    pub(super) below: &'l [f32],
+}
+
+impl pulp::NullaryFnOnce for Direction<'_> {
+    type Output = f32;
+
+    #[inline(always)]
+    fn call(self) -> f32 {
+        let mut largest = [0.0_f32; LANES];
+        let directions = self.direction.as_chunks_mut::<LANES>().0;
+        let rows = self.x.as_chunks_mut::<LANES>().0.iter_mut().zip(directions);
+        for (index, (x, direction)) in rows.enumerate() {
+            let (r, d) = (chunk(self.residual, index), chunk(self.inverse_diagonal, index));
+            let m = chunk(self.sensitivity, index);
+            let (above, below) = (chunk(self.above, index), chunk(self.below, index));
+            for i in 0..LANES {
+                let smooth = above[i] + self.height * (below[i] - above[i]);
+                let z = if d[i] > 0.0 { r[i] * d[i] + m[i] * smooth } else { 0.0 };
+                x[i] += self.step * direction[i];
+                direction[i] = z + self.keep * direction[i];
+                largest[i] = largest[i].max(z.abs());
+            }
+        }
+        largest.iter().copied().fold(0.0, f32::max)
+    }
+}

@@ -1,0 +1,70 @@
+//! Ritz values: eigenvalues of the tridiagonal matrix that conjugate gradients yield.
+//!
+//! They approach those of P⁻¹S from within (Golub and Van Loan, Matrix Computations); the smallest
+//! turns a residual into an estimate of the error (see [`convergence`](crate::convergence)).
+
+/// The tridiagonal matrix of Lanczos, from the coefficients of conjugate gradients: with steps a
+/// and kept shares b its diagonal is 1/a_j + b_(j−1)/a_(j−1), beside it stands √b_j/a_j.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Ritz {
+    diagonal: Vec<f64>,
+    /// Squares of the elements beside the diagonal, the first one before the first row.
+    beside: Vec<f64>,
+    /// b/a and √b/a, squared, of the last iteration.
+    carried: [f64; 2],
+}
+
+impl Ritz {
+    pub(crate) fn push(&mut self, step: f64, keep: f64) {
+        self.diagonal.push(1.0 / step + self.carried[0]);
+        self.beside.push(self.carried[1]);
+        self.carried = [keep / step, keep / (step * step)];
+    }
+
+    /// Whether no iteration was made.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.diagonal.is_empty()
+    }
+
+    /// The smallest eigenvalue, to three digits, by bisection on Sturm's count: below it no pivot
+    /// of T − θ is negative (Golub and Van Loan, Matrix Computations, section 8.4).
+    pub(crate) fn smallest(&self) -> f64 {
+        let (mut low, mut high) =
+            (0.0_f64, self.diagonal.iter().copied().fold(f64::INFINITY, f64::min));
+        while high - low > 1e-3 * high {
+            let middle = 0.5 * (low + high);
+            if self.is_below(middle) {
+                low = middle;
+            } else {
+                high = middle;
+            }
+        }
+        high
+    }
+
+    /// Whether every eigenvalue is above `theta`.
+    fn is_below(&self, theta: f64) -> bool {
+        let mut pivot = f64::INFINITY;
+        self.diagonal.iter().zip(&self.beside).all(|(diagonal, square)| {
+            pivot = diagonal - theta - square / pivot;
+            pivot > 0.0
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_smallest_ritz_value_of_a_chain_is_known() {
+        // T with 2 on the diagonal and −1 beside it: 2 − 2 cos(π/(n+1)).
+        let mut ritz = Ritz::default();
+        for count in 1..30 {
+            ritz.diagonal.push(2.0);
+            ritz.beside.push(if count > 1 { 1.0 } else { 0.0 });
+            let wanted = 2.0 - 2.0 * (std::f64::consts::PI / f64::from(count + 1)).cos();
+            assert!((ritz.smallest() / wanted - 1.0).abs() < 2e-3);
+        }
+    }
+}

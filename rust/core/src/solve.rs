@@ -1,0 +1,25 @@
+//! From exposures to a fit: the choice of the solver, and its three loops.
+//!
+//! ```text
+//! calibrate    what runs, and the result in its gauge
+//! refuse       what does not go together
+//! whole        M and L alone, at whole shifts: by descent or multiscale
+//! descent      the method of the paper, sweep by sweep
+//! multiscale   Gauss-Newton steps on all scales at once, with the beam eliminated
+//! joint        Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated
+//! response     pixels that do not respond to light
+//! ```
+
+mod calibrate;
+mod descent;
+mod found;
+mod joint;
+mod multiscale;
+mod options;
+mod refuse;
+mod response;
+mod start;
+mod whole;
+
+pub use calibrate::calibrate;
+pub use options::{Method, Options};

@@ -1,0 +1,104 @@
+//! Coordinate descent: sweeps until M has converged.
+
+use super::options::Options;
+use crate::control::Control;
+use crate::convergence::{Ended, FEWEST_ITERATIONS, History, Look};
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::fit::Solution;
+use crate::frames::Real;
+use crate::parallel::Workers;
+use crate::reduced::{Scale, Search, Smallest};
+use crate::sweep::Estimate;
+
+/// Fewest sweeps between two estimates of the error, each of which costs about as much.
+const CHECK_EVERY: u64 = 16;
+/// Sweeps that nobody waits for: what makes so many is no experiment that this method can solve.
+const MOST_SWEEPS: u64 = 1_000_000;
+/// An estimate that may be rounding alone, where some pixels are much brighter than others.
+const TINY_ERROR: f64 = 1e-9;
+
+/// Sweeps until the estimated error of M is at most the tolerance, the sweeps are used up, or the
+/// estimate no longer falls. Returns the pixels too that their measurements leave almost no weight.
+///
+/// # Errors
+/// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
+/// 0 sweeps, [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+pub(super) fn minimise<'m, 'a, T: Real>(
+    exposures: &'m Exposures<'a, T>,
+    options: &Options,
+    start: Option<&Solution<'_>>,
+    workers: &'m Workers,
+    control: &Control,
+) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>)> {
+    let limit = options.limit(MOST_SWEEPS)?;
+    let mut estimate = Estimate::new(exposures, workers, control);
+    if let Some(start) = start {
+        estimate = estimate.at(start.sensitivity);
+    }
+    let (scale, mut search) = (Scale::of(exposures), Search::new(exposures, workers, control));
+    let mut looks: Vec<Look> = Vec::new();
+    let mut next_look = limit.min(CHECK_EVERY / 2);
+    let mut sweep = 0;
+    loop {
+        estimate.sweep(control)?;
+        sweep += 1;
+        if sweep < next_look {
+            continue;
+        }
+        let look = look(sweep, &mut estimate, scale, &mut search, control)?;
+        looks.push(look);
+        let ended = if look.error <= options.tolerance {
+            Ended::Converged
+        } else if stalled(&looks) {
+            Ended::Stalled
+        } else if sweep >= limit {
+            Ended::SweepsUsed
+        } else {
+            let total = forecast(&looks, options.tolerance).min(limit);
+            control.report("calibrate", sweep, total);
+            // Rarer as the run grows longer, but not far beyond the sweep that may be the last.
+            let wait = (total - sweep).min(sweep / 4).max(CHECK_EVERY);
+            next_look = limit.min(sweep + wait);
+            continue;
+        };
+        let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
+        return Ok((estimate, History { looks, ended }, left_out));
+    }
+}
+
+/// F and the estimated error after a sweep, with L at its closed form for the M of that sweep.
+fn look<T: Real>(
+    sweep: u64,
+    estimate: &mut Estimate<'_, '_, T>,
+    scale: Scale,
+    search: &mut Search<'_, '_, T>,
+    control: &Control,
+) -> Result<Look> {
+    let objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
+    search.start(&estimate.sensitivity, estimate.beams(), control)?;
+    let mut smallest = Smallest::default();
+    while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}
+    Ok(Look { sweep, objective, error: smallest.error(search) })
+}
+
+/// Whether the estimate is tiny and no smaller than it was at half the sweeps.
+fn stalled(looks: &[Look]) -> bool {
+    let [earlier @ .., last] = looks else { return false };
+    let half = earlier.iter().find(|look| 2 * look.sweep >= last.sweep);
+    last.error < TINY_ERROR && half.is_some_and(|half| last.error >= half.error)
+}
+
+/// How many sweeps it will be until `tolerance` is met, if errors go on to fade as they did between
+/// the last two looks.
+fn forecast(looks: &[Look], tolerance: f64) -> u64 {
+    let rate = match looks {
+        [.., from, to] if to.error < from.error => {
+            (from.error / to.error).ln() / (to.sweep - from.sweep) as f64
+        }
+        [.., last] => 1.0 / last.sweep as f64,
+        [] => return MOST_SWEEPS,
+    };
+    let last = looks.last().map_or((0, 1.0), |look| (look.sweep, look.error));
+    last.0.saturating_add(((last.1 / tolerance).ln() / rate).max(0.0) as u64)
+}

@@ -1,0 +1,313 @@
+//! The joint fit: Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated.
+
+use super::found::Found;
+use super::options::Options;
+use super::start;
+use crate::beam::Beam;
+use crate::connectivity::NONE;
+use crate::control::Control;
+use crate::convergence::{
+    Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, rounding, stalled_since,
+};
+use crate::error::Result;
+use crate::exposures::{Exposures, FluxKind};
+use crate::fit::{Fit, Refinement, Solution};
+use crate::frames::Real;
+use crate::gauge;
+use crate::joint::{self, Preconditioner, Search, ShiftPrior, System};
+use crate::memory;
+use crate::parallel::Workers;
+
+/// Products that nobody waits for.
+const MOST_PRODUCTS: u64 = 5000;
+/// The estimated error of M at which shifts begin to be refined.
+const BEFORE_SHIFTS: f64 = 1e-3;
+/// A beam whose structure is so much larger than noise tells shifts; by the slopes of noise steps
+/// would lead nowhere.
+const TOLD: f64 = 10.0;
+/// How much of the tolerance a search aims at; the rest is for what linearising adds.
+const AIM: f64 = 0.5;
+/// What linearising adds counts as this share of a step at most, and at least.
+const CURVED: [f64; 2] = [1e-8, 0.03];
+/// Steps after which the weight of the penalty, which M has a part in, and the variance of a
+/// measurement, where it is not known, count as found.
+const SETTLING: usize = 3;
+/// Passes over the measurements that a look takes at most: M, the weights, a product.
+const A_LOOK: u64 = 3;
+/// Passes that an ordinary fit takes: what progress is measured against at first.
+const TYPICAL: u64 = 120;
+
+/// Minimises F until the estimated error of M is at most the tolerance, the products are used up, or
+/// the estimate no longer falls.
+///
+/// # Errors
+/// [`Error::Memory`](crate::Error::Memory) before anything else if the memory for it cannot be had;
+/// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
+/// 0, [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+pub(super) fn minimise<T: Real>(
+    exposures: &Exposures<'_, T>,
+    options: &Options,
+    start: Option<&Solution<'_>>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Found> {
+    memory::check(joint::bytes_needed(exposures), || {
+        format!("fitting {} exposures of {} jointly", exposures.count(), exposures.sensor())
+    })?;
+    let mut steps = Steps::new(exposures, options, start, workers, control)?;
+    loop {
+        if let Some(ended) = steps.next(control)? {
+            return steps.finish(ended, control);
+        }
+    }
+}
+
+/// Steps towards the minimum.
+struct Steps<'m, 'a, T> {
+    system: System<'m, 'a, T>,
+    search: Search,
+    options: &'m Options,
+    /// The most passes.
+    limit: u64,
+    /// Sweeps that made the first beam.
+    swept: u64,
+    looks: Vec<Look>,
+    /// The last step.
+    taken: Option<Vec<f64>>,
+    halvings: i32,
+    /// Whether a step raised F at any length.
+    stuck: bool,
+    preconditioner: Option<Preconditioner>,
+    /// What is known of shifts that are refined later.
+    shift_prior: Option<ShiftPrior>,
+    refinement: Refinement,
+}
+
+impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
+    fn new(
+        exposures: &'m Exposures<'a, T>,
+        options: &'m Options,
+        start: Option<&Solution<'_>>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Self> {
+        let limit = options.limit(MOST_PRODUCTS)?;
+        let (mut system, swept) = start::system(exposures, start, workers, control)?;
+        let mut shift_prior = ShiftPrior::of(exposures.positions());
+        let mut refinement =
+            shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
+        // Shifts are refined from a beam that is nearly found: that of a start that has refined them.
+        if start.is_some_and(|start| start.refined) && shift_prior.is_some() {
+            system.seek_shifts(shift_prior.take());
+            refinement = Refinement::Done;
+        }
+        Ok(Self {
+            system,
+            search: Search::default(),
+            options,
+            limit,
+            swept,
+            looks: Vec::new(),
+            taken: None,
+            halvings: 0,
+            stuck: false,
+            preconditioner: None,
+            shift_prior,
+            refinement,
+        })
+    }
+
+    /// One step, or a shorter last one; says why the search has ended, if it has.
+    fn next(&mut self, control: &Control) -> Result<Option<Ended>> {
+        let linear = self.system.linearise(control)?;
+        // Where shifts still move, cells come into the penalty, and F is not one function.
+        let moving = self.system.seeks_shifts() && self.looks.len() <= SETTLING;
+        if self.takes_back(linear.0, moving) {
+            return Ok(None);
+        }
+        let (objective, slope) = self.settled(linear, control)?;
+        let preconditioner = match self.preconditioner.take() {
+            Some(preconditioner) => preconditioner,
+            None => Preconditioner::new(&mut self.system, control)?,
+        };
+        self.search.begin(&self.system, &preconditioner, slope, control)?;
+        let first = self.search.product(&mut self.system, control)?;
+        let error = first / self.search.smallest;
+        self.looks.push(Look { sweep: self.products(), objective, error });
+        if self.begins_to_refine(error) {
+            return Ok(None);
+        }
+        let ended = self.ended();
+        if ended.is_none() {
+            self.step(first, &preconditioner, control)?;
+            self.preconditioner = (!moving).then_some(preconditioner);
+        }
+        Ok(ended)
+    }
+
+    /// Takes a part of the last step back if F rose.
+    fn takes_back(&mut self, objective: f64, moving: bool) -> bool {
+        let exposures = self.system.pass.exposures;
+        let last = self.looks.last().filter(|_| !moving);
+        let highest =
+            last.map_or(f64::INFINITY, |last| last.objective + rounding(exposures, last.objective));
+        // A number that is none is no fall either.
+        let fell = objective <= highest;
+        if let Some(x) = &self.taken
+            && !fell
+            && self.halvings <= MOST_HALVINGS
+        {
+            // The last time, what is left of the step is taken back.
+            self.halvings += 1;
+            self.stuck = self.halvings > MOST_HALVINGS;
+            let share = 0.5_f64.powi(self.halvings.min(MOST_HALVINGS));
+            self.system.advance(x, -share);
+            return true;
+        }
+        self.halvings = 0;
+        false
+    }
+
+    /// F and its slope, at the first looks with the variance and the penalty's weight found anew.
+    fn settled(&mut self, linear: (f64, Vec<f64>), control: &Control) -> Result<(f64, Vec<f64>)> {
+        if self.looks.len() >= SETTLING {
+            return Ok(linear);
+        }
+        if !self.system.pass.exposures.variance_is_known() {
+            self.system.unit = self.system.misfit / joint::freedom(&self.system);
+        }
+        self.system.renew(control)
+    }
+
+    /// Seeks the shifts too, once the beam is nearly found, if it has structure.
+    fn begins_to_refine(&mut self, error: f64) -> bool {
+        let near = error <= BEFORE_SHIFTS.max(self.options.tolerance)
+            && self.search.iterations >= FEWEST_ITERATIONS;
+        let Some(prior) = self.shift_prior.take_if(|_| near) else { return false };
+        if self.system.structure() < TOLD {
+            self.refinement = Refinement::Undetermined;
+            return false;
+        }
+        self.refinement = Refinement::Done;
+        self.system.seek_shifts(Some(prior));
+        (self.search, self.taken, self.looks) = (Search::default(), None, Vec::new());
+        true
+    }
+
+    /// Searches for a step and takes it.
+    fn step(
+        &mut self,
+        first: f64,
+        preconditioner: &Preconditioner,
+        control: &Control,
+    ) -> Result<()> {
+        let reachable = first * first.clamp(CURVED[0], CURVED[1]);
+        while self.products() + A_LOOK < self.limit {
+            let done = self.products();
+            control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
+            if !self.search.step(&self.system, preconditioner) {
+                break;
+            }
+            control.check()?;
+            let size = self.search.product(&mut self.system, control)?;
+            let aim = AIM * self.options.tolerance;
+            let near = size <= reachable || size / self.search.smallest <= aim;
+            if near && self.search.iterations >= FEWEST_ITERATIONS {
+                break;
+            }
+        }
+        let mut step = std::mem::take(&mut self.search.x);
+        // A multiple of the beam is no step, but the penalty would see one.
+        let cells = self.system.state.beam.len();
+        self.system.take_scale_out(&mut step[..cells]);
+        self.system.advance(&step, 1.0);
+        self.taken = Some(step);
+        Ok(())
+    }
+
+    /// Passes over the measurements so far.
+    const fn products(&self) -> u64 {
+        self.swept + self.system.pass.count
+    }
+
+    /// Why it has ended, if it has.
+    fn ended(&self) -> Option<Ended> {
+        let last = self.looks.last()?;
+        let settled = last.error == 0.0;
+        let certain = self.search.iterations >= FEWEST_ITERATIONS || settled;
+        let stalled = stalled_since(&self.looks).is_some_and(|earlier| earlier >= SETTLING);
+        if certain && last.error <= self.options.tolerance {
+            Some(Ended::Converged)
+        } else if last.sweep + A_LOOK >= self.limit {
+            Some(Ended::SweepsUsed)
+        } else if self.stuck || stalled {
+            Some(Ended::Stalled)
+        } else {
+            None
+        }
+    }
+
+    /// What was found, with the fluxes in their gauge.
+    fn finish(self, ended: Ended, control: &Control) -> Result<Found> {
+        let system = &self.system;
+        let exposures = system.pass.exposures;
+        let without_offset = system.without_offset();
+        let history = History { looks: self.looks, ended };
+        let smallest = self.search.smallest;
+        let mut fit = fit(system, history, self.refinement, smallest, control)?;
+        fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
+        if matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_)) {
+            let theta = system.state.theta.first().copied().unwrap_or_default();
+            let drift = system.fluxes.slope.map(|slope| theta * slope);
+            let rotation = exposures.positions().rotations[0];
+            gauge::fix_fluxes(&mut fit, drift, &system.fluxes.open, rotation, exposures.sensor());
+        }
+        let left_out = without_offset.clone();
+        Ok(Found { fit, left_out, dead: Vec::new(), without_offset })
+    }
+}
+
+/// The fit at the state of a problem.
+fn fit<T: Real>(
+    system: &System<'_, '_, T>,
+    history: History,
+    refinement: Refinement,
+    smallest_ritz: f64,
+    control: &Control,
+) -> Result<Fit> {
+    let (exposures, grid) = (system.pass.exposures, &system.pass.grid.geometry);
+    let [sensitivity, offset] = system.pixels();
+    Ok(Fit {
+        components: joint::components(system, control)?,
+        sensitivity,
+        offset: exposures.offset().then_some(offset),
+        beam: Beam {
+            values: joint::values_at_cells(system),
+            coefficients: joint::coefficients(system),
+            shape: grid.beam,
+            origin: grid.origin,
+        },
+        flux: system.pass.flux.clone(),
+        shifts: system.state.shifts.clone(),
+        flags: Vec::new(),
+        refinement,
+        leaves_tilt: !system.fluxes.open.is_empty(),
+        smallest_ritz: Some(smallest_ritz),
+        misfit: system.misfit,
+        degrees_of_freedom: 0,
+        variance_is_known: exposures.variance_is_known(),
+        history,
+    })
+}
+
+/// Measurements less unknowns; each component has one unknown less than values, by its gauge.
+fn degrees_of_freedom<T: Real>(
+    system: &System<'_, '_, T>,
+    fit: &Fit,
+    without_offset: usize,
+) -> i64 {
+    let pixels = fit.components.pixels.iter().filter(|&&label| label != NONE).count();
+    let offsets = if fit.offset.is_some() { pixels - without_offset } else { 0 };
+    let unknowns = joint::unknowns(system) + pixels + offsets - fit.components.sizes.len();
+    system.pass.exposures.used() as i64 - unknowns as i64
+}

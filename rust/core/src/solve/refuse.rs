@@ -1,0 +1,39 @@
+//! What does not go together.
+
+use super::options::{Method, Options};
+use crate::error::{Error, Result};
+use crate::exposures::Exposures;
+use crate::frames::Real;
+
+/// Refuses exposures that the method cannot fit, or that do not determine what is sought.
+///
+/// # Errors
+/// [`Error::Value`].
+pub(super) fn check<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Result<()> {
+    check_method(exposures, options)?;
+    if !exposures.are_whole() && !exposures.positions().differ(exposures.sensor()) {
+        let problem = "are all alike: each pixel sees one place of the beam, and nothing compares \
+                       it with others; move the sensor between exposures";
+        return Err(Error::value("shifts", problem));
+    }
+    if exposures.offset() && exposures.are_one_level() {
+        let problem = "is 'fit' with one flux for all: offset and gain cannot be told apart; take \
+                       exposures at two or more levels and give their 'flux', or subtract a dark";
+        return Err(Error::value("dark", problem));
+    }
+    Ok(())
+}
+
+/// Refuses what coordinate descent cannot fit.
+fn check_method<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Result<()> {
+    if options.method == Method::Multiscale || exposures.are_whole() {
+        return Ok(());
+    }
+    let problem = if exposures.seek_more() || exposures.positions().std.is_some() {
+        "is 'coordinate-descent', which knows whole shifts and given fluxes: to fit fluxes, shifts \
+         or the dark take 'multiscale'"
+    } else {
+        "is 'coordinate-descent', which knows whole shifts: round them, or take 'multiscale'"
+    };
+    Err(Error::value("method", problem))
+}

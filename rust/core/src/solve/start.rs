@@ -1,0 +1,104 @@
+//! Where the loops start: at equal pixels, or at another fit.
+
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::fit::Solution;
+use crate::frames::Real;
+use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
+use crate::parallel::Workers;
+use crate::sweep::Estimate;
+
+/// Sweeps that make the first beam.
+const FIRST_SWEEPS: u64 = 4;
+
+/// M of another fit, or equal pixels but for bright ones.
+pub(super) fn estimate<'m, 'a, T: Real>(
+    exposures: &'m Exposures<'a, T>,
+    start: Option<&Solution<'_>>,
+    workers: &'m Workers,
+    control: &Control,
+) -> Result<Estimate<'m, 'a, T>> {
+    let mut estimate = Estimate::new(exposures, workers, control);
+    match start {
+        Some(start) => estimate = estimate.at(start.sensitivity),
+        None => estimate.start_bright(control)?,
+    }
+    Ok(estimate)
+}
+
+/// The joint problem at another fit, or at a first beam from some sweeps at the nearest whole shifts;
+/// and how many sweeps that took.
+pub(super) fn system<'m, 'a, T: Real>(
+    exposures: &'m Exposures<'a, T>,
+    start: Option<&Solution<'_>>,
+    workers: &'m Workers,
+    control: &Control,
+) -> Result<(System<'m, 'a, T>, u64)> {
+    let positions = exposures.positions();
+    let (shifts, rotations) = (&positions.shifts, &positions.rotations);
+    let grid = Grid::new(exposures.sensor(), shifts, rotations, positions.std.is_some())?;
+    let fluxes = Fluxes::new(exposures.flux(), exposures.flux_kind(), shifts, rotations);
+    let (state, swept) = match start {
+        Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
+        None => (swept(exposures, &grid, &fluxes, workers, control)?, FIRST_SWEEPS),
+    };
+    Ok((System::new(exposures, grid, fluxes, state, workers, control), swept))
+}
+
+/// The state after some sweeps.
+fn swept<T: Real>(
+    exposures: &Exposures<'_, T>,
+    grid: &Grid,
+    fluxes: &Fluxes,
+    workers: &Workers,
+    control: &Control,
+) -> Result<State> {
+    let mut estimate = estimate(exposures, None, workers, control)?;
+    for _ in 0..FIRST_SWEEPS {
+        estimate.sweep(control)?;
+    }
+    let geometry = exposures.geometry();
+    let (known, places) = (&estimate.beams()[0], geometry.views[0].places);
+    let value = |row, col| known[places.at(row, col)];
+    let source = Source { shape: geometry.beam, origin: geometry.origin, value };
+    Ok(State {
+        beam: first_beam(grid, &source, workers, control)?,
+        theta: vec![0.0; fluxes.columns.len()],
+        shifts: exposures.positions().shifts.clone(),
+    })
+}
+
+/// The state of another fit on this grid: its coefficients, or values at cells; its fluxes and, if they
+/// were refined, its shifts.
+///
+/// In its gauge the fluxes may have a part a + γ·d that the problem here does not seek. It goes to
+/// the beam: c L(u) is the same with ln c less by a + γ·d and ln L more by a + γ·u, but for a tilt of
+/// M.
+fn moved<T: Real>(
+    start: &Solution<'_>,
+    exposures: &Exposures<'_, T>,
+    grid: &Grid,
+    fluxes: &Fluxes,
+    workers: &Workers,
+    control: &Control,
+) -> Result<State> {
+    let positions = exposures.positions();
+    let (theta, level, slope) = fluxes.split(start.flux, start.shifts);
+    let beam = &start.beam;
+    let cells = beam.coefficients.filter(|_| grid.is_spline()).unwrap_or(beam.values);
+    let value = |row: usize, col: usize| {
+        let [down, right] =
+            [row as f64 - beam.origin[0] as f64, col as f64 - beam.origin[1] as f64];
+        let value = cells[row * beam.shape.cols + col];
+        let factor = (level + slope[0] * down + slope[1] * right).exp();
+        if value.is_finite() { value * factor } else { 0.0 }
+    };
+    let source = Source { shape: beam.shape, origin: beam.origin, value };
+    let mut shifts = positions.shifts.clone();
+    if let Some(prior) = ShiftPrior::of(positions).filter(|_| start.refined) {
+        shifts.copy_from_slice(start.shifts);
+        prior.keep_near(&mut shifts);
+    }
+    Ok(State { beam: first_beam(grid, &source, workers, control)?, theta, shifts })
+}

@@ -1,0 +1,445 @@
+//! One sweep over all exposures: which lines of data meet in which cells and pixels.
+
+use std::ops::Range;
+
+use super::kernel::{Line, STRETCH, Scratch, improve, measure, quotient};
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::{Exposures, Stretch};
+use crate::frames::{Real, Shape};
+use crate::geometry::{Placement, View};
+use crate::median::median;
+use crate::padded::Padding;
+use crate::parallel::Workers;
+
+/// Rows that a thread works on at a time.
+const BAND: usize = 8;
+/// Bytes of data that may be expected to stay in the last-level cache.
+const IN_CACHE: usize = 1 << 25;
+
+/// How many times brighter than those around a pixel starts from its own brightness.
+const BRIGHT: f64 = 4.0;
+/// So many pixels on either side of it.
+const AROUND: usize = 4;
+
+/// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
+pub struct Estimate<'m, 'a, T> {
+    exposures: &'m Exposures<'a, T>,
+    workers: &'m Workers,
+    /// M, row by row; 1 where no measurement tells.
+    pub sensitivity: Vec<f64>,
+    /// L in each of the geometry's views; 0 where no measurement tells.
+    beams: Vec<Vec<f64>>,
+}
+
+impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
+    /// Starts from a sensor of equal pixels, M = 1.
+    #[must_use]
+    pub fn new(exposures: &'m Exposures<'a, T>, workers: &'m Workers, control: &Control) -> Self {
+        Self {
+            exposures,
+            workers,
+            sensitivity: workers.filled(exposures.sensor().len(), 1.0, control),
+            beams: vec![Vec::new(); exposures.geometry().views.len()],
+        }
+    }
+
+    /// Starts pixels that are much brighter than those around, in every exposure, from what they
+    /// show: with M = 1 they would make the beam bright that they see, and their neighbours dark.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn start_bright(&mut self, control: &Control) -> Result<()> {
+        let (exposures, cols) = (self.exposures, self.exposures.sensor().cols);
+        self.workers.map_blocks(&mut self.sensitivity, BAND * cols, |band, rows| {
+            let mut scratch = vec![0.0; cols];
+            for (index, pixels) in rows.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
+                }
+                let shown = darkest(exposures, band * BAND + index, &mut scratch);
+                for (col, m) in pixels.iter_mut().enumerate() {
+                    let around = &shown[col.saturating_sub(AROUND)..cols.min(col + AROUND + 1)];
+                    // Most are settled by the two at the ends.
+                    if shown[col] > BRIGHT * around[0].min(around[around.len() - 1]) {
+                        let median = median(&mut around.to_vec(), f64::total_cmp).unwrap_or(0.0);
+                        if median > 0.0 && shown[col] > BRIGHT * median && shown[col].is_finite() {
+                            *m = shown[col] / median;
+                        }
+                    }
+                }
+            }
+        });
+        control.check()
+    }
+
+    /// One sweep: all L, then all M. Returns F after it.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled); the state is then no whole sweep's.
+    pub fn sweep(&mut self, control: &Control) -> Result<f64> {
+        self.with_best_beam(control, |estimate, rows| estimate.update_sensitivity(rows, control))
+    }
+
+    /// Updates all L; writes half the slope of −F along each pixel's M, times `scale`, to `slopes`
+    /// and returns F.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn slopes(
+        &mut self,
+        scale: f64,
+        slopes: &mut [f32],
+        control: &Control,
+    ) -> Result<f64> {
+        let padding = Padding::of(&self.exposures.geometry());
+        let body = padding.body_mut(slopes);
+        self.with_best_beam(control, |estimate, rows| {
+            let body = &mut body[rows.start * padding.width..rows.end * padding.width];
+            estimate.measure_slopes(rows, scale, &padding, body, control)
+        })
+    }
+
+    /// Makes room for L where there is none, by the threads that will use it.
+    fn remember_beams(&mut self, control: &Control) {
+        let cells = self.exposures.geometry().beam.len();
+        for beam in self.beams.iter_mut().filter(|beam| beam.is_empty()) {
+            *beam = self.workers.filled(cells, 0.0, control);
+        }
+    }
+
+    /// Gives the memory of L back until it is found anew from M.
+    pub(crate) fn forget_beams(&mut self) {
+        self.beams.iter_mut().for_each(|beam| *beam = Vec::new());
+    }
+
+    /// Updates all L, and calls `work` for ranges of pixel rows, in order, once the cells that they
+    /// see are up to date; returns the sum of what it returns.
+    fn with_best_beam(
+        &mut self,
+        control: &Control,
+        mut work: impl FnMut(&mut Self, Range<usize>) -> Vec<f64>,
+    ) -> Result<f64> {
+        self.remember_beams(control);
+        let rows = self.exposures.sensor().rows;
+        let mut bands = Vec::with_capacity(rows.div_ceil(BAND));
+        if self.beams.len() == 1 {
+            let places = self.exposures.geometry().placements.iter();
+            let reach = places.map(|place| place.row).max().unwrap_or(0);
+            let mut done = 0;
+            for start in (0..rows).step_by(self.rows_in_cache()) {
+                let end = (start + self.rows_in_cache()).min(rows);
+                self.update_beam(done..end + reach, control);
+                done = end + reach;
+                bands.extend(work(self, start..end));
+            }
+        } else {
+            self.update_turned_beams(control);
+            bands.extend(work(self, 0..rows));
+        }
+        control.check()?;
+        Ok(bands.into_iter().sum())
+    }
+
+    /// Rows whose data are still in cache when M is updated, right after the cells of L that see
+    /// them. The cells of the rows that follow still see the old M, so nothing changes but the
+    /// number of times that the data come from memory: once a sweep, not twice.
+    fn rows_in_cache(&self) -> usize {
+        let Shape { cols, .. } = self.exposures.sensor();
+        let row = cols * self.exposures.count() * size_of::<T>();
+        (IN_CACHE / row).max(4 * BAND * self.workers.count()).next_multiple_of(BAND)
+    }
+
+    /// Takes M as given; what is not a number becomes 1.
+    #[must_use]
+    pub(crate) fn at(mut self, sensitivity: &[f64]) -> Self {
+        self.sensitivity.iter_mut().zip(sensitivity).for_each(|(m, &given)| {
+            *m = if given.is_finite() { given } else { 1.0 };
+        });
+        self
+    }
+
+    /// M and L, row by row.
+    pub(crate) fn into_maps(self) -> (Vec<f64>, Vec<f64>) {
+        let beam = self.beam();
+        (self.sensitivity, beam)
+    }
+
+    /// L on the beam grid, row by row; 0 where no measurement tells.
+    #[must_use]
+    pub fn beam(&self) -> Vec<f64> {
+        let geometry = &self.exposures.geometry();
+        let mut beam = vec![0.0; geometry.beam.len()];
+        self.workers.map_blocks(&mut beam, geometry.beam.cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell = self.beams[0][geometry.views[0].places.at(row, col)];
+            }
+        });
+        beam
+    }
+
+    /// Updates some rows of the beam, which has one view.
+    fn update_beam(&mut self, rows: Range<usize>, control: &Control) {
+        let cols = self.exposures.geometry().views[0].shape.cols;
+        let (exposures, sensitivity) = (self.exposures, &self.sensitivity[..]);
+        let first = rows.start;
+        let cells = &mut self.beams[0][rows.start * cols..rows.end * cols];
+        self.workers.map_blocks(cells, BAND * cols, |band, rows| {
+            let mut scratch = Scratch::new(exposures.count());
+            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return;
+                }
+                let row_of_view = first + band * BAND + index;
+                let seen = BeamRow { exposures, sensitivity, view: 0, row: row_of_view };
+                seen.for_each_stretch(&mut scratch, |lines, cells| {
+                    improve(lines, &mut row[cells]);
+                });
+            }
+        });
+    }
+
+    /// The update of L where exposures are turned against each other: the sums of each view are
+    /// brought together on the beam grid, and the new beam is turned into each view.
+    fn update_turned_beams(&mut self, control: &Control) {
+        let (views, beams) = (&self.exposures.geometry().views, &self.beams);
+        let sums: Vec<_> = (0..views.len()).map(|view| self.view_sums(view, control)).collect();
+        let Shape { rows, cols } = self.exposures.geometry().beam;
+        let mut beam = vec![0.0; rows * cols];
+        self.workers.map_blocks(&mut beam, cols, |row, cells| {
+            for (col, cell) in cells.iter_mut().enumerate() {
+                *cell = beams[0][views[0].places.at(row, col)];
+                let [mut slope, mut weight] = [0.0; 2];
+                for (view, sums) in views.iter().zip(&sums) {
+                    let place = view.places.at(row, col);
+                    slope += sums[0][place];
+                    weight += sums[1][place];
+                }
+                *cell += quotient(slope, weight);
+            }
+        });
+        for (view, turned) in views.iter().zip(&mut self.beams) {
+            turn(view, &beam, turned, self.workers);
+        }
+    }
+
+    /// Slope and weight of one view's exposures, for each of its cells.
+    fn view_sums(&self, view: usize, control: &Control) -> [Vec<f64>; 2] {
+        let (exposures, sensitivity, beam) =
+            (self.exposures, &self.sensitivity[..], &self.beams[view]);
+        let shape = exposures.geometry().views[view].shape;
+        let mut slopes = vec![0.0; shape.len()];
+        let mut weights = vec![0.0; shape.len()];
+        let size = BAND * shape.cols;
+        self.workers.map_pairs(&mut slopes, &mut weights, [size; 2], |band, slopes, weights| {
+            let mut scratch = Scratch::new(exposures.count());
+            let rows = slopes.chunks_exact_mut(shape.cols);
+            let rows = rows.zip(weights.chunks_exact_mut(shape.cols)).enumerate();
+            for (index, (slopes, weights)) in rows {
+                if control.is_cancelled() {
+                    return;
+                }
+                let row = band * BAND + index;
+                let sought = &beam[row * shape.cols..][..shape.cols];
+                let seen = BeamRow { exposures, sensitivity, view, row };
+                seen.for_each_stretch(&mut scratch, |lines, cells| {
+                    let (slopes, weights) =
+                        (&mut slopes[cells.clone()], &mut weights[cells.clone()]);
+                    measure(lines, &sought[cells], slopes, weights);
+                });
+            }
+        });
+        [slopes, weights]
+    }
+
+    /// Updates M in a range of rows; returns the share of F of each band of them.
+    fn update_sensitivity(&mut self, rows: Range<usize>, control: &Control) -> Vec<f64> {
+        let cols = self.exposures.sensor().cols;
+        let (exposures, beams) = (self.exposures, &self.beams[..]);
+        let pixels = &mut self.sensitivity[rows.start * cols..rows.end * cols];
+        self.workers.map_blocks(pixels, BAND * cols, |band, pixels| {
+            let mut scratch = Scratch::new(exposures.count());
+            let mut objective = 0.0;
+            for (index, pixels) in pixels.chunks_exact_mut(cols).enumerate() {
+                if control.is_cancelled() {
+                    return objective;
+                }
+                let row = rows.start + band * BAND + index;
+                for start in (0..cols).step_by(STRETCH) {
+                    let stretch = start..(start + STRETCH).min(cols);
+                    let lines = pixel_lines(exposures, beams, row, stretch.clone(), &mut scratch);
+                    objective += improve(&lines, &mut pixels[stretch]);
+                }
+            }
+            objective
+        })
+    }
+
+    /// Slopes along M in a range of rows, times `scale`; returns the share of F of each band.
+    fn measure_slopes(
+        &self,
+        rows: Range<usize>,
+        scale: f64,
+        padding: &Padding,
+        slopes: &mut [f32],
+        control: &Control,
+    ) -> Vec<f64> {
+        let cols = self.exposures.sensor().cols;
+        self.workers.map_blocks(slopes, BAND * padding.width, |band, slopes| {
+            let mut scratch = Scratch::new(self.exposures.count());
+            let [mut found, mut weights] = [[0.0; STRETCH]; 2];
+            let mut objective = 0.0;
+            for (index, slopes) in slopes.chunks_exact_mut(padding.width).enumerate() {
+                if control.is_cancelled() {
+                    return objective;
+                }
+                let row = rows.start + band * BAND + index;
+                for start in (0..cols).step_by(STRETCH) {
+                    let stretch = start..(start + STRETCH).min(cols);
+                    let sought = &self.sensitivity[row * cols..][stretch.clone()];
+                    let lines = pixel_lines(
+                        self.exposures,
+                        &self.beams,
+                        row,
+                        stretch.clone(),
+                        &mut scratch,
+                    );
+                    objective += measure(&lines, sought, &mut found, &mut weights);
+                    for (slope, found) in slopes[stretch].iter_mut().zip(&found) {
+                        *slope = (found * scale) as f32;
+                    }
+                }
+            }
+            objective
+        })
+    }
+
+    /// M ← M + share·x, for an `x` that lies as [`slopes`](Self::slopes) does.
+    pub(crate) fn advance(&mut self, x: &[f32], share: f64) {
+        let cols = self.exposures.sensor().cols;
+        let padding = Padding::of(&self.exposures.geometry());
+        self.workers.map_blocks(&mut self.sensitivity, cols, |row, pixels| {
+            for (m, &x) in pixels.iter_mut().zip(padding.row(x, row)) {
+                *m += share * f64::from(x);
+            }
+        });
+    }
+
+    /// L in each of the geometry's views; 0 where no measurement tells.
+    pub(crate) fn beams(&self) -> &[Vec<f64>] {
+        &self.beams
+    }
+}
+
+/// The least y/c of each pixel of a row; infinite without measurement.
+fn darkest<T: Real>(exposures: &Exposures<'_, T>, row: usize, scratch: &mut [f64]) -> Vec<f64> {
+    let mut least = vec![f64::INFINITY; scratch.len()];
+    for (exposure, flux) in exposures.flux().iter().enumerate() {
+        match exposures.stretch(exposure, row, 0..least.len(), scratch) {
+            Stretch::Uniform(values, _) => {
+                for (least, value) in least.iter_mut().zip(values) {
+                    *least = least.min(value.to_f64() / flux);
+                }
+            }
+            Stretch::Weighted(values, weights) => {
+                for ((least, value), &weight) in least.iter_mut().zip(values).zip(weights) {
+                    let value = if weight > 0.0 { value.to_f64() / flux } else { f64::INFINITY };
+                    *least = least.min(value);
+                }
+            }
+        }
+    }
+    least
+}
+
+/// Copies `beam` into the orientation of `view`.
+fn turn(view: &View, beam: &[f64], turned: &mut [f64], workers: &Workers) {
+    workers.map_blocks(turned, view.shape.cols, |row, cells| {
+        for (col, cell) in cells.iter_mut().enumerate() {
+            *cell = beam[view.cells.at(row, col)];
+        }
+    });
+}
+
+/// The exposures along a stretch of a row of pixels, with the beam that they see.
+fn pixel_lines<'s, T: Real>(
+    exposures: &Exposures<'s, T>,
+    beams: &'s [Vec<f64>],
+    row: usize,
+    cols: Range<usize>,
+    scratch: &'s mut Scratch,
+) -> Vec<Line<'s, T>> {
+    let places = exposures.geometry().placements.iter().zip(exposures.flux()).enumerate();
+    places
+        .zip(&mut scratch.weights)
+        .map(|((exposure, (place, &flux)), weights)| {
+            let view_cols = exposures.geometry().views[place.view].shape.cols;
+            let first = (row + place.row) * view_cols + place.col + cols.start;
+            let known = &beams[place.view][first..][..cols.len()];
+            Line { measured: exposures.stretch(exposure, row, cols.clone(), weights), known, flux }
+        })
+        .collect()
+}
+
+/// One row of beam cells, in one view, and what the exposures there see of it.
+struct BeamRow<'r, 'a, T> {
+    exposures: &'r Exposures<'a, T>,
+    sensitivity: &'r [f64],
+    view: usize,
+    row: usize,
+}
+
+impl<T: Real> BeamRow<'_, '_, T> {
+    /// Calls `work(lines, cells)` for each stretch of cells that the same exposures see.
+    fn for_each_stretch(
+        &self,
+        scratch: &mut Scratch,
+        mut work: impl FnMut(&[Line<'_, T>], Range<usize>),
+    ) {
+        let edges = self.edges();
+        for pair in edges.windows(2) {
+            for start in (pair[0]..pair[1]).step_by(STRETCH) {
+                let cells = start..(start + STRETCH).min(pair[1]);
+                let lines = self.lines(cells.clone(), scratch);
+                work(&lines, cells);
+            }
+        }
+    }
+
+    /// Where windows of exposures begin and end along the row, rising.
+    fn edges(&self) -> Vec<usize> {
+        let cols = self.exposures.sensor().cols;
+        let ends = self.seeing().flat_map(|(_, place)| [place.col, place.col + cols]);
+        let mut edges: Vec<usize> = ends.collect();
+        edges.sort_unstable();
+        edges.dedup();
+        edges
+    }
+
+    /// The exposures whose windows reach this row.
+    fn seeing(&self) -> impl Iterator<Item = (usize, &Placement)> {
+        let rows = self.exposures.sensor().rows;
+        let places = self.exposures.geometry().placements.iter().enumerate();
+        places.filter(move |(_, place)| {
+            place.view == self.view && (place.row..place.row + rows).contains(&self.row)
+        })
+    }
+
+    /// The exposures that see `cells`, with the sensitivities of the pixels that do.
+    fn lines<'s>(&'s self, cells: Range<usize>, scratch: &'s mut Scratch) -> Vec<Line<'s, T>> {
+        let cols = self.exposures.sensor().cols;
+        let seeing = self
+            .seeing()
+            .filter(|(_, place)| place.col <= cells.start && cells.end <= place.col + cols);
+        seeing
+            .zip(&mut scratch.weights)
+            .map(|((exposure, place), weights)| {
+                let row = self.row - place.row;
+                let pixels = cells.start - place.col..cells.end - place.col;
+                let known = &self.sensitivity[row * cols..][pixels.clone()];
+                let measured = self.exposures.stretch(exposure, row, pixels, weights);
+                Line { measured, known, flux: self.exposures.flux()[exposure] }
+            })
+            .collect()
+    }
+}

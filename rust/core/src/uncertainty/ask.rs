@@ -1,0 +1,113 @@
+//! The questions that can be asked of a fit.
+
+use super::joint::JointCovariance;
+use super::reduced::ReducedCovariance;
+use super::sampling::ErrorMap;
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::fit::{Fit, Solution};
+use crate::frames::Real;
+use crate::parallel::Workers;
+
+/// The uncertainty of a fit, ready for questions.
+///
+/// All answers are in units of the variance of a value of weight 1, which is [`Fit::unit`].
+pub struct Uncertainty<'m, 'a, T> {
+    problem: Problem<'m, 'a, T>,
+    control: &'m Control,
+}
+
+/// The linear problem at the solution.
+enum Problem<'m, 'a, T> {
+    Reduced(Box<ReducedCovariance<'m, 'a, T>>),
+    Joint(Box<JointCovariance<'m, 'a, T>>),
+}
+
+impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
+    /// That of the solution of a fit of `exposures`, whose variances are those of the noise.
+    ///
+    /// # Errors
+    /// [`Error::Shape`](crate::Error::Shape) if it belongs to other exposures,
+    /// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had,
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop, here and below.
+    pub fn new(
+        exposures: &'m Exposures<'a, T>,
+        solution: &Solution<'_>,
+        workers: &'m Workers,
+        control: &'m Control,
+    ) -> Result<Self> {
+        solution.check(exposures)?;
+        let problem = if solution.joint {
+            let joint = JointCovariance::new(exposures, solution, workers, control)?;
+            Problem::Joint(Box::new(joint))
+        } else {
+            let reduced = ReducedCovariance::new(exposures, solution, workers, control)?;
+            Problem::Reduced(Box::new(reduced))
+        };
+        Ok(Self { problem, control })
+    }
+
+    /// The standard deviation of M in each pixel.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn error_map(&mut self) -> Result<ErrorMap> {
+        match &mut self.problem {
+            Problem::Reduced(problem) => problem.error_map(self.control),
+            Problem::Joint(problem) => problem.error_map(self.control),
+        }
+    }
+
+    /// The variance of each linear functional Σ g(p) M(p), its g being an image of `functionals`.
+    ///
+    /// It is that in the gauge mean(M) = 1. A g must be 0 where M is undetermined, and in pixels that
+    /// their measurements leave almost no weight.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn variances(&mut self, functionals: &[f64]) -> Result<Vec<f64>> {
+        match &mut self.problem {
+            Problem::Reduced(problem) => problem.variances(functionals, self.control),
+            Problem::Joint(problem) => problem.variances(functionals, self.control),
+        }
+    }
+
+    /// The variances (row, column) of the shifts that were refined; `None` if none were.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn shift_variances(&mut self) -> Result<Option<Vec<[f64; 2]>>> {
+        match &mut self.problem {
+            Problem::Reduced(_) => Ok(None),
+            Problem::Joint(problem) => problem.shift_variances(self.control),
+        }
+    }
+
+    /// The variance of b, the least-squares part b M of the errors of all offsets, and the mean
+    /// variance of an offset by the noise of its pixel alone; `None` if no offset was sought.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn offset_variances(&mut self) -> Result<Option<[f64; 2]>> {
+        match &mut self.problem {
+            Problem::Reduced(_) => Ok(None),
+            Problem::Joint(problem) => problem.offset_variances(self.control),
+        }
+    }
+}
+
+impl Fit {
+    /// Its uncertainty, set up once and asked often, from the `exposures` that it was made from.
+    ///
+    /// # Errors
+    /// As [`Uncertainty::new`].
+    pub fn uncertainty<'m, 'a, T: Real>(
+        &self,
+        exposures: &'m Exposures<'a, T>,
+        workers: &'m Workers,
+        control: &'m Control,
+    ) -> Result<Uncertainty<'m, 'a, T>> {
+        Uncertainty::new(exposures, &self.solution(), workers, control)
+    }
+}

@@ -1,0 +1,488 @@
+//! How far noise, and what priors leave open, may have moved what a joint fit found.
+//!
+//! With x the error of the unknowns other than M and O, and C x the change of M that follows it,
+//!
+//! ```text
+//! δM = D⁻¹ eᵀw ε + C x,   Cov M = D⁻¹ + C S⁻¹ Cᵀ
+//! ```
+//!
+//! since the noise that moves a pixel alone and that which is left for x are independent (see
+//! `joint/system.rs`; with an offset, D is the pixel's matrix of 2 by 2). The first term is known; the
+//! second is the mean square of C x over draws S x = b of b with the covariance S. Priors and the
+//! penalty count as measurements of their own there: S⁻¹ is what they leave open too.
+//!
+//! Three things stand beside S. A prior on fluxes leaves a tilt of M open that S does not see
+//! (`joint/flux.rs`): its covariance is added. Shifts that have a prior but were not refined are wrong by
+//! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
+//! out the mean of M, and the tilt where free fluxes leave it undetermined.
+
+use super::joint_gauge::{Hidden, Tilts, count, form};
+use super::joint_pulls::{add_change, product, pull_by, pull_of};
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
+use crate::control::Control;
+use crate::convergence::FEWEST_ITERATIONS;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::fit::Solution;
+use crate::frames::Real;
+use crate::joint::{self, Fluxes, Follow, Grid, Preconditioner, Search, ShiftPrior, State, System};
+use crate::memory;
+use crate::parallel::Workers;
+use crate::random;
+
+/// Iterations for one right-hand side that nobody waits for.
+const MOST_ITERATIONS: u64 = 500;
+
+/// What is drawn besides the noise of exposures.
+enum Other {
+    Penalty,
+    Priors,
+    Shifts,
+}
+/// How many of them there are.
+const OTHERS: usize = 3;
+/// A linear functional of what was found.
+enum Functional {
+    /// Σ g M.
+    Gain(Vec<f64>),
+    /// Σ q d, of the shifts (row, column) of all exposures less their mean by the weights of the prior,
+    /// for which no measurement speaks.
+    Shifts(Vec<[f64; 2]>),
+    /// b of the least-squares part b M of the offsets' errors: what they have in common.
+    Offset,
+}
+
+/// The covariance at a joint fit, in units of the variance of a measurement of weight 1.
+pub(super) struct JointCovariance<'m, 'a, T> {
+    system: System<'m, 'a, T>,
+    preconditioner: Preconditioner,
+    search: Search,
+    tilts: Tilts,
+    /// The shifts that are uncertain though they were not refined.
+    considered: Option<ShiftPrior>,
+    /// Where M is determined.
+    determined: Vec<bool>,
+    /// 1 in the pixels whose mean M is 1, else 0.
+    valid: Vec<f32>,
+    /// The mean of D⁻¹: in these units squares have no extreme values.
+    scale: f64,
+}
+
+impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
+    /// # Errors
+    /// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had,
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
+    pub(super) fn new(
+        exposures: &'m Exposures<'a, T>,
+        solution: &Solution<'_>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Self> {
+        memory::check(joint::bytes_needed_by_covariance(exposures), || {
+            format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
+        })?;
+        let mut system = problem(exposures, solution, workers, control)?;
+        let prior = ShiftPrior::of(exposures.positions());
+        let (refined, considered) = if solution.refined { (prior, None) } else { (None, prior) };
+        system.seek_shifts(refined);
+        system.linearise(control)?;
+        let preconditioner = Preconditioner::new(&mut system, control)?;
+        let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
+        let (valid, scale) = valid(&system, &determined);
+        Ok(Self {
+            tilts: Tilts::of(&system, &valid),
+            system,
+            preconditioner,
+            search: Search::default(),
+            considered,
+            determined,
+            valid,
+            scale,
+        })
+    }
+
+    /// The standard deviation of M by pixel, in units of that of a value of weight 1.
+    pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
+        self.search = Search::default();
+        let sampled = Sampled::of(self, control)?;
+        let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
+            true => (self.scale * sampled.variance(pixel)).sqrt(),
+            false => f64::NAN,
+        });
+        let std = std.collect();
+        Ok(sampled.map(std))
+    }
+
+    /// The variance of Σ g M of each image g of a stack, in units of that of a value of weight 1.
+    pub(super) fn variances(&mut self, functionals: &[f64], control: &Control) -> Result<Vec<f64>> {
+        let stack = functionals.chunks_exact(self.valid.len());
+        self.variances_of(stack.map(|gain| Functional::Gain(gain.to_vec())), control)
+    }
+
+    /// The variances (row, column) of the shifts, if they were refined.
+    pub(super) fn shift_variances(&mut self, control: &Control) -> Result<Option<Vec<[f64; 2]>>> {
+        if !self.system.seeks_shifts() {
+            return Ok(None);
+        }
+        let count = self.system.pass.exposures.count();
+        let functionals = (0..2 * count).map(|index| {
+            let mut shifts = vec![[0.0; 2]; count];
+            shifts.as_flattened_mut()[index] = 1.0;
+            Functional::Shifts(shifts)
+        });
+        let found = self.variances_of(functionals, control)?;
+        Ok(Some(found.as_chunks().0.to_vec()))
+    }
+
+    /// The variance of b, the least-squares part b M of the errors of offsets, and the mean variance of
+    /// an offset by the noise of its pixel alone, if offsets were sought.
+    pub(super) fn offset_variances(&mut self, control: &Control) -> Result<Option<[f64; 2]>> {
+        if !self.system.pass.with_offset {
+            return Ok(None);
+        }
+        self.search = Search::default();
+        let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
+        Ok(Some([along, self.mean_variance_of_offset_alone()]))
+    }
+
+    fn variances_of(
+        &mut self,
+        functionals: impl ExactSizeIterator<Item = Functional>,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        self.search = Search::default();
+        let total = functionals.len() as u64;
+        let found = (0..).zip(functionals).map(|(index, functional)| {
+            control.report("uncertainty", index, total);
+            self.variance_of(functional, LACK_OF_FUNCTIONAL, control)
+        });
+        found.collect()
+    }
+
+    /// The part of the variance that is known: the diagonal of P D⁻¹ Pᵀ, and what S does not see.
+    fn known_part(&self) -> Vec<f32> {
+        let own = self.own();
+        let parts = &self.tilts.gauge.parts;
+        let dot = |a: &[f64], b: &[f64]| -> f64 {
+            a.iter().zip(b).zip(&own).map(|((a, b), own)| a * b * own).sum()
+        };
+        // (1 − U Wᵀ) V (1 − W Uᵀ) = V − U Wᵀ V − V W Uᵀ + U (Wᵀ V W) Uᵀ.
+        let mixed: Vec<Vec<f64>> =
+            parts.iter().map(|[_, w]| parts.iter().map(|[_, v]| dot(w, v)).collect()).collect();
+        let variance = |pixel: usize| {
+            let mut variance = own[pixel];
+            for ([u, w], mixed) in parts.iter().zip(&mixed) {
+                variance -= 2.0 * u[pixel] * own[pixel] * w[pixel];
+                for ([v, _], mixed) in parts.iter().zip(mixed) {
+                    variance += u[pixel] * mixed * v[pixel];
+                }
+            }
+            if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
+                variance += form(covariance, [tilts[0][pixel], tilts[1][pixel]]);
+            }
+            (variance / self.scale) as f32
+        };
+        (0..own.len()).map(variance).collect()
+    }
+
+    /// Adds the square of the change of M in one draw, solved until it lacks at most this share of
+    /// x · b.
+    fn add_square(
+        &mut self,
+        draw: u64,
+        lack: f64,
+        squares: &mut [f32],
+        control: &Control,
+    ) -> Result<()> {
+        let mut slope = self.draw(draw, control)?;
+        let mut change = vec![0.0; self.valid.len()];
+        if self.considered.is_some() {
+            // S x = b − S_d δ for shifts that are wrong by δ.
+            let mut sign = self.other_signs(draw, Other::Shifts);
+            let wrong = self.considered_variances().into_iter().map(|v| sign() * v.sqrt());
+            let mut moved = vec![0.0; slope.len()];
+            moved.extend(wrong);
+            let pulled = self.considering(|system| {
+                let pulled = product(system, &moved, control);
+                add_change(system, &mut change);
+                pulled
+            })?;
+            slope.iter_mut().zip(pulled).for_each(|(slope, pulled)| *slope -= pulled);
+        }
+        self.solve(slope, lack, control)?;
+        let x = std::mem::take(&mut self.search.x);
+        product(&mut self.system, &x, control)?;
+        add_change(&self.system, &mut change);
+        let workers = self.system.pass.workers;
+        if let Some(drift) = &self.tilts.drift {
+            workers.add_multiple(&mut change, x[self.system.state.beam.len()], drift);
+        }
+        self.tilts.gauge.apply(&mut change, workers);
+        for (square, change) in squares.iter_mut().zip(&change) {
+            *square += (change * change / self.scale) as f32;
+        }
+        Ok(())
+    }
+
+    /// The variance of a functional, in the gauge of the result, solved until it lacks at most this
+    /// share of what S has in it. A g must be 0 where M is undetermined.
+    fn variance_of(&mut self, functional: Functional, lack: f64, control: &Control) -> Result<f64> {
+        match functional {
+            Functional::Gain(gain) => self.variance_of_gain(gain, lack, control),
+            Functional::Shifts(shifts) => {
+                let mut pull = vec![0.0; self.system.size()];
+                let own = self.system.centred_pulls(shifts);
+                let others = pull.len() - own.as_flattened().len();
+                pull[others..].copy_from_slice(own.as_flattened());
+                self.solve(pull, lack, control)?;
+                Ok(self.search.energy)
+            }
+            Functional::Offset => self.variance_of_offset(lack, control),
+        }
+    }
+
+    fn variance_of_gain(
+        &mut self,
+        mut gain: Vec<f64>,
+        lack: f64,
+        control: &Control,
+    ) -> Result<f64> {
+        let cells = self.system.state.beam.len();
+        let others = cells + self.system.fluxes.columns.len();
+        let workers = self.system.pass.workers;
+        self.tilts.gauge.transpose(&mut gain, workers);
+        let none = vec![0.0; gain.len()];
+        let mut variance = self.own_of(&gain, &none);
+        if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
+            let heights = [0, 1].map(|axis| workers.dot(&tilts[axis], &gain));
+            variance += form(covariance, heights);
+        }
+        let mut pull = if self.considered.is_some() {
+            self.considering(|system| pull_of(system, &gain, &none, control))?
+        } else {
+            pull_of(&mut self.system, &gain, &none, control)?
+        };
+        if let Some(drift) = &self.tilts.drift {
+            pull[cells] += workers.dot(drift, &gain);
+        }
+        let seen = if self.considered.is_some() { pull.split_off(others) } else { Vec::new() };
+        self.solve(pull, lack, control)?;
+        variance += self.search.energy;
+        if self.considered.is_some() {
+            let mut x = std::mem::take(&mut self.search.x);
+            x.resize(others + seen.len(), 0.0);
+            let pulled = self.considering(|system| product(system, &x, control))?;
+            let left = seen.iter().zip(&pulled[others..]).map(|(seen, pulled)| seen - pulled);
+            variance += left.zip(self.considered_variances()).map(|(h, v)| h * h * v).sum::<f64>();
+        }
+        Ok(variance)
+    }
+
+    /// With h = M/Σ M² the variance of Σ h O.
+    ///
+    /// Where L is hardly different at the positions of a pixel, and fluxes c are fitted, O → O + b M
+    /// is met by L → L − b/c with other c, and no iteration finds that direction. So the search
+    /// starts from the best multiple of it: x = (rᵀv/vᵀSv) v for v of
+    ///
+    /// ```text
+    /// δL = −mean(1/c),   δ ln c = (−1/c − δL)/L
+    /// ```
+    fn variance_of_offset(&mut self, lack: f64, control: &Control) -> Result<f64> {
+        let [mut offset, _] = self.system.pixels();
+        offset.iter_mut().zip(&self.valid).for_each(|(m, valid)| *m *= f64::from(*valid));
+        let square: f64 = offset.iter().map(|m| m * m).sum();
+        offset.iter_mut().for_each(|m| *m /= square);
+        let none = vec![0.0; offset.len()];
+        let variance = self.own_of(&none, &offset);
+        let mut pull = pull_of(&mut self.system, &none, &offset, control)?;
+        let system = &mut self.system;
+        let (flux, workers) = (&system.pass.flux, system.pass.workers);
+        let light =
+            workers.dot(&system.weights, &system.state.beam) / system.weights.iter().sum::<f64>();
+        let of_beam = -flux.iter().map(|c| 1.0 / c).sum::<f64>() / flux.len() as f64;
+        let logs: Vec<f64> = flux.iter().map(|c| (-1.0 / c - of_beam) / light).collect();
+        let mut along: Vec<f64> =
+            system.weights.iter().map(|w| if *w > 0.0 { of_beam } else { 0.0 }).collect();
+        along.extend(system.fluxes.sought(&logs));
+        along.resize(pull.len(), 0.0);
+        let pulled = product(system, &along, control)?;
+        let (size, height) = (workers.dot(&along, &pulled), workers.dot(&along, &pull));
+        let mut found = 0.0;
+        if size > 0.0 {
+            found = height * height / size;
+            workers.add_multiple(&mut pull, -height / size, &pulled);
+        }
+        self.solve(pull, lack, control)?;
+        Ok(variance + found + self.search.energy)
+    }
+
+    fn considered_variances(&self) -> Vec<f64> {
+        let prior = self.considered.iter().flat_map(|prior| prior.precisions.as_flattened());
+        prior.map(|precision| 1.0 / (self.system.unit * precision)).collect()
+    }
+
+    /// Does something with the system as if the considered shifts were sought too.
+    fn considering<R>(&mut self, work: impl FnOnce(&mut System<'m, 'a, T>) -> R) -> R {
+        let own = self.system.seek_shifts(self.considered.take());
+        let result = work(&mut self.system);
+        self.considered = self.system.seek_shifts(own);
+        result
+    }
+
+    /// Solves S x = b.
+    fn solve(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
+        let Self { system, preconditioner, search, .. } = self;
+        search.begin(system, preconditioner, b, control)?;
+        let mut earlier = 0.0;
+        for iteration in 1..=MOST_ITERATIONS {
+            search.product(system, control)?;
+            if !search.step(system, preconditioner)
+                || iteration >= FEWEST_ITERATIONS
+                    && search.square / search.smallest <= lack * search.energy
+            {
+                break;
+            }
+            if iteration % FEWEST_ITERATIONS == 0 {
+                if search.energy - earlier <= NOTHING * lack * search.energy {
+                    break;
+                }
+                earlier = search.energy;
+            }
+        }
+        Ok(())
+    }
+
+    /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
+    fn draw(&mut self, draw: u64, control: &Control) -> Result<Vec<f64>> {
+        let streams: Vec<u64> =
+            (0..self.system.pass.exposures.count()).map(|k| self.stream(draw, k, 0)).collect();
+        let mut of_penalty = self.other_signs(draw, Other::Penalty);
+        let mut of_priors = self.other_signs(draw, Other::Priors);
+        let system = &mut self.system;
+        let mut slope = pull_by(system, control, |pass, row_index, row, room| {
+            let cols = pass.exposures.sensor().cols;
+            let (weights, values, sums) = room.parts();
+            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
+                let mut sign = random::signs(streams[k] + row_index as u64);
+                let pixels = weights.iter().zip(&*row.sensitivity);
+                for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
+                    // As a change of the light, which a pixel without response does not show.
+                    let shown = weight.sqrt() * flux * m;
+                    *value = if shown == 0.0 { 0.0 } else { sign() / shown };
+                }
+            }
+            let fluxes = &pass.flux[..];
+            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
+        })?;
+        let cells = system.state.beam.len();
+        if let Some(penalty) = &system.penalty {
+            let beam = &system.state.beam;
+            penalty.add_draw(beam, &mut of_penalty, &mut slope[..cells], system.pass.workers);
+        }
+        let params = system.fluxes.columns.len();
+        let mut pulls = system.precisions();
+        pulls.iter_mut().for_each(|precision| *precision = precision.sqrt() * of_priors());
+        let of_shifts = system.centred_pulls(pulls.split_off(params).as_chunks().0.to_vec());
+        let priors = pulls.iter().chain(of_shifts.as_flattened());
+        slope[cells..].iter_mut().zip(priors).for_each(|(slope, pull)| *slope += pull);
+        Ok(slope)
+    }
+
+    /// The number of a stream of signs: of a row of an exposure, or behind those of what else is drawn.
+    fn stream(&self, draw: u64, exposure: usize, row: usize) -> u64 {
+        let (rows, count) =
+            (self.system.pass.exposures.sensor().rows, self.system.pass.exposures.count());
+        (draw * (count + OTHERS) as u64 + exposure as u64) * rows as u64 + row as u64
+    }
+
+    /// The stream of signs for what else is drawn.
+    fn other_signs(&self, draw: u64, which: Other) -> impl FnMut() -> f64 + use<T> {
+        random::signs(self.stream(draw, self.system.pass.exposures.count() + which as usize, 0))
+    }
+
+    /// D⁻¹ of each pixel's M.
+    fn own(&self) -> Vec<f64> {
+        let mut own = Vec::with_capacity(self.valid.len());
+        self.system.pass.for_rows(|[_, inverse, ..]| own.extend_from_slice(inverse));
+        own
+    }
+
+    /// The mean variance of an offset, by what noise does to its pixel alone.
+    fn mean_variance_of_offset_alone(&self) -> f64 {
+        let mut variances = Vec::with_capacity(self.valid.len());
+        self.system.pass.for_rows(|[.., inverse]| variances.extend_from_slice(inverse));
+        let count = count(&self.valid);
+        variances.iter().zip(&self.valid).map(|(v, valid)| v * f64::from(*valid)).sum::<f64>()
+            / count
+    }
+
+    /// The variance of Σ g M + Σ h O of what noise does to each pixel alone.
+    fn own_of(&self, gain: &[f64], offset: &[f64]) -> f64 {
+        let (mut variance, mut first) = (0.0, 0);
+        self.system.pass.for_rows(|[_, gains, _, _, mixed, offsets]| {
+            for (a, g) in gains.iter().zip(&gain[first..]) {
+                variance += a * g * g;
+            }
+            for (col, (b, c)) in mixed.iter().zip(offsets).enumerate() {
+                let (g, h) = (gain[first + col], offset[first + col]);
+                variance += 2.0 * b * g * h + c * h * h;
+            }
+            first += gains.len();
+        });
+        variance
+    }
+}
+
+/// The problem at a solution.
+fn problem<'m, 'a, T: Real>(
+    exposures: &'m Exposures<'a, T>,
+    solution: &Solution<'_>,
+    workers: &'m Workers,
+    control: &Control,
+) -> Result<System<'m, 'a, T>> {
+    let positions = exposures.positions();
+    let (shifts, rotations) = (&positions.shifts, &positions.rotations);
+    let grid = Grid::new(exposures.sensor(), shifts, rotations, positions.std.is_some())?;
+    let fluxes = Fluxes::new(solution.flux, exposures.flux_kind(), solution.shifts, rotations);
+    let beam = solution.beam.coefficients.unwrap_or(solution.beam.values);
+    let known = |value: &f64| if value.is_finite() { *value } else { 0.0 };
+    let state = State {
+        beam: beam.iter().map(known).collect(),
+        theta: vec![0.0; fluxes.columns.len()],
+        shifts: solution.shifts.to_vec(),
+    };
+    let mut system = System::new(exposures, grid, fluxes, state, workers, control);
+    system.unit = solution.unit;
+    Ok(system)
+}
+
+/// 1 in the determined pixels that have a weight, and their mean D⁻¹.
+fn valid<T: Real>(system: &System<'_, '_, T>, determined: &[bool]) -> (Vec<f32>, f64) {
+    let mut valid = vec![0.0; determined.len()];
+    let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
+    system.pass.for_rows(|[_, inverse, ..]| {
+        for (pixel, inverse) in (first..).zip(inverse) {
+            if *inverse > 0.0 && determined[pixel] {
+                valid[pixel] = 1.0;
+                sum += inverse;
+                count += 1.0;
+            }
+        }
+        first += inverse.len();
+    });
+    (valid, sum / count)
+}
+
+impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
+    fn valid(&self) -> &[f32] {
+        &self.valid
+    }
+
+    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
+        Ok(self.known_part())
+    }
+
+    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
+        self.add_square(draw, LACK_OF_DRAW, squares, control)
+    }
+}

@@ -1,0 +1,74 @@
+//! Products and pulls of the joint problem that its covariance takes.
+
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::joint::{Pass, Room, Row, System};
+
+/// Cᵀ of a functional: what changes of the other unknowns do to it through M and O, which follow a
+/// change u = c M v of the light by −α = −(i₁₁ eᵀw u + i₁₂ 1ᵀw u) and −β = −(i₁₂ eᵀw u + i₂₂ 1ᵀw u).
+pub(super) fn pull_of<T: Real>(
+    system: &mut System<'_, '_, T>,
+    gain: &[f64],
+    offset: &[f64],
+    control: &Control,
+) -> Result<Vec<f64>> {
+    pull_by(system, control, |pass, row_index, row, room| {
+        let cols = pass.exposures.sensor().cols;
+        let (gain, offset) = (&gain[row_index * cols..], &offset[row_index * cols..]);
+        let [_, i12, i22] = row.offset;
+        let (weights, values, _) = room.parts();
+        for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
+            let light = &row.light[k * cols..];
+            for (col, value) in values.of_mut(k).iter_mut().enumerate() {
+                let (mut along_light, mut alone) = (row.inverse[col] * gain[col], 0.0);
+                if !i22.is_empty() {
+                    along_light += i12[col] * offset[col];
+                    alone = i12[col] * gain[col] + i22[col] * offset[col];
+                }
+                let change = along_light * light[col] + alone;
+                *value = -flux * row.sensitivity[col] * weights[col] * change;
+            }
+        }
+    })
+}
+
+/// What pixels pull at the unknowns if `work` leaves their pulls in the room's values, with their
+/// weights beside.
+pub(super) fn pull_by<T: Real>(
+    system: &mut System<'_, '_, T>,
+    control: &Control,
+    work: impl Fn(&Pass<'_, '_, T>, usize, Row<'_>, &mut Room) + Sync,
+) -> Result<Vec<f64>> {
+    let beam = std::mem::take(&mut system.state.beam);
+    let views = system.pass.views_of(&beam);
+    let mut pull = vec![0.0; beam.len()];
+    let found = system.pass.run(&mut pull, control, |pass, row_index, row, room, _| {
+        pass.weigh_row(row_index, room);
+        pass.see_slopes(&views, row_index, room);
+        work(pass, row_index, row, room);
+    });
+    drop(views);
+    system.state.beam = beam;
+    system.append(&found?, &mut pull);
+    Ok(pull)
+}
+
+/// S x.
+pub(super) fn product<T: Real>(
+    system: &mut System<'_, '_, T>,
+    x: &[f64],
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let mut product = Vec::new();
+    system.multiply(x, &mut product, 0.0, control)?;
+    Ok(product)
+}
+
+/// Adds the change of M that goes with the last product.
+pub(super) fn add_change<T: Real>(system: &System<'_, '_, T>, change: &mut [f64]) {
+    let mut sums = change.iter_mut();
+    system.pass.for_rows(|[_, _, change, ..]| {
+        sums.by_ref().zip(change).for_each(|(sum, change)| *sum += change);
+    });
+}

@@ -1,0 +1,271 @@
+//! What noise does to M where the beam was eliminated.
+//!
+//! At the minimum of F the solution for noise alone is a draw from the covariance of the estimate,
+//! (JᵀWJ)⁻¹, large scales included. To count how far draws of M scatter would take thousands of
+//! them. But given L the pixels are independent, and given M the cells of L are, so that with the
+//! sweep T = D⁻¹ B D_L⁻¹ Bᵀ, of which D⁻¹S = 1 − T (see `reduced.rs`),
+//!
+//! ```text
+//! Cov M = D⁻¹ + D⁻¹ B D_L⁻¹ Bᵀ D⁻¹ + T Cov(M) Tᵀ
+//! ```
+//!
+//! by the law of total covariance, used twice. The first two terms have a diagonal that one pass over
+//! the weights gives; only the third, a fifth of the whole with five exposures, is the mean square
+//! of T x over draws x. All is projected onto the gauge: with δM the solution in any gauge, that in
+//! the gauge mean(M) = 1 is δM − M mean(δM).
+//!
+//! A linear functional gᵀM has the variance gᵀ S⁻¹ g: one linear problem, no draws.
+
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
+use crate::control::Control;
+use crate::convergence::FEWEST_ITERATIONS;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::fit::Solution;
+use crate::frames::Real;
+use crate::geometry::{Geometry, View};
+use crate::memory;
+use crate::padded::{BAND, Padding};
+use crate::parallel::Workers;
+use crate::reduced::{self, Search, Smallest};
+
+/// The covariance at a fit of M and L alone, of its linear problem at the solution.
+pub(super) struct ReducedCovariance<'m, 'a, T> {
+    exposures: &'m Exposures<'a, T>,
+    workers: &'m Workers,
+    search: Search<'m, 'a, T>,
+    smallest: Smallest,
+    /// 1 in the pixels whose mean M is 1, else 0.
+    valid: Vec<f32>,
+    count: f64,
+    /// b.
+    slope: Vec<f32>,
+    undetermined: Vec<bool>,
+}
+
+impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
+    /// # Errors
+    /// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had,
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+    pub(super) fn new(
+        exposures: &'m Exposures<'a, T>,
+        solution: &Solution<'_>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Self> {
+        memory::check(bytes_needed(exposures.geometry()), || {
+            format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
+        })?;
+        let (sensitivity, beam) = (solution.sensitivity, solution.beam.values);
+        let mut search = Search::new(exposures, workers, control);
+        let finite = |values: &[f64]| -> Vec<f64> {
+            values.iter().map(|value| if value.is_finite() { *value } else { 0.0 }).collect()
+        };
+        let turned = |view: &View| -> Vec<f64> {
+            let places = (0..view.shape.rows)
+                .flat_map(|row| (0..view.shape.cols).map(move |col| view.cells.at(row, col)));
+            finite(&places.map(|place| beam[place]).collect::<Vec<_>>())
+        };
+        let beams: Vec<Vec<f64>> = exposures.geometry().views.iter().map(turned).collect();
+        search.linearise(&finite(sensitivity), &beams, control)?;
+        let padding = search.reduced.padding;
+        let undetermined: Vec<bool> = sensitivity.iter().map(|m| !m.is_finite()).collect();
+        let mut valid = padding.zeros(exposures.sensor().rows, workers, control);
+        let cols = exposures.sensor().cols;
+        let diagonal = padding.body(&search.reduced.inverse_diagonal);
+        let rows = padding.body_mut(&mut valid).chunks_exact_mut(padding.width);
+        let mut count = 0.0;
+        for ((row, diagonal), undetermined) in
+            rows.zip(diagonal.chunks_exact(padding.width)).zip(undetermined.chunks_exact(cols))
+        {
+            for ((valid, &d), &undetermined) in row.iter_mut().zip(diagonal).zip(undetermined) {
+                if d > 0.0 && !undetermined {
+                    *valid = 1.0;
+                    count += 1.0;
+                }
+            }
+        }
+        let slope = padding.zeros(exposures.sensor().rows, workers, control);
+        let smallest = Smallest::default();
+        Ok(Self { exposures, workers, search, smallest, valid, count, slope, undetermined })
+    }
+
+    fn image(&self, control: &Control) -> Vec<f32> {
+        self.search.reduced.padding.zeros(self.exposures.sensor().rows, self.workers, control)
+    }
+
+    /// Solves S x = b, b being the residual, until x · b lacks at most this share.
+    fn solve(&mut self, lack: f64, control: &Control) -> Result<()> {
+        let Self { search, smallest, .. } = self;
+        search.begin(control)?;
+        let (mut iterations, mut earlier) = (0, 0.0);
+        while smallest.iterate(search, control)? {
+            iterations += 1;
+            if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
+                break;
+            }
+            // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
+            // iterations brought tells.
+            if iterations % FEWEST_ITERATIONS == 0 {
+                if search.energy - earlier <= NOTHING * lack * search.energy {
+                    break;
+                }
+                earlier = search.energy;
+            }
+        }
+        Ok(())
+    }
+
+    /// The standard deviation of M by pixel, in units of that of a value of weight 1.
+    pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
+        self.smallest = Smallest::default();
+        let sampled = Sampled::of(self, control)?;
+        Ok(sampled.map(self.deviations(&sampled)))
+    }
+
+    /// The variance of Σ g M of each image g of a stack, in units of that of a value of weight 1.
+    pub(super) fn variances(&mut self, functionals: &[f64], control: &Control) -> Result<Vec<f64>> {
+        self.smallest = Smallest::default();
+        let pixels = self.exposures.sensor().len();
+        let total = (functionals.len() / pixels) as u64;
+        let stack = (0..).zip(functionals.chunks_exact(pixels));
+        stack
+            .map(|(index, functional)| {
+                control.report("uncertainty", index, total);
+                self.variance_of(functional, control)
+            })
+            .collect()
+    }
+
+    /// The variance of Σ g M.
+    fn variance_of(&mut self, functional: &[f64], control: &Control) -> Result<f64> {
+        let Self { search, slope, workers, valid, count, exposures, .. } = self;
+        let padding = search.reduced.padding;
+        // Pᵀ g = g − 1 (M · g)/N. Scaled, so that no g is beyond single precision.
+        let largest = functional.iter().fold(0.0_f64, |largest, g| largest.max(g.abs()));
+        if largest == 0.0 {
+            return Ok(0.0);
+        }
+        let to_single = |g: f64| (g / largest) as f32;
+        padding.copy(functional, exposures.sensor().cols, workers, slope, to_single);
+        let mean = dot(slope, &search.reduced.sensitivity, workers) / *count;
+        for (g, &valid) in slope.iter_mut().zip(valid.iter()) {
+            *g -= mean as f32 * valid;
+        }
+        search.residual.copy_from_slice(slope);
+        self.solve(LACK_OF_FUNCTIONAL, control)?;
+        let Self { search, slope, workers, .. } = self;
+        Ok(dot(slope, &search.x, workers) * (largest * search.reduced.scale.deviation()).powi(2))
+    }
+
+    /// The standard deviations in the units of M, row by row.
+    fn deviations(&self, sampled: &Sampled) -> Vec<f64> {
+        let reduced = &self.search.reduced;
+        let (padding, cols) = (reduced.padding, self.exposures.sensor().cols);
+        let scale = reduced.scale.deviation();
+        let mut std = vec![f64::NAN; self.exposures.sensor().len()];
+        self.workers.map_blocks(&mut std, BAND * cols, |band, rows| {
+            for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
+                let row_of_sensor = band * BAND + index;
+                let [known, squares, valid] = [&sampled.known, &sampled.squares, &self.valid]
+                    .map(|image| padding.row(image, row_of_sensor));
+                for (col, std) in row.iter_mut().enumerate() {
+                    if valid[col] > 0.0 {
+                        let drawn = f64::from(squares[col]) / sampled.draws as f64;
+                        *std = scale * (f64::from(known[col]) + drawn).sqrt();
+                    }
+                }
+            }
+        });
+        for (pixel, inverse) in reduced.left_out_variances() {
+            if inverse > 0.0 && !self.undetermined[pixel] {
+                std[pixel] = scale * inverse.sqrt();
+            }
+        }
+        std
+    }
+}
+
+impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
+    fn valid(&self) -> &[f32] {
+        &self.valid
+    }
+
+    /// The part of the variance that is known: the diagonal of P V Pᵀ, with V the first two terms of
+    /// Cov M and P = 1 − M 1ᵀ/N, so V − 2 M (V 1)/N + M² (1ᵀV 1)/N².
+    fn known(&mut self, control: &Control) -> Result<Vec<f32>> {
+        let mut variance = self.image(control);
+        let Self { search, valid, workers, count, slope, .. } = self;
+        search.reduced.two_terms(&mut variance, control)?;
+        // V 1 = 2 u − D⁻¹ S u with u = D⁻¹ 1, since V = D⁻¹ + T D⁻¹.
+        let mut alone = valid.clone();
+        for (u, d) in alone.iter_mut().zip(&search.reduced.inverse_diagonal) {
+            *u *= d;
+        }
+        search.reduced.multiply(&alone, slope, control)?;
+        for (u, (d, q)) in alone.iter_mut().zip(search.reduced.inverse_diagonal.iter().zip(slope)) {
+            *u = 2.0 * *u - d * *q;
+        }
+        let mean = dot(&alone, valid, workers) / (*count * *count);
+        let m = &search.reduced.sensitivity;
+        for ((variance, u), &m) in variance.iter_mut().zip(&alone).zip(m) {
+            let m = f64::from(m);
+            *variance += (m * (m * mean - 2.0 * f64::from(*u) / *count)) as f32;
+        }
+        Ok(variance)
+    }
+
+    /// Adds the square of T x, in the gauge, of one draw x.
+    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
+        let Self { search, slope, .. } = self;
+        search.reduced.draw(draw, &mut search.residual, control)?;
+        slope.copy_from_slice(&search.residual);
+        self.solve(LACK_OF_DRAW, control)?;
+        let Self { search, slope, workers, valid, count, .. } = self;
+        // T x = x − D⁻¹ S x, and S x = b − r.
+        let inverse = &search.reduced.inverse_diagonal;
+        workers.map_blocks(slope, PART, |part, slope| {
+            let from = part * PART;
+            for (index, rest) in slope.iter_mut().enumerate() {
+                let place = from + index;
+                let moved = *rest - search.residual[place];
+                *rest = search.x[place] - inverse[place] * moved;
+            }
+        });
+        let mean = (dot(slope, valid, workers) / *count) as f32;
+        let m = &search.reduced.sensitivity;
+        workers.map_blocks(squares, PART, |part, squares| {
+            let from = part * PART;
+            for (index, square) in squares.iter_mut().enumerate() {
+                let rest = slope[from + index] - mean * m[from + index];
+                *square += rest * rest;
+            }
+        });
+        Ok(())
+    }
+}
+
+/// Values that a thread takes at a time.
+const PART: usize = 1 << 16;
+
+/// Σ a b.
+fn dot(a: &[f32], b: &[f32], workers: &Workers) -> f64 {
+    let parts: Vec<_> = a.chunks(PART).zip(b.chunks(PART)).collect();
+    let sum = |(a, b): &(&[f32], &[f32])| -> f64 {
+        a.iter().zip(*b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
+    };
+    workers.map(parts.len(), |index| sum(&parts[index])).into_iter().sum()
+}
+
+/// What both take beside the measurements, in bytes: a search and three images more, a copy of L in
+/// each view, and the map.
+fn bytes_needed(geometry: &Geometry) -> u64 {
+    let padding = Padding::of(geometry);
+    let places = |rows| padding.size(rows) as u64;
+    let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
+    let views = geometry.views.len() as u64;
+    let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
+    let turned = if views > 1 { of_views } else { 0 };
+    let more = 12 * places(geometry.sensor.rows) + turned;
+    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(geometry)
+}

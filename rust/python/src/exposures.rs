@@ -1,0 +1,142 @@
+//! `Exposures`: what a calibration is made from.
+//!
+//! The object keeps references to the arrays, and what the check of their values counted. Each later
+//! call views the arrays again, without another look at the values.
+
+use std::num::NonZeroUsize;
+
+use equipix_core::{
+    Checked, Error, Exposures, Flux, FluxKind, Method, Options, Positions, Result, Workers,
+    calibrate,
+};
+use numpy::PyReadonlyArray2;
+use pyo3::prelude::*;
+
+use crate::arrays::{PyMeasurements, either, pairs, rotations};
+use crate::fit::PyFit;
+use crate::{errors, run};
+
+/// Mean frames of one beam, and all that is known of them.
+#[pyclass(frozen, module = "equipix._native", name = "Exposures")]
+pub(crate) struct PyExposures {
+    arrays: Arrays,
+    checked: Checked,
+}
+
+/// The arrays that exposures are made of.
+struct Arrays {
+    frames: Py<PyAny>,
+    variance: Option<Py<PyAny>>,
+    mask: Option<Py<PyAny>>,
+}
+
+#[pymethods]
+impl PyExposures {
+    /// Checks the exposures of an experiment.
+    #[new]
+    #[pyo3(signature = (frames, shifts, *, shift_std, rotation, flux, flux_model, offset, variance,
+                        mask, workers, progress))]
+    #[expect(clippy::too_many_arguments, reason = "all that is known of exposures")]
+    fn new(
+        py: Python<'_>,
+        frames: Py<PyAny>,
+        shifts: PyReadonlyArray2<'_, f64>,
+        shift_std: Option<PyReadonlyArray2<'_, f64>>,
+        rotation: Vec<i64>,
+        flux: Vec<f64>,
+        flux_model: (String, Vec<f64>),
+        offset: bool,
+        variance: Option<Py<PyAny>>,
+        mask: Option<Py<PyAny>>,
+        workers: Option<NonZeroUsize>,
+        progress: Option<Bound<'_, PyAny>>,
+    ) -> PyResult<Self> {
+        let arrays = Arrays { frames, variance, mask };
+        let (shifts, std) = (pairs(&shifts)?, shift_std.as_ref().map(pairs).transpose()?);
+        let borrowed = arrays.borrow(py)?;
+        let measurements = borrowed.view()?;
+        let checked = run::interruptible(py, progress.as_ref(), |control| {
+            let positions = Positions { shifts, rotations: rotations(&rotation)?, std };
+            let flux = Flux { values: flux, kind: flux_kind(flux_model)? };
+            let workers = Workers::new(workers)?;
+            either!(measurements, m => {
+                let exposures = Exposures::new(m, positions, flux, offset, &workers, control)?;
+                Ok(exposures.checked().clone())
+            })
+        })?;
+        Ok(Self { arrays, checked })
+    }
+
+    /// Minimises F.
+    #[pyo3(signature = (*, method, tolerance, max_sweeps, start, workers, progress))]
+    #[expect(clippy::too_many_arguments, reason = "the options of a fit")]
+    fn fit(
+        slf: &Bound<'_, Self>,
+        method: &str,
+        tolerance: f64,
+        max_sweeps: Option<u64>,
+        start: Option<&Bound<'_, PyFit>>,
+        workers: Option<NonZeroUsize>,
+        progress: Option<Bound<'_, PyAny>>,
+    ) -> PyResult<PyFit> {
+        let (py, exposures) = (slf.py(), slf.get());
+        let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
+        let options = Options { method, tolerance, max_sweeps };
+        let start = start.map(|start| start.get().borrow(py));
+        let start = start.as_ref().map(|start| start.solution()).transpose()?;
+        let borrowed = exposures.borrow(py)?;
+        let measurements = borrowed.view()?;
+        let fit = run::interruptible(py, progress.as_ref(), |control| {
+            let workers = Workers::new(workers)?;
+            either!(measurements, m => {
+                let exposures = Exposures::again(m, &exposures.checked)?;
+                calibrate(&exposures, &options, start.as_ref(), &workers, control)
+            })
+        })?;
+        PyFit::new(py, slf.clone().unbind(), fit)
+    }
+}
+
+impl PyExposures {
+    /// What the check of the values left.
+    pub(crate) const fn checked(&self) -> &Checked {
+        &self.checked
+    }
+
+    /// The arrays, borrowed.
+    pub(crate) fn borrow<'py>(&self, py: Python<'py>) -> PyResult<PyMeasurements<'py>> {
+        self.arrays.borrow(py)
+    }
+}
+
+impl Arrays {
+    fn borrow<'py>(&self, py: Python<'py>) -> PyResult<PyMeasurements<'py>> {
+        Ok(PyMeasurements {
+            frames: self.frames.extract(py)?,
+            variance: self.variance.as_ref().map(|variance| variance.extract(py)).transpose()?,
+            mask: self.mask.as_ref().map(|mask| mask.extract(py)).transpose()?,
+        })
+    }
+}
+
+pub(crate) fn method_named(name: &str) -> Result<Method> {
+    match name {
+        "multiscale" => Ok(Method::Multiscale),
+        "coordinate-descent" => Ok(Method::CoordinateDescent),
+        other => Err(Error::Value {
+            argument: "method",
+            problem: format!("is '{other}': expected 'multiscale' or 'coordinate-descent'"),
+        }),
+    }
+}
+
+/// What is known of the fluxes: the kind, with times or standard deviations.
+pub(crate) fn flux_kind((kind, values): (String, Vec<f64>)) -> Result<FluxKind> {
+    match kind.as_str() {
+        "known" => Ok(FluxKind::Known),
+        "fit" => Ok(FluxKind::Free),
+        "linear" => Ok(FluxKind::Linear(values)),
+        "prior" => Ok(FluxKind::Prior(values)),
+        other => Err(Error::Value { argument: "flux", problem: format!("is '{other}'") }),
+    }
+}

@@ -1,0 +1,302 @@
+//! `Fit`, `Beam` and `Uncertainty`: what a calibration found, and what can be asked of it.
+//!
+//! Large arrays move into NumPy without a copy; a question views them again.
+//!
+//! | argument | dtype and rank | here | how |
+//! |---|---|---|---|
+//! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
+//! | functionals | float64, 3 | `&[f64]` | view |
+
+use std::num::NonZeroUsize;
+
+use equipix_core::{
+    Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
+    Uncertainty, Workers,
+};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
+use pyo3::prelude::*;
+
+use crate::arrays::{either, image, rotation, shape_of};
+use crate::exposures::PyExposures;
+use crate::run;
+
+/// The beam on its grid.
+#[pyclass(frozen, get_all, module = "equipix._native", name = "Beam")]
+pub(crate) struct PyBeam {
+    values: Py<PyArray2<f64>>,
+    coefficients: Option<Py<PyArray2<f64>>>,
+    origin: (usize, usize),
+}
+
+#[pymethods]
+impl PyBeam {
+    #[new]
+    const fn new(
+        values: Py<PyArray2<f64>>,
+        coefficients: Option<Py<PyArray2<f64>>>,
+        origin: (usize, usize),
+    ) -> Self {
+        Self { values, coefficients, origin }
+    }
+
+    /// The light L(u) on each pixel of a sensor, without the flux.
+    #[pyo3(signature = (shape, shift, rotation, *, workers))]
+    fn light(
+        &self,
+        py: Python<'_>,
+        shape: (usize, usize),
+        shift: [f64; 2],
+        rotation: i64,
+        workers: Option<NonZeroUsize>,
+    ) -> PyResult<Py<PyArray2<f64>>> {
+        let (borrowed, sensor) = (self.borrow(py), Shape::new(shape.0, shape.1));
+        let beam = borrowed.view()?;
+        let light = run::interruptible(py, None, |_| {
+            let turned = self::rotation(rotation)?;
+            Ok(beam.light(shift, turned, sensor, &Workers::new(workers)?))
+        })?;
+        image(py, light, sensor)
+    }
+}
+
+impl PyBeam {
+    fn of(py: Python<'_>, beam: Beam) -> PyResult<Self> {
+        let Beam { values, coefficients, shape, origin } = beam;
+        let coefficients = coefficients.map(|values| image(py, values, shape)).transpose()?;
+        Ok(Self { values: image(py, values, shape)?, coefficients, origin: origin.into() })
+    }
+
+    fn borrow<'py>(&self, py: Python<'py>) -> BorrowedBeam<'py> {
+        BorrowedBeam {
+            values: self.values.bind(py).readonly(),
+            coefficients: self.coefficients.as_ref().map(|values| values.bind(py).readonly()),
+            origin: self.origin.into(),
+        }
+    }
+}
+
+/// The arrays of a beam, borrowed.
+struct BorrowedBeam<'py> {
+    values: PyReadonlyArray2<'py, f64>,
+    coefficients: Option<PyReadonlyArray2<'py, f64>>,
+    origin: [usize; 2],
+}
+
+impl BorrowedBeam<'_> {
+    fn view(&self) -> PyResult<Beam<&[f64]>> {
+        let (values, shape) = (self.values.as_slice()?, shape_of(&self.values));
+        let coefficients = self.coefficients.as_ref().map(|c| c.as_slice()).transpose()?;
+        Ok(Beam { values, coefficients, shape, origin: self.origin })
+    }
+}
+
+/// What a calibration found; see `equipix.Calibration`.
+#[pyclass(frozen, get_all, module = "equipix._native", name = "Fit")]
+pub(crate) struct PyFit {
+    exposures: Py<PyExposures>,
+    sensitivity: Py<PyArray2<f64>>,
+    beam: Py<PyBeam>,
+    flags: Py<PyArray2<u32>>,
+    component_labels: Py<PyArray2<i32>>,
+    components: usize,
+    flux: Vec<f64>,
+    shifts: Vec<[f64; 2]>,
+    offset: Option<Py<PyArray2<f64>>>,
+    sweeps: Py<PyArray1<u64>>,
+    objective: Py<PyArray1<f64>>,
+    error_estimate: Py<PyArray1<f64>>,
+    ended: &'static str,
+    misfit: f64,
+    degrees_of_freedom: i64,
+    unit: f64,
+    smallest_ritz: Option<f64>,
+    leaves_tilt: bool,
+    refinement: &'static str,
+    is_joint: bool,
+}
+
+#[pymethods]
+impl PyFit {
+    /// D = Σ w c² L² of each pixel.
+    #[pyo3(signature = (*, workers))]
+    fn information(
+        &self,
+        py: Python<'_>,
+        workers: Option<NonZeroUsize>,
+    ) -> PyResult<Py<PyArray2<f64>>> {
+        let (exposures, borrowed) = (self.exposures.get(), self.borrow(py));
+        let (arrays, solution) = (exposures.borrow(py)?, borrowed.solution()?);
+        let (measurements, checked) = (arrays.view()?, exposures.checked());
+        let found = run::interruptible(py, None, |control| {
+            let workers = Workers::new(workers)?;
+            either!(measurements, m => {
+                solution.information(&Exposures::again(m, checked)?, &workers, control)
+            })
+        })?;
+        image(py, found, checked.sensor())
+    }
+
+    /// Answers what is asked of it, from one linear problem.
+    #[pyo3(signature = (*, error_map, functionals, shifts, offset, workers, progress))]
+    #[expect(clippy::too_many_arguments, reason = "the questions that there are")]
+    fn uncertainty(
+        &self,
+        py: Python<'_>,
+        error_map: bool,
+        functionals: Option<PyReadonlyArray3<'_, f64>>,
+        shifts: bool,
+        offset: bool,
+        workers: Option<NonZeroUsize>,
+        progress: Option<Bound<'_, PyAny>>,
+    ) -> PyResult<PyUncertainty> {
+        let functionals = functionals.as_ref().map(|stack| stack.as_slice()).transpose()?;
+        let questions = Questions { error_map, functionals, shifts, offset };
+        let (exposures, borrowed) = (self.exposures.get(), self.borrow(py));
+        let (arrays, solution) = (exposures.borrow(py)?, borrowed.solution()?);
+        let (measurements, checked) = (arrays.view()?, exposures.checked());
+        let answers = run::interruptible(py, progress.as_ref(), |control| {
+            let workers = Workers::new(workers)?;
+            either!(measurements, m => {
+                questions.ask(&Exposures::again(m, checked)?, &solution, &workers, control)
+            })
+        })?;
+        PyUncertainty::new(py, answers, checked.sensor())
+    }
+}
+
+impl PyFit {
+    /// The result of a fit of `exposures`.
+    pub(crate) fn new(py: Python<'_>, exposures: Py<PyExposures>, fit: Fit) -> PyResult<Self> {
+        let sensor = exposures.get().checked().sensor();
+        let (unit, is_joint) = (fit.unit(), fit.is_joint());
+        let History { looks, ended } = fit.history;
+        let column = |value: fn(&Look) -> f64| looks.iter().map(value).collect::<Vec<_>>();
+        let sweeps: Vec<_> = looks.iter().map(|look| look.sweep).collect();
+        Ok(Self {
+            exposures,
+            sensitivity: image(py, fit.sensitivity, sensor)?,
+            beam: Py::new(py, PyBeam::of(py, fit.beam)?)?,
+            flags: image(py, fit.flags, sensor)?,
+            component_labels: image(py, fit.components.pixels, sensor)?,
+            components: fit.components.sizes.len(),
+            flux: fit.flux,
+            shifts: fit.shifts,
+            offset: fit.offset.map(|offset| image(py, offset, sensor)).transpose()?,
+            sweeps: sweeps.into_pyarray(py).unbind(),
+            objective: column(|look| look.objective).into_pyarray(py).unbind(),
+            error_estimate: column(|look| look.error).into_pyarray(py).unbind(),
+            ended: ended_code(ended),
+            misfit: fit.misfit,
+            degrees_of_freedom: fit.degrees_of_freedom,
+            unit,
+            smallest_ritz: fit.smallest_ritz,
+            leaves_tilt: fit.leaves_tilt,
+            refinement: refinement_code(fit.refinement),
+            is_joint,
+        })
+    }
+
+    /// The arrays of the solution, borrowed.
+    pub(crate) fn borrow<'py>(&'py self, py: Python<'py>) -> BorrowedFit<'py> {
+        let sensitivity = self.sensitivity.bind(py).readonly();
+        BorrowedFit { fit: self, sensitivity, beam: self.beam.get().borrow(py) }
+    }
+}
+
+/// The arrays of a fit, borrowed.
+pub(crate) struct BorrowedFit<'py> {
+    fit: &'py PyFit,
+    sensitivity: PyReadonlyArray2<'py, f64>,
+    beam: BorrowedBeam<'py>,
+}
+
+impl BorrowedFit<'_> {
+    pub(crate) fn solution(&self) -> PyResult<Solution<'_>> {
+        Ok(Solution {
+            sensitivity: self.sensitivity.as_slice()?,
+            beam: self.beam.view()?,
+            flux: &self.fit.flux,
+            shifts: &self.fit.shifts,
+            refined: self.fit.refinement == refinement_code(Refinement::Done),
+            joint: self.fit.is_joint,
+            unit: self.fit.unit,
+        })
+    }
+}
+
+/// Answers, in units of the variance of a value of weight 1; `None` for what was not asked.
+#[pyclass(frozen, get_all, module = "equipix._native", name = "Uncertainty")]
+pub(crate) struct PyUncertainty {
+    std: Option<Py<PyArray2<f64>>>,
+    draws: u64,
+    exactness: f64,
+    variances: Option<Py<PyArray1<f64>>>,
+    shift_variances: Option<Vec<[f64; 2]>>,
+    offset_variances: Option<(f64, f64)>,
+}
+
+impl PyUncertainty {
+    fn new(py: Python<'_>, answers: Answers, sensor: Shape) -> PyResult<Self> {
+        let (draws, exactness) =
+            answers.map.as_ref().map_or((0, f64::NAN), |map| (map.draws, map.exactness));
+        Ok(Self {
+            std: answers.map.map(|map| image(py, map.std, sensor)).transpose()?,
+            draws,
+            exactness,
+            variances: answers.variances.map(|values| values.into_pyarray(py).unbind()),
+            shift_variances: answers.shifts,
+            offset_variances: answers.offset.map(Into::into),
+        })
+    }
+}
+
+/// What is asked of a fit.
+struct Questions<'a> {
+    error_map: bool,
+    /// Images of weights of M.
+    functionals: Option<&'a [f64]>,
+    shifts: bool,
+    offset: bool,
+}
+
+struct Answers {
+    map: Option<equipix_core::ErrorMap>,
+    variances: Option<Vec<f64>>,
+    shifts: Option<Vec<[f64; 2]>>,
+    offset: Option<[f64; 2]>,
+}
+
+impl Questions<'_> {
+    fn ask<T: Real>(
+        &self,
+        exposures: &Exposures<'_, T>,
+        solution: &Solution<'_>,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Answers> {
+        let mut bars = Uncertainty::new(exposures, solution, workers, control)?;
+        Ok(Answers {
+            map: self.error_map.then(|| bars.error_map()).transpose()?,
+            variances: self.functionals.map(|stack| bars.variances(stack)).transpose()?,
+            shifts: if self.shifts { bars.shift_variances()? } else { None },
+            offset: if self.offset { bars.offset_variances()? } else { None },
+        })
+    }
+}
+
+const fn ended_code(ended: Ended) -> &'static str {
+    match ended {
+        Ended::Converged => "converged",
+        Ended::SweepsUsed => "sweeps used",
+        Ended::Stalled => "stalled",
+    }
+}
+
+const fn refinement_code(refinement: Refinement) -> &'static str {
+    match refinement {
+        Refinement::None => "none",
+        Refinement::NotTried => "not tried",
+        Refinement::Undetermined => "untold",
+        Refinement::Done => "refined",
+    }
+}

@@ -1,0 +1,143 @@
+"""The forward model: what was fitted predicts, before and after saving."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+
+SHAPE = (40, 52)
+CROSS = equipix.cross_pattern(5, 7).astype(float)
+BETWEEN = CROSS + np.array([[0, 0], [0.3, 0.2], [0.1, -0.4], [0.45, 0.1], [-0.2, 0.35]])
+VARIANCE = np.array([1.0, 2.0, 1.5, 1.0, 0.5]) * 1e-6
+
+CASES = {
+    "whole": {},
+    "coordinate descent": {"method": "coordinate-descent", "tolerance": 1e-4},
+    "turned": {"rotation": [0, 90, 180, 270, 0]},
+    "between pixels": {"shifts": BETWEEN},
+    "between pixels, turned": {"shifts": BETWEEN, "rotation": [0, 90, 0, 180, 270]},
+    "free fluxes": {"flux": "fit"},
+    "prior fluxes": {"flux": np.ones(5), "flux_std": 1e-3, "shifts": BETWEEN},
+    "refined": {"shifts": BETWEEN, "shift_std": 0.05},
+    "dark fitted": {"flux": np.array([1.0, 1.6, 1.0, 1.6, 1.0]), "dark": "fit"},
+    "each variance": {"shifts": BETWEEN, "variance": "each"},
+    "float32": {"shifts": BETWEEN, "dtype": np.float32},
+}
+
+
+def calibrated(case, *, masked=False):
+    """A calibration from noisy exposures, with what it was made from."""
+    options = dict(CASES[case])
+    rng = np.random.default_rng(7)
+    shifts = options.pop("shifts", CROSS)
+    dtype = options.pop("dtype", np.float64)
+    turns = options.get("rotation", [0] * 5)
+    levels = options["flux"] if options.get("dark") == "fit" else np.ones(5)
+    truth = simulate.cosine_sensitivity(SHAPE, rng=rng)
+    beam = simulate.wavy_beam(SHAPE, rng=3)
+    frames = simulate.exposures(truth, beam, shifts, flux=levels, rotation=turns)
+    if options.get("dark") == "fit":
+        frames += 0.1 * rng.uniform(size=SHAPE)
+    variance = VARIANCE
+    if options.pop("variance", None) == "each":
+        variance = (1e-6 * rng.uniform(0.5, 2, frames.shape)).astype(dtype)
+    scale = variance if variance.ndim == 3 else variance[:, None, None]
+    frames = (frames + np.sqrt(scale) * rng.standard_normal(frames.shape)).astype(dtype)
+    if masked:
+        options["mask"] = rng.uniform(size=frames.shape) < 0.03
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", equipix.errors.EquipixWarning)
+        cal = equipix.calibrate(frames, shifts, variance=variance, **options)
+    return cal, frames, variance, options.get("mask", np.zeros(frames.shape, bool))
+
+
+def squares_of(cal, frames, variance, mask):
+    """Sum of squared residuals over variances, of the measurements used."""
+    residuals = cal.residuals(frames, variance=variance)
+    assert np.isfinite(residuals[~mask]).all()
+    return np.sum(np.square(residuals[~mask], dtype=np.float64)), residuals
+
+
+@pytest.mark.parametrize("masked", [False, True], ids=["", "masked"])
+@pytest.mark.parametrize("case", CASES)
+def test_residuals_are_those_that_were_minimised(case, masked):
+    cal, frames, variance, mask = calibrated(case, masked=masked)
+    total, residuals = squares_of(cal, frames, variance, mask)
+    freedom = cal.objective / cal.reduced_chi2
+    # A prediction is rounded by eps of itself, M by eps of its dtype; each of N residuals r changes
+    # F by 2 r δ, and the roundings add up at random: 2 √F δ, ten of these, besides those of a sum.
+    precision = np.finfo(cal.sensitivity.dtype).eps
+    rounding = precision * np.abs(frames).max() / np.sqrt(np.min(variance))
+    sums = 4 * np.finfo(float).eps * residuals.size
+    tolerance = 10 * 2 * rounding / np.sqrt(cal.objective) + sums
+    assert total == pytest.approx(cal.reduced_chi2 * freedom, rel=tolerance)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+@pytest.mark.parametrize("case", ["whole", "turned", "refined", "dark fitted", "float32"])
+def test_a_loaded_calibration_predicts_the_same_bytes(case, suffix, tmp_path):
+    cal, frames, variance, _ = calibrated(case)
+    cal.save(tmp_path / f"cal{suffix}")
+    read = equipix.load(tmp_path / f"cal{suffix}")
+    for shift in ((0, 0), (2.25, -1.5), (3, 4.875)):
+        np.testing.assert_array_equal(read.predict(shift), cal.predict(shift))
+    np.testing.assert_array_equal(
+        read.residuals(frames, variance=variance), cal.residuals(frames, variance=variance)
+    )
+    assert read.verdicts == cal.verdicts
+
+
+def test_a_pickled_calibration_does_without_its_fit():
+    cal, frames, *_ = calibrated("between pixels")
+    copy = pickle.loads(pickle.dumps(cal))
+    np.testing.assert_array_equal(copy.residuals(frames), cal.residuals(frames))
+    with pytest.raises(equipix.errors.InputError, match="measurements"):
+        copy.std_of(np.ones(SHAPE))
+
+
+def test_between_cells_the_fitted_spline_predicts():
+    """Against the B-spline written out, with the coefficients of the result."""
+    cal, *_ = calibrated("between pixels")
+    predicted = cal.predict((1.3, 2.6), flux=2.0)
+    rows, cols = np.indices(SHAPE)
+    expected = np.zeros(SHAPE)
+    for i in range(-1, 3):
+        for j in range(-1, 3):
+            place = (rows + cal.beam_origin[0] + 1 + i, cols + cal.beam_origin[1] + 2 + j)
+            inside = (place[0] < cal.beam.shape[0]) & (place[1] < cal.beam.shape[1])
+            cells = np.full(SHAPE, np.nan)
+            cells[inside] = cal.beam_coefficients[place[0][inside], place[1][inside]]
+            expected += bspline(0.3 - i) * bspline(0.6 - j) * cells
+    expected *= 2 * cal.sensitivity
+    seen = np.isfinite(expected)
+    assert np.count_nonzero(seen) > 0.8 * seen.size
+    np.testing.assert_array_equal(np.isfinite(predicted), seen)
+    # Sums of 16 products.
+    np.testing.assert_allclose(predicted[seen], expected[seen], rtol=32 * np.finfo(float).eps)
+
+
+def bspline(x):
+    """The cubic B-spline, centred at 0."""
+    x = abs(x)
+    return 2 / 3 - x**2 + x**3 / 2 if x < 1 else max(2 - x, 0.0) ** 3 / 6
+
+
+@pytest.mark.parametrize("suffix", ["tif", "npz"])
+def test_files_of_format_1_are_read(suffix):
+    """Written by the release before: the beam without its coefficients, `rejected` in two axes."""
+    read = equipix.load(Path(__file__).parent / f"data/calibration-format-1.{suffix}")
+    assert read.converged
+    assert read.shifts[1].tolist() == [0.25, 5.5]
+    assert read.rejected.shape == (5, 24, 32)
+    assert read.rejected[1, 3, 4]
+    assert read.beam_coefficients is None
+    assert read.verdicts == ()
+    assert np.isfinite(read.predict((0, 0))).all()
+    assert np.nanmedian(read.sensitivity_std) == pytest.approx(5.8e-4, rel=0.05)

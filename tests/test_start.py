@@ -1,0 +1,182 @@
+"""What it costs to begin: `import equipix`, `equipix --help`, and what they load."""
+
+from __future__ import annotations
+
+import pickle
+import resource
+import subprocess
+import sys
+from importlib import import_module
+
+import numpy as np
+import pytest
+from typer.main import get_command as typer_command
+
+import equipix
+from equipix.cli import app, main
+from equipix.cli.app import COMMANDS
+from equipix.cli.app import command as real_command
+
+HELP = "from equipix.cli import main; main(['--help'])"
+EAGER = """
+import sys
+before = set(sys.modules)
+{}
+print(*sorted(set(sys.modules) - before))
+"""
+USER = """
+import numpy as np
+
+import equipix
+from equipix import Calibration, Correction, Flag, calibrate, cross_pattern, load
+from equipix.errors import InputError
+
+
+def gain(path: str) -> float:
+    correction = load(path)
+    reveal_type(correction)
+    return float(np.nanmean(correction.coefficients[1]))
+
+
+def save(correction: Correction, path: str) -> None:
+    correction.save(path, force=True)
+
+
+shifts = cross_pattern(11, 19)
+cal = calibrate(np.ones((5, 40, 50)), shifts, workers=1)
+reveal_type(cal)
+reveal_type(equipix.average("a.tif"))
+reveal_type(equipix.plan.suggest((40, 50), 5, 9))
+reveal_type(equipix.uncertainty.tilt_std(shifts, (40, 50)))
+save(cal, "cal.tif")
+bad = (cal.flags & Flag.DO_NOT_USE) != 0
+if not isinstance(cal, Calibration):
+    raise InputError("never")
+"""
+REVEALED = (
+    "equipix.correction.protocol.Correction",
+    ".Calibration",
+    "equipix.frames.FrameStatistics",
+    "list[equipix.plan.search.Suggestion]",
+    "numpy.ndarray",
+)
+
+
+def loaded_by(statement):
+    """Names of the modules outside the standard library that a statement loads."""
+    command = [sys.executable, "-c", EAGER.format(statement)]
+    names = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    names = names.splitlines()[-1].split()
+    return {name for name in names if name.split(".")[0] not in sys.stdlib_module_names}
+
+
+def cpu_seconds(statement):
+    """The least CPU time that a process with this statement takes, of 20."""
+    costs = []
+    for _ in range(20):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        command = [sys.executable, "-c", statement]
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        costs.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(costs)
+
+
+@pytest.mark.timing
+def test_the_import_costs_little_more_than_numpy():
+    assert cpu_seconds("import numpy, equipix") <= cpu_seconds("import numpy") + 0.04
+
+
+@pytest.mark.timing
+def test_the_help_costs_little_more_than_numpy():
+    assert cpu_seconds(HELP) <= 2.5 * cpu_seconds("import numpy")
+
+
+def test_the_import_loads_numpy_and_the_extension_only():
+    found = {name for name in loaded_by("import equipix") if name.split(".")[0] != "numpy"}
+    assert found == {"equipix", "equipix._native"}
+
+
+def test_the_help_loads_no_command():
+    statement = "try: from equipix.cli import main; main(['--help'])\nexcept SystemExit: pass"
+    found = loaded_by(f"exec({statement!r})")
+    assert {"equipix.cli.app", "typer"} <= found
+    assert not found & {"numpy", "pydantic", "tifffile", "matplotlib", "rich.progress"}
+    own = {name for name in found if name.startswith("equipix.")}
+    assert own == {
+        "equipix._native",
+        "equipix.cli",
+        "equipix.cli.app",
+        "equipix.cli.terminal",
+        "equipix.errors",
+    }
+
+
+def test_the_help_says_of_each_command_what_the_command_says():
+    listed = typer_command(app).commands
+    for name, placeholder in listed.items():
+        assert placeholder.help == real_command(name).help
+
+
+def test_the_commands_listed_are_all_that_there_are():
+    modules = {module for module, _ in COMMANDS.values()}
+    found = [
+        info.name or info.callback.__name__
+        for module in modules
+        for info in import_module(f"equipix.cli.{module}").commands.registered_commands
+    ]
+    assert sorted(found) == sorted(COMMANDS)
+
+
+def test_a_mistyped_command_is_corrected(capsys):
+    with pytest.raises(SystemExit) as done:
+        main(["calibrat"])
+    assert done.value.code == 2
+    assert "Did you mean 'calibrate'" in capsys.readouterr().err
+
+
+class TestNames:
+    def test_every_public_name_is_there_on_first_use(self):
+        code = "import equipix; print(*(name for name in dir(equipix) if getattr(equipix, name)))"
+        names = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
+        assert set(equipix.__all__) <= set(names.decode().split())
+
+    def test_a_module_is_an_attribute_before_it_is_imported(self):
+        code = "import equipix; assert issubclass(equipix.errors.InputError, ValueError)"
+        subprocess.run([sys.executable, "-c", code], check=True)
+
+    def test_a_star_imports_all_of_them(self):
+        names: dict[str, object] = {}
+        exec("from equipix import *", names)
+        assert set(names) - {"__builtins__"} == set(equipix.__all__)
+        assert set(equipix.__all__) <= set(dir(equipix))
+
+    def test_an_unknown_name_is_an_attribute_error(self):
+        with pytest.raises(AttributeError, match="module 'equipix' has no attribute 'calibrat'"):
+            equipix.calibrat  # noqa: B018
+
+    def test_the_names_for_type_checkers_are_those_at_run_time(self):
+        assert set(equipix._HOMES) | set(equipix._MODULES) | {"__version__"} == set(equipix.__all__)
+
+    def test_a_calibration_is_unpickled_in_a_fresh_process(self, tmp_path):
+        frames = np.ones((5, 24, 26)) + 1e-3 * np.arange(26)
+        cal = equipix.calibrate(frames, equipix.cross_pattern(2, 3))
+        (tmp_path / "cal.pickle").write_bytes(pickle.dumps(cal))
+        code = (
+            "import pickle, sys; cal = pickle.load(open(sys.argv[1], 'rb')); "
+            "sys.stdout.buffer.write(cal.sensitivity.tobytes())"
+        )
+        command = [sys.executable, "-c", code, str(tmp_path / "cal.pickle")]
+        out = subprocess.run(command, capture_output=True, check=True).stdout
+        assert out == cal.sensitivity.tobytes()
+
+
+def test_user_code_is_checked_strictly(tmp_path):
+    pytest.importorskip("mypy")
+    (tmp_path / "user.py").write_text(USER)
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "user.py"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout
+    revealed = [line for line in done.stdout.splitlines() if "Revealed type" in line]
+    for line, wanted in zip(revealed, REVEALED, strict=True):
+        assert wanted in line
