@@ -23,6 +23,7 @@ from pydantic import BaseModel
 
 import equipix
 from equipix import simulate
+from equipix.calibration.verdicts import _CATEGORIES as CATEGORIES
 from equipix.cli import app
 from equipix.experiment.manifest import Manifest
 
@@ -151,6 +152,11 @@ def test_the_readme_names_attributes_that_exist():
     named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert "sensitivity" in named
     assert named <= {*equipix.Calibration.__dataclass_fields__, *dir(equipix.Calibration)}
+
+
+def test_the_readme_describes_every_verdict_and_its_warning():
+    described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in table("verdict")}
+    assert described == {kind: warning.__name__ for kind, warning in CATEGORIES.items()}
 
 
 def test_the_readme_describes_every_flag():
