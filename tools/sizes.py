@@ -1,7 +1,7 @@
 """Sizes of the sources: lines, long files, lengths of functions. Prints a table.
 
-Lines of a Python function are counted without its docstring, those of a Rust function from ``fn`` to
-its closing brace; tests inside Rust files count as lines, not as functions.
+Lines of a Python function are counted without its docstring, those of a Rust function from ``fn``
+to its closing brace; tests inside Rust files count as lines, not as functions.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ def rust_functions(source: str) -> dict[str, int]:
     for number, line in enumerate(source.split("#[cfg(test)]")[0].splitlines(), 1):
         head = re.match(r"(\s*)(?:pub(?:\([\w:]+\))? )?(?:const )?fn (\w+)", line)
         if head and start is None:
-            start = (head[1], head[2], number)
-            if line.rstrip().endswith("}") and "{" in line:
-                lengths[f"{head[2]}:{number}"], start = 1, None
-        elif start and (line == f"{start[0]}}}" or line.rstrip().endswith(";") and _is_signature(line, start)):
-            lengths[f"{start[1]}:{start[2]}"], start = number - start[2] + 1, None
+            start = (head[1], f"{head[2]}:{number}", number)
+        if start is None:
+            continue
+        indent, name, first = start
+        if line == f"{indent}}}" or (number == first and line.endswith("}")):
+            lengths[name], start = number - first + 1, None
+        elif (line.startswith(f"{indent})") and line.endswith(";")) or (
+            number == first and line.endswith(";")
+        ):  # a declaration
+            start = None
     return lengths
-
-
-def _is_signature(line: str, start: tuple[str, str, int]) -> bool:
-    """Whether a line ends the declaration of a function without a body."""
-    return line.startswith(f"{start[0]})")
 
 
 def main() -> None:
