@@ -2,7 +2,7 @@
 
 The rows are shifts between pixels, a drifting lamp, a grain of dust, and shifts with an error. The
 columns are the error of M with the fault ignored, with the option of `calibrate` that models it,
-and without the fault: with whole shifts, true fluxes, the grain masked, true shifts; `make figures`.
+and without the fault (whole shifts, true fluxes, the grain masked, true shifts); `make figures`.
 """
 
 from __future__ import annotations
