@@ -18,6 +18,7 @@ bench: $(BIN)/.built-release $(BIN)/.installed-bench
 
 figures: $(BIN)/.built-release
 	$(BIN)/python docs/figures.py
+	$(BIN)/python docs/before_after.py
 	$(BIN)/python docs/convergence.py
 	$(BIN)/python docs/spectrum.py
 	$(BIN)/python docs/estimate.py

@@ -1,8 +1,8 @@
-"""Draw docs/joint.png: what four faults of a measurement do to M, and what is left of them.
+"""Draw docs/joint.png: the errors of M that four faults of a measurement cause.
 
-A row each for shifts between pixels, a drifting lamp, a grain of dust and shifts that are a little
-off. From left to right the error of M when the fault is ignored, when `calibrate` is told of it,
-and without it: with whole shifts, true fluxes, the grain masked, true shifts; `make figures`.
+The rows are shifts between pixels, a drifting lamp, a grain of dust, and shifts with an error. The
+columns are the error of M with the fault ignored, with the option of `calibrate` that models it,
+and without the fault (whole shifts, true fluxes, the grain masked, true shifts); `make figures`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CROSS = equipix.cross_pattern(11, 19).astype(float)
 NOISE = 1e-3
 VARIANCE = np.full(5, NOISE**2)
 TOLERANCE = 1e-5
-HEADINGS = ("the fault ignored", "calibrate told of it", "without the fault")
+HEADINGS = ("the fault ignored", "the fault modelled", "without the fault")
 
 
 @dataclass(frozen=True)
@@ -171,6 +171,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     with warnings.catch_warnings():
-        # The left column is what becomes of a fault that nobody heeds.
+        # The left column is the effect of a fault that is ignored.
         warnings.simplefilter("ignore", MisfitWarning)
         main()

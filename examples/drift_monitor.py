@@ -1,4 +1,4 @@
-"""A lamp that drifts by 1 %, watched by a monitor diode good to 2e-4."""
+"""A lamp that drifts by 1 %, and a monitor diode with an error of 2e-4."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NOISE, DRIFT, MONITOR = 1e-3, 1e-2, 2e-4
 
 
 def main() -> None:
-    """Calibrate as if the lamp were steady, and with the monitor's readings as a prior."""
+    """Calibrate with equal fluxes, and with the readings of the monitor as a prior."""
     rng = np.random.default_rng(2)
     truth = simulate.paper_sensitivity(SENSOR, rng=rng)
     shifts = equipix.cross_pattern(11, 19)
@@ -29,8 +29,8 @@ def main() -> None:
     for name, cal in runs.items():
         error = simulate.relative_error(cal.sensitivity, truth)
         tilt = cal.tilt - np.array(slope(truth))
-        print(f"{name:12} rms error {np.std(error):.1e}, tilt off by {np.abs(tilt).max():.1e}")
-    # What is left of the tilt is the monitor's own error: equipix.plan.error_budget foretells it.
+        print(f"{name:12} rms error {np.std(error):.1e}, tilt error {np.abs(tilt).max():.1e}")
+    # The remaining error of the tilt is that of the monitor. equipix.plan.error_budget predicts it.
 
 
 def slope(truth: np.ndarray) -> tuple[float, float]:

@@ -1,6 +1,6 @@
-"""Plan an experiment: judge a pattern of shifts, find a better one, put its exposures in order.
+"""Plan an experiment: evaluate a pattern of shifts, find a better one, choose the order.
 
-A simulated calibration at the end shows that the errors are those predicted.
+A simulated calibration at the end compares the errors with the prediction.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from equipix.errors import DriftWarning
 
 SENSOR = (96, 128)
 CAUSES = {"noise": 1e-3, "drift": 2e-5, "shift_error": 0.02, "beam_width": 200}
-"""Noise of an exposure's mean, drift of the lamp, errors of the stage, width of the beam."""
+"""Noise of the mean of an exposure, drift of the lamp, errors of the stage, width of the beam."""
 
 
 def main() -> None:
-    """Compare the paper's cross with what the stage's travel of 20 pixels allows."""
+    """Compare the cross of the paper with the best pattern within a travel of 20 pixels."""
     cross = equipix.cross_pattern(11, 19)
     print(plan.identify(SENSOR, cross))
     budget = plan.error_budget(SENSOR, cross, **CAUSES)
@@ -27,11 +27,11 @@ def main() -> None:
 
     best = plan.suggest(SENSOR, 5, 20, **CAUSES)[0]
     print("suggested:", best.budget)
-    print("take them in this order (row, col):", best.shifts.tolist())
-    told = plan.trend_told(cross), plan.trend_told(best.shifts)
-    print(f"of a linear drift, {told[0]:.1%} and {told[1]:.1%} cannot be taken for a tilt")
+    print("in this order (row, col):", best.shifts.tolist())
+    shares = plan.trend_told(cross), plan.trend_told(best.shifts)
+    print(f"of a linear drift {shares[0]:.1%} and {shares[1]:.1%} do not look like a tilt")
 
-    # The experiment itself, of a sensor whose truth is known, with all three errors.
+    # The experiment with all three errors, simulated with a known sensitivity.
     rng = np.random.default_rng(1)
     truth = simulate.paper_sensitivity(SENSOR, rng=rng)
     beam = simulate.gaussian_beam(SENSOR, width=CAUSES["beam_width"])
@@ -41,7 +41,7 @@ def main() -> None:
     frames += CAUSES["noise"] * rng.standard_normal(frames.shape)
     cal = equipix.calibrate(frames, best.shifts)
     rms = np.std(simulate.relative_error(cal.sensitivity, truth))
-    print(f"rms error {rms:.2e}, where the plan says {best.budget.rms:.2e}")
+    print(f"rms error {rms:.2e}, predicted by the plan {best.budget.rms:.2e}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Shifts between pixels, measured with some error, in a beam with fine structure."""
+"""Shifts between pixels, measured with an error, in a beam with fine structure."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def main() -> None:
         rms = np.std(simulate.relative_error(cal.sensitivity, truth))
         print(f"{name:12} rms error {rms:.1e}, reduced chi2 {cal.reduced_chi2:.2f}")
     refined = runs["refined"].shifts - shifts
-    # What moves all exposures alike moves the beam, and no measurement tells it.
-    print(f"shifts known to {np.std(refined - refined.mean(axis=0)):.4f} pixel after it")
+    # A displacement common to all exposures moves the beam only; no measurement determines it.
+    print(f"remaining error of the shifts {np.std(refined - refined.mean(axis=0)):.4f} pixel")
 
 
 if __name__ == "__main__":

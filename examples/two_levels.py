@@ -1,4 +1,4 @@
-"""Gain and offset together: shifts at two levels of the lamp, and no dark frame at all."""
+"""Gain and offset together: shifts at two levels of the lamp, without a dark frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NOISE = 5e-4
 
 
 def main() -> None:
-    """Take a cross of five shifts at each level, and find sensitivity and dark."""
+    """Simulate a cross of five shifts at each level, and fit sensitivity and dark."""
     rng = np.random.default_rng(4)
     truth = simulate.paper_sensitivity(SENSOR, rng=rng)
     dark = 0.05 + 0.01 * rng.standard_normal(SENSOR)
@@ -25,10 +25,10 @@ def main() -> None:
     cal = equipix.calibrate(frames, shifts, flux=flux, dark="fit")
     error = np.std(simulate.relative_error(cal.sensitivity, truth))
     print(f"sensitivity: rms error {error:.1e}; dark: {np.std(cal.dark - dark):.1e}")
-    # The dark is part of the calibration, so raw frames can be corrected at once.
+    # The dark is part of the calibration, so raw frames are corrected without another dark.
     equal = cal.correct(frames[0])
     beam = simulate.gaussian_beam(SENSOR)(*np.indices(SENSOR))
-    print(f"a corrected frame follows the beam to {np.std(equal / beam):.1e}")
+    print(f"rms deviation of a corrected frame from the beam {np.std(equal / beam):.1e}")
 
 
 if __name__ == "__main__":

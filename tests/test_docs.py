@@ -13,15 +13,22 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import TYPE_CHECKING, get_args
 
+import before_after
 import numpy as np
 import pytest
 import typer.main
+from pydantic import BaseModel
 
 import equipix
 from equipix import simulate
+from equipix.calibration.verdicts import _CATEGORIES as CATEGORIES
 from equipix.cli import app
 from equipix.experiment.manifest import Manifest
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -41,6 +48,13 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^ *```{language}\n(.*?)^ *```", README, re.DOTALL | re.MULTILINE)
 
 
+def table(header: str) -> list[list[str]]:
+    """The cells of the table of the README whose first line begins with these cells."""
+    (body,) = re.findall(rf"^\| {re.escape(header)} \|.*\n\|[-|]+\n((?:\|.*\n)+)", README, re.M)
+    rows = [line.strip("| ").split(" | ") for line in body.splitlines()]
+    return [[cell.strip() for cell in row] for row in rows]
+
+
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
@@ -50,6 +64,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     # The largest of 19 200 normal values of this rms stays below 6 of them.
     assert np.abs(error).max() < 6 * names["camera"].noise_prediction(rng=1)[0]
     assert names["equal"].shape == truth.shape
+    assert names["usable"].all()
 
 
 def test_the_commands_of_the_readme_run(tmp_path):
@@ -73,6 +88,53 @@ def test_the_experiment_of_the_readme_is_one():
     assert len(Manifest.model_validate(tomllib.loads(text)).exposure) == 3
 
 
+def manifest_keys() -> dict[str, str]:
+    """The default of every key of an experiment.toml, as the README writes it."""
+    keys = {}
+    for name, field in Manifest.model_fields.items():
+        tables = [
+            each for each in (field.annotation, *get_args(field.annotation)) if is_table(each)
+        ]
+        if not tables:
+            keys[name] = default(field)
+        for each in tables:
+            keys |= {f"{name}.{key}": default(of) for key, of in each.model_fields.items()}
+    return keys
+
+
+def is_table(annotation: object) -> bool:
+    return inspect.isclass(annotation) and issubclass(annotation, BaseModel)
+
+
+def default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    return {None: "none", "": "empty"}.get(field.default, str(field.default))
+
+
+def test_the_readme_describes_every_key_of_an_experiment_and_its_default():
+    described = {key.split("`")[1]: given for key, _, given, _ in table("key")}
+    assert described == manifest_keys()
+
+
+def test_the_errors_of_the_readme_are_those_of_the_example(capsys):
+    runpy.run_path(str(ROOT / "examples/precision.py"), run_name="__main__")
+    _, *lines = capsys.readouterr().out.splitlines()
+    lines.remove("lamp drift, error of M that it adds for 5 and for 9 exposures:")
+    rows = [line.replace("e-0", "e-").split() for line in lines[:6]]
+    assert rows == table("frames N") + table("change of the flux, rms")
+    simulated, predicted = (float(line.rsplit(" ", 1)[1]) for line in lines[6:])
+    # 455 124 errors scatter by 0.1 %; the prediction is an approximation good to some per cent.
+    assert simulated == pytest.approx(predicted, rel=0.05)
+
+
+def test_the_picture_of_the_readme_shows_what_it_says(capsys):
+    before_after.photograph()
+    printed = re.findall(r"\d\.\d%", capsys.readouterr().out)
+    said = [value for _, value in table("one frame, good pixels")]
+    assert said == [value.replace("%", " %") for value in printed]
+
+
 def test_the_make_targets_of_the_readme_exist():
     targets = re.findall(r"^make (\w+)", "\n".join(blocks("sh")), re.MULTILINE)
     makefile = (ROOT / "Makefile").read_text()
@@ -92,11 +154,32 @@ def test_the_readme_names_attributes_that_exist():
     assert named <= {*equipix.Calibration.__dataclass_fields__, *dir(equipix.Calibration)}
 
 
+def test_the_readme_describes_every_verdict_and_its_warning():
+    described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in table("verdict")}
+    assert described == {kind: warning.__name__ for kind, warning in CATEGORIES.items()}
+
+
+def test_the_readme_describes_every_flag():
+    described = {name.strip("`").removeprefix("Flag.") for name, *_ in table("flag")}
+    assert described == {flag.name for flag in equipix.Flag} - {"DO_NOT_USE"}
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page):
     path = ROOT / page
     links = re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text())
     assert [link for link in links if not (path.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_to_sections_lead_to_headings(page):
+    path = ROOT / page
+    for target, section in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", path.read_text()):
+        headings = re.findall(
+            r"^#+ (.*)", (path.parent / target if target else path).read_text(), re.MULTILINE
+        )
+        slugs = [re.sub(r"[^\w\- ]", "", each).lower().replace(" ", "-") for each in headings]
+        assert section in slugs
 
 
 @pytest.mark.parametrize("module", MODULES)
