@@ -91,25 +91,24 @@ class Calibration:
         Versions, options and origin, as JSON values (``options["weights"]``: "equal" where no
         variance was known, else "variances"); under ``uncertainty`` the draws that
         `sensitivity_std` was made of, and its relative standard error; under ``dark``, where it
-        was fitted together with fluxes, the standard deviation of b in its error b·M, which
-        with which it is nearly degenerate, and that of a pixel by the noise of its own values.
+        was fitted together with fluxes, the standard deviation of b in its possible error b·M,
+        and that of a pixel by the noise of its own values.
     sensitivity_std : ndarray, shape (rows, cols), or None
-        Standard deviation of `sensitivity` by noise, and by what fitted fluxes and shifts leave
-        uncertain, large scales included, in the gauge mean 1, and slope 0 where free fluxes leave
-        a tilt undetermined; NaN where undetermined. In `sensitivity`'s dtype; None unless asked
-        for, or where a joint fit did not find M at all.
+        Standard deviation of `sensitivity` by noise and by the priors on fluxes and shifts, large
+        scales included, in the gauge of mean 1, and of slope 0 where free fluxes leave a tilt
+        undetermined; NaN where undetermined. In `sensitivity`'s dtype; None unless asked for, or
+        where a joint fit ended too far from its minimum.
     tilt_std : ndarray, shape (2,), or None
         Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None unless
         asked for.
     shift_std : ndarray, shape (n, 2), or None
-        Standard deviation of `shifts`, in pixels, where they had one before: of those refined, less
-        their mean by the prior's weights, since what moves all exposures alike moves but the beam;
-        else that given. None unless asked for.
+        Posterior standard deviation of refined shifts, less their mean, which no measurement
+        determines; the prior one of the others, in pixels. None unless asked for.
     weighted : Weighted or None
         The exposures with their weights and the fit, for `std_of`; None if read from a file or
         unpickled.
     verdicts : tuple of Verdict
-        What one must know of the result: what `calibrate` warned of.
+        Findings that limit the result: `calibrate` has warned of each.
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
