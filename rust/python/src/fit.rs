@@ -8,6 +8,7 @@
 //! | functionals | float64, 3 | `&[f64]` | view |
 
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 
 use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
@@ -17,7 +18,7 @@ use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, P
 use pyo3::prelude::*;
 
 use crate::arrays::{either, image, rotation, shape_of};
-use crate::exposures::PyExposures;
+use crate::data::Data;
 use crate::run;
 
 /// The beam on its grid.
@@ -91,27 +92,48 @@ impl BorrowedBeam<'_> {
 }
 
 /// What a calibration found; see `equipix.Calibration`.
-#[pyclass(frozen, get_all, module = "equipix._native", name = "Fit")]
+#[pyclass(frozen, module = "equipix._native", name = "Fit")]
 pub(crate) struct PyFit {
-    exposures: Py<PyExposures>,
+    data: Arc<Data>,
+    #[pyo3(get)]
+    exposures: Py<PyAny>,
+    #[pyo3(get)]
     sensitivity: Py<PyArray2<f64>>,
+    #[pyo3(get)]
     beam: Py<PyBeam>,
+    #[pyo3(get)]
     flags: Py<PyArray2<u32>>,
+    #[pyo3(get)]
     component_labels: Py<PyArray2<i32>>,
+    #[pyo3(get)]
     components: usize,
+    #[pyo3(get)]
     flux: Vec<f64>,
+    #[pyo3(get)]
     shifts: Vec<[f64; 2]>,
+    #[pyo3(get)]
     offset: Option<Py<PyArray2<f64>>>,
+    #[pyo3(get)]
     sweeps: Py<PyArray1<u64>>,
+    #[pyo3(get)]
     objective: Py<PyArray1<f64>>,
+    #[pyo3(get)]
     error_estimate: Py<PyArray1<f64>>,
+    #[pyo3(get)]
     ended: &'static str,
+    #[pyo3(get)]
     misfit: f64,
+    #[pyo3(get)]
     degrees_of_freedom: i64,
+    #[pyo3(get)]
     unit: f64,
+    #[pyo3(get)]
     smallest_ritz: Option<f64>,
+    #[pyo3(get)]
     leaves_tilt: bool,
+    #[pyo3(get)]
     refinement: &'static str,
+    #[pyo3(get)]
     is_joint: bool,
 }
 
@@ -124,9 +146,9 @@ impl PyFit {
         py: Python<'_>,
         workers: Option<NonZeroUsize>,
     ) -> PyResult<Py<PyArray2<f64>>> {
-        let (exposures, borrowed) = (self.exposures.get(), self.borrow(py));
-        let (arrays, solution) = (exposures.borrow(py)?, borrowed.solution()?);
-        let (measurements, checked) = (arrays.view()?, exposures.checked());
+        let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
+        let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
+        let checked = &self.data.checked;
         let found = run::interruptible(py, None, |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
@@ -151,9 +173,9 @@ impl PyFit {
     ) -> PyResult<PyUncertainty> {
         let functionals = functionals.as_ref().map(|stack| stack.as_slice()).transpose()?;
         let questions = Questions { error_map, functionals, shifts, offset };
-        let (exposures, borrowed) = (self.exposures.get(), self.borrow(py));
-        let (arrays, solution) = (exposures.borrow(py)?, borrowed.solution()?);
-        let (measurements, checked) = (arrays.view()?, exposures.checked());
+        let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
+        let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
+        let checked = &self.data.checked;
         let answers = run::interruptible(py, progress.as_ref(), |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
@@ -166,14 +188,15 @@ impl PyFit {
 
 impl PyFit {
     /// The result of a fit of `exposures`.
-    pub(crate) fn new(py: Python<'_>, exposures: Py<PyExposures>, fit: Fit) -> PyResult<Self> {
-        let sensor = exposures.get().checked().sensor();
+    pub(crate) fn new(exposures: &Bound<'_, PyAny>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
+        let (py, sensor) = (exposures.py(), data.checked.sensor());
         let (unit, is_joint) = (fit.unit(), fit.is_joint());
         let History { looks, ended } = fit.history;
         let column = |value: fn(&Look) -> f64| looks.iter().map(value).collect::<Vec<_>>();
         let sweeps: Vec<_> = looks.iter().map(|look| look.sweep).collect();
         Ok(Self {
-            exposures,
+            data,
+            exposures: exposures.clone().unbind(),
             sensitivity: image(py, fit.sensitivity, sensor)?,
             beam: Py::new(py, PyBeam::of(py, fit.beam)?)?,
             flags: image(py, fit.flags, sensor)?,
