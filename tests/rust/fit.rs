@@ -121,6 +121,7 @@ fn cases() -> Vec<(&'static str, Case)> {
         ("whole", Case::at(WHOLE)),
         ("free fluxes", Case::at(WHOLE).with_lamp(DRIFT, FluxKind::Free)),
         ("between pixels", Case::at(BETWEEN)),
+        ("free fluxes between pixels", Case::at(BETWEEN).with_lamp(DRIFT, FluxKind::Free)),
         ("turned", turned),
         ("linear", Case::at(BETWEEN).with_lamp(linear, FluxKind::Linear(times))),
         ("refined", refined),

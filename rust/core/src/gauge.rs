@@ -85,6 +85,9 @@ fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
         let u = [row as f64 - origin[0] as f64, col as f64 - origin[1] as f64];
         (down * u[0] + along * u[1] + corner).exp()
     };
+    if fit.beam.coefficients.is_some() {
+        fit.beam.tilt = [fit.beam.tilt[0] + down, fit.beam.tilt[1] + along];
+    }
     for (cell, value) in fit.beam.values.iter_mut().enumerate() {
         let factor = factor(cell);
         *value *= factor;

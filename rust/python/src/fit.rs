@@ -27,17 +27,20 @@ pub(crate) struct PyBeam {
     values: Py<PyArray2<f64>>,
     coefficients: Option<Py<PyArray2<f64>>>,
     origin: (usize, usize),
+    tilt: [f64; 2],
 }
 
 #[pymethods]
 impl PyBeam {
     #[new]
+    #[pyo3(signature = (values, coefficients, origin, *, tilt = [0.0, 0.0]))]
     const fn new(
         values: Py<PyArray2<f64>>,
         coefficients: Option<Py<PyArray2<f64>>>,
         origin: (usize, usize),
+        tilt: [f64; 2],
     ) -> Self {
-        Self { values, coefficients, origin }
+        Self { values, coefficients, origin, tilt }
     }
 
     /// The light L(u) on each pixel of a sensor, without the flux.
@@ -62,9 +65,9 @@ impl PyBeam {
 
 impl PyBeam {
     fn of(py: Python<'_>, beam: Beam) -> PyResult<Self> {
-        let Beam { values, coefficients, shape, origin } = beam;
+        let Beam { values, coefficients, tilt, shape, origin } = beam;
         let coefficients = coefficients.map(|values| image(py, values, shape)).transpose()?;
-        Ok(Self { values: image(py, values, shape)?, coefficients, origin: origin.into() })
+        Ok(Self { values: image(py, values, shape)?, coefficients, origin: origin.into(), tilt })
     }
 
     fn borrow<'py>(&self, py: Python<'py>) -> BorrowedBeam<'py> {
@@ -72,6 +75,7 @@ impl PyBeam {
             values: self.values.bind(py).readonly(),
             coefficients: self.coefficients.as_ref().map(|values| values.bind(py).readonly()),
             origin: self.origin.into(),
+            tilt: self.tilt,
         }
     }
 }
@@ -81,13 +85,14 @@ struct BorrowedBeam<'py> {
     values: PyReadonlyArray2<'py, f64>,
     coefficients: Option<PyReadonlyArray2<'py, f64>>,
     origin: [usize; 2],
+    tilt: [f64; 2],
 }
 
 impl BorrowedBeam<'_> {
     fn view(&self) -> PyResult<Beam<&[f64]>> {
         let (values, shape) = (self.values.as_slice()?, shape_of(&self.values));
         let coefficients = self.coefficients.as_ref().map(|c| c.as_slice()).transpose()?;
-        Ok(Beam { values, coefficients, shape, origin: self.origin })
+        Ok(Beam { values, coefficients, tilt: self.tilt, shape, origin: self.origin })
     }
 }
 
