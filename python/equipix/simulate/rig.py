@@ -13,7 +13,7 @@ from equipix.io import as_path
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
 from equipix.simulate.signal import Beam, window
-from equipix.simulate.store import Progress, write_experiment
+from equipix.simulate.store import Progress, Recording, Stream, write_experiment
 
 if TYPE_CHECKING:
     import os
@@ -199,7 +199,23 @@ class VirtualExperiment:
         InputError
             If `folder` is not the name of a folder.
         """
-        return write_experiment(self, as_path("folder", folder), force=force, progress=progress)
+        path = as_path("folder", folder)
+        return write_experiment(self._recording(), path, force=force, progress=progress)
+
+    def _recording(self) -> Recording:
+        """All streams, with what else the folder holds."""
+        each, hole = range(len(self.positions)), self.aperture_count
+        return Recording(
+            bit_depth=self.camera.bit_depth,
+            frame_bytes=self.camera.response.size * (1 if self.camera.bit_depth == 8 else 2),
+            dark=Stream(self.dark(), self.dark_count),
+            exposures=[Stream(self.frames(k), self.count) for k in each],
+            moves=[
+                (Stream(self.aperture_before(k), hole), Stream(self.aperture_after(k), hole))
+                for k in each[1:]
+            ],
+            truth=vars(self.truth),
+        )
 
 
 def experiment(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -16,57 +17,96 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from equipix.simulate.rig import VirtualExperiment
-
 Progress: TypeAlias = "Callable[[int, int, str], None]"
 
 
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Frames of one shape, made one at a time as they are written.
+
+    Attributes
+    ----------
+    frames : iterator of ndarray
+        The frames.
+    count : int
+        Their number.
+    """
+
+    frames: Iterator[NDArray[Any]]
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """All that an experiment holds on disk.
+
+    Attributes
+    ----------
+    bit_depth : int
+        Bits of the camera's ADC.
+    frame_bytes : int
+        Bytes of one frame.
+    dark : Stream
+        Dark frames.
+    exposures : list of Stream
+        Frames of each exposure.
+    moves : list of tuple of Stream
+        Images of the hole before and after each move, from the first exposure on.
+    truth : dict
+        What a calibration should find, by name.
+    """
+
+    bit_depth: int
+    frame_bytes: int
+    dark: Stream
+    exposures: list[Stream]
+    moves: list[tuple[Stream, Stream]]
+    truth: dict[str, Any]
+
+
 def write_experiment(
-    virtual: VirtualExperiment, target: Path, *, force: bool, progress: Progress | None
+    recording: Recording, target: Path, *, force: bool, progress: Progress | None
 ) -> Path:
     """Write an experiment whole or not at all; see `VirtualExperiment.write`."""
-    streams = dict(_streams(virtual))
-    frame_bytes = virtual.camera.response.size * (1 if virtual.camera.bit_depth == 8 else 2)
     if target.exists() and not _may_replace(target, force):
         raise FileError(
             f"'{target}' exists and is not empty: name another folder, or force the replacement "
             "of a folder that holds nothing but an experiment written before"
         )
+    streams = dict(_named(recording))
     with folder_beside(target) as folder:
-        counter = _Counter(progress, sum(count for _, count in streams.values()))
-        for name, (frames, count) in streams.items():
+        counter = _Counter(progress, sum(stream.count for stream in streams.values()))
+        for name, stream in streams.items():
             (folder / name).parent.mkdir(exist_ok=True)
-            write_frames(folder / name, counter.pass_on(frames), nbytes=count * frame_bytes)
-        np.savez(folder / "truth.npz", **vars(virtual.truth))
-        (folder / "experiment.toml").write_text(_manifest(virtual), encoding="utf-8")
+            nbytes = stream.count * recording.frame_bytes
+            write_frames(folder / name, counter.pass_on(stream.frames), nbytes=nbytes)
+        np.savez(folder / "truth.npz", **recording.truth)
+        (folder / "experiment.toml").write_text(_manifest(recording), encoding="utf-8")
         replace_folder(target, folder)
     return target / "experiment.toml"
 
 
-def _streams(
-    virtual: VirtualExperiment,
-) -> Iterator[tuple[str, tuple[Iterator[NDArray[Any]], int]]]:
-    """Name the files, with the frames of each and their number."""
-    yield "dark/dark.tif", (virtual.dark(), virtual.dark_count)
-    for k in range(len(virtual.positions)):
-        yield f"frames/p{k}.tif", (virtual.frames(k), virtual.count)
-    for k in range(1, len(virtual.positions)):
-        count = virtual.aperture_count
-        yield f"aperture/p{k}-before.tif", (virtual.aperture_before(k), count)
-        yield f"aperture/p{k}-after.tif", (virtual.aperture_after(k), count)
+def _named(recording: Recording) -> Iterator[tuple[str, Stream]]:
+    """Name the files, with the frames of each."""
+    yield "dark/dark.tif", recording.dark
+    for k, stream in enumerate(recording.exposures):
+        yield f"frames/p{k}.tif", stream
+    for k, (before, after) in enumerate(recording.moves, start=1):
+        yield f"aperture/p{k}-before.tif", before
+        yield f"aperture/p{k}-after.tif", after
 
 
-def _manifest(virtual: VirtualExperiment) -> str:
+def _manifest(recording: Recording) -> str:
     lines = [
         "# calibration experiment of a virtual camera; the truth is in truth.npz",
         "[sensor]",
         'name = "virtual"',
-        f"bit_depth = {virtual.camera.bit_depth}",
+        f"bit_depth = {recording.bit_depth}",
         "",
         "[dark]",
         'frames = "dark/dark.tif"',
     ]
-    for k in range(len(virtual.positions)):
+    for k in range(len(recording.exposures)):
         lines += ["", "[[exposure]]", f'name = "p{k}"', f'frames = "frames/p{k}.tif"']
         if k:
             lines.append(f'aperture_before = "aperture/p{k}-before.tif"')
