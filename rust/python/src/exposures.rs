@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 
 use crate::arrays::{either, pairs, rotations};
 use crate::data::{Arrays, Data};
-use crate::fit::PyFit;
+use crate::fit::{BorrowedFit, PyFit};
 use crate::{errors, run};
 
 /// Mean frames of one beam, and all that is known of them.
@@ -61,7 +61,6 @@ impl PyExposures {
 
     /// Minimises F.
     #[pyo3(signature = (*, method, tolerance, max_sweeps, start, workers, progress))]
-    #[expect(clippy::too_many_arguments, reason = "the options of a fit")]
     fn fit(
         slf: &Bound<'_, Self>,
         method: &str,
@@ -75,7 +74,7 @@ impl PyExposures {
         let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
         let options = Options { method, tolerance, max_sweeps };
         let start = start.map(|start| start.get().borrow(py));
-        let start = start.as_ref().map(|start| start.solution()).transpose()?;
+        let start = start.as_ref().map(BorrowedFit::solution).transpose()?;
         let borrowed = data.arrays.borrow(py)?;
         let measurements = borrowed.view()?;
         let fit = run::interruptible(py, progress.as_ref(), |control| {
