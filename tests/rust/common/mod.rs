@@ -1,0 +1,333 @@
+//! The one place where these tests meet the crate: an experiment goes in, a plain answer comes out.
+//!
+//! The tests know no other name of the crate, so that a change of its interface changes this file alone.
+
+#![allow(dead_code, reason = "each test file uses its own part of it")]
+
+use std::num::NonZeroUsize;
+
+use equipix_core::Result;
+use equipix_core::calibrate::{self, Solution};
+use equipix_core::control::Control;
+use equipix_core::error::Error;
+use equipix_core::estimate::{Ended, Stop};
+use equipix_core::frames::{Shape, Stack};
+use equipix_core::geometry::{Geometry, Rotation};
+use equipix_core::joint::{Flux, Refinement, Solved, Unknowns};
+use equipix_core::model::{Mask, Model, Variance};
+use equipix_core::parallel::Workers;
+use equipix_core::uncertainty;
+
+/// The weight τ of the penalty, as a share of the mean weight of a cell.
+pub(crate) const SMOOTHING: f64 = equipix_core::joint::SMOOTHING;
+
+/// What is known of the fluxes.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Lamp {
+    Known,
+    Free,
+    /// ln c is linear in these times.
+    Linear(Vec<f64>),
+    /// The given fluxes have these relative standard deviations.
+    Prior(Vec<f64>),
+}
+
+/// What is known of the variance of the values.
+#[derive(Clone, Debug)]
+pub(crate) enum Noise {
+    Unknown,
+    Exposures(Vec<f64>),
+    Measurements(Vec<f64>),
+}
+
+/// The exposures of one sensor, and what is to be found from them.
+#[derive(Clone, Debug)]
+pub(crate) struct Experiment {
+    /// Rows and columns.
+    pub(crate) shape: [usize; 2],
+    /// Exposure by exposure, row by row.
+    pub(crate) frames: Vec<f64>,
+    pub(crate) shifts: Vec<[f64; 2]>,
+    /// Given, the shifts are refined with this prior.
+    pub(crate) shift_std: Option<Vec<[f64; 2]>>,
+    /// The rotation of each exposure.
+    pub(crate) degrees: Vec<i64>,
+    pub(crate) flux: Vec<f64>,
+    pub(crate) lamp: Lamp,
+    pub(crate) noise: Noise,
+    /// Measurements not to use; empty if all are used.
+    pub(crate) mask: Vec<bool>,
+    /// Whether an offset of each pixel is sought.
+    pub(crate) offset: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Method {
+    Multiscale,
+    CoordinateDescent,
+}
+
+/// How to fit.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Options {
+    pub(crate) method: Method,
+    pub(crate) tolerance: f64,
+    pub(crate) most_passes: Option<u64>,
+    pub(crate) workers: usize,
+}
+
+impl Options {
+    pub(crate) const fn to(tolerance: f64) -> Self {
+        Self { method: Method::Multiscale, tolerance, most_passes: None, workers: 2 }
+    }
+}
+
+/// One entry of the history of a fit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Look {
+    pub(crate) passes: u64,
+    pub(crate) objective: f64,
+    pub(crate) error: f64,
+}
+
+/// What was found.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Answer {
+    /// M; NaN where undetermined.
+    pub(crate) sensitivity: Vec<f64>,
+    /// O, if it was sought.
+    pub(crate) offset: Option<Vec<f64>>,
+    /// L at the cells of its grid; NaN where unobserved.
+    pub(crate) beam: Vec<f64>,
+    /// The coefficients of the spline that L is, of a joint fit.
+    pub(crate) coefficients: Option<Vec<f64>>,
+    pub(crate) beam_shape: [usize; 2],
+    /// The cell that pixel (0, 0) sees at shift 0, unrotated.
+    pub(crate) origin: [usize; 2],
+    pub(crate) flux: Vec<f64>,
+    pub(crate) shifts: Vec<[f64; 2]>,
+    /// Whether shifts were refined.
+    pub(crate) refined: bool,
+    pub(crate) leaves_tilt: bool,
+    /// The component of each pixel and of each cell, the largest one being 0; −1 for none.
+    pub(crate) labels: [Vec<i32>; 2],
+    /// F of the measurements alone.
+    pub(crate) misfit: f64,
+    pub(crate) degrees_of_freedom: i64,
+    pub(crate) history: Vec<Look>,
+    pub(crate) converged: bool,
+}
+
+impl Answer {
+    /// Whether beam, fluxes and shifts were fitted jointly.
+    pub(crate) fn is_joint(&self) -> bool {
+        self.coefficients.is_some()
+    }
+}
+
+/// The standard deviation of M in each pixel.
+#[derive(Clone, Debug)]
+pub(crate) struct ErrorMap {
+    pub(crate) std: Vec<f64>,
+    pub(crate) draws: u64,
+    /// The relative standard error of `std`, root mean square over the pixels.
+    pub(crate) exactness: f64,
+}
+
+/// Minimises F.
+pub(crate) fn fit(experiment: &Experiment, options: Options) -> Result<Answer> {
+    let (workers, control) = (pool(options.workers)?, Control::new());
+    let (rotations, unknowns) = (rotations(experiment)?, unknowns(experiment));
+    let stop = Stop { tolerance: options.tolerance, max_sweeps: options.most_passes };
+    let method = match options.method {
+        Method::Multiscale => calibrate::Method::Multiscale,
+        Method::CoordinateDescent => calibrate::Method::CoordinateDescent,
+    };
+    let solution = with_model(experiment, &experiment.flux, &workers, |model| {
+        if unknowns.is_none() {
+            calibrate::calibrate(model, method, stop, &workers, &control)
+        } else {
+            calibrate::calibrate_jointly(model, &rotations, &unknowns, stop, &workers, &control)
+        }
+    })?;
+    Ok(answer(experiment, solution))
+}
+
+/// The standard deviation of M in each pixel.
+pub(crate) fn error_map(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+) -> Result<ErrorMap> {
+    let unit = variance_of_weight_1(experiment, answer);
+    let map = ask(experiment, answer, workers, |model, solved, workers, control| match solved {
+        Some(solved) => uncertainty::error_map_jointly(model, solved, workers, control),
+        None => {
+            let (sensitivity, beam) = (&answer.sensitivity, &answer.beam);
+            uncertainty::error_map(model, sensitivity, beam, workers, control)
+        }
+    })?;
+    let std = map.std.iter().map(|std| std * unit.sqrt()).collect();
+    Ok(ErrorMap { std, draws: map.draws, exactness: map.exactness })
+}
+
+/// The variance of Σ g M for each image g.
+pub(crate) fn variances(
+    experiment: &Experiment,
+    answer: &Answer,
+    functionals: &[Vec<f64>],
+    workers: usize,
+) -> Result<Vec<f64>> {
+    let unit = variance_of_weight_1(experiment, answer);
+    let functionals = functionals.concat();
+    let found = ask(experiment, answer, workers, |model, solved, workers, control| match solved {
+        Some(solved) => {
+            uncertainty::variances_of_jointly(model, solved, &functionals, workers, control)
+        }
+        None => {
+            let (m, beam) = (&answer.sensitivity, &answer.beam);
+            uncertainty::variances_of(model, m, beam, &functionals, workers, control)
+        }
+    })?;
+    Ok(found.into_iter().map(|variance| variance * unit).collect())
+}
+
+/// The variances (row, column) of the shifts of a joint fit that refined them.
+pub(crate) fn shift_variances(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+) -> Result<Vec<[f64; 2]>> {
+    let unit = variance_of_weight_1(experiment, answer);
+    let found = ask(experiment, answer, workers, |model, solved, workers, control| {
+        solved.map_or(Ok(Vec::new()), |solved| {
+            uncertainty::shift_variances(model, solved, workers, control)
+        })
+    })?;
+    Ok(found.into_iter().map(|pair| pair.map(|variance| variance * unit)).collect())
+}
+
+/// The variance of b, the part b M that the offsets' errors have in common, and the mean variance of an
+/// offset by the noise of its own pixel.
+pub(crate) fn offset_variances(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+) -> Result<[f64; 2]> {
+    let unit = variance_of_weight_1(experiment, answer);
+    let found = ask(experiment, answer, workers, |model, solved, workers, control| {
+        solved.map_or(Ok([0.0; 2]), |solved| {
+            uncertainty::offset_variances(model, solved, workers, control)
+        })
+    })?;
+    Ok(found.map(|variance| variance * unit))
+}
+
+/// The variance of a measurement of weight 1: 1 where variances are given, else reduced χ².
+fn variance_of_weight_1(experiment: &Experiment, answer: &Answer) -> f64 {
+    match experiment.noise {
+        Noise::Unknown => answer.misfit / answer.degrees_of_freedom as f64,
+        _ => 1.0,
+    }
+}
+
+fn pool(workers: usize) -> Result<Workers> {
+    Workers::new(NonZeroUsize::new(workers))
+}
+
+fn rotations(experiment: &Experiment) -> Result<Vec<Rotation>> {
+    let rotation = |degrees: &i64| {
+        let problem = || format!("holds {degrees}");
+        let refused = || Error::Value { argument: "rotation", problem: problem() };
+        Rotation::from_degrees(*degrees).ok_or_else(refused)
+    };
+    experiment.degrees.iter().map(rotation).collect()
+}
+
+fn unknowns(experiment: &Experiment) -> Unknowns {
+    Unknowns {
+        shifts: experiment.shifts.clone(),
+        shift_std: experiment.shift_std.clone(),
+        flux: match &experiment.lamp {
+            Lamp::Known => Flux::Known,
+            Lamp::Free => Flux::Free,
+            Lamp::Linear(times) => Flux::Linear(times.clone()),
+            Lamp::Prior(std) => Flux::Prior(std.clone()),
+        },
+        offset: experiment.offset,
+    }
+}
+
+/// Calls `visit` with the model of an experiment at these fluxes.
+fn with_model<R>(
+    experiment: &Experiment,
+    flux: &[f64],
+    workers: &Workers,
+    visit: impl FnOnce(&Model<'_, f64>) -> Result<R>,
+) -> Result<R> {
+    let Experiment { frames, shifts, noise, mask, .. } = experiment;
+    let (count, [rows, cols]) = (shifts.len(), experiment.shape);
+    let shape = Shape::new(rows, cols);
+    let nearest: Vec<_> =
+        shifts.iter().map(|shift| shift.map(|d| d.round_ties_even() as i64)).collect();
+    let geometry = Geometry::new(shape, &nearest, &rotations(experiment)?)?;
+    let variance = match noise {
+        Noise::Unknown => Variance::Unknown,
+        Noise::Exposures(variance) => Variance::Exposures(variance),
+        Noise::Measurements(variance) => {
+            Variance::Measurements(Stack::new("variance", variance, count, shape)?)
+        }
+    };
+    let mask = if mask.is_empty() { Mask::None } else { Mask::Measurements(mask) };
+    let frames = Stack::new("frames", frames, count, shape)?;
+    visit(&Model::new(frames, geometry, flux, variance, mask, workers, &Control::new())?)
+}
+
+/// Asks something of an answer; joint fits bring what they found along.
+fn ask<R>(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+    question: impl FnOnce(&Model<'_, f64>, Option<&Solved<'_>>, &Workers, &Control) -> Result<R>,
+) -> Result<R> {
+    let (workers, control) = (pool(workers)?, Control::new());
+    let (unknowns, rotations) = (unknowns(experiment), rotations(experiment)?);
+    let solved = answer.coefficients.as_ref().map(|coefficients| Solved {
+        unknowns: &unknowns,
+        rotations: &rotations,
+        sensitivity: &answer.sensitivity,
+        coefficients,
+        shifts: &answer.shifts,
+        refined: answer.refined,
+        unit: variance_of_weight_1(experiment, answer),
+    });
+    with_model(experiment, &answer.flux, &workers, |model| {
+        question(model, solved.as_ref(), &workers, &control)
+    })
+}
+
+fn answer(experiment: &Experiment, solution: Solution) -> Answer {
+    let looks = solution.history.looks.iter();
+    let look = |look: &equipix_core::estimate::Look| Look {
+        passes: look.sweep,
+        objective: look.objective,
+        error: look.error,
+    };
+    Answer {
+        sensitivity: solution.sensitivity,
+        offset: solution.offset,
+        beam: solution.beam,
+        coefficients: solution.coefficients,
+        beam_shape: [solution.beam_shape.rows, solution.beam_shape.cols],
+        origin: solution.beam_origin,
+        flux: solution.flux,
+        shifts: solution.shifts.unwrap_or_else(|| experiment.shifts.clone()),
+        refined: solution.refinement == Refinement::Done,
+        leaves_tilt: solution.leaves_tilt,
+        labels: [solution.components.pixels, solution.components.cells],
+        misfit: solution.objective,
+        degrees_of_freedom: solution.degrees_of_freedom,
+        converged: solution.history.ended == Ended::Converged,
+        history: looks.map(look).collect(),
+    }
+}
