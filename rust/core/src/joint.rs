@@ -23,6 +23,8 @@ mod precondition;
 mod rim;
 mod survey;
 mod system;
+#[cfg(test)]
+mod tests;
 mod wide;
 
 pub use covariance::Solved;
