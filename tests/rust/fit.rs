@@ -8,7 +8,7 @@ use equipix_core::{
     Result, Rotation, Shape, Stack, Variance, Workers, calibrate,
 };
 
-const SENSOR: Shape = Shape::new(40, 48);
+const SENSOR: Shape = Shape::new(28, 36);
 const COUNT: usize = 5;
 /// Standard deviation of the noise.
 const NOISE: f64 = 1e-3;
@@ -90,7 +90,7 @@ impl Case {
 
 /// A beam with structure that determines shifts.
 fn beam(u: f64, v: f64) -> f64 {
-    let fall = (-((u - 24.0).powi(2) + (v - 28.0).powi(2)) / 120_f64.powi(2)).exp();
+    let fall = (-((u - 18.0).powi(2) + (v - 22.0).powi(2)) / 120_f64.powi(2)).exp();
     fall * (1.0 + 0.08 * (u / 6.0).sin() * (v / 7.0).cos() + 0.05 * ((u + v) / 4.0).sin())
 }
 
@@ -212,7 +212,7 @@ fn a_start_of_another_sensor_is_refused() {
     let refused = case.with(&frames, &variance, |exposures, workers, control| {
         Ok(calibrate(exposures, &TO, Some(&start.solution()), workers, control).unwrap_err())
     });
-    assert!(refused.to_string().starts_with("'start' has shape 5 exposures of 1919 pixels"));
+    assert!(refused.to_string().starts_with("'start' has shape 5 exposures of 1007 pixels"));
 }
 
 #[test]
@@ -243,7 +243,9 @@ fn the_weight_of_a_pixel_is_what_its_measurements_say() {
 
 #[test]
 fn answers_do_not_depend_on_what_was_asked_before() {
-    for (name, case) in cases() {
+    for (name, case) in
+        cases().into_iter().filter(|case| ["whole", "refined", "dark"].contains(&case.0))
+    {
         let frames = case.frames();
         let variance = vec![NOISE * NOISE; frames.len()];
         let fit = case.fit(&frames, &variance, &TO, None);

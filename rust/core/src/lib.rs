@@ -210,6 +210,7 @@ pub use exposures::{Checked, Exposures, Flux, FluxKind, Mask, Measurements, Posi
 pub use fit::{Fit, Refinement, Solution};
 pub use frames::{Real, Shape, Stack};
 pub use geometry::Rotation;
+pub use joint::SMOOTHING;
 pub use parallel::Workers;
 pub use solve::{Method, Options, calibrate};
 pub use uncertainty::{ErrorMap, Uncertainty};
