@@ -228,7 +228,7 @@ class TestBetweenPixels:
         given = equipix.calibrate(frames, known, **options)
         refined = equipix.calibrate(frames, known, shift_std=std, **options)
         assert refined.converged
-        assert refined.metadata["options"]["shifts"] == "untold"
+        assert refined.metadata["options"]["shifts"] == "undetermined"
         np.testing.assert_array_equal(refined.shifts, known)
         np.testing.assert_allclose(refined.sensitivity, given.sensitivity, atol=1e-4)
 

@@ -214,7 +214,7 @@ def test_shifts_that_no_beam_tells_are_wrong_by_their_prior():
     step = 0.01 * np.eye(10).reshape(10, 5, 2)
     slopes = np.array([(modes(move) - modes(-move)) / 0.02 for move in step])
     cal = equipix.calibrate(frames, shifts, shift_std=std, uncertainty=True, **options)
-    assert cal.metadata["options"]["shifts"] == "untold"
+    assert cal.metadata["options"]["shifts"] == "undetermined"
     np.testing.assert_array_equal(cal.shift_std, np.full((5, 2), std))
     exact = equipix.calibrate(frames, shifts + 1e-9, **options)
     # What moves all exposures alike moves the beam; the prior's mean is no error of M.

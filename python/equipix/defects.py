@@ -133,7 +133,7 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
 
 
 def odd_responses(
-    sensitivity: NDArray[Any], std: Callable[[NDArray[Any]], NDArray[Any]]
+    sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.
 
@@ -142,8 +142,8 @@ def odd_responses(
     sensitivity : ndarray, shape (rows, cols)
         Sensitivity M; NaN where undetermined.
     std : callable
-        Standard deviations of M in pixels given by their flat indices: it must be beyond the limit
-        by more than chance explains.
+        Gives the standard deviations of M, which is asked only if there are suspects: M must be
+        beyond the limit by more than chance explains.
 
     Returns
     -------
@@ -155,11 +155,11 @@ def odd_responses(
         # Where no pixel is twice as sensitive as another, none is as its neighbours' median.
         if not np.nanmin(sensitivity) < DEAD_RESPONSE * np.nanmax(sensitivity):
             return dead, hot
-    usual = _block_medians(sensitivity)
+    usual, deviation = _block_medians(sensitivity), std()
     for found, sign, limit in ((dead, -1, DEAD_RESPONSE), (hot, 1, 1 / DEAD_RESPONSE)):
         beyond = sign * (sensitivity - limit * usual).ravel()
         suspects = np.flatnonzero(beyond > 0)
-        found.flat[suspects] = beyond[suspects] > SIGMAS * std(suspects)
+        found.flat[suspects] = beyond[suspects] > SIGMAS * deviation.flat[suspects]
     return dead, hot
 
 

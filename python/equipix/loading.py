@@ -67,7 +67,7 @@ def _load(path: str | PathLike[str], readers: Mapping[str, tuple[str, str]]) -> 
     module, function = readers[kind]
     try:
         return getattr(import_module(module), function)(path, pages, content)
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path}: damaged or incomplete {kind}: {error!r}") from error
 
 

@@ -93,7 +93,7 @@ def calibrate(
         Standard deviations of `shifts`, in pixels: the shifts are then refined, with this prior.
         A displacement common to all exposures stays as given. All shifts stay as given where the
         beam has no structure that determines them: ``metadata["options"]["shifts"]`` is "refined",
-        "untold" or "not tried".
+        "undetermined" or "not tried".
     dark : {"subtracted", "fit"}
         Whether the dark is already subtracted, or to be found as an offset of each pixel: for
         exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.

@@ -23,7 +23,7 @@ def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
     exposures, fit, rejected = weighted
     flags: Array = fit.flags.copy()
     sensitivity = fit.sensitivity.astype(exposures.values.dtype, copy=False)
-    dead, hot = odd_responses(sensitivity, lambda pixels: _std(weighted, pixels))
+    dead, hot = odd_responses(sensitivity, lambda: _std(weighted))
     set_bits(flags, "dead", dead | (sensitivity <= tolerance))
     set_bits(flags, "hot", hot)
     for finding, pixels in vars(exposures.findings).items():
@@ -34,8 +34,8 @@ def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
     return flags
 
 
-def _std(weighted: Weighted, pixels: Array) -> Array:
-    """Standard deviation of M in pixels by flat indices, that of the beam left out: 1/√D."""
-    information = weighted.fit.information(workers=None).flat[pixels]
+def _std(weighted: Weighted) -> Array:
+    """Standard deviation of M, that of the beam left out: 1/√D."""
+    information = weighted.fit.information(workers=None)
     with np.errstate(divide="ignore"):
         return np.asarray(1 / np.sqrt(information / weighted.noise_variance))

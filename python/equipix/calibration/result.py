@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -49,7 +50,11 @@ class Calibration:
         ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
     beam_coefficients : ndarray, shape of the padded grid, float64, or None
         Coefficients of the cubic B-spline that the beam is where shifts are no whole numbers; None
-        where it is known at the cells alone.
+        where it is known at the cells alone, and in a file of format 1. Between the cells of such a
+        beam polynomials of degree 5 interpolate.
+    beam_tilt : ndarray, shape (2,), float64
+        Slope β of ln L (row, col) per cell that the gauge put into the coefficients a:
+        L(u) = Σ_j a_j exp(β·(u − j)) B(u − j).
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`; 0 for a good pixel. One whose sensitivity is below half of its
         neighbours', or not above 0, is ``DEAD | DO_NOT_USE``, above twice theirs ``HOT |
@@ -120,6 +125,7 @@ class Calibration:
     beam: NDArray[Any]
     beam_origin: tuple[int, int]
     beam_coefficients: NDArray[Any] | None
+    beam_tilt: NDArray[Any]
     flags: NDArray[Any]
     shifts: NDArray[Any]
     rotation: NDArray[Any]
@@ -162,6 +168,7 @@ class Calibration:
             beam=fit.beam.values,
             beam_origin=fit.beam.origin,
             beam_coefficients=fit.beam.coefficients,
+            beam_tilt=np.array(fit.beam.tilt),
             flags=flags,
             shifts=np.array(fit.shifts, dtype=np.float64),
             rotation=exposures.positions.rotation,
@@ -214,6 +221,10 @@ class Calibration:
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the compiled fit, which cannot be pickled."""
         return {**vars(self), "weighted": None}
+
+    def __copy__(self) -> Self:
+        """Return a copy that keeps the fit."""
+        return dataclasses.replace(self)
 
     def std_of(
         self,
@@ -272,8 +283,8 @@ class Calibration:
         """
         if self.weighted is None:
             raise InputError(
-                "this calibration was read from a file, which does not hold the measurements: "
-                "call std_of on the result of calibrate or Experiment.run"
+                "this calibration was read from a file or unpickled, which does not keep the "
+                "measurements: call std_of on the result of calibrate or Experiment.run"
             )
         check_progress(progress)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
@@ -380,7 +391,8 @@ class Calibration:
         """
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
-        return self._predictions(np.reshape(shift, (1, 2)), [rotation], [flux])[0]
+        (place,) = self._places(np.reshape(shift, (1, 2)), [rotation], [flux])
+        return self._signal(*place)
 
     def residuals(
         self,
@@ -428,46 +440,43 @@ class Calibration:
             raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
         if shifts is None:
             check_count("frames", len(values), len(self.shifts))
-        predicted = self._predictions(
+        places = self._places(
             self.shifts if shifts is None else shifts,
             self.rotation if shifts is None and rotation is None else rotation,
             self.flux if shifts is None and flux is None else flux,
         )
-        check_count("shifts", len(predicted), len(values))
-        residuals: NDArray[Any] = np.where(np.isfinite(values), values, np.nan) - predicted
-        if self.dark_is_fitted:
-            residuals -= self.dark
-        if measured.models:
-            pairs = zip(measured.models, predicted, strict=True)
-            scales = [model.variance(each) for model, each in pairs]
-        elif measured.variance is not None:
-            given = measured.variance
-            scales = list(given if given.ndim == 3 else given[:, None, None])
-        else:
-            return residuals
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for residual, scale in zip(residuals, scales, strict=True):
-                residual /= np.sqrt(scale)
+        check_count("shifts", len(places), len(values))
+        residuals = np.full(values.shape, np.nan, np.result_type(values, self.sensitivity))
+        for k, place in enumerate(places):
+            signal = self._signal(*place)
+            np.subtract(values[k], signal, out=residuals[k], where=np.isfinite(values[k]))
+            if self.dark_is_fitted:
+                residuals[k] -= self.dark
+            variance = measured.variance_of(k, signal)
+            if variance is not None:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    residuals[k] /= np.sqrt(variance)
         return residuals
 
-    def _predictions(
+    def _places(
         self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
-    ) -> list[NDArray[Any]]:
-        """Frames from these positions, each of shape (rows, cols)."""
+    ) -> list[tuple[list[float], int, float]]:
+        """Shift, rotation and flux of each exposure, checked."""
         positions = Positions.of(shifts, rotation=rotation)
         fluxes = per_exposure("flux", flux, len(positions), default=1)
-        beam = self._beam
-        frames = []
-        for (row, col), turn, c in zip(
-            positions.shifts.tolist(), positions.rotation.tolist(), fluxes, strict=True
-        ):
-            frame = c * beam.light(self.shape, (row, col), turn, workers=None) * self.sensitivity
-            frames.append(frame.astype(self.sensitivity.dtype))
-        return frames
+        rows = zip(positions.shifts, positions.rotation, fluxes, strict=True)
+        return [(shift.tolist(), int(turn), float(c)) for shift, turn, c in rows]
+
+    def _signal(self, shift: list[float], rotation: int, flux: float) -> NDArray[Any]:
+        """Frame c · L(u) · M(p) from a position, in the dtype of the sensitivity."""
+        row, col = shift
+        light = self._beam.light(self.shape, (row, col), rotation, workers=None)
+        return np.asarray(flux * light * self.sensitivity, self.sensitivity.dtype)
 
     @property
     def _beam(self) -> Beam:
-        return Beam(self.beam, self.beam_coefficients, self.beam_origin)
+        tilt = self.beam_tilt.tolist()
+        return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.

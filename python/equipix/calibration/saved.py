@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -97,9 +98,7 @@ def read_fields(
     """
     check_format(path, content, KIND, FORMAT)
     check_pages(path, pages, _MAPS | dict.fromkeys(_MAYBE & pages.keys(), np.floating))
-    check_pages(
-        path, pages, {"beam": np.floating, **dict.fromkeys(_SPLINE & pages.keys(), np.floating)}
-    )
+    check_pages(path, pages, dict.fromkeys(["beam", *sorted(_SPLINE & pages.keys())], np.float64))
     if content["format"] == 1 and "rejected" in pages:
         images = pages["rejected"].reshape(-1, *pages["sensitivity"].shape)
         pages = {**pages, "rejected": images}
@@ -109,14 +108,15 @@ def read_fields(
     if content["format"] == 1:
         options = content["metadata"]["options"]
         former = {"rotation": options["rotation"], "dark_is_fitted": options["dark"] == "fit"}
-        numbers = {**numbers, **former, "verdicts": []}
+        numbers = {**numbers, **former, "verdicts": [], "beam_tilt": [0.0, 0.0]}
     chi2, rejected = numbers["reduced_chi2"], pages.get("rejected")
-    row, col = numbers["beam_origin"]
+    row, col = (operator.index(cell) for cell in numbers["beam_origin"])
+    _check_numbers(numbers, pages["beam"].shape)
     return {
         **{name: pages[name] for name in ("sensitivity", "beam", "flags", "component_labels")},
         **{name: pages.get(name) for name in _OPTIONAL},
         **{name: numbers[name] for name in _PLAIN},
-        **{name: _array(numbers[name]) for name in ("shifts", "flux")},
+        **{name: _array(numbers[name]) for name in ("shifts", "flux", "beam_tilt")},
         **{name: _array(numbers.get(name)) for name in ("tilt_std", "shift_std")},
         "beam_origin": (row, col),
         "rotation": np.array(numbers["rotation"], dtype=np.int64),
@@ -127,6 +127,20 @@ def read_fields(
         "rejected": None if rejected is None else rejected.astype(bool),
         "metadata": content["metadata"],
     }
+
+
+def _check_numbers(numbers: Mapping[str, Any], grid: tuple[int, ...]) -> None:
+    """Refuse numbers that cannot be those of a calibration."""
+    count = len(numbers["flux"])
+    if np.shape(numbers["shifts"]) != (count, 2) or len(numbers["rotation"]) != count:
+        raise ValueError(f"shifts and rotations, expected those of {count} exposures")
+    if not set(numbers["rotation"]) <= {0, 90, 180, 270}:
+        raise ValueError(f"rotation {numbers['rotation']}, expected 0, 90, 180 or 270 degrees")
+    inside = all(0 <= cell < size for cell, size in zip(numbers["beam_origin"], grid, strict=True))
+    if not inside:
+        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected a cell of {grid}")
+    if np.shape(numbers["beam_tilt"]) != (2,):
+        raise ValueError(f"beam_tilt {numbers['beam_tilt']}, expected two numbers")
 
 
 def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
@@ -148,6 +162,7 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
         "flux": fields["flux"].tolist(),
         **{name: fields[name] for name in _PLAIN},
         "rotation": fields["rotation"].tolist(),
+        "beam_tilt": fields["beam_tilt"].tolist(),
         "reduced_chi2": chi2 if np.isfinite(chi2) else None,
         "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
         "shift_sign": fields["shift_sign"],

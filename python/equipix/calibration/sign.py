@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from equipix._native import Fit
     from equipix._types import Array, Bools, Progress, ShiftSign
     from equipix.exposures.exposures import Exposures
+    from equipix.exposures.positions import Positions
 
 _MOST_EXPOSURES = 12
 """Exposures that are asked, from first to last: each has a flux to be found."""
@@ -73,14 +74,15 @@ class _Residuals(NamedTuple):
 
 
 class SignTest(NamedTuple):
-    """Outcome of the comparison, and how many times larger F is with the other sign.
+    """Outcome of the comparison.
 
-    `ratio` is F of the fit with the higher F over that of the lower, each per degree of freedom;
-    NaN where the sign is undetermined.
+    `given` and `reversed` are F per degree of freedom with the shifts as given and reversed; NaN
+    where the sign is undetermined.
     """
 
     sign: ShiftSign
-    ratio: float = float("nan")
+    given: float = float("nan")
+    reversed: float = float("nan")
 
 
 def shift_sign(exposures: Exposures, fit: Fit, options: FitOptions) -> SignTest:
@@ -122,9 +124,10 @@ def shift_sign(exposures: Exposures, fit: Fit, options: FitOptions) -> SignTest:
         exposures,
         flux=exposures.flux.free(np.array(fit.flux)),
         positions=dataclasses.replace(exposures.positions, std=None),
-    ).chosen(asked)
-    side = _side(exposures)
-    windows = [each.window(side) for each in (exposures, exposures.reversed())]
+    )
+    side = _side(exposures.positions.chosen(asked), exposures.shape)
+    # The window first: the exposures chosen are copied.
+    windows = [each.window(side).chosen(asked) for each in (exposures, exposures.reversed())]
     if len(asked) < 3 or (len(asked) - 2) * windows[0].values[0].size < _FEWEST:
         return SignTest("undetermined")
     try:
@@ -136,19 +139,18 @@ def shift_sign(exposures: Exposures, fit: Fit, options: FitOptions) -> SignTest:
     if lower is None:
         return SignTest("undetermined")
     sign: ShiftSign = "contradicted" if lower else "confirmed"
-    return SignTest(sign, found[1 - lower].left / found[lower].left)
+    return SignTest(sign, found[0].left, found[1].left)
 
 
-def _side(exposures: Exposures) -> int:
+def _side(positions: Positions, shape: tuple[int, int]) -> int:
     """Pixels along the window: some four times the largest shift s.
 
     Where that is many it is as small as leaves half a measurement a pixel to judge by:
     (n − 1)·w² − (w + s)² ≥ w²/2, the cells being at most (w + s)². 0 if nothing moves.
     """
     # Where the sensor's middle looks: a quarter turn exchanges its coordinates.
-    positions = exposures.positions
     turned = positions.rotation % 180 == 90
-    middle = (np.array(exposures.shape) - 1) / 2
+    middle = (np.array(shape) - 1) / 2
     middles = np.where(turned[:, None], middle[::-1], middle)
     reach = max(float(np.ptp(middles + sign * positions.shifts, axis=0).max()) for sign in (1, -1))
     enough: float = reach / (max(len(positions) - 1.5, 1.5) ** 0.5 - 1)

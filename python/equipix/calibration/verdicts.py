@@ -69,6 +69,11 @@ class Verdict:
     kind: str
     message: str
 
+    def __post_init__(self) -> None:
+        """Refuse a kind that there is not."""
+        if self.kind not in _CATEGORIES:
+            raise ValueError(f"verdict of kind {self.kind!r}, expected one of {[*_CATEGORIES]}")
+
 
 def say(verdicts: Iterable[Verdict]) -> None:
     """Warn of each; the only place where a calibration warns."""
@@ -127,9 +132,9 @@ def _on_sign(test: SignTest) -> Verdict | None:
     return Verdict(
         "sign",
         "the data contradict the sign of the shifts: with all shifts reversed and free fluxes the "
-        f"squared residuals are {1 / test.ratio:.2g} times as large. A shift grows when the sensor "
-        "moves towards larger rows and columns: give 'shifts' with the other sign, or exchange the "
-        "aperture images before and after the moves",
+        f"squared residuals are {test.reversed / test.given:.2g} times as large. A shift grows "
+        "when the sensor moves towards larger rows and columns: give 'shifts' with the other sign, or "
+        "exchange the aperture images before and after the moves",
     )
 
 

@@ -78,7 +78,7 @@ class Averaged:
             raise InputError(
                 f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
             )
-        if frames.dark is not self.dark:
+        if not _same(frames.dark, self.dark):
             raise InputError(
                 f"'frames': exposure {exposure} has another dark than the first: average all with "
                 "one 'dark'"
@@ -94,7 +94,8 @@ class Averaged:
         self.saturated |= saturates
         count = int(frames.count.max())
         self._frames.append(count)
-        self._of_dark.append(_added_by_dark(frames, count))
+        if self.dark is None:
+            self._of_dark.append(_added_by_dark(frames, count))
         self._points.append(photon_transfer(frames.mean, frames.variance, ~saturates, count))
 
     @cached_property
@@ -134,6 +135,14 @@ class Averaged:
         measured = np.isfinite(self.values).any(axis=0)
         dead: Bools = dead_pixels(self.values, models) & measured
         return dead
+
+
+def _same(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
+    """Whether two darks are the same measurement: one object, or equal to the last bit."""
+    if one is None or other is None or one is other:
+        return one is other
+    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

@@ -77,6 +77,12 @@ class Measured(NamedTuple):
     findings: Findings
     dark: Array | None = None
 
+    def variance_of(self, exposure: int, signal: Array) -> Array | None:
+        """Variance of the values of an exposure, where a model needs it at this signal."""
+        if self.models:
+            return self.models[exposure].variance(signal)
+        return None if self.variance is None else np.asarray(self.variance[exposure])
+
 
 def measured_of(
     frames: ArrayLike | Sequence[FrameStatistics] | Averaged,

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix import _native
 from equipix._types import Floats
+from equipix.exposures.front import exposures_of
+from equipix.exposures.options import FitOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -94,24 +95,9 @@ def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats)
     ratios: list[float] = []
     for _ in range(min(max(_PIXELS // local.size, _FEWEST), _MOST)):
         frames = light + _NOISE * rng.standard_normal(light.shape)
-        # Not `calibrate`, which would ask each draw for the sign of the shifts as well. One thread:
-        # on so small a part, two would mostly wait for each other.
-        solved = _native.calibrate_frames(
-            frames,
-            positions.astype(np.float64),
-            shift_std=None,
-            rotation=[0] * len(positions),
-            flux=powers.tolist(),
-            flux_model=("known", []),
-            offset=False,
-            variance=None,
-            mask=None,
-            method="multiscale",
-            tolerance=_TOLERANCE,
-            max_sweeps=None,
-            workers=1,
-            progress=None,
-        )
+        # A bare fit, without the test of the sign. One thread: on so small a part two are slower.
+        options = FitOptions(tolerance=_TOLERANCE, workers=1)
+        solved = exposures_of(frames, positions, flux=powers).fit(options)
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
         ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))

@@ -324,7 +324,7 @@ const fn refinement_code(refinement: Refinement) -> &'static str {
     match refinement {
         Refinement::None => "none",
         Refinement::NotTried => "not tried",
-        Refinement::Undetermined => "untold",
+        Refinement::Undetermined => "undetermined",
         Refinement::Done => "refined",
     }
 }
