@@ -11,19 +11,13 @@ __all__ = [
     "Beam",
     "Exposures",
     "Fit",
-    "Solution",
     "Uncertainty",
     "__version__",
     "average_files",
-    "calibrate_frames",
-    "error_map",
     "file_format",
-    "functional_variances",
     "locate_spots",
-    "offset_variances",
     "planned_components",
     "read_file",
-    "shift_variances",
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
@@ -188,97 +182,6 @@ class Uncertainty:
     @property
     def offset_variances(self) -> tuple[float, float] | None: ...
 
-@final
-class Solution:
-    @property
-    def sensitivity(self) -> NDArray[Any]: ...
-    @property
-    def beam(self) -> NDArray[Any]: ...
-    @property
-    def coefficients(self) -> NDArray[Any] | None: ...
-    @property
-    def beam_origin(self) -> tuple[int, int]: ...
-    @property
-    def flags(self) -> NDArray[Any]: ...
-    @property
-    def flux(self) -> list[float]: ...
-    @property
-    def shifts(self) -> list[list[float]] | None: ...
-    @property
-    def offset(self) -> NDArray[Any] | None: ...
-    @property
-    def leaves_tilt(self) -> bool: ...
-    @property
-    def refinement(self) -> str: ...
-    @property
-    def smallest_ritz(self) -> float | None: ...
-    @property
-    def misfit(self) -> float: ...
-    @property
-    def component_labels(self) -> NDArray[Any]: ...
-    @property
-    def components(self) -> int: ...
-    @property
-    def objective(self) -> NDArray[Any]: ...
-    @property
-    def sweeps(self) -> NDArray[Any]: ...
-    @property
-    def error_estimate(self) -> NDArray[Any]: ...
-    @property
-    def ended(self) -> str: ...
-    @property
-    def degrees_of_freedom(self) -> int: ...
-
-def calibrate_frames(
-    frames: NDArray[Any],
-    shifts: NDArray[Any],
-    *,
-    shift_std: NDArray[Any] | None,
-    rotation: list[int],
-    flux: list[float],
-    flux_model: tuple[str, list[float]],
-    offset: bool,
-    variance: NDArray[Any] | None,
-    mask: NDArray[Any] | None,
-    method: str,
-    tolerance: float,
-    max_sweeps: int | None,
-    workers: int | None,
-    progress: _Progress | None,
-) -> Solution: ...
-def error_map(
-    measurements: Any,
-    sensitivity: NDArray[Any],
-    beam: NDArray[Any],
-    *,
-    workers: int | None,
-    progress: _Progress | None,
-) -> tuple[NDArray[Any], int, float]: ...
-def functional_variances(
-    measurements: Any,
-    sensitivity: NDArray[Any],
-    beam: NDArray[Any],
-    *,
-    functionals: NDArray[Any],
-    workers: int | None,
-    progress: _Progress | None,
-) -> NDArray[Any]: ...
-def shift_variances(
-    measurements: Any,
-    sensitivity: NDArray[Any],
-    beam: NDArray[Any],
-    *,
-    workers: int | None,
-    progress: _Progress | None,
-) -> list[list[float]]: ...
-def offset_variances(
-    measurements: Any,
-    sensitivity: NDArray[Any],
-    beam: NDArray[Any],
-    *,
-    workers: int | None,
-    progress: _Progress | None,
-) -> list[float]: ...
 def locate_spots(
     before: NDArray[Any],
     after: NDArray[Any],

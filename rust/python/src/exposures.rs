@@ -88,7 +88,7 @@ impl PyExposures {
     }
 }
 
-pub(crate) fn method_named(name: &str) -> Result<Method> {
+fn method_named(name: &str) -> Result<Method> {
     match name {
         "multiscale" => Ok(Method::Multiscale),
         "coordinate-descent" => Ok(Method::CoordinateDescent),
@@ -100,7 +100,7 @@ pub(crate) fn method_named(name: &str) -> Result<Method> {
 }
 
 /// What is known of the fluxes: the kind, with times or standard deviations.
-pub(crate) fn flux_kind((kind, values): (String, Vec<f64>)) -> Result<FluxKind> {
+fn flux_kind((kind, values): (String, Vec<f64>)) -> Result<FluxKind> {
     match kind.as_str() {
         "known" => Ok(FluxKind::Known),
         "fit" => Ok(FluxKind::Free),

@@ -13,8 +13,6 @@ mod data;
 mod errors;
 mod exposures;
 mod fit;
-mod old_calibrate;
-mod old_uncertainty;
 mod plan;
 mod run;
 
@@ -34,12 +32,6 @@ mod _native {
     use crate::exposures::PyExposures;
     #[pymodule_export]
     use crate::fit::{PyBeam, PyFit, PyUncertainty};
-    #[pymodule_export]
-    use crate::old_calibrate::{PySolution, calibrate_frames};
-    #[pymodule_export]
-    use crate::old_uncertainty::{
-        error_map, functional_variances, offset_variances, shift_variances,
-    };
     #[pymodule_export]
     use crate::plan::planned_components;
 
