@@ -133,8 +133,8 @@ def _on_sign(test: SignTest) -> Verdict | None:
         "sign",
         "the data contradict the sign of the shifts: with all shifts reversed and free fluxes the "
         f"squared residuals are {test.reversed / test.given:.2g} times as large. A shift grows "
-        "when the sensor moves towards larger rows and columns: give 'shifts' with the other sign, or "
-        "exchange the aperture images before and after the moves",
+        "when the sensor moves towards larger rows and columns: give 'shifts' with the other "
+        "sign, or exchange the aperture images before and after the moves",
     )
 
 
