@@ -35,7 +35,7 @@ def with_value(array, place, value):
         ({"frames": "frame.tif"}, "'frames' has dtype"),
         ({"frames": frames().astype(complex)}, "'frames' has dtype complex128"),
         ({"frames": [frames()[0], frames()[0, :3]]}, "'frames' is not an array"),
-        ({"frames": np.ma.masked_greater(frames(), 1)}, "'frames' is a masked array.* mask="),
+        ({"frames": np.ma.masked_greater(frames(), 1)}, "'frames' is a masked array.*'mask'"),
         ({"frames": list(np.ma.masked_greater(frames(), 1))}, "'frames' is a masked array"),
         ({"frames": frames((1, 8, 9)), "shifts": [(0, 0)]}, "at least two"),
         ({"frames": frames((4, 8, 9))}, "'shifts' has 5 entries, expected 4"),
