@@ -97,7 +97,7 @@ def test_warnings_are_one_line_each(run, experiment, tmp_path):
     )
     assert status == 0
     assert json.loads(out)["converged"] is False
-    assert re.fullmatch(r"equipix: warning: stopped after \d sweeps[^\n]*\n", err)
+    assert re.fullmatch(r"equipix: warning: not converged after \d sweeps[^\n]*\n", err)
 
 
 def test_inspect_shows_the_calibration(run, calibration):
@@ -444,8 +444,8 @@ class TestPlan:
         ("arguments", "words"),
         [
             (("--max-shift", 9, 9, "--noise", "nan"), "'noise' is nan"),
-            ((), "give either --shifts"),
-            (("--shifts", CROSS, "--max-shift", 9, 9), "give either --shifts"),
+            ((), "give either '--shifts'"),
+            (("--shifts", CROSS, "--max-shift", 9, 9), "give either '--shifts'"),
             (("--shifts", "0,0 5"), "'--shifts' is '0,0 5'"),
             (("--shifts", CROSS, "-o", "plan.doc"), "plan.doc"),
         ],
