@@ -6,10 +6,8 @@ use std::hint::black_box;
 use std::num::NonZeroUsize;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use equipix_core::control::Control;
-use equipix_core::frames::{Shape, Stack};
-use equipix_core::parallel::Workers;
 use equipix_core::statistics::Accumulator;
+use equipix_core::{Control, Shape, Stack, Workers};
 
 const FRAMES: usize = 32;
 

@@ -8,19 +8,14 @@ mod common;
 
 use std::time::Instant;
 
-use common::{SHIFTS, frames, sensitivity};
-use equipix_core::calibrate::{Method, Solution, calibrate};
-use equipix_core::control::Control;
-use equipix_core::descent::Descent;
-use equipix_core::estimate::{Ended, Stop};
-use equipix_core::frames::{Real, Shape, Stack};
-use equipix_core::geometry::{Geometry, Rotation};
-use equipix_core::model::{Mask, Model, Variance};
-use equipix_core::multiscale;
-use equipix_core::parallel::Workers;
-use equipix_core::parts::Parts;
+use common::{frames, sensitivity};
+use equipix_core::parts::{self, Parts};
+use equipix_core::sweep::Estimate;
+use equipix_core::{
+    Control, Ended, Exposures, Fit, Method, Options, Real, Shape, Workers, calibrate,
+};
 
-const STOP: Stop = Stop { tolerance: 1e-6, max_sweeps: None };
+const OPTIONS: Options = Options { method: Method::Multiscale, tolerance: 1e-6, max_sweeps: None };
 const SIZES: [Shape; 5] = [
     Shape::new(240, 320),
     Shape::new(582, 782),
@@ -48,25 +43,23 @@ fn main() {
 fn measure<T: Real>(shape: Shape, precision: &str, convert: fn(f64) -> T, workers: &Workers) {
     let control = Control::new();
     let data = frames(shape, workers, convert);
-    let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
-    let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
-    let (variance, mask) = (Variance::Unknown, Mask::None);
-    let model = Model::new(stack, geometry, &[1.0; 5], variance, mask, workers, &control).unwrap();
+    let exposures = common::exposures(&data, shape, workers).unwrap();
     let mut solution = None;
     let mut times: [Vec<f64>; 6] = Default::default();
     for _ in 0..((1 << 25) / shape.len()).clamp(2, 9) {
-        let [sweep, assemble, factorise, product] = pieces(&model, workers, &control);
+        let [sweep, assemble, factorise, product] = pieces(&exposures, workers, &control);
         let whole = seconds(1, || {
-            solution = calibrate(&model, Method::Multiscale, STOP, workers, &control).ok();
+            solution = calibrate(&exposures, &OPTIONS, None, workers, &control).ok();
         });
-        let alone = seconds(1, || multiscale::solve(&model, STOP, workers, &control).unwrap());
+        let alone =
+            seconds(1, || parts::multiscale(&exposures, &OPTIONS, workers, &control).unwrap());
         let taken = [sweep, assemble, factorise, product, whole, alone];
         times.iter_mut().zip(taken).for_each(|(times, taken)| times.push(taken));
     }
     let [sweep, assemble, factorise, product, whole, alone] = times.map(median);
-    let Solution { sensitivity, history, .. } = solution.unwrap();
+    let Fit { sensitivity, history, .. } = solution.unwrap();
     let last = history.last();
-    let awaited = (shape == AWAITED.0).then(|| await_descent(&model, workers, &control));
+    let awaited = (shape == AWAITED.0).then(|| await_descent(&exposures, workers, &control));
     println!(
         "{{\"rows\": {}, \"cols\": {}, \"precision\": \"{precision}\", \"sweep_s\": {sweep:.3e}, \
          \"assemble_s\": {assemble:.3e}, \"factorise_s\": {factorise:.3e}, \
@@ -86,13 +79,13 @@ fn measure<T: Real>(shape: Shape, precision: &str, convert: fn(f64) -> T, worker
 
 /// Seconds of a sweep, of assembling S, of assembling and factorising the coarse matrix, and of a
 /// product with S.
-fn pieces<T: Real>(model: &Model<'_, T>, workers: &Workers, control: &Control) -> [f64; 4] {
+fn pieces<T: Real>(exposures: &Exposures<'_, T>, workers: &Workers, control: &Control) -> [f64; 4] {
     // Enough rounds that the clock and the first touch of memory do not count.
-    let rounds = (1 << 21) / model.sensor().len() + 2;
-    let mut descent = Descent::new(model, workers, control);
-    let sweep = seconds(rounds, || descent.sweep(control).unwrap());
-    let mut parts = Parts::new(model, workers);
-    let assemble = seconds(rounds, || parts.assemble(&descent, control).unwrap());
+    let rounds = (1 << 21) / exposures.sensor().len() + 2;
+    let mut estimate = Estimate::new(exposures, workers, control);
+    let sweep = seconds(rounds, || estimate.sweep(control).unwrap());
+    let mut parts = Parts::new(exposures, workers);
+    let assemble = seconds(rounds, || parts.assemble(&estimate, control).unwrap());
     let factorise = seconds(rounds, || parts.factorise(control).unwrap());
     let product = seconds(rounds, || parts.multiply(control).unwrap());
     [sweep, assemble, factorise, product]
@@ -100,15 +93,15 @@ fn pieces<T: Real>(model: &Model<'_, T>, workers: &Workers, control: &Control) -
 
 /// The sweeps and the seconds that coordinate descent takes.
 fn await_descent<T: Real>(
-    model: &Model<'_, T>,
+    exposures: &Exposures<'_, T>,
     workers: &Workers,
     control: &Control,
 ) -> (usize, f64) {
-    let mut descent = Descent::new(model, workers, control);
+    let mut estimate = Estimate::new(exposures, workers, control);
     let (mut sweeps, mut taken) = (0, 0.0);
-    while true_error(&descent.sensitivity, model.sensor(), workers) > AWAITED.1 {
+    while true_error(&estimate.sensitivity, exposures.sensor(), workers) > AWAITED.1 {
         assert!(sweeps < MOST_SWEEPS, "coordinate descent does not get there");
-        let each = seconds(CHECK_EVERY, || descent.sweep(control).unwrap());
+        let each = seconds(CHECK_EVERY, || estimate.sweep(control).unwrap());
         sweeps += CHECK_EVERY;
         taken += CHECK_EVERY as f64 * each;
     }

@@ -9,13 +9,9 @@ mod common;
 
 use std::time::Instant;
 
-use common::{SHIFTS, frames};
-use equipix_core::control::Control;
-use equipix_core::descent::Descent;
-use equipix_core::frames::{Shape, Stack};
-use equipix_core::geometry::{Geometry, Rotation};
-use equipix_core::model::{Mask, Model, Variance};
-use equipix_core::parallel::Workers;
+use common::{exposures, frames};
+use equipix_core::sweep::Estimate;
+use equipix_core::{Control, Shape, Workers};
 
 /// Values that one thread copies at a time.
 const BLOCK: usize = 1 << 16;
@@ -32,11 +28,8 @@ fn measure(shape: Shape, repetitions: usize) {
     let workers = Workers::new(None).unwrap();
     let control = Control::new();
     let data = frames(shape, &workers, |value| value as f32);
-    let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
-    let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
-    let (variance, mask) = (Variance::Unknown, Mask::None);
-    let model = Model::new(stack, geometry, &[1.0; 5], variance, mask, &workers, &control).unwrap();
-    let mut descent = Descent::new(&model, &workers, &Control::new());
+    let exposures = exposures(&data, shape, &workers).unwrap();
+    let mut estimate = Estimate::new(&exposures, &workers, &control);
     let mut target = vec![0.0_f32; data.len()];
     // Enough rounds that the clock's and the threads' start do not count.
     let rounds = (1 << 25) / data.len() + 1;
@@ -48,7 +41,7 @@ fn measure(shape: Shape, repetitions: usize) {
             });
         }));
         sweeps.push(seconds(rounds, || {
-            descent.sweep(&control).unwrap();
+            estimate.sweep(&control).unwrap();
         }));
     }
     // The first of each touches its memory for the first time.

@@ -2,16 +2,12 @@
 
 #![allow(clippy::unwrap_used, reason = "a bench has nobody to report to")]
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use equipix_core::control::Control;
-use equipix_core::descent::Descent;
-use equipix_core::frames::{Shape, Stack};
-use equipix_core::geometry::{Geometry, Rotation};
-use equipix_core::model::{Mask, Model, Variance};
-use equipix_core::parallel::Workers;
+use equipix_core::sweep::Estimate;
+use equipix_core::{Control, Shape, Workers};
 use std::hint::black_box;
 
 mod common;
-use common::{SHIFTS, frames};
+use common::{SHIFTS, exposures, frames};
 
 /// How far the beam grid reaches beyond the sensor.
 const PAD: usize = 19;
@@ -55,21 +51,10 @@ fn sweep(criterion: &mut Criterion) {
         for (name, count) in [("one worker", Some(1)), ("all workers", None)] {
             let workers = Workers::new(count.and_then(std::num::NonZeroUsize::new)).unwrap();
             let control = Control::new();
-            let stack = Stack::new("frames", &data, SHIFTS.len(), shape).unwrap();
-            let geometry = Geometry::new(shape, &SHIFTS, &[Rotation::None; 5]).unwrap();
-            let model = Model::new(
-                stack,
-                geometry,
-                &[1.0; 5],
-                Variance::Unknown,
-                Mask::None,
-                &workers,
-                &control,
-            )
-            .unwrap();
-            let mut descent = Descent::new(&model, &workers, &Control::new());
+            let exposures = exposures(&data, shape, &workers).unwrap();
+            let mut estimate = Estimate::new(&exposures, &workers, &control);
             group.bench_function(BenchmarkId::new(name, shape), |bencher| {
-                bencher.iter(|| descent.sweep(&control).unwrap());
+                bencher.iter(|| estimate.sweep(&control).unwrap());
             });
         }
     }

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
-from equipix.exposures.checks import warn_of_order
 
 import equipix
-from equipix import drift, plan, uncertainty
-from equipix.errors import IdentifiabilityWarning
+from equipix import drift, plan, simulate, uncertainty
+from equipix.calibration import verdicts
+from equipix.exposures.front import exposures_of
 
 CROSS = equipix.cross_pattern(11, 19).astype(float)
 CCD = (582, 782)
@@ -127,11 +125,11 @@ class TestTrend:
     def test_the_plan_and_the_warning_agree(self):
         told = drift.trend_told(CROSS, np.arange(5))
         assert plan.trend_told(CROSS) == told
-        upright = np.zeros(5, int)
-        with pytest.warns(IdentifiabilityWarning, match=f"only {told:.1%} of the variance"):
-            warn_of_order(("linear", [0.0, 10.0, 20.0, 30.0, 40.0]), CROSS, upright)
+        frames = simulate.exposures(np.ones((24, 32)), simulate.gaussian_beam((24, 32)), CROSS)
+        times = {"flux": "linear", "time": [0.0, 10.0, 20.0, 30.0, 40.0]}
+        advised = verdicts.on_plan(exposures_of(frames, CROSS, **times))
+        assert [verdict.kind for verdict in advised] == ["order"]
+        assert f"only {told:.1%} of the variance" in advised[0].message
         order = plan.advise_order(CROSS)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            warn_of_order(("linear", [0.0, 10.0, 20.0, 30.0, 40.0]), CROSS[order], upright)
-            warn_of_order(("fit", []), CROSS, upright)
+        assert verdicts.on_plan(exposures_of(frames, CROSS[order], **times)) == []
+        assert verdicts.on_plan(exposures_of(frames, CROSS, flux="fit")) == []

@@ -5,11 +5,22 @@
 //! M = (1 + ξ) (1 + 0.05 cos(3v + 1) cos 2u),   |ξ| ≤ 0.05,   u, v from −0.5 to 0.5
 //! ```
 
-use equipix_core::frames::Shape;
-use equipix_core::parallel::Workers;
+use equipix_core::{Control, Exposures, Flux, Positions, Real, Result, Shape, Stack, Workers};
 
 /// The cross of the paper.
 pub(crate) const SHIFTS: [[i64; 2]; 5] = [[0, 0], [0, 11], [0, 19], [11, 0], [19, 0]];
+
+/// The exposures of these frames.
+pub(crate) fn exposures<'a, T: Real>(
+    data: &'a [T],
+    shape: Shape,
+    workers: &Workers,
+) -> Result<Exposures<'a, T>> {
+    let frames = Stack::new("frames", data, SHIFTS.len(), shape)?;
+    let positions = Positions::of_shifts(&SHIFTS.map(|shift| shift.map(|d| d as f64)));
+    let flux = Flux::steady(SHIFTS.len());
+    Exposures::new(frames.into(), positions, flux, false, workers, &Control::new())
+}
 
 /// The exposures, one behind the other, as `convert` gives their values.
 pub(crate) fn frames<T: Copy + Send>(

@@ -85,13 +85,18 @@ class Exposures:
 
 @final
 class Beam:
-    """The beam on its grid; a spline if there are coefficients. NaN where it was not seen."""
+    """The beam on its grid; a spline if there are coefficients. NaN where it was not seen.
+
+    `tilt` is the slope of ln L that the gauge put into the coefficients: it goes into files too.
+    """
 
     def __new__(
         cls,
         values: NDArray[Any],
         coefficients: NDArray[Any] | None,
         origin: tuple[int, int],
+        *,
+        tilt: tuple[float, float] | list[float] = (0.0, 0.0),
     ) -> Beam: ...
     @property
     def values(self) -> NDArray[Any]: ...
@@ -99,6 +104,8 @@ class Beam:
     def coefficients(self) -> NDArray[Any] | None: ...
     @property
     def origin(self) -> tuple[int, int]: ...
+    @property
+    def tilt(self) -> list[float]: ...
     def light(
         self,
         shape: tuple[int, int],

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 _UNNOTICED = 0.02
 """Fraction of a pixel that a shift may be rounded by without a warning."""
 
-_ROUNDING = 1e-6
-"""Largest fraction of a pixel that counts as rounding."""
-
 _BEYOND = 2**31
 """More pixels than any sensor has along a side."""
 
@@ -173,14 +170,6 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     if first == second:
         raise InputError(f"'second' is {second!r}, the same as 'first': the positions coincide")
     return np.array([(0, 0), (0, first), (0, second), (first, 0), (second, 0)], dtype=np.int64)
-
-
-def as_positions(shifts: ArrayLike) -> NDArray[np.float64]:
-    """Shifts for the solver: whole where they differ from whole numbers by rounding only."""
-    # A shift beyond any sensor, which the solver refuses, must still fit an integer.
-    exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
-    whole = np.rint(exact)
-    return np.where(np.abs(exact - whole) < _ROUNDING, whole, exact)
 
 
 def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.int64]:

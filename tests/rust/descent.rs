@@ -4,13 +4,9 @@ mod experiment;
 
 use std::num::NonZeroUsize;
 
-use equipix_core::Result;
-use equipix_core::control::Control;
-use equipix_core::descent::Descent;
-use equipix_core::frames::{Shape, Stack};
-use equipix_core::geometry::{Geometry, Rotation};
-use equipix_core::model::{Mask, Model, Variance};
-use equipix_core::parallel::Workers;
+use equipix_core::geometry::Geometry;
+use equipix_core::sweep::Estimate;
+use equipix_core::{Control, Exposures, Flux, Positions, Result, Shape, Stack, Workers};
 use experiment::{Experiment, experiments, rounding_of_objective};
 use proptest::prelude::*;
 
@@ -18,12 +14,12 @@ impl Experiment {
     /// F after each sweep, and M and L after the last.
     fn swept(&self, sweeps: usize, workers: usize) -> Result<(Vec<f64>, Vec<f64>, Vec<f64>)> {
         let workers = Workers::new(NonZeroUsize::new(workers))?;
-        self.with_model(&workers, |model| {
-            let mut descent = Descent::new(model, &workers, &Control::new());
-            let objective = (0..sweeps).map(|_| descent.sweep(&Control::new()));
+        self.with_exposures(&workers, |exposures| {
+            let mut estimate = Estimate::new(exposures, &workers, &Control::new());
+            let objective = (0..sweeps).map(|_| estimate.sweep(&Control::new()));
             let objective = objective.collect::<Result<_>>()?;
-            let beam = descent.beam();
-            Ok((objective, descent.sensitivity, beam))
+            let beam = estimate.beam();
+            Ok((objective, estimate.sensitivity, beam))
         })
     }
 
@@ -58,7 +54,7 @@ impl Experiment {
     /// Value, weight, flux, pixel and cell of each used measurement.
     fn measurements(&self, geometry: &Geometry) -> Vec<(f64, f64, f64, usize, usize)> {
         let mut used = Vec::new();
-        for (k, place) in geometry.exposures.iter().enumerate() {
+        for (k, place) in geometry.placements.iter().enumerate() {
             for pixel in 0..self.shape.len() {
                 let index = k * self.shape.len() + pixel;
                 let (row, col) = (pixel / self.shape.cols, pixel % self.shape.cols);
@@ -129,16 +125,16 @@ fn rows_that_do_not_fit_the_cache_make_no_difference() {
     let shape = Shape::new(200, 60_000);
     let frames: Vec<f32> =
         (0..2 * shape.len()).map(|i| 1.0 + 0.1 * ((i % 977) as f32).sin()).collect();
-    let shifts = [[0, 0], [3, 5]];
+    let shifts = [[0.0, 0.0], [3.0, 5.0]];
     let swept = |workers| {
         let workers = Workers::new(NonZeroUsize::new(workers)).unwrap();
         let stack = Stack::new("frames", &frames, 2, shape).unwrap();
-        let geometry = Geometry::new(shape, &shifts, &[Rotation::None; 2]).unwrap();
-        let (variance, mask, control) = (Variance::Unknown, Mask::None, Control::new());
-        let model =
-            Model::new(stack, geometry, &[1.0; 2], variance, mask, &workers, &control).unwrap();
-        let mut descent = Descent::new(&model, &workers, &Control::new());
-        (descent.sweep(&control).unwrap().to_bits(), descent.sensitivity)
+        let (positions, control) = (Positions::of_shifts(&shifts), Control::new());
+        let flux = Flux::steady(2);
+        let exposures =
+            Exposures::new(stack.into(), positions, flux, false, &workers, &control).unwrap();
+        let mut estimate = Estimate::new(&exposures, &workers, &control);
+        (estimate.sweep(&control).unwrap().to_bits(), estimate.sensitivity)
     };
     // Three workers take more rows at a time than one.
     assert!(swept(1) == swept(3));

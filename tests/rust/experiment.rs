@@ -1,11 +1,9 @@
 //! Small experiments of every kind, for the tests of the solvers.
 
-use equipix_core::Result;
-use equipix_core::control::Control;
-use equipix_core::frames::{Shape, Stack};
-use equipix_core::geometry::{Geometry, Rotation};
-use equipix_core::model::{Mask, Model, Variance};
-use equipix_core::parallel::Workers;
+use equipix_core::{
+    Control, Exposures, Flux, FluxKind, Mask, Measurements, Positions, Result, Rotation, Shape,
+    Stack, Variance, Workers,
+};
 use proptest::prelude::*;
 
 /// Everything that one small experiment consists of.
@@ -21,19 +19,25 @@ pub(crate) struct Experiment {
 }
 
 impl Experiment {
-    /// Calls `visit` with the model of this experiment.
-    pub(crate) fn with_model<R>(
+    /// Calls `visit` with the exposures of this experiment.
+    pub(crate) fn with_exposures<R>(
         &self,
         workers: &Workers,
-        visit: impl FnOnce(&Model<'_, f64>) -> Result<R>,
+        visit: impl FnOnce(&Exposures<'_, f64>) -> Result<R>,
     ) -> Result<R> {
         let (count, shape) = (self.shifts.len(), self.shape);
         let frames = Stack::new("frames", &self.frames, count, shape)?;
         let variance = Stack::new("variance", &self.variance, count, shape)?;
-        let geometry = Geometry::new(shape, &self.shifts, &self.rotations)?;
-        let (variance, mask) = (Variance::Measurements(variance), Mask::Measurements(&self.mask));
+        let variance = Variance::Measurements(variance);
+        let measurements = Measurements { frames, variance, mask: Mask::Measurements(&self.mask) };
+        let positions = Positions {
+            shifts: self.shifts.iter().map(|shift| shift.map(|d| d as f64)).collect(),
+            rotations: self.rotations.clone(),
+            std: None,
+        };
+        let flux = Flux { values: self.flux.clone(), kind: FluxKind::Known };
         let control = Control::new();
-        visit(&Model::new(frames, geometry, &self.flux, variance, mask, workers, &control)?)
+        visit(&Exposures::new(measurements, positions, flux, false, workers, &control)?)
     }
 }
 

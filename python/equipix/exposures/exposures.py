@@ -121,6 +121,7 @@ class Exposures:
             else variance,
             mask=None if mask is None else np.ascontiguousarray(mask[part]),
             findings=Findings(),
+            dark=None,
         )
 
     def reversed(self) -> Self:

@@ -83,11 +83,6 @@ class Flux:
         return cls("linear", ones, time=times)
 
     @property
-    def is_one_level(self) -> bool:
-        """Whether all exposures are given one flux."""
-        return self.kind in ("known", "prior") and len(set(self.values.tolist())) == 1
-
-    @property
     def model(self) -> tuple[str, list[float]]:
         """The kind, with standard deviations or times, as the compiled part takes it."""
         known = self.time if self.std is None else self.std

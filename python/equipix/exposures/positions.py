@@ -78,17 +78,6 @@ class Positions:
         """Return the number of exposures."""
         return len(self.shifts)
 
-    @property
-    def are_whole(self) -> bool:
-        """Whether all shifts are whole numbers of pixels."""
-        return bool((self.shifts == np.rint(self.shifts)).all())
-
-    def move(self, shape: tuple[int, ...]) -> bool:
-        """Whether exposures differ by more than turns that exchange four pixels."""
-        rows, cols = shape
-        turned = rows != cols and len(set(self.rotation % 180)) > 1
-        return bool(np.ptp(self.shifts, axis=0).any()) or turned
-
     def reversed(self) -> Self:
         """Return the positions with all shifts of the other sign."""
         return dataclasses.replace(self, shifts=-self.shifts)

@@ -16,6 +16,9 @@ pub struct Beam<V = Vec<f64>> {
     pub values: V,
     /// The coefficients of the spline, one for each cell; NaN where no measurement sees them.
     pub coefficients: Option<V>,
+    /// The slope β of ln L (row, column) per cell that the gauge has put into the coefficients. A spline
+    /// times exp(β·u) is no spline: L(u) = Σ_j a_j exp(β·(u − j)) B(u − j).
+    pub tilt: [f64; 2],
     /// Sizes of the grid.
     pub shape: Shape,
     /// The cell that the sensor's first pixel sees at shift 0, not turned.
@@ -28,6 +31,7 @@ impl<V: AsRef<[f64]> + Sync> Beam<V> {
         Beam {
             values: self.values.as_ref(),
             coefficients: self.coefficients.as_ref().map(AsRef::as_ref),
+            tilt: self.tilt,
             shape: self.shape,
             origin: self.origin,
         }
@@ -47,7 +51,10 @@ impl<V: AsRef<[f64]> + Sync> Beam<V> {
     ) -> Vec<f64> {
         let window = rotation.turned(sensor);
         let beam = self.view();
-        let [rows, cols] = shift.map(|d| Factors::at(d - d.floor(), beam.coefficients.is_some()));
+        let tilt = beam.coefficients.map(|_| beam.tilt);
+        let [rows, cols] = [0, 1].map(|axis| {
+            Factors::at(shift[axis] - shift[axis].floor(), tilt.map(|tilt| tilt[axis]))
+        });
         let corner = [0, 1].map(|axis| shift[axis].floor() as i64 + beam.origin[axis] as i64);
         let mut light = vec![0.0; window.len()];
         workers.map_blocks(&mut light, window.cols, |row, light| {
@@ -97,9 +104,13 @@ struct Factors {
 }
 
 impl Factors {
-    fn at(fraction: f64, is_spline: bool) -> Self {
-        if is_spline {
-            Self { before: 1, factors: Taps::at(fraction).values.to_vec(), line: None }
+    /// Those behind a fraction of a cell: of a spline of that tilt, or of values at cells.
+    fn at(fraction: f64, tilt: Option<f64>) -> Self {
+        if let Some(tilt) = tilt {
+            let behind = [fraction + 1.0, fraction, fraction - 1.0, fraction - 2.0];
+            let taps = Taps::at(fraction).values.into_iter().zip(behind);
+            let factors = taps.map(|(tap, behind)| tap * (tilt * behind).exp()).collect();
+            Self { before: 1, factors, line: None }
         } else if fraction == 0.0 {
             Self { before: 0, factors: vec![1.0], line: None }
         } else {
@@ -165,7 +176,8 @@ mod tests {
         let (shape, origin) = (Shape::new(12, 14), [3, 2]);
         let cells = (0..shape.len()).map(|cell| (cell / shape.cols, cell % shape.cols));
         let values: Vec<f64> = cells.map(|(r, c)| at(r as f64 - 3.0, c as f64 - 2.0)).collect();
-        Beam { coefficients: is_spline.then(|| values.clone()), values, shape, origin }
+        let coefficients = is_spline.then(|| values.clone());
+        Beam { values, coefficients, tilt: [0.0; 2], shape, origin }
     }
 
     #[test]
@@ -213,5 +225,21 @@ mod tests {
         let known: Vec<bool> = at(&spline, [1.0, 2.0]).iter().map(|l| l.is_finite()).collect();
         assert_eq!(known, [false; 9]);
         assert!(at(&spline, [5.0, 6.0]).iter().all(|l| l.is_finite()));
+    }
+
+    #[test]
+    fn a_tilted_spline_is_the_spline_times_an_exponential() {
+        let workers = Workers::new(None).unwrap();
+        let (sensor, shift, tilt) = (Shape::new(4, 5), [0.25, 1.5], [0.02, -0.03]);
+        let spline = beam(|r, c| 1.0 + 0.3 * (r + 2.0 * c).sin(), true);
+        let factor = |r: f64, c: f64| (tilt[0] * r + tilt[1] * c).exp();
+        let mut tilted = beam(|r, c| (1.0 + 0.3 * (r + 2.0 * c).sin()) * factor(r, c), true);
+        tilted.tilt = tilt;
+        let light = |beam: &Beam| beam.light(shift, Rotation::None, sensor, &workers);
+        for (pixel, (a, b)) in light(&tilted).iter().zip(light(&spline)).enumerate() {
+            let u = [(pixel / 5) as f64 + shift[0], (pixel % 5) as f64 + shift[1]];
+            // Sums of 16 products of size 1, each of some ten roundings.
+            assert!((a - b * factor(u[0], u[1])).abs() < 160.0 * f64::EPSILON);
+        }
     }
 }

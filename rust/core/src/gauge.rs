@@ -12,10 +12,8 @@ use crate::connectivity::Components;
 use crate::fit::Fit;
 use crate::frames::Shape;
 use crate::geometry::Rotation;
+use crate::linalg::inverse;
 use crate::parallel::Workers;
-
-/// What rounding leaves of a determinant.
-const SINGULAR: f64 = 1e-12;
 
 /// Brings M to mean 1, each component for itself, and M to NaN outside the largest, L to NaN outside
 /// all. The pixels `left_out` are not in the means unless nothing else is there.
@@ -87,6 +85,9 @@ fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
         let u = [row as f64 - origin[0] as f64, col as f64 - origin[1] as f64];
         (down * u[0] + along * u[1] + corner).exp()
     };
+    if fit.beam.coefficients.is_some() {
+        fit.beam.tilt = [fit.beam.tilt[0] + down, fit.beam.tilt[1] + along];
+    }
     for (cell, value) in fit.beam.values.iter_mut().enumerate() {
         let factor = factor(cell);
         *value *= factor;
@@ -123,21 +124,6 @@ pub(crate) fn slopes(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [Vec
     inverse.map(|axis| (0..sensitivity.len()).map(|pixel| weight(pixel, axis)).collect())
 }
 
-/// The inverse of a matrix [a b; b c] without negative eigenvalues; 0 along the direction that one of
-/// rank 1 does not tell, and the matrix over its trace squared along the other.
-pub(crate) fn inverse([a, b, c]: [f64; 3]) -> [[f64; 2]; 2] {
-    let determinant = a * c - b * b;
-    if determinant > SINGULAR * (a + c).powi(2) {
-        let mixed = -b / determinant;
-        [[c / determinant, mixed], [mixed, a / determinant]]
-    } else if a + c > 0.0 {
-        let square = (a + c).powi(2);
-        [[a / square, b / square], [b / square, c / square]]
-    } else {
-        [[0.0; 2]; 2]
-    }
-}
-
 /// Replaces each value by `scaled(value, label)`.
 fn rescale(
     values: &mut [f64],
@@ -169,18 +155,4 @@ fn component_means(sensitivity: &[f64], components: &Components, left_out: &[usi
     }
     let chosen = kept.iter().zip(&all).map(|(kept, all)| if kept.1 > 0 { kept } else { all });
     chosen.map(|(sum, count)| sum / *count as f64).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_a_matrix_does_not_tell_is_left_out_of_its_inverse() {
-        assert_eq!(inverse([2.0, 1.0, 1.0]), [[1.0, -1.0], [-1.0, 2.0]]);
-        // 4 along (1, 1)/√2, nothing across.
-        assert_eq!(inverse([2.0, 2.0, 2.0]), [[0.125, 0.125], [0.125, 0.125]]);
-        assert_eq!(inverse([0.0, 0.0, 4.0]), [[0.0, 0.0], [0.0, 0.25]]);
-        assert_eq!(inverse([0.0; 3]), [[0.0; 2]; 2]);
-    }
 }

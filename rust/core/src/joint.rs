@@ -28,6 +28,8 @@ mod room;
 mod search;
 mod survey;
 mod system;
+#[cfg(test)]
+mod tests;
 mod unknowns;
 mod wide;
 
@@ -38,6 +40,7 @@ pub(crate) use layout::Grid;
 pub(crate) use memory::{bytes_needed, bytes_needed_by_covariance};
 pub(crate) use outcome::{coefficients, components, freedom, unknowns, values_at_cells};
 pub(crate) use pass::Pass;
+pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
 pub(crate) use room::Room;
 pub(crate) use search::Search;

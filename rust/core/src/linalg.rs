@@ -1,9 +1,12 @@
-//! Sparse linear algebra: the only module that names faer.
+//! Linear algebra: sparse Cholesky factors, and matrices of two rows. The only module that names faer.
 
 use faer::linalg::solvers::Solve;
 use faer::sparse::linalg::solvers::{Llt, SymbolicLlt};
 use faer::sparse::{SparseColMat, Triplet};
 use faer::{ColMut, Side};
+
+/// What rounding leaves of a determinant.
+const SINGULAR: f64 = 1e-12;
 
 /// The Cholesky factor of a sparse symmetric matrix.
 pub(crate) struct Cholesky {
@@ -25,6 +28,21 @@ impl Cholesky {
     /// Replaces the right-hand side by the solution.
     pub(crate) fn solve(&self, right: &mut [f64]) {
         self.factor.solve_in_place(ColMut::from_slice_mut(right));
+    }
+}
+
+/// The inverse of a matrix [a b; b c] without negative eigenvalues; 0 along the direction that one of
+/// rank 1 does not tell, and the matrix over its trace squared along the other.
+pub(crate) fn inverse([a, b, c]: [f64; 3]) -> [[f64; 2]; 2] {
+    let determinant = a * c - b * b;
+    if determinant > SINGULAR * (a + c).powi(2) {
+        let mixed = -b / determinant;
+        [[c / determinant, mixed], [mixed, a / determinant]]
+    } else if a + c > 0.0 {
+        let square = (a + c).powi(2);
+        [[a / square, b / square], [b / square, c / square]]
+    } else {
+        [[0.0; 2]; 2]
     }
 }
 
@@ -52,5 +70,14 @@ mod tests {
     fn an_indefinite_matrix_is_none() {
         assert!(Cholesky::new(2, &[(0, 0, 1.0), (1, 0, 2.0), (1, 1, 1.0)]).is_none());
         assert!(Cholesky::new(1, &[(0, 0, 0.0)]).is_none());
+    }
+
+    #[test]
+    fn what_a_matrix_does_not_tell_is_left_out_of_its_inverse() {
+        assert_eq!(inverse([2.0, 1.0, 1.0]), [[1.0, -1.0], [-1.0, 2.0]]);
+        // 4 along (1, 1)/√2, nothing across.
+        assert_eq!(inverse([2.0, 2.0, 2.0]), [[0.125, 0.125], [0.125, 0.125]]);
+        assert_eq!(inverse([0.0, 0.0, 4.0]), [[0.0, 0.0], [0.0, 0.25]]);
+        assert_eq!(inverse([0.0; 3]), [[0.0; 2]; 2]);
     }
 }

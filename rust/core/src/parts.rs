@@ -1,12 +1,14 @@
-//! The parts of a step of [`multiscale`](crate::multiscale), one by one: for the bench that tells
+//! The parts of a step of `multiscale`, one by one: for the bench that tells
 //! what assembling and factorising cost in products. No interface to rely on.
 
 use crate::control::Control;
+use crate::convergence::History;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::parallel::Workers;
 use crate::reduced::{Reduced, TwoLevel};
+use crate::solve::{self, Options};
 use crate::sweep::Estimate;
 
 /// The linear problem of a step.
@@ -53,4 +55,18 @@ impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     pub fn multiply(&mut self, control: &Control) -> Result<f64> {
         self.reduced.multiply(&self.x, &mut self.product, control)
     }
+}
+
+/// Runs the loop of the fast solver alone, without what follows it.
+///
+/// # Errors
+/// As [`calibrate`](crate::solve::calibrate).
+pub fn multiscale<T: Real>(
+    exposures: &Exposures<'_, T>,
+    options: &Options,
+    workers: &Workers,
+    control: &Control,
+) -> Result<History> {
+    let (_, history, _) = solve::multiscale(exposures, options, None, workers, control)?;
+    Ok(history)
 }

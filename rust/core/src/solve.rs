@@ -22,4 +22,5 @@ mod start;
 mod whole;
 
 pub use calibrate::calibrate;
+pub(crate) use multiscale::minimise as multiscale;
 pub use options::{Method, Options};

@@ -17,5 +17,6 @@
 
 mod estimate;
 mod kernel;
+mod lines;
 
 pub use estimate::Estimate;

@@ -4,31 +4,22 @@
 //! call views the arrays again, without another look at the values.
 
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 
 use equipix_core::{
-    Checked, Error, Exposures, Flux, FluxKind, Method, Options, Positions, Result, Workers,
-    calibrate,
+    Error, Exposures, Flux, FluxKind, Method, Options, Positions, Result, Workers, calibrate,
 };
 use numpy::PyReadonlyArray2;
 use pyo3::prelude::*;
 
-use crate::arrays::{PyMeasurements, either, pairs, rotations};
-use crate::fit::PyFit;
+use crate::arrays::{either, pairs, rotations};
+use crate::data::{Arrays, Data};
+use crate::fit::{BorrowedFit, PyFit};
 use crate::{errors, run};
 
 /// Mean frames of one beam, and all that is known of them.
 #[pyclass(frozen, module = "equipix._native", name = "Exposures")]
-pub(crate) struct PyExposures {
-    arrays: Arrays,
-    checked: Checked,
-}
-
-/// The arrays that exposures are made of.
-struct Arrays {
-    frames: Py<PyAny>,
-    variance: Option<Py<PyAny>>,
-    mask: Option<Py<PyAny>>,
-}
+pub(crate) struct PyExposures(Arc<Data>);
 
 #[pymethods]
 impl PyExposures {
@@ -64,12 +55,12 @@ impl PyExposures {
                 Ok(exposures.checked().clone())
             })
         })?;
-        Ok(Self { arrays, checked })
+        drop(borrowed);
+        Ok(Self(Arc::new(Data { arrays, checked })))
     }
 
     /// Minimises F.
     #[pyo3(signature = (*, method, tolerance, max_sweeps, start, workers, progress))]
-    #[expect(clippy::too_many_arguments, reason = "the options of a fit")]
     fn fit(
         slf: &Bound<'_, Self>,
         method: &str,
@@ -79,43 +70,21 @@ impl PyExposures {
         workers: Option<NonZeroUsize>,
         progress: Option<Bound<'_, PyAny>>,
     ) -> PyResult<PyFit> {
-        let (py, exposures) = (slf.py(), slf.get());
+        let (py, data) = (slf.py(), &slf.get().0);
         let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
         let options = Options { method, tolerance, max_sweeps };
         let start = start.map(|start| start.get().borrow(py));
-        let start = start.as_ref().map(|start| start.solution()).transpose()?;
-        let borrowed = exposures.borrow(py)?;
+        let start = start.as_ref().map(BorrowedFit::solution).transpose()?;
+        let borrowed = data.arrays.borrow(py)?;
         let measurements = borrowed.view()?;
         let fit = run::interruptible(py, progress.as_ref(), |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
-                let exposures = Exposures::again(m, &exposures.checked)?;
+                let exposures = Exposures::again(m, &data.checked)?;
                 calibrate(&exposures, &options, start.as_ref(), &workers, control)
             })
         })?;
-        PyFit::new(py, slf.clone().unbind(), fit)
-    }
-}
-
-impl PyExposures {
-    /// What the check of the values left.
-    pub(crate) const fn checked(&self) -> &Checked {
-        &self.checked
-    }
-
-    /// The arrays, borrowed.
-    pub(crate) fn borrow<'py>(&self, py: Python<'py>) -> PyResult<PyMeasurements<'py>> {
-        self.arrays.borrow(py)
-    }
-}
-
-impl Arrays {
-    fn borrow<'py>(&self, py: Python<'py>) -> PyResult<PyMeasurements<'py>> {
-        Ok(PyMeasurements {
-            frames: self.frames.extract(py)?,
-            variance: self.variance.as_ref().map(|variance| variance.extract(py)).transpose()?,
-            mask: self.mask.as_ref().map(|mask| mask.extract(py)).transpose()?,
-        })
+        PyFit::new(slf.as_any(), Arc::clone(data), fit)
     }
 }
 

@@ -8,6 +8,7 @@
 //! | functionals | float64, 3 | `&[f64]` | view |
 
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 
 use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
@@ -17,7 +18,7 @@ use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, P
 use pyo3::prelude::*;
 
 use crate::arrays::{either, image, rotation, shape_of};
-use crate::exposures::PyExposures;
+use crate::data::Data;
 use crate::run;
 
 /// The beam on its grid.
@@ -26,17 +27,20 @@ pub(crate) struct PyBeam {
     values: Py<PyArray2<f64>>,
     coefficients: Option<Py<PyArray2<f64>>>,
     origin: (usize, usize),
+    tilt: [f64; 2],
 }
 
 #[pymethods]
 impl PyBeam {
     #[new]
+    #[pyo3(signature = (values, coefficients, origin, *, tilt = [0.0, 0.0]))]
     const fn new(
         values: Py<PyArray2<f64>>,
         coefficients: Option<Py<PyArray2<f64>>>,
         origin: (usize, usize),
+        tilt: [f64; 2],
     ) -> Self {
-        Self { values, coefficients, origin }
+        Self { values, coefficients, origin, tilt }
     }
 
     /// The light L(u) on each pixel of a sensor, without the flux.
@@ -61,9 +65,9 @@ impl PyBeam {
 
 impl PyBeam {
     fn of(py: Python<'_>, beam: Beam) -> PyResult<Self> {
-        let Beam { values, coefficients, shape, origin } = beam;
+        let Beam { values, coefficients, tilt, shape, origin } = beam;
         let coefficients = coefficients.map(|values| image(py, values, shape)).transpose()?;
-        Ok(Self { values: image(py, values, shape)?, coefficients, origin: origin.into() })
+        Ok(Self { values: image(py, values, shape)?, coefficients, origin: origin.into(), tilt })
     }
 
     fn borrow<'py>(&self, py: Python<'py>) -> BorrowedBeam<'py> {
@@ -71,6 +75,7 @@ impl PyBeam {
             values: self.values.bind(py).readonly(),
             coefficients: self.coefficients.as_ref().map(|values| values.bind(py).readonly()),
             origin: self.origin.into(),
+            tilt: self.tilt,
         }
     }
 }
@@ -80,38 +85,60 @@ struct BorrowedBeam<'py> {
     values: PyReadonlyArray2<'py, f64>,
     coefficients: Option<PyReadonlyArray2<'py, f64>>,
     origin: [usize; 2],
+    tilt: [f64; 2],
 }
 
 impl BorrowedBeam<'_> {
     fn view(&self) -> PyResult<Beam<&[f64]>> {
         let (values, shape) = (self.values.as_slice()?, shape_of(&self.values));
         let coefficients = self.coefficients.as_ref().map(|c| c.as_slice()).transpose()?;
-        Ok(Beam { values, coefficients, shape, origin: self.origin })
+        Ok(Beam { values, coefficients, tilt: self.tilt, shape, origin: self.origin })
     }
 }
 
 /// What a calibration found; see `equipix.Calibration`.
-#[pyclass(frozen, get_all, module = "equipix._native", name = "Fit")]
+#[pyclass(frozen, module = "equipix._native", name = "Fit")]
 pub(crate) struct PyFit {
-    exposures: Py<PyExposures>,
+    data: Arc<Data>,
+    #[pyo3(get)]
+    exposures: Py<PyAny>,
+    #[pyo3(get)]
     sensitivity: Py<PyArray2<f64>>,
+    #[pyo3(get)]
     beam: Py<PyBeam>,
+    #[pyo3(get)]
     flags: Py<PyArray2<u32>>,
+    #[pyo3(get)]
     component_labels: Py<PyArray2<i32>>,
+    #[pyo3(get)]
     components: usize,
+    #[pyo3(get)]
     flux: Vec<f64>,
+    #[pyo3(get)]
     shifts: Vec<[f64; 2]>,
+    #[pyo3(get)]
     offset: Option<Py<PyArray2<f64>>>,
+    #[pyo3(get)]
     sweeps: Py<PyArray1<u64>>,
+    #[pyo3(get)]
     objective: Py<PyArray1<f64>>,
+    #[pyo3(get)]
     error_estimate: Py<PyArray1<f64>>,
+    #[pyo3(get)]
     ended: &'static str,
+    #[pyo3(get)]
     misfit: f64,
+    #[pyo3(get)]
     degrees_of_freedom: i64,
+    #[pyo3(get)]
     unit: f64,
+    #[pyo3(get)]
     smallest_ritz: Option<f64>,
+    #[pyo3(get)]
     leaves_tilt: bool,
+    #[pyo3(get)]
     refinement: &'static str,
+    #[pyo3(get)]
     is_joint: bool,
 }
 
@@ -124,9 +151,9 @@ impl PyFit {
         py: Python<'_>,
         workers: Option<NonZeroUsize>,
     ) -> PyResult<Py<PyArray2<f64>>> {
-        let (exposures, borrowed) = (self.exposures.get(), self.borrow(py));
-        let (arrays, solution) = (exposures.borrow(py)?, borrowed.solution()?);
-        let (measurements, checked) = (arrays.view()?, exposures.checked());
+        let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
+        let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
+        let checked = &self.data.checked;
         let found = run::interruptible(py, None, |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
@@ -151,9 +178,9 @@ impl PyFit {
     ) -> PyResult<PyUncertainty> {
         let functionals = functionals.as_ref().map(|stack| stack.as_slice()).transpose()?;
         let questions = Questions { error_map, functionals, shifts, offset };
-        let (exposures, borrowed) = (self.exposures.get(), self.borrow(py));
-        let (arrays, solution) = (exposures.borrow(py)?, borrowed.solution()?);
-        let (measurements, checked) = (arrays.view()?, exposures.checked());
+        let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
+        let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
+        let checked = &self.data.checked;
         let answers = run::interruptible(py, progress.as_ref(), |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
@@ -166,14 +193,15 @@ impl PyFit {
 
 impl PyFit {
     /// The result of a fit of `exposures`.
-    pub(crate) fn new(py: Python<'_>, exposures: Py<PyExposures>, fit: Fit) -> PyResult<Self> {
-        let sensor = exposures.get().checked().sensor();
+    pub(crate) fn new(exposures: &Bound<'_, PyAny>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
+        let (py, sensor) = (exposures.py(), data.checked.sensor());
         let (unit, is_joint) = (fit.unit(), fit.is_joint());
         let History { looks, ended } = fit.history;
         let column = |value: fn(&Look) -> f64| looks.iter().map(value).collect::<Vec<_>>();
         let sweeps: Vec<_> = looks.iter().map(|look| look.sweep).collect();
         Ok(Self {
-            exposures,
+            data,
+            exposures: exposures.clone().unbind(),
             sensitivity: image(py, fit.sensitivity, sensor)?,
             beam: Py::new(py, PyBeam::of(py, fit.beam)?)?,
             flags: image(py, fit.flags, sensor)?,

@@ -9,6 +9,7 @@
 mod arrays;
 mod average;
 mod centroid;
+mod data;
 mod errors;
 mod exposures;
 mod fit;

@@ -64,7 +64,7 @@ macro_rules! answer {
             let workers = Workers::new($workers)?;
             let solution = Solution {
                 sensitivity,
-                beam: Beam { values: cells, coefficients: None, shape, origin: [0, 0] },
+                beam: Beam { values: cells, coefficients: None, tilt: [0.0; 2], shape, origin: [0, 0] },
                 flux: &flux,
                 shifts: &found,
                 refined,

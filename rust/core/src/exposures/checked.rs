@@ -8,7 +8,7 @@ use super::positions::Positions;
 use super::stretch::{Stretch, weigh};
 use super::tally::{Tally, check_light, tally};
 use crate::control::Control;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::frames::{Real, Shape, Stack};
 use crate::geometry::Geometry;
 use crate::parallel::Workers;
@@ -87,7 +87,7 @@ impl<'a, T: Real> Exposures<'a, T> {
         if frames.shape() != geometry.sensor {
             let got = frames.shape().to_string();
             let wanted = geometry.sensor.to_string();
-            return Err(crate::Error::Shape { argument: "frames", got, wanted });
+            return Err(Error::Shape { argument: "frames", got, wanted });
         }
         Ok(Self { measurements, checked: checked.clone() })
     }

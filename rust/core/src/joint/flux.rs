@@ -7,8 +7,8 @@
 //! Σ π a b in place of Σ a b: then the best of the parts that no measurement tells is the given one.
 
 use crate::exposures::FluxKind;
-use crate::gauge::inverse;
 use crate::geometry::Rotation;
+use crate::linalg::inverse;
 
 /// ln c = ln c₀ + T θ.
 pub(crate) struct Fluxes {

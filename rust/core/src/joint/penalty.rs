@@ -10,7 +10,7 @@ use crate::frames::Shape;
 use crate::parallel::Workers;
 
 /// The weight τ of the penalty, as a share of the mean weight of a cell.
-pub(crate) const SMOOTHING: f64 = 1e-5;
+pub const SMOOTHING: f64 = 1e-5;
 const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
 const BAND: usize = 32;
@@ -280,5 +280,117 @@ mod tests {
         // Sums of some 56 · 20 products of size 100.
         assert!((dot(&ax, &y) - dot(&ay, &x)).abs() < 1e-10);
         assert!((dot(&ax, &x) - energy).abs() < 1e-10);
+    }
+
+    /// A penalty on a beam of which one cell is not seen, beside the rows of G and the matrix P.
+    struct Dense {
+        penalty: Penalty,
+        beam: Vec<f64>,
+        differences: Vec<Vec<f64>>,
+        relative: Vec<Vec<f64>>,
+        workers: Workers,
+    }
+
+    impl Dense {
+        const SHAPE: Shape = Shape::new(6, 7);
+        const TAU: f64 = 0.7;
+
+        fn new() -> Self {
+            let Shape { rows, cols } = Self::SHAPE;
+            let random = |seed: f64| (0..42).map(move |i| (f64::from(i) * seed).sin() + 1.5);
+            let beam: Vec<f64> = random(1.7).collect();
+            let mut weights: Vec<f64> = random(2.9).collect();
+            weights[3 * cols + 5] = 0.0;
+            let line = |first: usize, step: usize| {
+                let cells = [0, 1, 2, 3, 4].map(|i| first + i * step);
+                let mut row = vec![0.0; 42];
+                cells.iter().zip([1.0, -4.0, 6.0, -4.0, 1.0]).for_each(|(&cell, g)| row[cell] = g);
+                cells.iter().all(|&cell| weights[cell] > 0.0).then_some(row)
+            };
+            let down = (0..(rows - 4) * cols).filter_map(|first| line(first, cols));
+            let starts = (0..42).filter(|cell| cell % cols + 4 < cols);
+            let differences = down.chain(starts.filter_map(|first| line(first, 1))).collect();
+            let norm: f64 = weights.iter().zip(&beam).map(|(d, a)| d * a * a).sum();
+            let element = |row: usize, col: usize| {
+                f64::from(row == col) - beam[row] * weights[col] * beam[col] / norm
+            };
+            let relative =
+                (0..42).map(|row| (0..42).map(|col| element(row, col)).collect()).collect();
+            let workers = Workers::new(None).unwrap();
+            let control = Control::default();
+            let mut penalty = Penalty::new(Self::SHAPE, &weights, Self::TAU, &workers, &control);
+            penalty.turn_to(&beam, &weights, &workers);
+            Self { penalty, beam, differences, relative, workers }
+        }
+
+        /// G P, whose square times τ is the matrix of the penalty.
+        fn rows(&self) -> Vec<Vec<f64>> {
+            let of = |line: &Vec<f64>| {
+                let column = |col: usize| {
+                    line.iter().zip(&self.relative).map(|(g, row)| g * row[col]).sum::<f64>()
+                };
+                (0..42).map(column).collect()
+            };
+            self.differences.iter().map(of).collect()
+        }
+    }
+
+    /// Sums of some thousand products of size 100.
+    const ROUNDING: f64 = 1e-9;
+
+    fn square(rows: &[Vec<f64>], i: usize, j: usize) -> f64 {
+        Dense::TAU * rows.iter().map(|row| row[i] * row[j]).sum::<f64>()
+    }
+
+    #[test]
+    fn product_and_slope_are_those_of_the_dense_matrix() {
+        let dense = Dense::new();
+        let (rows, beam) = (dense.rows(), &dense.beam);
+        for cell in 0..42 {
+            let (mut unit, mut product) = (vec![0.0; 42], vec![0.0; 42]);
+            unit[cell] = 1.0;
+            dense.penalty.add_product(&unit, &mut product, &dense.workers);
+            for (other, value) in product.iter().enumerate() {
+                assert!((value - square(&rows, cell, other)).abs() < ROUNDING);
+            }
+        }
+        let bent: Vec<f64> = dense
+            .differences
+            .iter()
+            .map(|line| line.iter().zip(beam).map(|(g, a)| g * a).sum())
+            .collect();
+        let mut slope = vec![0.0; 42];
+        let objective = dense.penalty.pull(&mut slope, &dense.workers);
+        let energy: f64 = bent.iter().map(|difference| difference * difference).sum();
+        assert!((objective - Dense::TAU * energy).abs() < ROUNDING);
+        for (cell, slope) in slope.iter().enumerate() {
+            let wanted: f64 = rows.iter().zip(&bent).map(|(row, g)| row[cell] * g).sum();
+            assert!((slope + Dense::TAU * wanted).abs() < ROUNDING);
+        }
+    }
+
+    #[test]
+    fn draws_have_the_covariance_of_the_dense_matrix() {
+        let dense = Dense::new();
+        let rows = dense.rows();
+        // Each sign alone: draws of independent signs have the sum of these squares as covariance.
+        let draws: Vec<Vec<f64>> = (0..rows.len())
+            .map(|drawn| {
+                let (mut number, mut sums) = (0..rows.len(), vec![0.0; 42]);
+                let sign = || if number.next() == Some(drawn) { 1.0 } else { 0.0 };
+                dense.penalty.add_draw(&dense.beam, sign, &mut sums, &dense.workers);
+                sums
+            })
+            .collect();
+        for cell in 0..42 {
+            let mut elements = vec![0.0; 42];
+            dense.penalty.for_row(cell, |other, value| elements[other] += value);
+            for other in 0..42 {
+                let covariance: f64 = draws.iter().map(|draw| draw[cell] * draw[other]).sum();
+                assert!((covariance - square(&rows, cell, other)).abs() < ROUNDING);
+                let element = square(&dense.differences, cell, other);
+                assert!((elements[other] - element).abs() < ROUNDING);
+            }
+        }
     }
 }

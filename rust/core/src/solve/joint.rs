@@ -284,6 +284,7 @@ fn fit<T: Real>(
         beam: Beam {
             values: joint::values_at_cells(system),
             coefficients: joint::coefficients(system),
+            tilt: [0.0; 2],
             shape: grid.beam,
             origin: grid.origin,
         },

@@ -43,7 +43,7 @@ const TYPICAL: u64 = 60;
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
 /// 0 sweeps, [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
-pub(super) fn minimise<'m, 'a, T: Real>(
+pub(crate) fn minimise<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
     options: &Options,
     start: Option<&Solution<'_>>,

@@ -50,7 +50,7 @@ pub(super) fn minimise<T: Real>(
     let Geometry { beam: shape, origin, .. } = *exposures.geometry();
     let fit = Fit {
         sensitivity,
-        beam: Beam { values, coefficients: None, shape, origin },
+        beam: Beam { values, coefficients: None, tilt: [0.0; 2], shape, origin },
         flux: exposures.flux().to_vec(),
         shifts: exposures.positions().shifts.clone(),
         offset: None,

@@ -2,12 +2,13 @@
 
 use std::ops::Range;
 
-use super::kernel::{Line, STRETCH, Scratch, improve, measure, quotient};
+use super::kernel::{STRETCH, Scratch, improve, measure, quotient};
+use super::lines::{BeamRow, darkest, pixel_lines};
 use crate::control::Control;
 use crate::error::Result;
-use crate::exposures::{Exposures, Stretch};
+use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
-use crate::geometry::{Placement, View};
+use crate::geometry::View;
 use crate::median::median;
 use crate::padded::Padding;
 use crate::parallel::Workers;
@@ -92,7 +93,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         slopes: &mut [f32],
         control: &Control,
     ) -> Result<f64> {
-        let padding = Padding::of(&self.exposures.geometry());
+        let padding = Padding::of(self.exposures.geometry());
         let body = padding.body_mut(slopes);
         self.with_best_beam(control, |estimate, rows| {
             let body = &mut body[rows.start * padding.width..rows.end * padding.width];
@@ -317,7 +318,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     /// M ← M + share·x, for an `x` that lies as [`slopes`](Self::slopes) does.
     pub(crate) fn advance(&mut self, x: &[f32], share: f64) {
         let cols = self.exposures.sensor().cols;
-        let padding = Padding::of(&self.exposures.geometry());
+        let padding = Padding::of(self.exposures.geometry());
         self.workers.map_blocks(&mut self.sensitivity, cols, |row, pixels| {
             for (m, &x) in pixels.iter_mut().zip(padding.row(x, row)) {
                 *m += share * f64::from(x);
@@ -331,27 +332,6 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     }
 }
 
-/// The least y/c of each pixel of a row; infinite without measurement.
-fn darkest<T: Real>(exposures: &Exposures<'_, T>, row: usize, scratch: &mut [f64]) -> Vec<f64> {
-    let mut least = vec![f64::INFINITY; scratch.len()];
-    for (exposure, flux) in exposures.flux().iter().enumerate() {
-        match exposures.stretch(exposure, row, 0..least.len(), scratch) {
-            Stretch::Uniform(values, _) => {
-                for (least, value) in least.iter_mut().zip(values) {
-                    *least = least.min(value.to_f64() / flux);
-                }
-            }
-            Stretch::Weighted(values, weights) => {
-                for ((least, value), &weight) in least.iter_mut().zip(values).zip(weights) {
-                    let value = if weight > 0.0 { value.to_f64() / flux } else { f64::INFINITY };
-                    *least = least.min(value);
-                }
-            }
-        }
-    }
-    least
-}
-
 /// Copies `beam` into the orientation of `view`.
 fn turn(view: &View, beam: &[f64], turned: &mut [f64], workers: &Workers) {
     workers.map_blocks(turned, view.shape.cols, |row, cells| {
@@ -359,87 +339,4 @@ fn turn(view: &View, beam: &[f64], turned: &mut [f64], workers: &Workers) {
             *cell = beam[view.cells.at(row, col)];
         }
     });
-}
-
-/// The exposures along a stretch of a row of pixels, with the beam that they see.
-fn pixel_lines<'s, T: Real>(
-    exposures: &Exposures<'s, T>,
-    beams: &'s [Vec<f64>],
-    row: usize,
-    cols: Range<usize>,
-    scratch: &'s mut Scratch,
-) -> Vec<Line<'s, T>> {
-    let places = exposures.geometry().placements.iter().zip(exposures.flux()).enumerate();
-    places
-        .zip(&mut scratch.weights)
-        .map(|((exposure, (place, &flux)), weights)| {
-            let view_cols = exposures.geometry().views[place.view].shape.cols;
-            let first = (row + place.row) * view_cols + place.col + cols.start;
-            let known = &beams[place.view][first..][..cols.len()];
-            Line { measured: exposures.stretch(exposure, row, cols.clone(), weights), known, flux }
-        })
-        .collect()
-}
-
-/// One row of beam cells, in one view, and what the exposures there see of it.
-struct BeamRow<'r, 'a, T> {
-    exposures: &'r Exposures<'a, T>,
-    sensitivity: &'r [f64],
-    view: usize,
-    row: usize,
-}
-
-impl<T: Real> BeamRow<'_, '_, T> {
-    /// Calls `work(lines, cells)` for each stretch of cells that the same exposures see.
-    fn for_each_stretch(
-        &self,
-        scratch: &mut Scratch,
-        mut work: impl FnMut(&[Line<'_, T>], Range<usize>),
-    ) {
-        let edges = self.edges();
-        for pair in edges.windows(2) {
-            for start in (pair[0]..pair[1]).step_by(STRETCH) {
-                let cells = start..(start + STRETCH).min(pair[1]);
-                let lines = self.lines(cells.clone(), scratch);
-                work(&lines, cells);
-            }
-        }
-    }
-
-    /// Where windows of exposures begin and end along the row, rising.
-    fn edges(&self) -> Vec<usize> {
-        let cols = self.exposures.sensor().cols;
-        let ends = self.seeing().flat_map(|(_, place)| [place.col, place.col + cols]);
-        let mut edges: Vec<usize> = ends.collect();
-        edges.sort_unstable();
-        edges.dedup();
-        edges
-    }
-
-    /// The exposures whose windows reach this row.
-    fn seeing(&self) -> impl Iterator<Item = (usize, &Placement)> {
-        let rows = self.exposures.sensor().rows;
-        let places = self.exposures.geometry().placements.iter().enumerate();
-        places.filter(move |(_, place)| {
-            place.view == self.view && (place.row..place.row + rows).contains(&self.row)
-        })
-    }
-
-    /// The exposures that see `cells`, with the sensitivities of the pixels that do.
-    fn lines<'s>(&'s self, cells: Range<usize>, scratch: &'s mut Scratch) -> Vec<Line<'s, T>> {
-        let cols = self.exposures.sensor().cols;
-        let seeing = self
-            .seeing()
-            .filter(|(_, place)| place.col <= cells.start && cells.end <= place.col + cols);
-        seeing
-            .zip(&mut scratch.weights)
-            .map(|((exposure, place), weights)| {
-                let row = self.row - place.row;
-                let pixels = cells.start - place.col..cells.end - place.col;
-                let known = &self.sensitivity[row * cols..][pixels.clone()];
-                let measured = self.exposures.stretch(exposure, row, pixels, weights);
-                Line { measured, known, flux: self.exposures.flux()[exposure] }
-            })
-            .collect()
-    }
 }

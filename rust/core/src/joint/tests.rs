@@ -1,0 +1,143 @@
+//! The rim against dense algebra.
+
+use super::flux::Fluxes;
+use super::layout::Grid;
+use super::rim::Rim;
+use super::system::System;
+use super::unknowns::State;
+use crate::control::Control;
+use crate::exposures::{Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
+use crate::frames::{Shape, Stack};
+use crate::geometry::Rotation;
+use crate::parallel::Workers;
+
+const SENSOR: Shape = Shape::new(9, 11);
+const ROTATIONS: [Rotation; 4] =
+    [Rotation::None, Rotation::Quarter, Rotation::Half, Rotation::ThreeQuarters];
+const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [0.3, 2.2], [-1.6, 0.7], [2.4, 1.5]];
+
+/// A number from 0 to 1 that looks random.
+fn random(index: usize) -> f64 {
+    ((index as f64 * 12.9898).sin() * 43758.5453).rem_euclid(1.0)
+}
+
+/// Variances, and what is masked.
+fn uneven() -> (Vec<f64>, Vec<bool>) {
+    let each = 0..ROTATIONS.len() * SENSOR.len();
+    (each.clone().map(|i| 0.5 + random(i)).collect(), each.map(|i| random(i + 999) < 0.1).collect())
+}
+
+/// Calls `visit` with the linear problem of a sensor that is turned every way, and its dense N.
+fn with_system(visit: impl FnOnce(&System<'_, '_, f64>, &[Vec<f64>])) {
+    let (variance, mask) = uneven();
+    let frames: Vec<f64> = (0..mask.len()).map(|i| 1.0 + 0.1 * random(i + 5000)).collect();
+    let flux = [1.0, 1.1, 0.9, 1.2];
+    let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+    let stack = |values| Stack::new("frames", values, ROTATIONS.len(), SENSOR).unwrap();
+    let measurements = Measurements {
+        frames: stack(&frames),
+        variance: Variance::Measurements(stack(&variance)),
+        mask: Mask::Measurements(&mask),
+    };
+    let positions = Positions { shifts: SHIFTS.to_vec(), rotations: ROTATIONS.to_vec(), std: None };
+    let lamp = Flux { values: flux.to_vec(), kind: FluxKind::Known };
+    let exposures =
+        Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
+    let grid = Grid::new(SENSOR, &SHIFTS, &ROTATIONS, false).unwrap();
+    let fluxes = Fluxes::new(&flux, &FluxKind::Known, &SHIFTS, &ROTATIONS);
+    let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
+    let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
+    let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control);
+    system.linearise(&control).unwrap();
+    let normal = dense(&system, &flux, &variance, &mask);
+    visit(&system, &normal);
+}
+
+/// N: the sum of w c² M² B_i B_j over the measurements.
+fn dense(
+    system: &System<'_, '_, f64>,
+    flux: &[f64],
+    variance: &[f64],
+    mask: &[bool],
+) -> Vec<Vec<f64>> {
+    let cells = system.state.beam.len();
+    let [sensitivity, _] = system.pixels();
+    let mut normal = vec![vec![0.0; cells]; cells];
+    for at in (0..mask.len()).filter(|&at| !mask[at]) {
+        let (k, pixel) = (at / SENSOR.len(), at % SENSOR.len());
+        let gain = flux[k] * sensitivity[pixel];
+        let seen = taps(system, k, pixel);
+        for &(i, a) in &seen {
+            for &(j, b) in &seen {
+                normal[i][j] += gain * gain * a * b / variance[at];
+            }
+        }
+    }
+    normal
+}
+
+/// The cells that a pixel sees, with B: of the cubic B-spline at A p + t + d.
+fn taps(system: &System<'_, '_, f64>, exposure: usize, pixel: usize) -> Vec<(usize, f64)> {
+    let [r, c] = [(pixel / SENSOR.cols) as f64, (pixel % SENSOR.cols) as f64];
+    let [last_row, last_col] = [SENSOR.rows as f64 - 1.0, SENSOR.cols as f64 - 1.0];
+    let p = match ROTATIONS[exposure] {
+        Rotation::None => [r, c],
+        Rotation::Quarter => [c, last_row - r],
+        Rotation::Half => [last_row - r, last_col - c],
+        Rotation::ThreeQuarters => [last_col - c, r],
+    };
+    let geometry = &system.pass.grid.geometry;
+    let u = [0, 1].map(|axis| p[axis] + SHIFTS[exposure][axis] + geometry.origin[axis] as f64);
+    let b = |x: f64| match x.abs() {
+        t if t < 1.0 => 2.0 / 3.0 - t * t + t * t * t / 2.0,
+        t if t < 2.0 => (2.0 - t).powi(3) / 6.0,
+        _ => 0.0,
+    };
+    let Shape { cols, .. } = geometry.beam;
+    let each = (0..geometry.beam.len())
+        .map(|cell| (cell, b(u[0] - (cell / cols) as f64) * b(u[1] - (cell % cols) as f64)));
+    each.filter(|(_, b)| *b > 0.0).collect()
+}
+
+#[test]
+fn the_rim_is_where_a_cell_near_has_less_than_a_sixth() {
+    with_system(|system, normal| {
+        let Shape { rows, cols } = system.pass.grid.geometry.beam;
+        // D = Σ w c² M² B, the sum of a row of N, since all B of a pixel sum to 1.
+        let weight = |row: usize, col: usize| normal[row * cols + col].iter().sum::<f64>();
+        let is_rim = |cell: usize| {
+            let (row, col) = (cell / cols, cell % cols);
+            let near = |at: usize, size: usize| (at + 1).saturating_sub(3)..(at + 3).min(size);
+            let inside = row >= 2 && col >= 2 && row + 2 < rows && col + 2 < cols;
+            let mut around = near(row, rows).flat_map(|r| near(col, cols).map(move |c| (r, c)));
+            let own = weight(row, col);
+            own > 0.0 && (!inside || around.any(|(r, c)| weight(r, c) < own / 6.0))
+        };
+        let rim = Rim::new(system, &Control::new()).unwrap();
+        let mut found: Vec<usize> = rim.cells().collect();
+        found.sort_unstable();
+        assert!(found == (0..rows * cols).filter(|&cell| is_rim(cell)).collect::<Vec<_>>());
+    });
+}
+
+#[test]
+fn on_the_rim_the_normal_matrix_is_inverted() {
+    with_system(|system, normal| {
+        let rim = Rim::new(system, &Control::new()).unwrap();
+        let cells: Vec<usize> = rim.cells().collect();
+        let right: Vec<f64> = (0..normal.len()).map(|cell| random(cell + 77) - 0.5).collect();
+        let mut found = vec![0.0; normal.len()];
+        rim.add(&right, &mut found, system.pass.workers);
+        for &cell in &cells {
+            let mut row = normal[cell].clone();
+            let penalty = system.penalty.as_ref().unwrap();
+            penalty.for_row(cell, |other, value| row[other] += value);
+            let terms = || cells.iter().map(|&other| row[other] * found[other]);
+            let size: f64 = terms().map(f64::abs).sum();
+            // A ridge of 1e-10 of the diagonal is added to N.
+            assert!((terms().sum::<f64>() - right[cell]).abs() < 1e-9 * size);
+        }
+        let outside = (0..normal.len()).filter(|cell| !cells.contains(cell));
+        assert!(outside.into_iter().all(|cell| found[cell] == 0.0));
+    });
+}

@@ -1,0 +1,322 @@
+//! Error bars against the dense covariance.
+
+#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
+
+mod common;
+mod dense;
+mod simulation;
+
+use common::{
+    Answer, ErrorMap, Experiment, Lamp, Noise, Options, error_map, fit, offset_variances,
+    shift_variances, variances,
+};
+use dense::covariance::Covariance;
+use simulation::{
+    BETWEEN, CROSS, DRIFT, LONG, SHIFT_STD, SMALL, Simulation, TIMES, TURNED, random, rolling,
+    smooth,
+};
+
+const TOLERANCE: f64 = 1e-8;
+/// What the variance of a functional may lack of it.
+const LACK: f64 = 1e-4;
+/// What rounding adds: sums in single precision, of a problem whose condition is some hundred.
+const SINGLE: f64 = 1e-5;
+/// The relative standard error that a map is made to, and the most draws that it takes.
+const EXACTNESS: f64 = 0.02;
+const MOST_DRAWS: f64 = 400.0;
+
+/// An answer with its covariance.
+struct Case {
+    experiment: Experiment,
+    answer: Answer,
+    covariance: Covariance,
+}
+
+impl Case {
+    fn new(experiment: Experiment) -> Self {
+        let answer = fit(&experiment, Options::to(TOLERANCE)).unwrap();
+        assert!(answer.converged);
+        let unit = match experiment.noise {
+            Noise::Unknown => answer.misfit / answer.degrees_of_freedom as f64,
+            _ => 1.0,
+        };
+        let covariance = Covariance::of(&experiment, &answer, unit).unwrap();
+        Self { experiment, answer, covariance }
+    }
+
+    fn known(&self) -> impl Iterator<Item = usize> + Clone {
+        let known = |pixel: &usize| self.answer.sensitivity[*pixel].is_finite();
+        (0..self.covariance.pixels).filter(known)
+    }
+
+    /// The variances of functionals are the dense ones, less what they may lack.
+    fn check_functionals(&self, functionals: &[Vec<f64>]) {
+        let found = variances(&self.experiment, &self.answer, functionals, 1).unwrap();
+        assert!(found.len() == functionals.len());
+        for (found, functional) in found.iter().zip(functionals) {
+            check_ratio(found / self.covariance.variance(functional));
+        }
+    }
+
+    /// A functional of every pixel, of one, and of a quarter of the sensor: 0 where M is undetermined.
+    fn functionals(&self) -> [Vec<f64>; 3] {
+        let [rows, cols] = self.experiment.shape;
+        let image = |weight: &dyn Fn(usize) -> f64| -> Vec<f64> {
+            let mut image = vec![0.0; self.covariance.pixels];
+            self.known().for_each(|pixel| image[pixel] = weight(pixel));
+            image
+        };
+        let quarter = |pixel: usize| 2 * (pixel / cols) < rows && 2 * (pixel % cols) < cols;
+        [
+            image(&|pixel| random(70, pixel)),
+            image(&|pixel| if pixel == cols + 2 { 3.0 } else { 0.0 }),
+            image(&|pixel| if quarter(pixel) { 1.0 } else { 0.0 }),
+        ]
+    }
+
+    /// A map is made of draws, whose covariance between the pixels follows from the part R of Cov M that is
+    /// drawn: a mean over n draws of squares of normal values scatters by 2 R²/n. So relative errors of the
+    /// deviations scatter by C = R²/(2 n v v), v being the variances; their mean and their mean square must
+    /// be those of such errors.
+    fn check_map(&self) {
+        let map = error_map(&self.experiment, &self.answer, 1).unwrap();
+        let undetermined = map.std.iter().zip(&self.answer.sensitivity);
+        assert!(undetermined.clone().all(|(std, m)| std.is_finite() == m.is_finite()));
+        let error = |pixel: usize| {
+            let variance = self.covariance.std(pixel).powi(2);
+            0.5 * (map.std[pixel].powi(2) / variance - 1.0)
+        };
+        let count = self.known().count() as f64;
+        let mean = self.known().map(error).sum::<f64>() / count;
+        let square = self.known().map(|pixel| error(pixel).powi(2)).sum::<f64>() / count;
+        let [trace, sum, squares] = self.scatter(&map);
+        // Four standard errors; six of the mean square, which a few patterns may make.
+        assert!(mean.abs() <= 4.0 * sum.sqrt() / count, "the map is off by {mean}");
+        let limit = trace / count + 6.0 * (2.0 * squares).sqrt() / count;
+        assert!(square <= limit, "the map is off by {} rms", square.sqrt());
+        // It says so itself, as far as so many draws tell their own scatter.
+        let draws = map.draws as f64;
+        let stated = map.exactness / (trace / count).sqrt();
+        assert!((stated - 1.0).abs() <= 4.0 / draws.sqrt(), "{stated}");
+        assert!(map.exactness <= EXACTNESS || draws >= MOST_DRAWS);
+    }
+
+    /// The trace of C, the sum of its elements, and that of their squares.
+    fn scatter(&self, map: &ErrorMap) -> [f64; 3] {
+        let Covariance { pixels, drawn, .. } = &self.covariance;
+        let element = |p: usize, q: usize| {
+            let size = self.covariance.std(p) * self.covariance.std(q);
+            (drawn[p * pixels + q] / size).powi(2) / (2.0 * map.draws as f64)
+        };
+        let pairs = || self.known().flat_map(|p| self.known().map(move |q| (p, q)));
+        [
+            self.known().map(|p| element(p, p)).sum(),
+            pairs().map(|(p, q)| element(p, q)).sum(),
+            pairs().map(|(p, q)| element(p, q).powi(2)).sum(),
+        ]
+    }
+}
+
+/// A variance by the dense one: what it may lack, and rounding.
+fn check_ratio(ratio: f64) {
+    assert!((1.0 - LACK..=1.0 + SINGLE).contains(&ratio), "{ratio}");
+}
+
+fn noisy(shape: [usize; 2], shifts: &[[f64; 2]]) -> Simulation {
+    Simulation::new(shape, shifts).with_noise(1e-3, 3)
+}
+
+fn given(shifts: &[[f64; 2]], degrees: &[i64]) -> Experiment {
+    noisy(SMALL, shifts).with_flux(&DRIFT).turned(degrees).experiment()
+}
+
+/// Both with even weights, and with uneven ones and gaps.
+fn both(experiment: Experiment) -> [Experiment; 2] {
+    [experiment.clone(), experiment.uneven()]
+}
+
+fn refined(std: &[[f64; 2]], degrees: &[i64]) -> Experiment {
+    let simulation = noisy(LONG, &BETWEEN).with_noise(1e-4, 3).turned(degrees);
+    Simulation { beam: rolling, ..simulation }.experiment().measured_to(std)
+}
+
+/// A beam by which shifts cannot be refined.
+fn considered() -> Experiment {
+    let simulation = Simulation { beam: smooth, ..noisy(SMALL, &BETWEEN) };
+    simulation.experiment().measured_to(&[
+        [2e-3; 2],
+        [1e-3; 2],
+        [0.0, 1e-3],
+        [1e-3; 2],
+        [3e-3, 1e-3],
+    ])
+}
+
+fn check_all_functionals(experiments: impl IntoIterator<Item = Experiment>) {
+    for experiment in experiments {
+        let case = Case::new(experiment);
+        case.check_functionals(&case.functionals());
+    }
+}
+
+#[test]
+fn functionals_of_whole_pixels() {
+    check_all_functionals(both(noisy([4, 5], &CROSS).experiment()));
+    check_all_functionals(
+        [[0; 5], TURNED].into_iter().flat_map(|degrees| both(given(&CROSS, &degrees))),
+    );
+}
+
+#[test]
+fn functionals_of_given_fluxes() {
+    check_all_functionals(
+        [[0; 5], TURNED].into_iter().flat_map(|degrees| both(given(&BETWEEN, &degrees))),
+    );
+}
+
+#[test]
+fn functionals_of_free_fluxes() {
+    let cases = [
+        (CROSS, [0; 5]),
+        (CROSS, [270; 5]),
+        (CROSS, TURNED),
+        (BETWEEN, [90; 5]),
+        (BETWEEN, TURNED),
+    ];
+    for (shifts, degrees) in cases {
+        check_all_functionals(both(given(&shifts, &degrees).with_lamp(Lamp::Free)));
+    }
+}
+
+#[test]
+fn functionals_of_fluxes_with_a_prior() {
+    // Between pixels the penalty resists the tilt that a prior leaves open, which no error bar knows.
+    let std = vec![3e-4, 2e-4, 4e-4, 3e-4, 3e-4];
+    for (shifts, degrees) in [(CROSS, [0; 5]), (CROSS, [90; 5]), (CROSS, TURNED), (BETWEEN, TURNED)]
+    {
+        check_all_functionals(both(given(&shifts, &degrees).with_lamp(Lamp::Prior(std.clone()))));
+    }
+    let unknown = Experiment { noise: Noise::Unknown, ..given(&CROSS, &[0; 5]) };
+    check_all_functionals([unknown.with_lamp(Lamp::Prior(std))]);
+}
+
+#[test]
+fn functionals_of_a_drift_linear_in_time() {
+    let lamp = Lamp::Linear(TIMES.to_vec());
+    for (shifts, degrees) in
+        [(CROSS, [0; 5]), (CROSS, [270; 5]), (CROSS, TURNED), (BETWEEN, TURNED)]
+    {
+        check_all_functionals(both(given(&shifts, &degrees).with_lamp(lamp.clone())));
+    }
+    let raster = [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]];
+    for degrees in [0, 90] {
+        let experiment = noisy(SMALL, &raster).turned(&[degrees; 4]).experiment();
+        check_all_functionals(both(experiment.with_lamp(Lamp::Linear(vec![0.0, 1.0, 2.0, 3.0]))));
+    }
+}
+
+#[test]
+fn functionals_and_offsets_at_two_levels() {
+    for (shifts, degrees, lamp) in
+        [(CROSS, [0; 5], Lamp::Known), (BETWEEN, TURNED, Lamp::Known), (CROSS, [0; 5], Lamp::Free)]
+    {
+        let experiment = noisy(SMALL, &shifts).turned(&degrees).at_two_levels().experiment();
+        let experiment = if lamp == Lamp::Free { experiment.with_lamp(lamp) } else { experiment };
+        let case = Case::new(experiment);
+        case.check_functionals(&case.functionals());
+        let [along, alone] = offset_variances(&case.experiment, &case.answer, 1).unwrap();
+        check_ratio(along / case.covariance.along);
+        // Sums of ten terms, in a determinant that loses ten times as much.
+        assert!((alone / case.covariance.alone - 1.0).abs() < 1e3 * f64::EPSILON);
+    }
+}
+
+fn check_refined(std: &[[f64; 2]], degrees: &[i64]) {
+    for experiment in both(refined(std, degrees)) {
+        let case = Case::new(experiment);
+        assert!(case.answer.refined);
+        case.check_functionals(&case.functionals());
+        let found = shift_variances(&case.experiment, &case.answer, 1).unwrap();
+        let wanted = case.covariance.of_shifts.as_flattened();
+        for (found, wanted) in found.as_flattened().iter().zip(wanted) {
+            check_ratio(found / wanted);
+        }
+    }
+}
+
+#[test]
+fn functionals_and_shifts_after_refining() {
+    // Priors that know the shifts about as well as the beam does.
+    let std = [[0.0; 2], [3e-4; 2], [1e-4, 3e-4], [3e-4; 2], [2e-4; 2]];
+    check_refined(&std, &[0; 5]);
+    check_refined(&std, &[0, 90, 180, 0, 0]);
+}
+
+#[test]
+#[ignore = "open: a search ends before it has found a direction that shifts and M hardly determine together, \
+            and the variance lacks up to 91 %"]
+fn functionals_and_shifts_after_refining_from_afar() {
+    check_refined(&SHIFT_STD, &[0; 5]);
+    check_refined(&SHIFT_STD, &[0, 90, 180, 0, 0]);
+}
+
+#[test]
+#[ignore = "open: one functional of six lacks 1.13e-4 of its variance, above 1e-4"]
+fn functionals_of_a_drift_linear_in_time_between_pixels() {
+    let experiment = given(&BETWEEN, &[0; 5]);
+    check_all_functionals(both(experiment.with_lamp(Lamp::Linear(TIMES.to_vec()))));
+}
+
+#[test]
+fn functionals_of_shifts_that_are_wrong_by_their_prior() {
+    for experiment in both(considered()) {
+        let case = Case::new(experiment);
+        assert!(!case.answer.refined);
+        case.check_functionals(&case.functionals());
+    }
+}
+
+#[test]
+fn maps_of_whole_pixels() {
+    for experiment in both(noisy([4, 5], &CROSS).experiment()) {
+        Case::new(experiment).check_map();
+    }
+    for degrees in [[0; 5], TURNED] {
+        Case::new(given(&CROSS, &degrees).uneven()).check_map();
+    }
+}
+
+#[test]
+fn maps_of_free_fluxes_and_drifts() {
+    Case::new(given(&CROSS, &[90; 5]).with_lamp(Lamp::Free).uneven()).check_map();
+    Case::new(given(&CROSS, &[0; 5]).with_lamp(Lamp::Linear(TIMES.to_vec()))).check_map();
+}
+
+#[test]
+fn maps_of_fluxes_with_a_prior() {
+    let std = vec![3e-4, 2e-4, 4e-4, 3e-4, 3e-4];
+    for degrees in [[0; 5], TURNED] {
+        Case::new(given(&CROSS, &degrees).with_lamp(Lamp::Prior(std.clone())).uneven()).check_map();
+    }
+}
+
+#[test]
+fn a_map_of_fractional_shifts_with_all_rotations() {
+    Case::new(given(&BETWEEN, &TURNED).uneven()).check_map();
+}
+
+#[test]
+fn a_map_at_two_levels() {
+    let experiment = noisy(SMALL, &BETWEEN).at_two_levels().experiment();
+    Case::new(experiment.uneven()).check_map();
+}
+
+#[test]
+fn a_map_after_refining() {
+    Case::new(refined(&SHIFT_STD, &[0; 5])).check_map();
+}
+
+#[test]
+fn a_map_of_shifts_that_are_wrong_by_their_prior() {
+    Case::new(considered()).check_map();
+}

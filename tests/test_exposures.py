@@ -1,0 +1,149 @@
+"""The nouns of the input: exposures, their positions and fluxes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.errors import InputError
+from equipix.exposures.flux import Flux
+from equipix.exposures.front import exposures_of
+from equipix.exposures.options import FitOptions
+from equipix.exposures.positions import Positions, in_beam, variance_in_beam
+
+SHAPE = (9, 14)
+TURNS = (0, 90, 180, 270)
+SHIFTS = [(0.0, 0.0), (1.5, -2.25), (3.0, 4.0), (-2.0, 0.5)]
+
+
+def grid(turn):
+    """Row and column of each cell that a turned sensor at shift 0 sees."""
+    rows, cols = SHAPE if turn % 180 == 0 else SHAPE[::-1]
+    return [np.rot90(axis, turn // 90) for axis in np.indices((rows, cols))]
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_pixel_sees_the_cell_that_a_turned_window_shows_it(turn):
+    seen = grid(turn)
+    for pixel in np.ndindex(SHAPE):
+        assert in_beam(pixel, turn, SHAPE).tolist() == [axis[pixel] for axis in seen]
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_variances_turn_with_the_axes(turn):
+    rng = np.random.default_rng(1)
+    spots = rng.normal(0, (0.1, 0.3), (4000, 2))
+    turned = np.array([in_beam(spot, turn, SHAPE) for spot in spots])
+    found = variance_in_beam(spots.var(axis=0), turn)
+    # The same numbers in another order, and a constant added to them.
+    np.testing.assert_allclose(found, turned.var(axis=0), rtol=1e-10)
+
+
+def test_a_window_sees_what_its_pixels_saw():
+    positions = Positions.of(SHIFTS, rotation=TURNS)
+    first, sizes = np.array([2, 5]), np.array([4, 6])
+    part = positions.of_window(first, sizes, SHAPE)
+    offsets = []
+    for k, turn in enumerate(TURNS):
+        for pixel in np.ndindex(*sizes):
+            whole = in_beam(np.add(pixel, first), turn, SHAPE) + positions.shifts[k]
+            own = in_beam(pixel, turn, tuple(sizes)) + part.shifts[k]
+            offsets.append(whole - own)
+    # One displacement of the beam, by whole cells, for all exposures and pixels.
+    np.testing.assert_array_equal(offsets, np.broadcast_to(offsets[0], np.shape(offsets)))
+    np.testing.assert_array_equal(offsets[0], np.rint(offsets[0]))
+
+
+def test_a_window_of_exposures_has_the_sensitivity_of_its_part():
+    rng = np.random.default_rng(2)
+    shape, shifts = (48, 56), equipix.cross_pattern(5, 7)
+    truth = simulate.paper_sensitivity(shape, rng=rng)
+    turns = [0, 90, 0, 180, 270]
+    frames = simulate.exposures(truth, simulate.wavy_beam(shape, rng=3), shifts, rotation=turns)
+    exposures = exposures_of(frames, shifts, rotation=turns)
+    fit = exposures.window(32).fit(FitOptions(tolerance=1e-8))
+    part = truth[8:40, 12:44]
+    np.testing.assert_allclose(fit.sensitivity, part / part.mean(), rtol=1e-7)
+
+
+def test_reversed_exposures_differ_in_the_sign_of_shifts_alone():
+    exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2.5)])
+    other = exposures.reversed()
+    np.testing.assert_array_equal(other.positions.shifts, -exposures.positions.shifts)
+    assert other.values is exposures.values
+    np.testing.assert_array_equal(other.reversed().positions.shifts, exposures.positions.shifts)
+
+
+def test_masks_add_up():
+    exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2)], mask=np.eye(8, 9) > 0)
+    more = np.zeros((3, 8, 9), bool)
+    more[1, 2, 3] = True
+    usable = exposures.without(more).usable()
+    assert not usable[1, 2, 3]
+    assert not usable[:, range(8), range(8)].any()
+    assert np.count_nonzero(~usable) == 25
+
+
+def test_a_start_at_the_solution_saves_passes_and_keeps_the_answer():
+    rng = np.random.default_rng(4)
+    shape, shifts = (60, 80), equipix.cross_pattern(7, 11) + rng.uniform(-0.4, 0.4, (5, 2))
+    truth = simulate.cosine_sensitivity(shape, rng=rng)
+    frames = simulate.exposures(truth, simulate.wavy_beam(shape, rng=3), shifts)
+    frames += 1e-3 * rng.standard_normal(frames.shape)
+    options = FitOptions(tolerance=1e-6)
+    for places in (np.rint(shifts), shifts):
+        exposures = exposures_of(frames, places)
+        cold = exposures.fit(options)
+        warm = exposures.fit(options, cold)
+        assert warm.ended == "converged"
+        assert warm.sweeps[-1] < 0.8 * cold.sweeps[-1]
+        # Each is within the tolerance of the minimum, as estimated: three times for the estimate.
+        np.testing.assert_allclose(warm.sensitivity, cold.sensitivity, rtol=3 * 2 * 1e-6)
+
+
+def test_exposures_cannot_be_changed():
+    exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2)])
+    for noun, name in (
+        (exposures, "values"),
+        (exposures.flux, "kind"),
+        (exposures.positions, "std"),
+    ):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(noun, name, None)
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "model"),
+    [
+        ({}, "known", []),
+        ({"flux": [1, 2, 3]}, "known", []),
+        ({"flux": [1, 2, 3], "flux_std": 0.1}, "prior", [0.1, 0.1, 0.1]),
+        ({"flux": "fit"}, "fit", []),
+        ({"flux": "linear", "time": [0, 5, 9]}, "linear", [0.0, 5.0, 9.0]),
+    ],
+)
+def test_fluxes_are_of_one_kind(given, kind, model):
+    flux = Flux.of(*(given.get(name) for name in ("flux", "flux_std", "time")), 3)
+    assert flux.model == (kind, model)
+    free = flux.free(np.array([1.0, 2.0, 3.0]))
+    assert free.model == ("fit", [])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"flux": "free"}, "'flux' is 'free', expected numbers, 'fit' or 'linear'"),
+        ({"flux": "fit", "flux_std": 0.1}, "'flux_std' goes with fluxes that are given"),
+        ({"flux": "linear"}, "'time' and flux='linear' go together"),
+        ({"time": [1, 2, 3]}, "'time' is given but 'flux' is not 'linear'"),
+        ({"flux": "linear", "time": [1, 1, 1]}, "not all the same"),
+        ({"flux_std": 0.0}, "expected positive numbers"),
+    ],
+)
+def test_fluxes_that_do_not_go_together_are_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        Flux.of(*(given.get(name) for name in ("flux", "flux_std", "time")), 3)
