@@ -444,8 +444,8 @@ class TestPlan:
         ("arguments", "words"),
         [
             (("--max-shift", 9, 9, "--noise", "nan"), "'noise' is nan"),
-            ((), "give either --shifts"),
-            (("--shifts", CROSS, "--max-shift", 9, 9), "give either --shifts"),
+            ((), "give either '--shifts'"),
+            (("--shifts", CROSS, "--max-shift", 9, 9), "give either '--shifts'"),
             (("--shifts", "0,0 5"), "'--shifts' is '0,0 5'"),
             (("--shifts", CROSS, "-o", "plan.doc"), "plan.doc"),
         ],

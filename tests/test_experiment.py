@@ -229,7 +229,11 @@ def test_real_input(data_dir):
         ("[sensor]", "[sensro]", r"unknown key 'sensro'"),
         ("bit_depth", "bits", r"unknown key 'bits' in \[sensor\]"),
         ('name = "p1"', 'name = "p1"\nshift_std = 1', r"'shift_std' in exposure 1 \('p1'\)"),
-        ('name = "p1"', 'name = "p1"\nflux_std = 1', r"'flux_std' goes with 'flux' in exposure 1"),
+        (
+            'name = "p1"',
+            'name = "p1"\nflux_std = 1',
+            r"'flux_std' is given without 'flux' in exposure 1",
+        ),
         (
             'name = "p1"',
             'name = "p1"\ntime = 1',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import warnings
 from pathlib import Path
@@ -24,6 +25,17 @@ CASES = {
     "between pixels": {"shifts": BETWEEN},
     "between pixels, turned": {"shifts": BETWEEN, "rotation": [0, 90, 0, 180, 270]},
     "free fluxes": {"flux": "fit"},
+    "free fluxes between pixels": {"shifts": BETWEEN, "flux": "fit"},
+    "linear fluxes between pixels": {
+        "shifts": BETWEEN,
+        "flux": "linear",
+        "time": [0.0, 30.0, 10.0, 20.0, 40.0],
+    },
+    "free fluxes between pixels, turned": {
+        "shifts": BETWEEN,
+        "flux": "fit",
+        "rotation": [0, 0, 0, 0, 180],
+    },
     "prior fluxes": {"flux": np.ones(5), "flux_std": 1e-3, "shifts": BETWEEN},
     "refined": {"shifts": BETWEEN, "shift_std": 0.05},
     "dark fitted": {"flux": np.array([1.0, 1.6, 1.0, 1.6, 1.0]), "dark": "fit"},
@@ -70,7 +82,7 @@ def squares_of(cal, frames, variance, mask):
 def test_residuals_are_those_that_were_minimised(case, masked):
     cal, frames, variance, mask = calibrated(case, masked=masked)
     total, residuals = squares_of(cal, frames, variance, mask)
-    freedom = cal.objective / cal.reduced_chi2
+    freedom = cal.weighted.fit.degrees_of_freedom
     # A prediction is rounded by eps of itself, M by eps of its dtype; each of N residuals r changes
     # F by 2 r δ, and the roundings add up at random: 2 √F δ, ten of these, besides those of a sum.
     precision = np.finfo(cal.sensitivity.dtype).eps
@@ -80,8 +92,38 @@ def test_residuals_are_those_that_were_minimised(case, masked):
     assert total == pytest.approx(cal.reduced_chi2 * freedom, rel=tolerance)
 
 
+def test_the_degrees_of_freedom_are_measurements_less_unknowns():
+    """At whole shifts: M of each pixel, L of each cell seen, less one for the scale."""
+    cal, *_, mask = calibrated("whole", masked=True)
+    seen = np.zeros(cal.beam.shape, bool)
+    for (row, col), masked in zip(CROSS.astype(int) + cal.beam_origin, mask, strict=True):
+        seen[row : row + SHAPE[0], col : col + SHAPE[1]] |= ~masked
+    unknowns = np.count_nonzero(~mask.all(axis=0)) + np.count_nonzero(seen) - 1
+    assert cal.weighted.fit.degrees_of_freedom == np.count_nonzero(~mask) - unknowns
+
+
+def test_a_tilt_that_the_gauge_removes_goes_to_the_beam():
+    """M with a steep slope and free fluxes: the residuals are still those that were minimised."""
+    rng = np.random.default_rng(5)
+    slope = np.linspace(-0.5, 0.5, SHAPE[1])
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng) * np.exp(slope)
+    frames = simulate.exposures(truth, simulate.wavy_beam(SHAPE, rng=3), BETWEEN)
+    frames += 1e-4 * rng.standard_normal(frames.shape)
+    variance = np.full(5, 1e-8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", equipix.errors.EquipixWarning)
+        cal = equipix.calibrate(frames, BETWEEN, variance=variance, flux="fit")
+    assert np.abs(cal.beam_tilt * SHAPE).max() > 0.5
+    total, _ = squares_of(cal, frames, variance, np.zeros(frames.shape, bool))
+    # Predictions of size 1.6 rounded by eps, over the standard deviation 1e-4, as above.
+    rounding = np.finfo(float).eps * np.abs(frames).max() / 1e-4
+    assert total == pytest.approx(cal.objective, rel=20 * rounding / np.sqrt(cal.objective) + 1e-11)
+
+
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
-@pytest.mark.parametrize("case", ["whole", "turned", "refined", "dark fitted", "float32"])
+@pytest.mark.parametrize(
+    "case", ["whole", "turned", "refined", "free fluxes between pixels", "dark fitted", "float32"]
+)
 def test_a_loaded_calibration_predicts_the_same_bytes(case, suffix, tmp_path):
     cal, frames, variance, _ = calibrated(case)
     cal.save(tmp_path / f"cal{suffix}")
@@ -94,12 +136,19 @@ def test_a_loaded_calibration_predicts_the_same_bytes(case, suffix, tmp_path):
     assert read.verdicts == cal.verdicts
 
 
+def test_a_copy_keeps_the_fit():
+    cal, *_ = calibrated("whole")
+    weights = np.zeros(SHAPE)
+    weights[3, 4], weights[5, 6] = 1, -1
+    assert copy.copy(cal).std_of(weights) == cal.std_of(weights)
+
+
 def test_a_pickled_calibration_does_without_its_fit():
     cal, frames, *_ = calibrated("between pixels")
-    copy = pickle.loads(pickle.dumps(cal))
-    np.testing.assert_array_equal(copy.residuals(frames), cal.residuals(frames))
+    again = pickle.loads(pickle.dumps(cal))
+    np.testing.assert_array_equal(again.residuals(frames), cal.residuals(frames))
     with pytest.raises(equipix.errors.InputError, match="measurements"):
-        copy.std_of(np.ones(SHAPE))
+        again.std_of(np.ones(SHAPE))
 
 
 def test_between_cells_the_fitted_spline_predicts():

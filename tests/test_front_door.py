@@ -139,3 +139,24 @@ def test_saved_averages_keep_their_dark(tmp_path, suffix):
     read = load_statistics(tmp_path / f"mean{suffix}")
     for name, values in each.dark.maps.items():
         np.testing.assert_array_equal(read.dark.maps[name], values)
+
+
+def test_averages_saved_and_loaded_one_by_one_calibrate(tmp_path):
+    """Each file holds the dark; equal darks are one."""
+    from equipix.frames import load_statistics, save_statistics
+
+    found = statistics_of(virtual_experiment(7), 255)
+    for k, each in enumerate(found):
+        save_statistics(tmp_path / f"{k}.npz", each)
+    read = [load_statistics(tmp_path / f"{k}.npz") for k in range(len(found))]
+    again, first = (equipix.calibrate(each, SHIFTS) for each in (read, found))
+    np.testing.assert_array_equal(again.sensitivity, first.sensitivity)
+
+
+def test_exact_data_confirm_their_sign():
+    """Whole numbers without noise: F is 0 with the right shifts."""
+    rows, cols = np.indices((90, 100))
+    beam = 500 + 3 * rows + 7 * cols + rows * cols % 11
+    shifts = [(0, 0), (0, 5), (7, 0), (5, 9)]
+    frames = [beam[r : r + 60, c : c + 64].astype(float) for r, c in shifts]
+    assert equipix.calibrate(np.array(frames), shifts).shift_sign == "confirmed"

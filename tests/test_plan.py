@@ -236,7 +236,7 @@ class TestDrift:
         assert tilt_rms(tilt) == pytest.approx(wanted, abs=0.05 * 10 ** np.floor(np.log10(wanted)))
 
     def test_is_loud_when_it_exceeds_the_noise(self):
-        with pytest.warns(DriftWarning, match="times what noise leaves"):
+        with pytest.warns(DriftWarning, match="times the error by noise"):
             plan.error_budget((64, 80), CROSS, noise=1e-4, drift=1e-4)
         plan.error_budget((64, 80), CROSS, noise=1e-2, drift=1e-4)  # warnings are errors here
 

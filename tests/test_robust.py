@@ -194,5 +194,7 @@ def test_what_was_left_out_is_saved(tmp_path, suffix):
 
 
 def test_two_exposures_do_not_tell_which_is_wrong():
-    with pytest.raises(errors.InputError, match="'robust' needs at least 3 exposures"):
+    with pytest.raises(
+        errors.InputError, match="'robust' is True with 2 exposures, expected at least 3"
+    ):
         equipix.calibrate(np.ones((2, 30, 40)), CROSS[:2], robust=True)

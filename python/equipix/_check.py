@@ -1,4 +1,4 @@
-"""Arrays from the caller made fit for the compiled part, with errors that name the argument."""
+"""Arrays of the caller, checked and converted for the compiled part."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _MOST_WORKERS = 1024
 
 @contextmanager
 def naming_memory(what: str) -> Iterator[None]:
-    """Make NumPy's MemoryError, which names the bytes, one of the package that says what for."""
+    """Convert NumPy's MemoryError to an InsufficientMemoryError that names the work."""
     try:
         yield
     except InsufficientMemoryError:
         raise
     except MemoryError as error:
-        reason = str(error) or "the system gives no more memory"
+        reason = str(error) or "no more memory is available"
         raise InsufficientMemoryError(f"{what}: {reason}") from error
 
 
@@ -36,8 +36,8 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
     """
     if _is_masked(values):
         raise InputError(
-            f"'{name}' is a masked array, whose mask would be lost: pass it as mask=, or fill "
-            "the masked values with NaN"
+            f"'{name}' is a masked array, whose mask would be ignored: give it as 'mask', or set "
+            "the masked values to NaN"
         )
     try:
         array = np.asarray(values)
@@ -102,7 +102,7 @@ def positive_workers(workers: int | None) -> int | None:
 
 
 def positive_count(name: str, value: int) -> int:
-    """A whole number above 0, checked; one beyond 64 bits becomes the largest within."""
+    """A whole number above 0, checked; above 64 bits it becomes the largest of 64 bits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
     return min(int(value), 2**63 - 1)
@@ -119,7 +119,7 @@ def number(name: str, value: float) -> float:
 
 
 def as_tolerance(value: float) -> float:
-    """The largest relative error of the sensitivity, checked: with 1 nothing would be known."""
+    """The largest relative error of the sensitivity, checked: it is below 1."""
     checked = number("tolerance", value)
     if not 0 < checked < 1:
         raise InputError(

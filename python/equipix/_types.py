@@ -13,7 +13,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
 
 Progress: TypeAlias = Callable[[int, int, str], object]
-"""Called as ``progress(done, total, stage)``; what it raises stops the work."""
+"""Called as ``progress(done, total, stage)``; an exception in it stops the work."""
 
 Rng: TypeAlias = np.random.Generator | int
 """A generator of random numbers, or its seed."""
@@ -22,4 +22,4 @@ Method = Literal["multiscale", "coordinate-descent"]
 FluxModel = Literal["fit", "linear"]
 ShiftSign = Literal["confirmed", "contradicted", "undetermined"]
 Flagged = Literal["nan", "keep", "replace"]
-"""What becomes of pixels flagged ``DO_NOT_USE`` when frames are corrected."""
+"""The values of pixels flagged ``DO_NOT_USE`` in corrected frames."""

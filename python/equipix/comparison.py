@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from equipix.calibration.result import Calibration
 
 _MOST_BLOCKS = 16
-"""Blocks whose uncertainty stands for all: each takes about as long as a calibration."""
+"""Blocks whose uncertainty represents all: each takes about as long as a calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,8 @@ def compare(
     predicted : array_like, shape (n, 2), optional
         Of each calibration the root mean square of its relative error that is expected in single
         pixels and in means over blocks of 16×16, as `equipix.simulate.noise_prediction` gives.
-        Unless given it follows from `sensitivity_std` where all have one; that of the blocks, by
-        `Calibration.std_of` of 16 of them, where none was read from a file.
+        Unless given it is computed from `sensitivity_std` where all have one; that of the blocks
+        by `Calibration.std_of` of 16 of them, where none was read from a file.
 
     Returns
     -------
@@ -89,9 +89,9 @@ def compare(
 
     Notes
     -----
-    What errors two calibrations have in common, such as a dark level that is off, does not show.
-    A shift error or lamp drift does: it differs between experiments, and tilts or bends M as a
-    whole, so it stands out in the block means.
+    Common errors of two calibrations, such as a wrong dark level, leave no difference. A shift
+    error or lamp drift does: it differs between experiments and changes M at large scales, so it
+    dominates the block means.
 
     References
     ----------
@@ -116,7 +116,7 @@ def compare(
     """
     several = isinstance(calibrations, list | tuple)
     if not several or not all(hasattr(each, "sensitivity") for each in calibrations):
-        raise InputError("'calibrations' is no list of results of calibrate")
+        raise InputError("'calibrations' is not a list of results of calibrate")
     count = len(calibrations)
     if count < 2:
         raise InputError(f"'calibrations' has {count} entries, expected two or more")

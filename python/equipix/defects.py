@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from equipix.noise import NoiseModel
 
 SIGMAS = 6.0
-"""Standard deviations that chance does not reach on a sensor of some million pixels."""
+"""Standard deviations that noise does not reach on a sensor of some million pixels."""
 
 HOT_SIGMAS = 10.0
-"""How far above the others' spread a dark level is hot: real ones have long tails."""
+"""Limit of a hot dark level in standard deviations of the others: dark levels have long tails."""
 
 DEAD_RESPONSE = 0.5
 """Response relative to the neighbours below which a pixel is dead."""
@@ -33,18 +33,18 @@ _BLOCK = 16
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the frames show of the pixels before any fit: maps (rows, cols) of bool, or None.
+    """Bad pixels found in the frames before any fit: maps (rows, cols) of bool, or None.
 
     Attributes
     ----------
     saturated : ndarray of bool or None
         A sample reaches the saturation level in some exposure.
     dead : ndarray of bool or None
-        No answer to light: see `dead_pixels`.
+        No response to light: see `dead_pixels`.
     hot : ndarray of bool or None
         A high dark level or much dark noise: see `hot_pixels`.
     noisy : ndarray of bool or None
-        More scatter from frame to frame than chance explains: see `noisy_pixels`.
+        More scatter between frames than the noise explains: see `noisy_pixels`.
     """
 
     saturated: Bools | None = None
@@ -54,14 +54,14 @@ class Findings:
 
 
 def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:
-    """Find pixels that answer to light with less than half of what their neighbours do.
+    """Find pixels whose response to light is below half of that of their neighbours.
 
     Parameters
     ----------
     signals : ndarray, shape (n, rows, cols)
         Dark-subtracted means of the exposures, in DN.
     models : sequence of NoiseModel, optional
-        Those of `signals`, one an exposure: a pixel must be below by more than chance explains.
+        Those of `signals`, one an exposure: a pixel must be below by more than noise explains.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> N
     dead = np.ones(signals.shape[1:], dtype=bool)
     for k, signal in enumerate(signals):
         margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
-        # A comparison with NaN is false: no measurement does not make a pixel alive.
+        # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
         dead &= ~(signal + margin >= DEAD_RESPONSE * _block_medians(signal))
     return dead
 
@@ -92,7 +92,7 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     ndarray of bool, shape (rows, cols)
         True where the level is more than 10 standard deviations above the median (estimated by
         1.4826 times the median absolute deviation, and at least one DN), or the variance beyond
-        what chance explains.
+        what noise explains.
     """
     excess = dark.mean - np.nanmedian(dark.mean)
     spread = max(1.0, 1.4826 * float(np.nanmedian(np.abs(excess))))
@@ -104,7 +104,7 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
 
 
 def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: NoiseModel) -> Bools:
-    """Find pixels that scatter from frame to frame by more than chance explains.
+    """Find pixels that scatter between frames by more than the noise explains.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def odd_responses(
     """
     dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
     with np.errstate(invalid="ignore"):
-        # Where no pixel is twice as sensitive as another, none is as its neighbours' median.
+        # Where no pixel is twice as sensitive as another, none is twice its neighbours' median.
         if not np.nanmin(sensitivity) < DEAD_RESPONSE * np.nanmax(sensitivity):
             return dead, hot
     usual, deviation = _block_medians(sensitivity), std()

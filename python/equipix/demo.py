@@ -1,4 +1,4 @@
-"""The main job on a virtual camera, its result beside the truth and beside a flat field."""
+"""A calibration with a virtual camera, compared with the truth and with a flat field."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 RMS_LIMIT, BLOCK_RMS_LIMIT = 1.1, 1.5
-"""How far the errors may exceed what the noise predicts."""
+"""Factors by which the errors may exceed the value that noise predicts."""
 
 ARMS = {200: (23, 41), 96: (11, 19), 0: (5, 7)}
 """Shifts in pixels by the least size of a sensor: the sweeps needed fall with the square of shifts,
@@ -47,7 +47,7 @@ class Demo:
     Attributes
     ----------
     calibration : Calibration
-        What the experiment gave.
+        The result of the experiment.
     truth, flat_field : ndarray, shape (rows, cols), float64
         The true sensitivity, NaN in dead and hot pixels, and that by the uneven source.
     predicted : tuple of float
@@ -200,7 +200,7 @@ def run_demo(
 
 
 def _flat_field(camera: Camera, dark: NDArray[Any], frames: int, rng: int) -> NDArray[Any]:
-    """Sensitivity as the mean of frames of a source taken for uniform, which it is not."""
+    """Sensitivity as the mean of frames of a source that is assumed uniform but is not."""
     rows, cols = camera.shape
     slope = np.add.outer(np.linspace(-0.25, 0.25, rows), np.linspace(-0.25, 0.25, cols))
     light = EXPOSURE_E * (1 + SOURCE_UNEVENNESS * slope)

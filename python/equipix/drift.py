@@ -1,4 +1,4 @@
-"""Lamp drift: the tilt of ln M that it leaves without a residual, and what of a trend shows.
+"""Lamp drift: the tilt of ln M that leaves no residual, and the part of a trend that leaves one.
 
 The one home of both, since the error budget, the search for patterns, the error bars and the
 warnings must agree. Errors of ln c that are affine in the shifts d, a + s·d, leave no residual: the
@@ -104,8 +104,8 @@ def trend_told(shifts: NDArray[Any], times: NDArray[Any]) -> float:
     Returns
     -------
     float
-        1 − R² of the regression of the times on (1, d): 0 where a trend looks just like a tilt, 1
-        where none of it does, or all times are equal.
+        1 − R² of the regression of the times on (1, d): 0 where a trend is degenerate with a tilt,
+        1 where no part of it is, or all times are equal.
     """
     return float(1 - np.sum((unit_times(times) @ tilt_basis(shifts)) ** 2))
 

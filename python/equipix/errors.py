@@ -11,7 +11,7 @@ class EquipixError(Exception):
 
 
 class InputError(EquipixError, ValueError):
-    """An argument is not what was wanted; the message names it, its value and what to do."""
+    """An argument is invalid; the message contains its name, its value and the remedy."""
 
 
 class SpotError(InputError):
@@ -27,7 +27,7 @@ class UnsupportedFileError(FileError):
 
 
 class InsufficientMemoryError(EquipixError, MemoryError):
-    """The memory that the work needs cannot be had; the message names the bytes."""
+    """Not enough memory for the work; the message contains the number of bytes."""
 
 
 class EquipixWarning(UserWarning):
@@ -35,7 +35,7 @@ class EquipixWarning(UserWarning):
 
 
 class ConvergenceWarning(EquipixWarning):
-    """A solver stopped before the error that was asked for."""
+    """A solver stopped before it reached the tolerance."""
 
 
 class IdentifiabilityWarning(EquipixWarning):
@@ -63,7 +63,7 @@ class MisfitWarning(EquipixWarning):
 
 
 def warn(message: str, category: type[EquipixWarning]) -> None:
-    """Warn at the line outside of the package that led here."""
+    """Warn, at the line outside of the package that called it."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and _is_own(frame.f_globals.get("__name__", "")):
         level, frame = level + 1, frame.f_back

@@ -1,4 +1,4 @@
-"""What is wrong with a pixel, and which finding sets which bits."""
+"""Flags of pixels, and which finding sets which bits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Flag(IntFlag):
-    """What is wrong with a pixel: bits of ``flags`` arrays, with JWST's bit numbers.
+    """Defects of a pixel: bits of ``flags`` arrays, with JWST's bit numbers.
 
     A pixel without any bit set is good. ``DO_NOT_USE`` accompanies every flag that makes the
     pixel's corrected value worthless.

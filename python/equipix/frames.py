@@ -78,7 +78,7 @@ def average(
     workers: int | None = None,
     progress: Callable[[int, int, str], object] | None = None,
 ) -> FrameStatistics:
-    r"""Mean and variance of each pixel over repeated frames, however many.
+    r"""Mean and variance of each pixel over any number of repeated frames.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ def average(
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
     progress : callable, optional
-        Called as ``progress(done, total, stage)`` from time to time, in frames; `total` is a
-        forecast until all files have been opened.
+        Called as ``progress(done, total, stage)`` repeatedly, in frames; `total` is an
+        estimate until all files have been opened.
 
     Returns
     -------
@@ -107,12 +107,11 @@ def average(
     Raises
     ------
     InputError
-        If an argument is not what is wanted.
+        If an argument has a wrong shape or value.
     FileError
         If a file is missing, broken, in colour, or differs from the first in shape or depth.
     InsufficientMemoryError
-        If the memory that it takes cannot be had; where the system tells (Linux), before the
-        work starts.
+        If there is not enough memory; on Linux this is checked before the work starts.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Corrections read back from the files that they were saved to, whatever their kind."""
+"""Corrections of any kind, read from the files that they were saved to."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _load(path: str | PathLike[str], readers: Mapping[str, tuple[str, str]]) -> 
 
 
 def _what(kind: object, readers: Iterable[str]) -> str:
-    """Say what a file holds that is not wanted, or not known."""
+    """Describe the content of a file that is not expected here."""
     words = _NO_CORRECTIONS.get(str(kind))
     wanted = f"expected {' or '.join(readers)} that equipix has saved"
     return f"{kind or 'something else'}, {wanted}{f' ({words})' if words else ''}"

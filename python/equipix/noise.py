@@ -1,4 +1,4 @@
-"""How noisy a pixel is at a given signal: the weights of a calibration."""
+"""Noise of a pixel at a given signal: the source of the weights of a calibration."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class NoiseModel:
     weights.
 
     `signal` should be an expectation, not a noisy value: with a model evaluated on the values
-    themselves those that happen to be low weigh more, which at N electrons lowers a weighted mean
-    by 1/N of itself, and raises χ² with five exposures by some 2/(3N); and what a grain of dust
-    has darkened would get the largest weight of all. `equipix.calibrate` evaluates it on its own
-    fit, whose residuals do not correlate with it.
+    themselves those that are low by chance have larger weights, which at N electrons lowers a
+    weighted mean by 1/N of itself, and raises χ² with five exposures by about 2/(3N). A value
+    darkened by a grain of dust would have the largest weight of all. `equipix.calibrate` evaluates
+    it on its own fit, whose residuals do not correlate with it.
 
     Examples
     --------
@@ -58,7 +58,7 @@ class NoiseModel:
     gain: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no variance."""
+        """Refuse parameters that give no variance."""
         for name, value in (("read_noise", self.read_noise), ("gain", self.gain)):
             if not 0 <= number(name, value) < np.inf:
                 raise InputError(f"'{name}' is {value!r}, expected a number not below 0")
@@ -70,7 +70,7 @@ class NoiseModel:
         return self.read_noise**2 + self.gain * np.maximum(signal, 0)
 
     def of_mean(self, frames: int, *, dark_variance: float = 0.0) -> Self:
-        """Model of the mean of so many frames, from which a dark of that variance was taken."""
+        """Model of the mean of so many frames, minus a dark of that variance."""
         variance = self.read_noise**2 / frames + dark_variance
         return type(self)(read_noise=float(np.sqrt(variance)), gain=self.gain / frames)
 
@@ -102,7 +102,7 @@ class NoiseModel:
         floor = _FLOOR * variance.max()
         if not floor > 0:
             raise InputError(
-                "repeated frames are all equal, which shows no scatter: give a single one of them"
+                "repeated frames are all equal, which gives no noise model: give one of them"
             )
         weight = degrees / np.maximum(variance, floor) ** 2
         given = gain
@@ -113,7 +113,7 @@ class NoiseModel:
         read_variance = np.average(variance - gain * signal, weights=weight)
         if read_variance < floor:
             read_variance = floor
-            # At its bound the other parameter must follow, or every variance would be too large.
+            # At its bound the other parameter is fitted again: else every variance is too large.
             energy = np.sum(weight * signal**2)
             if given is None and energy > 0:
                 gain = max(0.0, float(np.sum(weight * signal * (variance - floor)) / energy))
@@ -126,7 +126,7 @@ def photon_transfer(
     """Give the points of the photon-transfer curve that one exposure contributes.
 
     The usable pixels, in the order of their signal, are cut into bins of equal numbers. A pixel
-    whose variance lies beyond chance (`scatter_limit`) stays out of its bin's mean.
+    whose variance is above `scatter_limit` is left out of its bin's mean.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def modelled_variances(
 
 
 def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
-    """Largest ratio of a sample variance to the true one that chance explains.
+    """Largest ratio of a sample variance to the true one that its scatter explains.
 
     Notes
     -----

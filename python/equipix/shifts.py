@@ -1,4 +1,4 @@
-"""How far the sensor moved between exposures: measured moves, and patterns of positions."""
+"""Measured moves of the sensor between exposures, and patterns of positions."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class ShiftMeasurement:
 def measure_shift(
     before: ArrayLike, after: ArrayLike, *, saturation: float | None = None
 ) -> ShiftMeasurement:
-    """Measure how far the sensor moved, from a spot that stands still in the beam.
+    """Measure a move of the sensor, from a spot that is fixed in the beam.
 
     Parameters
     ----------
     before, after : array_like, shape (rows, cols) or (n, rows, cols)
         Images of a small hole in the beam before and after the move, in DN; several frames each
-        give a standard error that knows the camera's noise. The dark need not be subtracted. At
+        give a standard error that includes the camera's noise. The dark need not be subtracted. At
         least 16 rows and columns.
     saturation : float, optional
         Level in DN that saturated samples reach; by default the largest value of an integer
@@ -88,9 +88,8 @@ def measure_shift(
 
     Notes
     -----
-    Sign: the spot stands still in the beam. A sensor that moves towards larger rows sees it at a
-    smaller row than before. A shift d is the place in the beam that the sensor's first pixel sees,
-    so ::
+    Sign: the spot is fixed in the beam. When the sensor moves towards larger rows, the spot is at a
+    smaller row than before. A shift d is the place in the beam of the sensor's first pixel, so ::
 
         d_new = d_old + centroid(before) - centroid(after)
 
@@ -207,8 +206,8 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
         worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
         warnings.warn(
             f"shifts are rounded to whole pixels: that of exposure {worst[0]} (from 0) is "
-            f"{np.round(exact[worst[0]], 3).tolist()}; a smooth beam forgives it, for a "
-            "structured one move the sensor by whole pixels",
+            f"{np.round(exact[worst[0]], 3).tolist()} (limit {_UNNOTICED:g} from whole): use "
+            "method='multiscale', or move the sensor by whole pixels",
             ShiftRoundingWarning,
             stacklevel=3,
         )

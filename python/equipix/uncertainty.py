@@ -1,4 +1,4 @@
-"""What noise, lamp drift and errors of the shifts leave uncertain in a calibration."""
+"""Uncertainty of a calibration by lamp drift and errors of the shifts."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def tilt_std(
     shift_std : array_like, shape () or (n, 2), optional
         Standard deviation of each shift, in pixels.
     beam_slope : array_like, shape (2,)
-        Mean slope (row, col) of ln L over the sensor, per pixel: what makes an error of a shift
-        look like one of the flux.
+        Mean slope (row, col) of ln L over the sensor, per pixel: it converts an error of a shift to
+        one of the flux.
 
     Returns
     -------
     ndarray, shape (2,), float64
         Standard deviation of the slope of ln M, edge to edge, (row, col); infinite along an axis
-        that the shifts leave open.
+        that the shifts do not determine.
 
     Notes
     -----
@@ -82,6 +82,7 @@ def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
     array = as_array(name, values, ndim=(0, 1, len(shape))).astype(np.float64)
     if array.shape not in ((1,), shape):
         raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
-    if not (np.isfinite(array) & (array >= 0)).all():
-        raise InputError(f"'{name}' holds values that are not 0 or above")
+    wrong = array[~(np.isfinite(array) & (array >= 0))]
+    if wrong.size:
+        raise InputError(f"'{name}' holds {wrong[0]:g}, expected finite numbers not below 0")
     return np.broadcast_to(array, shape)

@@ -59,20 +59,20 @@ def calibrate(
     ----------
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
-        `FrameStatistics` bring their noise along: a noise model fitted over all pixels, not each
-        pixel's own sample variance, gives the weights. A mean with saturated samples is left out of
-        its exposure, and the pixel is flagged ``SATURATED``; it keeps the sensitivity that the
-        other exposures determine. Dead, hot and noisy pixels are masked and flagged, the hot ones
-        where `equipix.average` was given the dark frames as `FrameStatistics`.
+        `FrameStatistics` contain their noise: the weights come from a noise model fitted over all
+        pixels, not from each pixel's own sample variance. A mean with saturated samples is left
+        out of its exposure, and the pixel is flagged ``SATURATED``; it keeps the sensitivity that
+        the other exposures determine. Dead, hot and noisy pixels are masked and flagged, the hot
+        ones where `equipix.average` was given the dark frames as `FrameStatistics`.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
         unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result, and in a
-        smooth beam no residual shows it: see `Calibration.shift_sign`. If shifts are not whole
+        smooth beam it leaves no residual: see `Calibration.shift_sign`. If shifts are not whole
         numbers the beam is a cubic spline; coordinate descent rounds them.
     variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
         Variance of the values given; without it all weights are 1. A noise model, or one for each
         exposure, is evaluated at the signal of a first fit: evaluated at the noisy values, it
-        would give more weight to those that are low by chance. With `FrameStatistics` it is the
+        would give larger weights to values that are low by chance. With `FrameStatistics` it is the
         model of one frame.
     mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
         True = do not use.
@@ -118,13 +118,13 @@ def calibrate(
     uncertainty : bool
         Whether to compute `Calibration.sensitivity_std`, `Calibration.tilt_std` and, for refined
         shifts, `Calibration.shift_std`: the effect of noise and of the priors on fluxes and
-        shifts. Takes some ten times as long as the calibration, after a joint fit some hundred
-        times. Without `variance` the noise is that of the residuals.
+        shifts. It takes about ten times as long as the calibration, after a joint fit about a
+        hundred times. Without `variance` the noise is that of the residuals.
     workers : int, optional
         Number of threads; by default as many as processors may be used. It changes no bit of the
         result.
     progress : callable, optional
-        Called as ``progress(done, total, stage)`` now and then; what it raises stops the work.
+        Called as ``progress(done, total, stage)`` repeatedly; an exception in it stops the work.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def calibrate(
     ConvergenceWarning
         If the tolerance was not reached.
     MisfitWarning
-        If residuals are more than twice what the variances given say.
+        If residuals are more than twice as large as the variances predict.
     ShiftSignWarning
         If the data contradict the sign of the shifts.
 
@@ -160,18 +160,18 @@ def calibrate(
     beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
     mean(M) = 1 over valid pixels. With fitted fluxes the mean of ln c is 0; then a tilt of ln M
     is determined only if exposures are turned against each other, or by `flux_std` or `time`:
-    else its least-squares slope over valid pixels is set to 0, and a warning says so.
+    else its least-squares slope over valid pixels is set to 0, with a warning.
 
     With shifts between pixels L is a cubic B-spline on the padded grid, with a penalty of 1e-5 of a
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
-    Gauss-Newton steps in which M follows at its closed form.
+    Gauss-Newton steps in which M is eliminated by its closed form.
 
-    The sign of the shifts is asked of twelve exposures at most and of the central pixels: four
-    times as many along each axis as the largest shift, or fewer where that is more than 80. Fitted
-    with the shifts as given and with all of them reversed, fluxes free in both, the lower F must be
-    lower by 6·√(2/dof) of itself, in two thirds of all places. It is undetermined without a
-    question with fewer than three exposures or a thousand degrees of freedom, with
-    ``dark="fit"``, where nothing moves, and where the middle of the sensor has no light.
+    The sign of the shifts is tested with at most twelve exposures and with the central pixels: four
+    times as many along each axis as the largest shift, or fewer where that is more than 80. They
+    are fitted with the shifts as given and with all of them reversed, fluxes free in both. The
+    lower F must be lower by 6·√(2/dof) of itself, in two thirds of all places. The sign is not
+    tested, and undetermined, with fewer than three exposures or a thousand degrees of freedom,
+    with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
 
     References
     ----------
@@ -219,7 +219,7 @@ def calibrated(
 ) -> Calibration:
     """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars.
 
-    The fit begins from `start`; `provenance` is added to the metadata.
+    The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
     advice = verdicts.on_plan(exposures)

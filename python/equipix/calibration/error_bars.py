@@ -30,17 +30,17 @@ class ErrorBars(NamedTuple):
 
 
 class DarkStd(NamedTuple):
-    """How well a fitted dark is known.
+    """Uncertainty of a fitted dark.
 
     Attributes
     ----------
     along_sensitivity : float or None
         Standard deviation of b, the least-squares part b·M of all errors, in the units of the
         frames; None where the fit did not converge or no noise is known. With fitted ratios of the
-        levels nothing that is measured changes when O → O + b·M, L → L − b and the ratios follow,
+        levels no measurement changes when O → O + b·M, L → L − b and the ratios are adapted,
         if L is the same at all positions of a pixel.
     of_a_pixel : float or None
-        Root mean square of what the noise of a pixel's own measurements does to its dark.
+        Root mean square of the error of the dark by the noise of the same pixel.
     """
 
     along_sensitivity: float | None
@@ -75,7 +75,7 @@ def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBa
 
 
 def dark_std(weighted: Weighted, options: FitOptions) -> DarkStd | None:
-    """How well the dark is known that was fitted together with fluxes; None if it was not."""
+    """Uncertainty of a dark that was fitted together with fluxes; None for any other."""
     exposures, fit, _ = weighted
     if not exposures.offset or exposures.flux.kind == "known":
         return None
@@ -118,7 +118,7 @@ def of_logarithm(weights: Floats, fit: Fit) -> Floats:
 
 
 def _std(scale: float, variances: ArrayLike | None) -> Floats:
-    """Standard deviations of variances that were asked for."""
+    """Standard deviations from variances, scaled."""
     return np.asarray(scale * np.sqrt(np.asarray(cast("ArrayLike", variances))))
 
 

@@ -1,4 +1,4 @@
-"""How a calibration went."""
+"""The course of a calibration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """How a calibration went, at some moments on its way.
+    """The course of a calibration: its state after some of its sweeps.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What may be asked of a calibration, and what excludes what."""
+"""Options of a calibration, and which of them exclude each other."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from equipix.exposures.options import FitOptions
 
 _FEWEST_FOR_REJECTION = 3
-"""Exposures without which no residual shows which of two measurements is wrong."""
+"""Fewest exposures: with two, no residual shows which of two measurements is wrong."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Options:
     uncertainty: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what is neither true nor false."""
+        """Refuse values that are not bool."""
         for name in ("robust", "uncertainty"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"'{name}' is {getattr(self, name)!r}, expected True or False")
 
     def check(self, exposures: Exposures) -> None:
-        """Refuse what such exposures exclude."""
+        """Refuse options that these exposures exclude."""
         if exposures.offset and (self.robust or exposures.noise):
             raise InputError(
                 "'dark' is 'fit', but 'robust' and noise models expect the signal alone: subtract "
@@ -48,13 +48,13 @@ class Options:
             )
         if self.robust and len(exposures) < _FEWEST_FOR_REJECTION:
             raise InputError(
-                f"'robust' needs at least {_FEWEST_FOR_REJECTION} exposures to tell which "
-                f"measurement is false, got {len(exposures)}"
+                f"'robust' is True with {len(exposures)} exposures, expected at least "
+                f"{_FEWEST_FOR_REJECTION}: with fewer no residual shows which measurement is false"
             )
 
 
 def is_to_be_fitted(dark: object) -> bool:
-    """Whether the dark is an unknown of the fit; refuses what is no choice."""
+    """Whether the dark is an unknown of the fit; refuses other values."""
     if not isinstance(dark, str):
         raise InputError(
             "'dark' holds values: subtract it from the frames, or give it to equipix.average"

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def pixel_flags(weighted: Weighted, tolerance: float) -> Array:
     """Bits of `equipix.Flag` of each pixel, shape (rows, cols), uint32.
 
-    Flagged is what the solver left undetermined, what was odd before the fit, an odd response, and
-    a pixel whose measurements contradict each other.
+    Flagged are pixels that the solver left undetermined, those found before the fit, outliers of
+    the response, and pixels whose measurements contradict each other.
     """
     exposures, fit, rejected = weighted
     flags: Array = fit.flags.copy()

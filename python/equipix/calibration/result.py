@@ -74,18 +74,18 @@ class Calibration:
         variance of one value where none were given. NaN without any degree of freedom.
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
-        A pixel that does not respond ties none together; nor does one whose measurements carry
-        next to no weight.
+        A pixel that does not respond connects no parts; nor does one whose measurements have
+        almost no weight.
     component_labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     sweeps : int
-        Sweeps of coordinate descent; of the multiscale method, passes over the data or its weights
-        of about a sweep's worth each.
+        Sweeps of coordinate descent; in the multiscale method passes over the data or its weights,
+        each of about the cost of a sweep.
     converged : bool
         Whether `error_estimate` is within the tolerance.
     error_estimate : float
-        Estimated largest distance of `sensitivity` from the minimum of F, large scales included.
-        It says nothing of noise.
+        Estimate (not a bound) of the largest remaining solver error of `sensitivity` at any
+        spatial scale; noise is not included.
     history : History
         Objective and error estimate along the way.
     dark : ndarray, shape (rows, cols), or None
@@ -101,14 +101,14 @@ class Calibration:
     sensitivity_std : ndarray, shape (rows, cols), or None
         Standard deviation of `sensitivity` by noise and by the priors on fluxes and shifts, large
         scales included, in the gauge of mean 1, and of slope 0 where free fluxes leave a tilt
-        undetermined; NaN where undetermined. In `sensitivity`'s dtype; None unless asked for, or
-        where a joint fit ended too far from its minimum.
+        undetermined; NaN where undetermined. In `sensitivity`'s dtype; None without
+        ``uncertainty=True``, or where a joint fit ended too far from its minimum.
     tilt_std : ndarray, shape (2,), or None
-        Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None unless
-        asked for.
+        Standard deviation of `tilt`; infinite where free fluxes leave it undetermined. None without
+        ``uncertainty=True``.
     shift_std : ndarray, shape (n, 2), or None
         Posterior standard deviation of refined shifts, less their mean, which no measurement
-        determines; the prior one of the others, in pixels. None unless asked for.
+        determines; the prior one of the others, in pixels. None without ``uncertainty=True``.
     weighted : Weighted or None
         The exposures with their weights and the fit, for `std_of`; None if read from a file or
         unpickled.
@@ -160,7 +160,7 @@ class Calibration:
         bars: ErrorBars | None,
         metadata: dict[str, Any],
     ) -> Self:
-        """Make the result of a fit and what was found out about it."""
+        """Make the result from a fit and what was derived from it."""
         exposures, fit, rejected = weighted
         dtype = exposures.values.dtype
         return cls(
@@ -248,8 +248,8 @@ class Calibration:
         -------
         float, or ndarray of shape (m,)
             One for each image of weights, in the gauge mean(M) = 1; where free fluxes leave a tilt
-            undetermined, in that of slope 0, though a sum that sees the tilt is as uncertain as
-            `tilt_std`.
+            undetermined, in that of slope 0, although a sum that depends on the tilt is as
+            uncertain as `tilt_std`.
 
         Raises
         ------
@@ -309,7 +309,7 @@ class Calibration:
             The dark frame to subtract, in DN: the one that is part of the calibration, another
             (of averaged frames the mean), or none where it is already subtracted.
         flagged : {"nan", "keep", "replace"}
-            What becomes of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
+            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
         out : ndarray, optional
             Array for the result, of the frames' shape, float32 or float64.
@@ -429,10 +429,10 @@ class Calibration:
 
         Notes
         -----
-        Of the exposures that a calibration was made from M and L have followed some of the
-        noise: the mean square of residuals in standard deviations is `reduced_chi2` times the
-        degrees of freedom over the number of measurements. Of one held out it is above 1, by
-        the variance of the prediction.
+        M and L fit some of the noise of the exposures that the calibration was made from: the mean
+        square of their residuals in standard deviations is `reduced_chi2` times the degrees of
+        freedom over the number of measurements. For an exposure held out it is above 1, by the
+        variance of the prediction.
         """
         measured = measured_of(frames, variance)
         values = measured.values

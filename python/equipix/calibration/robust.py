@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from equipix.exposures.exposures import Exposures
 
 _BEYOND = 5.0
-"""Standard deviations that honest noise exceeds in one of two million measurements."""
+"""Standard deviations that normal noise exceeds in one of two million measurements."""
 
 _NEAR = 3.0
 """The same beside a measurement that is rejected: grains have soft edges."""
@@ -51,10 +51,10 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Boo
 
     Notes
     -----
-    A hard redescending weight, 1 or 0, in rounds. A false value pulls M and L, and so makes its
-    own residual smaller and those that share its pixel or its cell larger. So in each round only
-    what deviates most in its pixel and in its cell goes; the next fit shows what remains. What no
-    longer deviates comes back, and so do those of a pixel that would be left without M.
+    A hard redescending weight, 1 or 0, in rounds. A false value changes M and L, and so makes its
+    own residual smaller and those that share its pixel or its cell larger. So each round leaves out
+    only what deviates most in its pixel and in its cell; the next fit shows what remains. A value
+    that no longer deviates is used again, and so are those of a pixel that would have no M.
     """
     new, old = deviations(exposures, fit, before, floor)
     leading = np.where(before, 0, np.nan_to_num(new))
@@ -64,8 +64,8 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Boo
         seen = exposures.cells(by_cell, fit, k)
         np.maximum(seen, each, out=seen)
     result = before & ~(old <= _NEAR)
-    # A pixel that has lost its ties by mistake, while larger deviations hid the true ones, gets
-    # its measurements back.
+    # A pixel may lose its connections by mistake while larger deviations mask the false values:
+    # then all its measurements are used again.
     result[:, np.isnan(fit.sensitivity)] = False
     for k in range(len(exposures)):
         rival = _LEADING * np.maximum(by_pixel, exposures.cells(by_cell, fit, k))
@@ -96,17 +96,17 @@ def deviations(
     new, old : ndarray, shape (n, rows, cols), float32
         The larger of both absolute deviations, in standard deviations; NaN where the residual
         carries no information. `new` is for what was not left out: the mean is over such only, and
-        does not count beside one that is conspicuous by itself, whose pull on others would show in
+        does not count beside one that is conspicuous by itself, whose effect on others would be in
         it. `old` is for what was left out: the mean is over both, each deviation cut off at five.
 
     Notes
     -----
     M takes the share h_M = w c²L² / Σ w c²L² (over the exposures of the pixel) of a measurement's
-    noise out of its residual, L the share h_L = w c²M² / Σ w c²M² (over those that see the cell):
-    its variance is near (1 − h_M)(1 − h_L) σ², which is exact where every exposure sees all, as
+    noise out of its residual, L the share h_L = w c²M² / Σ w c²M² (over those of the cell):
+    its variance is near (1 − h_M)(1 − h_L) σ², which is exact where every exposure covers all, as
     in a two-way analysis of variance. That of one that was left out is (1 + h_M)(1 + h_L) σ². The
-    scale of these is the residuals' own, in each exposure, from their median absolute value; so it
-    matters little whether the variances given are right by a factor.
+    scale of these is the residuals' own, in each exposure, from their median absolute value. So a
+    common factor of the variances given has little effect.
     """
     shape, flux = exposures.shape, fit.flux
     response = np.nan_to_num(fit.sensitivity).astype(np.float64)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 KIND = "calibration"
-"""What the metadata of the file call it."""
+"""The kind in the metadata of the file."""
 
 FORMAT = 2
 """Number of the file format; a file with a higher one is refused. Format 1 held no coefficients of

@@ -17,36 +17,36 @@ if TYPE_CHECKING:
     from equipix.exposures.positions import Positions
 
 _MOST_EXPOSURES = 12
-"""Exposures that are asked, from first to last: each has a flux to be found."""
+"""Most exposures of the test, from first to last: each has a flux to be fitted."""
 
 _SIGMAS = 6.0
-"""Standard deviations √(2/dof) of F that chance does not reach."""
+"""Standard deviations √(2/dof) of F that noise does not reach."""
 
 _FEWEST = 1000
-"""Degrees of freedom below which F scatters by more than its standard deviation says."""
+"""Degrees of freedom below which F scatters by more than √(2/dof)."""
 
 _WIDE, _LEAST = 4, 80
 """Side of the window in largest shifts, and the pixels that it may have whatever they are."""
 
 _COARSE, _MOST_COARSE = 1e-2, 300
-"""Tolerance and most products of the first fits, which tell structure."""
+"""Tolerance and most products of the first fits, sufficient in a beam with structure."""
 
 _FINER, _MOST_FINE = 0.3, 100
-"""Tolerance, in parts of the noise that is left, and most products of later ones."""
+"""Tolerance, relative to the remaining noise, and most products of later fits."""
 
 _ROUNDS = 4
-"""Of finer fits, and of leaving out what stands far outside."""
+"""Rounds of finer fits, and of leaving out outliers."""
 
 _ODD = 30.0
 """Median absolute residuals, 20 standard deviations: no noise, nor the waves of a wrong sign."""
 
 _BLOCK, _MOST = 4, 2 / 3
-"""Pixels along a block, and the share of blocks where a fit that is better must be better: what a
-grain of dust does to F is more than chance does, but it does it in a few places."""
+"""Pixels along a block, and the share of blocks where the better fit must be better. A grain of
+dust changes F by more than noise does, but in few blocks only."""
 
 
 class _Residuals(NamedTuple):
-    """What a fit leaves.
+    """Residuals of a fit.
 
     `left` is F for each degree of freedom, `squares` its parts (n, rows, cols), `noise` the root of
     it relative to the signal, `error` the estimated error of M, `stuck` that it did not converge.
@@ -66,9 +66,9 @@ class _Residuals(NamedTuple):
 
     @property
     def least(self) -> float:
-        """What `left` counts for: what it may still lose is of the order of Σ w y²·error².
+        """Lower limit of `left`: it may still decrease by the order of Σ w y²·error².
 
-        Measured, it was 80 times less.
+        The measured decrease was 80 times smaller.
         """
         return self.left if self.settled else self.left * (1 - (self.error / self.noise) ** 2)
 
@@ -106,15 +106,14 @@ def shift_sign(exposures: Exposures, fit: Fit, options: FitOptions) -> SignTest:
 
     Notes
     -----
-    F/dof has the standard deviation √(2/dof) of itself. Fluxes are free in both fits, since what
-    reversed shifts leave of a smooth beam looks like a drifting lamp; of a Gaussian one nothing is
-    left: ln L is quadratic, and with 1/L for L, M·L² for M and fluxes to match they fit as well.
+    F/dof has the standard deviation √(2/dof) of itself. Fluxes are free in both fits, since in a
+    smooth beam the residuals of reversed shifts are degenerate with a lamp drift. A Gaussian beam
+    leaves none: ln L is quadratic, and 1/L for L, M·L² for M and other fluxes fit as well.
 
-    F is known where the estimated error of M is below 0.3 of the relative noise that the fit leaves
-    (it was then at most 2e-4 of itself above its minimum); else it counts less by the square of
-    error over noise. That is asked of the higher F alone; one that is lower before its end is lower
-    still at it. What one of the fits leaves far outside the others, such as dust, is left out of
-    both.
+    F is accurate where the estimated error of M is below 0.3 of the relative noise that the fit
+    leaves (it was then at most 2e-4 of itself above its minimum); else it is reduced by the square
+    of error over noise. Only the higher F must be accurate, since the lower one can only decrease.
+    Outliers of one of the fits, such as dust, are left out of both.
     """
     if exposures.offset:
         return SignTest("undetermined")
@@ -133,7 +132,7 @@ def shift_sign(exposures: Exposures, fit: Fit, options: FitOptions) -> SignTest:
     try:
         found = _residuals(windows, options)
     except (InputError, InsufficientMemoryError):
-        # All arguments are good for the whole sensor: the window has too little light or room.
+        # All arguments are valid for the whole sensor: the window has too little light or memory.
         return SignTest("undetermined")
     lower = _lower(found)
     if lower is None:
@@ -145,7 +144,7 @@ def shift_sign(exposures: Exposures, fit: Fit, options: FitOptions) -> SignTest:
 def _side(positions: Positions, shape: tuple[int, int]) -> int:
     """Pixels along the window: some four times the largest shift s.
 
-    Where that is many it is as small as leaves half a measurement a pixel to judge by:
+    Where that is large, it is the smallest that leaves half a measurement a pixel for the test:
     (n − 1)·w² − (w + s)² ≥ w²/2, the cells being at most (w + s)². 0 if nothing moves.
     """
     # Where the sensor's middle looks: a quarter turn exchanges its coordinates.
@@ -158,7 +157,7 @@ def _side(positions: Positions, shape: tuple[int, int]) -> int:
 
 
 def _residuals(windows: list[Exposures], options: FitOptions) -> list[_Residuals]:
-    """Residuals with the shifts as given and with all of them reversed, as exact as it takes."""
+    """Residuals with the shifts as given and with all of them reversed, as exact as necessary."""
     noises: list[float | None] = [None, None]
 
     def fit(k: int) -> _Residuals:
@@ -204,13 +203,13 @@ def _fitted(window: Exposures, noise: float | None, options: FitOptions) -> _Res
 
 
 def _lower(fits: list[_Residuals]) -> int | None:
-    """Which fit has the lower F, if the other's is known and far above it, in most places."""
+    """Which fit has the lower F, if the other F is accurate and far above it, in most blocks."""
     freedom = min(fit.freedom for fit in fits)
     lower = int(fits[1].left < fits[0].left)
     low, high = fits[lower], fits[1 - lower]
     if freedom < _FEWEST or high.noise == 0:
         return None
-    # So that NaN decides nothing.
+    # Written so that NaN gives no decision.
     if not high.least > (1 + _SIGMAS * (2 / freedom) ** 0.5) * low.left:
         return None
     excess = high.squares - low.squares
@@ -227,7 +226,7 @@ def _sums_of_blocks(image: Array) -> Array:
 
 
 def _odd(fits: list[_Residuals]) -> Bools:
-    """Which measurements one of the fits leaves far outside the others, such as of dust."""
+    """Outliers of one of the fits, such as measurements of dust."""
     limits = [_ODD**2 * np.nanmedian(fit.squares) for fit in fits]
     odd: Bools = np.any(
         [fit.squares > limit for fit, limit in zip(fits, limits, strict=True)], axis=0
@@ -236,5 +235,5 @@ def _odd(fits: list[_Residuals]) -> Bools:
 
 
 def _named(progress: Progress) -> Progress:
-    """Progress under a name of its own."""
+    """Progress with the name of this stage."""
     return lambda done, total, _: progress(done, total, "sign of shifts")

@@ -1,4 +1,4 @@
-"""What to say of a fit, as data."""
+"""Findings that limit a result, as data."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _UNDETERMINED = 1e-4
 100 times that of others."""
 
 _MISFIT = 4.0
-"""A reduced χ² this large has a cause other than variances that are a little off."""
+"""A reduced χ² above this is not caused by slightly wrong variances."""
 
 _NOT_FOUND = 0.1
-"""A joint fit that ends with so large an error of M has no errors that noise would make."""
+"""Largest estimated error of M of a joint fit for which noise determines the errors."""
 
 _DEGENERATE = 0.1
-"""A share of a drift's variance below which the error of its size is over three times larger."""
+"""Share of the variance of a drift below which the error of its size is over three times larger."""
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "order": IdentifiabilityWarning,
@@ -56,14 +56,14 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """Something that the user of a result must know.
+    """A finding that limits a result.
 
     Attributes
     ----------
     kind : str
-        What it is about: one of the keys above.
+        Its subject: one of the keys above.
     message : str
-        What is wrong, the value, the limit, and what to do.
+        What is wrong, the value, the limit and the remedy.
     """
 
     kind: str
@@ -76,13 +76,13 @@ class Verdict:
 
 
 def say(verdicts: Iterable[Verdict]) -> None:
-    """Warn of each; the only place where a calibration warns."""
+    """Raise the warning of each; no other function warns of a result."""
     for verdict in verdicts:
         warn(verdict.message, _CATEGORIES[verdict.kind])
 
 
 def on_plan(exposures: Exposures) -> list[Verdict]:
-    """Judge what is known before any fit: whether a drift in time looks like a tilt."""
+    """Verdicts before any fit: whether a drift in time is degenerate with a tilt."""
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
         return []
@@ -100,7 +100,7 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
 def on_fit(
     weighted: Weighted, options: Options, test: SignTest, dark: DarkStd | None
 ) -> list[Verdict]:
-    """Judge a fit, in the order of what one must know first."""
+    """Verdicts on a fit, the most important first."""
     found = [
         _on_sign(test),
         _on_components(weighted.fit),
@@ -115,7 +115,7 @@ def on_fit(
 
 
 def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
-    """Judge whether the fit is near enough to its minimum for the standard deviations asked for."""
+    """Verdict on a fit that is too far from its minimum for standard deviations."""
     error = float(fit.error_estimate[-1])
     if not options.uncertainty or not fit.is_joint or error <= _NOT_FOUND:
         return None

@@ -1,4 +1,4 @@
-"""Weights that depend on the fit: variances by a noise model, and none for what disagrees."""
+"""Weights that depend on the fit: variances by a noise model, and 0 for outliers."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _ROUGH = 1e-3
 """Tolerance of a fit that only predicts how much signal to expect: its noise is larger."""
 
 _MOST_ROUNDS = 20
-"""Of fitting and leaving out; a grain of dust takes three or four."""
+"""Most rounds of fitting and leaving out; a grain of dust takes three or four."""
 
 
 class Weighted(NamedTuple):
-    """Exposures with the weights that go with their fit, that fit, and what it left out."""
+    """Exposures with their final weights, their fit, and the measurements left out."""
 
     exposures: Exposures
     fit: Fit
@@ -64,7 +64,7 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
 
 
 def _robust_fit(exposures: Exposures, options: FitOptions, start: Fit | None) -> Weighted:
-    """Fit, leave out what disagrees, and so on until nothing changes."""
+    """Fit and leave out outliers, until nothing changes."""
     usable = exposures.usable()
     out = np.zeros_like(usable)
     fit = exposures.fit(options, start)

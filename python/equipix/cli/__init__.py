@@ -1,4 +1,4 @@
-"""The command line: it parses and prints, the work is done elsewhere."""
+"""The command line: it parses options and prints results."""
 
 from equipix.cli.app import app, main
 

@@ -28,13 +28,13 @@ COMMANDS = {
         "simulate",
         "Calibrate a simulated CCD from image files and compare with the truth and a flat field.",
     ),
-    "plan": ("plan", "Say what errors a pattern of shifts will leave, or find better patterns."),
+    "plan": ("plan", "Predict the errors of a pattern of shifts, or find better patterns."),
 }
-"""The module of each command, and what --help says of it without importing the module."""
+"""The module of each command, and its line in --help, which needs no import of the module."""
 
 
 class _Commands(TyperGroup):
-    """A group that knows names and lines of help, and imports a command that is called."""
+    """A group with names and lines of help, which imports a command when it is called."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -40,7 +40,7 @@ def calibrate(
         bool, typer.Option("--robust", help="Leave out measurements that disagree with the others.")
     ] = False,
     method: Annotated[
-        Method, typer.Option(help="How to solve: fast, or as the paper does.")
+        Method, typer.Option(help="The solver: the fast one, or the paper's.")
     ] = "multiscale",
     flux: Annotated[
         FluxModel | None,
@@ -103,7 +103,7 @@ def _flagged(correction: Correction) -> dict[str, int]:
 
 
 def _summary(calibration: Calibration) -> dict[str, Any]:
-    """Collect what one wants to know first of a calibration."""
+    """Collect the main figures of a calibration."""
     sensitivity = calibration.sensitivity
     options = calibration.metadata.get("options", {})
     return {
@@ -123,12 +123,12 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
 
 
 def _misfit_name(options: dict[str, Any]) -> str:
-    """What the mean square residual is: without variances to measure it by, one in DN²."""
+    """Name of the mean square residual: without variances it is a variance in DN²."""
     return "variance_of_a_value" if options.get("weights") == "equal" else "reduced_chi2"
 
 
 def _uncertainty(calibration: Calibration) -> dict[str, Any]:
-    """What noise leaves uncertain, if it was asked for, and how exact that is."""
+    """Standard deviations by noise, if they were computed, and their exactness."""
     std, tilt_std = calibration.sensitivity_std, calibration.tilt_std
     if std is None or tilt_std is None:
         return {}

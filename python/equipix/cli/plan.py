@@ -1,4 +1,4 @@
-"""The command plan: what a pattern of shifts will leave, and better patterns."""
+"""The command plan: errors of a pattern of shifts, and better patterns."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ commands = typer.Typer()
 def plan(
     shape: Annotated[tuple[int, int], typer.Option(min=1, help="Rows and columns of the sensor.")],
     shifts: Annotated[
-        str | None, typer.Option(help="The pattern to judge: 'row,col row,col …' in pixels.")
+        str | None, typer.Option(help="The pattern to evaluate: 'row,col row,col …' in pixels.")
     ] = None,
     max_shift: Annotated[
         tuple[int, int] | None,
         typer.Option(min=0, help="Find patterns within this travel (row, col), in pixels."),
     ] = None,
     exposures: Annotated[
-        int | None, typer.Option(min=2, help="Of the patterns to find; the fewest unless given.")
+        int | None,
+        typer.Option(min=2, help="Exposures of the patterns to find; the fewest unless given."),
     ] = None,
     noise: Annotated[float, typer.Option(help="Noise of an exposure, over its signal.")] = 1e-3,
     drift: Annotated[
@@ -46,9 +47,11 @@ def plan(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Say what errors a pattern of shifts will leave, or find better patterns."""
+    """Predict the errors of a pattern of shifts, or find better patterns."""
     if (shifts is None) == (max_shift is None):
-        raise InputError("give either --shifts, to judge a pattern, or --max-shift, to find some")
+        raise InputError(
+            "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
+        )
     if output is not None:
         check_picture(output)
         check_output(output, force=force)
@@ -119,7 +122,7 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
         "equations / unknowns": lambda p: f"{p['equations']} / {p['unknowns']}",
         "worst wave, cycles per pixel": lambda p: "({:.3f}, {:.3f})".format(*p["worst_wave"]),
         "λ of it": lambda p: f"{p['smallest_eigenvalue']:.3f}",
-        "linear trend told from tilt": lambda p: f"{p['trend_told']:.1%}",
+        "linear trend distinct from tilt": lambda p: f"{p['trend_told']:.1%}",
         "  in the order advised": lambda p: f"{p['trend_told_in_order']:.1%}",
     }
     patterns = [f"pattern {k + 1}" for k in range(len(plans))]

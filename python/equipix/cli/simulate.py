@@ -45,7 +45,8 @@ def demo(
     frames: Annotated[int, typer.Option(min=2, help="Frames of an exposure.")] = 40,
     rng: Seed = 1,
     keep: Annotated[
-        Path | None, typer.Option(help="Folder to make for the images, which else go away.")
+        Path | None,
+        typer.Option(help="Folder to make for the images; without it they are removed."),
     ] = None,
     workers: Workers = None,
     force: Force = False,

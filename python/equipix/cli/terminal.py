@@ -1,4 +1,4 @@
-"""What every command of the command line shares: bars, one-line messages, results, outputs."""
+"""Common parts of all commands: bars, one-line messages, results, outputs."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ def say(kind: str, message: object) -> None:
 
 
 def show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Stand in for `warnings.showwarning`: one line on stderr, no source code."""
+    """Replace `warnings.showwarning`: one line on stderr, no source code."""
     say("warning", message)
 
 
 def show_result(result: dict[str, Any], *, as_json: bool) -> None:
-    """Print a result for machines (one JSON object) or for people (a table)."""
+    """Print a result as one JSON object or as a table."""
     if as_json:
         print(json.dumps(_json_value(result), allow_nan=False))  # noqa: T201
         return
@@ -122,7 +122,7 @@ def check_output(
 
 
 def _json_value(value: Any) -> Any:
-    """Put None in the place of numbers that JSON does not have."""
+    """Replace numbers that JSON does not have by None."""
     if isinstance(value, dict):
         return {key: _json_value(item) for key, item in value.items()}
     if isinstance(value, float) and not math.isfinite(value):

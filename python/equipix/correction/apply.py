@@ -1,4 +1,4 @@
-"""Frames corrected one by one by a formula, and what becomes of flagged pixels."""
+"""Frames corrected one by one by a formula, and the values of flagged pixels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def apply(
     flagged: Flagged,
     out: NDArray[Any] | None,
 ) -> NDArray[Any]:
-    """Correct frames by a formula, and do with flagged pixels what `flagged` says.
+    """Correct frames by a formula, and treat flagged pixels as `flagged` requires.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def apply_gain(
     flagged: Flagged,
     out: NDArray[Any] | None,
 ) -> NDArray[Any]:
-    """(frame − dark) / gain, frame by frame, and what becomes of flagged pixels.
+    """(frame − dark) / gain, frame by frame, and the values of flagged pixels.
 
     The parameters are those of `equipix.Calibration.correct`.
     """

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 _MARK = "corrected by equipix"
-"""Description of what `correct_files` writes, so that it is not corrected again unnoticed."""
+"""Description of what `correct_files` writes, so that a second correction is detected."""
 
 
 def correct_files(
@@ -117,7 +117,7 @@ def correct_files(
 
 
 def is_folder(output: Path) -> bool:
-    """Whether the name of an output stands for a folder of files."""
+    """Whether an output is a folder of files, by its name."""
     return output.suffix.lower() not in (".tif", ".tiff")
 
 
@@ -132,12 +132,12 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
 
 
 def _warn_of_corrected(files: list[Path]) -> None:
-    """Warn of what this module has written: of floating-point numbers, which cameras do not."""
+    """Warn of files that this module has written: cameras write no floating-point numbers."""
     floats = [file for file in files if frame_format(file)[1].kind == "f"]
     if corrected := [file for file in floats if description(file) == _MARK]:
         others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
         warnings.warn(
-            f"{corrected[0]}{others}: corrected already; correcting again divides by the "
+            f"{corrected[0]}{others}: corrected already; a second correction divides by the "
             "sensitivity twice: give the raw frames",
             AlreadyCorrectedWarning,
             stacklevel=3,
@@ -149,7 +149,7 @@ def _count(file: Path, correction: Correction) -> int:
     (count, *shape), _ = frame_format(file)
     if tuple(shape) != correction.shape:
         raise InputError(
-            f"{file}: frames of shape {tuple(shape)}, the calibrated sensor has {correction.shape}"
+            f"{file}: holds frames of shape {tuple(shape)}, expected {correction.shape}"
         )
     return count
 
@@ -161,7 +161,7 @@ def _with_dark(correction: Correction, dark: str) -> Callable[..., NDArray[Any]]
     if not _takes_dark(correction):
         raise InputError(
             f"'dark' is '{dark}', but the offsets of this correction are part of it and no dark "
-            "frame can take their place: expected 'stored'"
+            "frame can replace them: expected 'stored'"
         )
     return partial(correction.correct, dark=None if dark == "none" else _dark_frame(dark))
 

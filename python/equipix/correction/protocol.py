@@ -1,4 +1,4 @@
-"""What every correction of a sensor has in common, whatever method found it."""
+"""The protocol of all corrections of a sensor, whatever method found them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Correction(Protocol):
-    """What every correction of a sensor has in common, whatever method found it."""
+    """The protocol of all corrections of a sensor, whatever method found them."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -42,7 +42,7 @@ class Correction(Protocol):
         """Frames as a sensor of equal pixels would have given them.
 
         Of the frames' shape, (rows, cols) or (n, rows, cols); float64 for float64 frames, else
-        float32; or in `out`. Pixels flagged ``DO_NOT_USE`` become what `flagged` says.
+        float32; or in `out`. `flagged` determines the value of pixels flagged ``DO_NOT_USE``.
         """
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
@@ -50,7 +50,7 @@ class Correction(Protocol):
 
 
 class DarkCorrection(Correction, Protocol):
-    """A correction that subtracts a dark frame, in whose place another may be given."""
+    """A correction that subtracts a dark frame, which may be replaced by another."""
 
     @property
     def dark(self) -> NDArray[Any] | None:

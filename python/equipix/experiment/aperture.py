@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from equipix.shifts import ShiftMeasurement, Spot
 
 _AROUND = 8
-"""Pixels to each side of a spot's middle that stand for those under it."""
+"""Pixels to each side of a spot's middle that represent those under it."""
 
 _UNEQUAL_PIXELS = 0.008
 """Error of a centroid by unequal pixels under the spot, in pixels: s/(2√π) for a disc of any size
-and pixels of relative spread s, here that of a uniform ±5 % as it is usual before a calibration."""
+and pixels of relative spread s, here that of a uniform ±5 %, usual before a calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Equalisation:
     Attributes
     ----------
     gain : ndarray, shape (rows, cols)
-        Sensitivity; 1 in pixels that are not to be used, which the centroid mends.
+        Sensitivity; 1 in pixels that are not to be used, which the centroid corrects itself.
     dark : ndarray, shape (rows, cols)
         The dark frame, in DN.
     variance : ndarray, shape (rows, cols)
@@ -127,7 +127,7 @@ def _spots(
     try:
         level = manifest.sensor.saturation_level
         if equalisation is not None:
-            # In other units; the first measurement has seen that nothing saturates.
+            # In other units; the first measurement has checked that nothing saturates.
             before, after = equalisation.apply(before), equalisation.apply(after)
             level = None
         return measure_shift(before, after, saturation=level), before.shape[-2:]

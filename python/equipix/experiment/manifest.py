@@ -1,4 +1,4 @@
-"""What stands in experiment.toml, checked: faults are named with their value and place."""
+"""The content of experiment.toml, checked: errors contain the value and its place."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Dark(_Table):
 
 
 class Exposure(_Table):
-    """One ``[[exposure]]``: the frames of one sensor position and how the sensor came there."""
+    """One ``[[exposure]]``: the frames of one sensor position, and that position."""
 
     name: Text
     frames: Files
@@ -90,9 +90,9 @@ class Exposure(_Table):
         if self.aperture_before is not None and self.shift is not None:
             raise _problem("give aperture images or 'shift', not both")
         if self.shift_std is not None and self.shift is None:
-            raise _problem("'shift_std' goes with 'shift'")
+            raise _problem("'shift_std' is given without 'shift'")
         if self.flux_std is not None and self.flux is None:
-            raise _problem("'flux_std' goes with 'flux'")
+            raise _problem("'flux_std' is given without 'flux'")
         return self
 
 
@@ -144,7 +144,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
-    """Find the files that an entry of `manifest` (a file, a glob or a list) stands for."""
+    """Find the files of an entry of `manifest` (a file, a glob or a list)."""
     try:
         return io.find_files(entry, folder=manifest.parent)
     except EquipixError as error:
@@ -156,7 +156,7 @@ def _problem(text: str) -> PydanticCustomError:
 
 
 def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]:
-    """Say each mistake once, with the number of exposures where many make the same."""
+    """Name each mistake once, with the number of exposures that share it."""
     found: dict[tuple[object, ...], dict[int | None, str]] = {}
     for detail in details:
         location = detail["loc"]

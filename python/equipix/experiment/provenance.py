@@ -1,4 +1,4 @@
-"""Where a calibration comes from."""
+"""The origin of a calibration: files, versions and hashes."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ class Experiment:
     -----
     Frames, dark frames and aperture images are named relative to the file: one file (a
     multi-page TIFF holds many frames), a glob or a list. The position of an exposure is either
-    ``shift = [row, col]`` in pixels or follows from the one before it and from images of a small
-    aperture in the beam, taken before and after the move.
+    ``shift = [row, col]`` in pixels, or computed from the position before it and from images of
+    a small aperture in the beam, taken before and after the move.
     """
 
     path: Path
@@ -134,8 +134,9 @@ class Experiment:
             Absolute shifts (row, col) in pixels.
         std : ndarray, shape (n, 2)
             Standard errors; for shifts that the file gives those that it gives, or 0. Those of
-            successive moves add in quadrature, and so does what the unequal pixels under a spot do
-            to its centroid: 0.008 pixel, or s/(2√π) where a calibration leaves them unequal by s.
+            successive moves add in quadrature, and so does the error of a centroid by the unequal
+            pixels under the spot: 0.008 pixel, or s/(2√π) where a calibration leaves them unequal
+            by s.
 
         Raises
         ------
@@ -147,7 +148,7 @@ class Experiment:
 
         Notes
         -----
-        The aperture stands still in the beam, where it has the coordinate u = A p + t + d: with
+        The aperture is fixed in the beam, at the coordinate u = A p + t + d: with
         its image at p_before and p_after, d_new = d_old + (A_old p_before + t_old) −
         (A_new p_after + t_new).
         """
@@ -188,13 +189,13 @@ class Experiment:
         tolerance : float
             Largest relative error of the sensitivity at which the solver stops.
         max_sweeps : int, optional
-            Most passes over the data.
+            Upper limit on passes over the data.
         uncertainty : bool
             Whether to find the standard deviation of every pixel and of the tilt.
         workers : int, optional
             Number of threads; by default one for each processor.
         progress : callable, optional
-            Called as ``progress(done, total, stage)`` now and then.
+            Called as ``progress(done, total, stage)`` repeatedly.
 
         Returns
         -------
@@ -237,7 +238,7 @@ class Experiment:
     def _exposures(
         self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
     ) -> tuple[Exposures, NoiseModel | None]:
-        """The averaged frames with what the file says of them, and the noise of one frame."""
+        """The exposures from averaged frames and the file, and the noise model of one frame."""
         whole = options.method == "coordinate-descent"
         averaged = self._average(options)
         exposures = exposures_of(

@@ -1,4 +1,4 @@
-"""Averaged frames of the exposures of one experiment, reduced as they come."""
+"""Averaged frames of the exposures of one experiment, reduced one by one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Averaged:
-    """What a calibration needs of the `FrameStatistics` of each exposure, and no more.
+    """The part of the `FrameStatistics` of each exposure that a calibration needs.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Averaged:
         return [noise.of_mean(frames, dark_variance=variance) for frames, variance in pairs]
 
     def findings(self, noise: NoiseModel | None) -> Findings:
-        """Pixels that are odd before any fit; `noise` is the model of one frame, if known."""
+        """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
             noisy = noisy_pixels(self.values, self.variances, self._frames, noise)

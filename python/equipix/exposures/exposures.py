@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from equipix.noise import NoiseModel
 
 _BLOCK = 64
-"""Rows that medians are taken of at a time."""
+"""Rows of a block for medians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Exposures:
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
     findings : Findings
-        Pixels that were odd before any fit.
+        Bad pixels found before any fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
     """
@@ -129,7 +129,7 @@ class Exposures:
         return dataclasses.replace(self, positions=self.positions.reversed())
 
     def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
-        """Fit sensitivity, beam and what else is sought, from `start` if there is one.
+        """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class Exposures:
             If a value is out of range, an exposure shows no light, or what is sought cannot be
             determined by such exposures or by such a method.
         InsufficientMemoryError
-            If the memory that it takes cannot be had.
+            If there is not enough memory.
         """
         with naming_memory("calibrating"):
             return self._compiled(options).fit(
@@ -216,7 +216,7 @@ class Exposures:
 
 
 def _medians(values: Array) -> Array:
-    """Medians along the first axis of the values that are no NaN."""
+    """Medians along the first axis of the values that are not NaN."""
     values.sort(axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
     middle = [np.maximum(index, 0)[None] for index in ((count - 1) // 2, count // 2)]

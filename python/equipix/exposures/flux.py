@@ -54,7 +54,9 @@ class Flux:
         if isinstance(flux, str):
             return cls._fitted(flux, flux_std, time, count)
         if time is not None:
-            raise InputError("'time' is given but 'flux' is not 'linear'")
+            raise InputError(
+                "'time' is given but 'flux' is not 'linear': leave it out, or give flux='linear'"
+            )
         values = per_exposure("flux", flux, count, default=1)
         if flux_std is None:
             return cls("known", values)
@@ -68,9 +70,11 @@ class Flux:
         if flux not in ("fit", "linear"):
             raise InputError(f"'flux' is {flux!r}, expected numbers, 'fit' or 'linear'")
         if flux_std is not None:
-            raise InputError(f"'flux_std' goes with fluxes that are given, but 'flux' is {flux!r}")
+            raise InputError(
+                f"'flux_std' is given, but 'flux' is {flux!r}: expected fluxes as numbers"
+            )
         if (time is None) == (flux == "linear"):
-            raise InputError("'time' and flux='linear' go together: give both or neither")
+            raise InputError("'time' and flux='linear' need each other: give both or neither")
         if time is None:
             return cls("fit", ones)
         times = per_exposure("time", time, count, default=0)

@@ -1,4 +1,4 @@
-"""The one way from what a caller gives, arrays or averaged frames, to `Exposures`."""
+"""The one function that makes `Exposures` of arrays or averaged frames, and its checks."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def exposures_of(
 
 
 class Measured(NamedTuple):
-    """Mean frames and what is known of them, whatever they were given as."""
+    """Mean frames and what is known of them, from arrays or averages."""
 
     values: Array
     mask: Bools | None
@@ -95,8 +95,8 @@ def measured_of(
         return _of_arrays(cast("ArrayLike", frames), variance, saturation)
     if averaged is not frames and variance is None and averaged.noise is None:
         raise InputError(
-            "'frames' are single frames, which show no scatter: give their 'variance', or the "
-            "means alone for unit weights"
+            "'frames' are single frames, from which no noise can be estimated: give 'variance', or "
+            "the means alone for unit weights"
         )
     return _of_averaged(averaged, variance, saturation)
 
@@ -136,7 +136,7 @@ def _of_arrays(
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
     saturation: float | None,
 ) -> Measured:
-    """Arrays, of which nothing is known but what the caller says."""
+    """Arrays: only what the caller gives is known of them."""
     values = as_floats("frames", frames, ndim=3)
     if 0 in values.shape:
         raise InputError(
@@ -205,7 +205,7 @@ def as_variances(variance: ArrayLike, values: Array) -> Array:
 
 
 def union(*masks: Bools | None) -> Bools | None:
-    """Mask of what any of several masks, of one exposure or of all, hides."""
+    """Union of several masks, of one exposure or of all."""
     given = [mask for mask in masks if mask is not None]
     return functools.reduce(np.logical_or, given) if given else None
 

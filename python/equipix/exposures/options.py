@@ -26,11 +26,11 @@ class FitOptions:
     tolerance : float
         Largest relative error of the sensitivity at which the solver stops.
     max_sweeps : int or None
-        Most passes over the data or its weights.
+        Upper limit on passes over the data or its weights.
     workers : int or None
         Number of threads; None: as many as processors may be used.
     progress : callable or None
-        Called as ``progress(done, total, stage)`` now and then.
+        Called as ``progress(done, total, stage)`` repeatedly.
     """
 
     method: Method = "multiscale"

@@ -1,4 +1,4 @@
-"""Where the sensor stood in the beam during each exposure."""
+"""Positions of the sensor in the beam."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _TURNS = {
     180: ((-1, 0), (0, -1)),
     270: ((0, -1), (1, 0)),
 }
-"""A of each rotation, in degrees: the sensor sees ``numpy.rot90(window, rotation / 90)``."""
+"""A of each rotation, in degrees: the exposure is ``numpy.rot90(window, rotation / 90)``."""
 
 _WIDEST = 0.3
 """Largest prior standard deviation of a shift, in pixels: a fit moves it by less than a pixel."""
 
 _ROUNDING = 1e-6
-"""A fraction of a pixel that is rounding alone."""
+"""Largest fraction of a pixel that counts as rounding."""
 
 _BEYOND = 2**31
 """More pixels than any sensor has along a side."""
@@ -39,7 +39,7 @@ _BEYOND = 2**31
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Positions of the sensor in the beam: pixel p sees the place u = A p + t + d.
+    """Positions of the sensor in the beam: pixel p is at u = A p + t + d.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class Positions:
 
 
 def in_beam(pixel: ArrayLike, rotation: int, shape: tuple[int, int]) -> Array:
-    """Return A p + t: the place in the beam that a pixel sees at shift 0."""
+    """Return A p + t: the place of a pixel in the beam at shift 0."""
     place: Array = np.array(_TURNS[rotation]) @ np.asarray(pixel) + _offset(rotation, shape)
     return place
 
@@ -145,6 +145,6 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> Floats:
     if std.max() > _WIDEST:
         raise InputError(
             f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined "
-            "within a pixel of where they were measured; measure them better"
+            "within a pixel of where they were measured: measure them more accurately"
         )
     return std

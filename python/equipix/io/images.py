@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def read_frames(
     source: str | PathLike[str] | Iterable[str | PathLike[str]], *, workers: int | None = None
 ) -> NDArray[Any]:
-    """All frames of some files at once; `equipix.average` takes them without holding them.
+    """All frames of some files at once; `equipix.average` does not hold them all.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Names that callers give, and the files that they stand for."""
+"""Names given by callers, and the files that they denote."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def find_files(
     Returns
     -------
     list of Path
-        At least one file; a list keeps its order, and ``f2`` stands before ``f10`` in a glob.
+        At least one file; a list keeps its order, and ``f2`` precedes ``f10`` in a glob.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def as_path(name: str, value: object) -> Path:
-    """Take an argument for the name of a file or a folder.
+    """Check that an argument is the name of a file or a folder.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def as_path(name: str, value: object) -> Path:
 
 
 def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Refuse to write over a file that the work reads.
+    """Refuse an output that is also an input.
 
     Raises
     ------

@@ -130,7 +130,7 @@ def check_pages(
     wanted: Mapping[str, type],
     stacks: Mapping[str, type] | None = None,
 ) -> None:
-    """Refuse pages that lack one of those wanted, or are not all maps of one sensor.
+    """Refuse pages without those required, or that are not all maps of one sensor.
 
     Parameters
     ----------

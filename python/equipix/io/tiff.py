@@ -1,4 +1,4 @@
-"""TIFF files by tifffile: frames that the compiled reader leaves to it, and all that is written.
+"""TIFF files by tifffile: frames that the compiled reader does not decode, and all outputs.
 
 The only module that imports tifffile.
 """
@@ -25,7 +25,7 @@ _PAGE_NUMBER = 297  # TIFF tag: number from 0, and how many there are
 _SUBFILE_TYPE = 255  # TIFF tag
 _PHOTOMETRIC = 262  # TIFF tag
 _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
-_TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that still leave room for the directories
+_TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that leave space for the directories
 
 
 def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
@@ -53,13 +53,13 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
             return
         for page in file.pages:
             frame = page.asarray()
-            if frame.shape != page.shape:  # tifffile's way to say that the pixels are not there
+            if frame.shape != page.shape:  # how tifffile reports missing pixels
                 raise FileError(f"{path}: is broken: a page has no pixels")
             yield frame[None]
 
 
 def _check_page(path: Path, page: Any, length: int) -> None:
-    """Refuse what the compiled reader refuses: colour, white at 0, and what is no frame."""
+    """Refuse what the compiled reader refuses: colour, white at 0, and pages that are no frames."""
     old_type = page.tags.valueof(_SUBFILE_TYPE, default=1)
     if page.is_reduced or page.is_mask or page.subifds or old_type == 2:
         raise FileError(
@@ -89,13 +89,13 @@ def write_frames(
     Parameters
     ----------
     path : path
-        Output, written in place: give it a folder that nobody reads yet.
+        Output, written in place: use a folder that no other process reads.
     frames : iterable of ndarray, shape (rows, cols)
         The frames.
     nbytes : int
         Bytes of all frames together; above 4 GB they need BigTIFF.
     description : str, optional
-        ASCII text that goes with the first page.
+        ASCII text, stored with the first page.
     """
     with tifffile.TiffWriter(path, bigtiff=nbytes > _TIFF_LIMIT) as file:
         for frame in frames:
@@ -152,7 +152,7 @@ def _image_or_stack(path: Path, name: str, images: Sequence[Any]) -> NDArray[Any
 
 
 def description(path: Path) -> str:
-    """Text that goes with the first page of a file; empty where there is none."""
+    """Text stored with the first page of a file; empty where there is none."""
     with reading(path), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         return str(page.description)

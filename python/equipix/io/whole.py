@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[Path]:
-    """Give a file's place to a new version in one step, when all of it is written.
+    """Replace a file in one step, when all of its new version is written.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def folder_beside(target: Path) -> Iterator[Path]:
     Parameters
     ----------
     target : path
-        Where the content is to be; the folders that it lies in are made.
+        Where the content is to be; its parent folders are made.
 
     Yields
     ------
@@ -91,7 +91,7 @@ def folder_beside(target: Path) -> Iterator[Path]:
 
 
 def replace_folder(target: Path, new: Path) -> None:
-    """Put a folder in the place of another, if there is one, which goes away last of all."""
+    """Replace a folder, if there is one, by another; the old one is removed last."""
     target = target.resolve()
     if not target.exists():
         new.rename(target)
@@ -107,5 +107,5 @@ def replace_folder(target: Path, new: Path) -> None:
 
 
 def _beside(target: Path) -> Path:
-    """Give a hidden name in the folder of `target` that nothing else has, of the same suffix."""
+    """Return an unused hidden name in the folder of `target`, of the same suffix."""
     return target.parent / f".{uuid.uuid4().hex}{target.suffix}"

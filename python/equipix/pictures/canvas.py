@@ -43,11 +43,13 @@ def check_picture(path: Path) -> None:
     EquipixError
         If matplotlib is not installed.
     InputError
-        If it does not know the suffix.
+        If the suffix is unknown.
     """
     formats = new_figure(1, 1).canvas.get_supported_filetypes()
     if path.suffix.lower().removeprefix(".") not in formats:
-        raise InputError(f"'{path}' is no name of a picture: end it in {', '.join(formats)}")
+        raise InputError(
+            f"'{path}' is not the name of a picture, expected the suffix {' or '.join(formats)}"
+        )
 
 
 def save_figure(figure: Figure, path: Path, *, force: bool = False) -> None:
@@ -70,7 +72,7 @@ def draw_map(
     cmap: str,
     step: int = 1,
 ) -> None:
-    """Draw an image with its scale; a pixel of it stands for `step` pixels each way."""
+    """Draw an image with its scale; a pixel of it is `step` pixels wide and high."""
     rows, cols = (step * size for size in image.shape)
     extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
     shown = axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=cmap, extent=extent)

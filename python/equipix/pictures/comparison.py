@@ -60,7 +60,7 @@ def draw_comparison(comparison: Comparison, names: Sequence[str]) -> Figure:
 
 
 def _lines(axes: Axes, profiles: NDArray[Any], names: Sequence[str]) -> None:
-    """Draw profiles one over the other, the later thinner, so that each is seen."""
+    """Draw profiles one over the other, the later thinner, so that each is visible."""
     part = slice(profiles.shape[1] // 2, profiles.shape[1] // 2 + 60)
     columns = np.arange(profiles.shape[1])[part]
     for index, (profile, name) in enumerate(zip(profiles, names, strict=True)):

@@ -53,7 +53,7 @@ def _thinned(image: NDArray[Any]) -> tuple[NDArray[Any], int]:
 
 
 def _positions(axes: Axes, budget: ErrorBudget) -> None:
-    """Draw where the sensor stands in each exposure."""
+    """Draw the positions of the sensor."""
     rows, cols = budget.shifts.T
     axes.plot(cols, rows, color="gray", linewidth=0.6, linestyle=":")
     axes.plot(cols, rows, "o", color=CALIBRATION)

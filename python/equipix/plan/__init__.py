@@ -1,4 +1,4 @@
-"""The experiment planned before it is done: what shifts can compare, what errors will be left."""
+"""Planning of an experiment: which pixels shifts compare, and which errors remain."""
 
 from equipix.plan.budget import ErrorBudget, error_budget
 from equipix.plan.identifiability import Identifiability, identify

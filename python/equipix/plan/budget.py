@@ -1,4 +1,4 @@
-"""What limits a calibration, before it is done: noise, lamp drift, errors of the shifts."""
+"""The error budget of a planned calibration: noise, lamp drift, errors of the shifts."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ErrorBudget:
         λ(q) and its worst wave.
     trend_told : float
         Share of the variance of a linear trend of the lamp, with the exposures in this order,
-        that can be told from a tilt: see `advise_order`.
+        that is distinct from a tilt: see `advise_order`.
     components : int
         Number of connected components; of more than one, the errors are those within each.
     """
@@ -82,7 +82,7 @@ class ErrorBudget:
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """What the map of errors from noise is made of when it is asked for."""
+    """Data for the map of errors from noise, which is computed on demand."""
 
     shape: tuple[int, int]
     positions: NDArray[np.int64]
@@ -158,12 +158,11 @@ def error_budget(
     Notes
     -----
     With weights 1 and M = 1, noise σ leaves a covariance of :math:`\sigma^2 S^{-1}`, S being the
-    matrix of the linear problem for M: its diagonal is approximated by ways of one step, which
-    know of edges and of the beam, and scaled to draws of noise that `calibrate` solves. It is
-    within some per cent. Drift: only the part of ln c that is affine in d hides, and becomes a tilt
-    whose slope has the covariance (drift²/n)·cov(d)⁻¹; it leaves no residual. Errors of shifts: by
-    least squares over polynomials of degree 6. Weights are 1 throughout, as in `calibrate` without
-    `variance`.
+    matrix of the linear problem for M: its diagonal is approximated by paths of one step, which
+    include edges and the beam, and scaled to draws of noise that `calibrate` solves. It is within
+    some per cent. Drift: the part of ln c that is affine in d leaves no residual and becomes a
+    tilt, whose slope has the covariance (drift²/n)·cov(d)⁻¹. Errors of shifts: by least squares
+    over polynomials of degree 6. Weights are 1 throughout, as in `calibrate` without `variance`.
 
     Examples
     --------
@@ -219,12 +218,14 @@ def check_causes(
     shift_error: float,
     beam_width: float | None,
 ) -> None:
-    """Refuse a sensor that has nothing to compare, and causes of errors that are no numbers.
+    """Refuse a sensor of one pixel, and causes of errors that are not numbers.
 
     The parameters are those of `error_budget`.
     """
     if shape == (1, 1):
-        raise InputError(f"'shape' is {shape}: one pixel has no other to be compared with")
+        raise InputError(
+            f"'shape' is {shape}, expected at least two pixels: one cannot be compared with another"
+        )
     _positive("noise", noise)
     _positive("drift", drift, zero=True)
     _positive("shift_error", shift_error, zero=True)
@@ -247,8 +248,8 @@ def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
     )
     if components > 1:
         warnings.warn(
-            f"the shifts leave {components} parts of the sensor that nothing compares: the errors "
-            "are those within a part; choose other shifts (equipix.plan.suggest)",
+            f"the shifts leave {components} parts of the sensor unconnected: the errors are those "
+            "within a part: choose other shifts (equipix.plan.suggest)",
             IdentifiabilityWarning,
             stacklevel=3,
         )
@@ -260,8 +261,8 @@ def warn_of_drift(causes: dict[str, float]) -> None:
     if causes["drift"] > causes["noise"] > 0:
         warnings.warn(
             f"lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
-            f"{causes['drift'] / causes['noise']:.1f} times what noise leaves, and no residual "
-            "will show it: measure the flux, turn one exposure, or use larger shifts "
+            f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
+            "residual: measure the flux, turn one exposure, or use larger shifts "
             "(equipix.plan.suggest)",
             DriftWarning,
             stacklevel=3,

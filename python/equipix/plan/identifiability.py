@@ -1,4 +1,4 @@
-"""Which pixels an experiment compares: the connected components of its measurements."""
+"""Connected components: which pixels the measurements of an experiment compare."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Identifiability:
     ----------
     components : int
         Number of connected components: within one, sensitivity and beam are determined up to one
-        factor; between two nothing is compared. 1 is wanted.
+        factor; between two they are not compared. It should be 1.
     labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     largest : int

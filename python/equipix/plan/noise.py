@@ -1,4 +1,4 @@
-"""How far random noise alone will put the sensitivity from the truth, pixel by pixel."""
+"""Error of the sensitivity by random noise alone, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def local_variance(
     """Variance of M for noise of variance 1, but for a factor near 1 over the whole sensor.
 
     With M = 1 and unit weights the least-squares problem S g = b has S = D_M − B·D_L⁻¹·Bᵀ, and
-    noise of variance 1 leaves g of covariance S⁻¹. With S = D_M − K D_M, the chance that a walk
-    from pixel p to a cell and on to a pixel that sees it comes straight back is the diagonal
+    noise of variance 1 leaves g of covariance S⁻¹. With S = D_M − K D_M, the probability that a
+    walk from pixel p to a cell, and from there to a pixel of that cell, returns is the diagonal
 
         K_p = Σ_k c_k⁴ L(u_k)² / C(u_k) / D_M(p),   D_M(p) = Σ_k c_k² L(u_k)²,
 
-    C(u) being the sum of c² of the exposures that see cell u: fewer of them near the edges. So
-    (S⁻¹)_pp ≈ 1 / (D_M (1 − K)); what longer ways back add is left to `factor`.
+    C(u) being the sum of c² of the exposures that cover cell u: fewer of them near the edges. So
+    (S⁻¹)_pp ≈ 1 / (D_M (1 − K)); longer paths are included by `factor`.
     """
     rows, cols = shape
     places = positions - positions.min(axis=0)
@@ -68,7 +68,7 @@ def local_variance(
 
 
 def _seen_by(size: int, places: NDArray[np.int64]) -> Floats:
-    """Whether exposure l sees row (or column) i of the beam, counted from the first: (i, l)."""
+    """Whether exposure l covers row (or column) i of the beam, counted from the first: (i, l)."""
     away = np.arange(size + places.max())[:, None] - places
     return ((away >= 0) & (away < size)).astype(np.float64)
 

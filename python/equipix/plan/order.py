@@ -1,4 +1,4 @@
-"""In which order to take exposures, so that a lamp's steady drift does not look like a tilt."""
+"""The order of exposures in which a steady lamp drift is least degenerate with a tilt."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TIE = 12
 
 
 def trend_told(shifts: ArrayLike) -> float:
-    """Share of the variance of a linear trend of the lamp that can be told from a tilt.
+    """Share of the variance of a linear trend of the lamp that is distinct from a tilt.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ def trend_told(shifts: ArrayLike) -> float:
     Returns
     -------
     float
-        From 0, where a trend looks just like a tilt of the sensitivity, to 1, where none of it
-        does. The tilt that it causes falls with the square root of the rest.
+        From 0, where a trend is degenerate with a tilt of the sensitivity, to 1, where no part of
+        it is. The tilt that it causes decreases with the square root of 1 − this share.
 
     Notes
     -----
-    Only the part of ln c that is affine in d hides: the share is 1 − R² of the regression of the
-    exposures' numbers on (1, d). Three exposures off one line hide every trend.
+    Only the part of ln c that is affine in d leaves no residual: the share is 1 − R² of the
+    regression of the exposures' numbers on (1, d). With three exposures, not on one line, it is 0.
 
     Examples
     --------
@@ -52,7 +52,7 @@ def trend_told(shifts: ArrayLike) -> float:
 
 
 def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
-    """Order of exposures in which a linear drift of the lamp looks least like a tilt.
+    """Order of exposures in which a linear drift of the lamp is least degenerate with a tilt.
 
     Parameters
     ----------
@@ -101,14 +101,14 @@ def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
 def _hidden_share(
     ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Share of a trend that hides, in orders (m, n); what differs by rounding only is a tie."""
+    """Share of a trend without a residual, in orders (m, n); differences by rounding count as 0."""
     return np.asarray(np.round(np.sum((times[ranks] @ basis) ** 2, axis=1), _TIE))
 
 
 def _exchanged(
     ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Exchange the pair of exposures that helps most until none does."""
+    """Exchange the pair of exposures that reduces the share most, until none does."""
     first, second = np.triu_indices(len(ranks), 1)
     apart = basis[first] - basis[second]
     ranks, best = ranks.copy(), np.inf

@@ -25,13 +25,13 @@ _STARTS, _FINALISTS = 10, 6
 """Searches from different patterns, and how many of their ends get a full error budget."""
 
 _WAVES = 2048
-"""Waves that a pattern is judged by while searching."""
+"""Waves that a pattern is evaluated at during the search."""
 
 _NEAR, _FAR, _TRIED = 32, 16, 4
 """Places that a position might move to, nearby and anywhere; of those how many are checked."""
 
 _GAIN = 1e-3
-"""Relative gain below which a move is not worth while."""
+"""Least relative gain of a move."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +42,7 @@ class Suggestion:
     ----------
     shifts : ndarray, shape (n, 2), int64
         The shifts (row, col) in pixels, the smallest 0, in the order in which a linear drift of
-        the lamp looks least like a tilt (`advise_order`).
+        the lamp is least degenerate with a tilt (`advise_order`).
     budget : ErrorBudget
         Its errors.
     """
@@ -257,7 +257,7 @@ def _improved(
     score: _Score,
     rng: np.random.Generator,
 ) -> Points | None:
-    """Move positions one by one while that helps; None if nothing connected was met."""
+    """Move positions one by one while the error decreases; None if no pattern is connected."""
     best = _whole_score(points, score) if is_connected(shape, points) else np.inf
     unmoved, k = 0, 0
     while unmoved < 2 * len(points):
@@ -290,7 +290,7 @@ def _whole_score(points: Points, score: _Score) -> float:
 
 
 def _distinct(found: list[Points], score: _Score) -> list[Points]:
-    """Put patterns in the order of their scores, and what is only a move of another aside."""
+    """Sort patterns by their scores, without those that are others moved as a whole."""
     patterns: dict[tuple[Any, ...], Points] = {}
     for points in found:
         moved = points - points.min(axis=0)

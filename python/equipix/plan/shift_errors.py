@@ -1,4 +1,4 @@
-"""What errors of shifts do: large-scale errors that leave next to no residual."""
+"""Effect of errors of shifts: large-scale errors that leave almost no residual."""
 
 from __future__ import annotations
 

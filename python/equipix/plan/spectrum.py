@@ -1,4 +1,4 @@
-"""How well a pattern of shifts sees waves of the sensitivity: the symbol λ(q)."""
+"""How well a pattern of shifts determines waves of the sensitivity: the symbol λ(q)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FREQUENCIES = 512
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Spectrum:
-    """What the least-squares problem does to waves of the sensitivity, far from the edges.
+    """The symbol of the least-squares problem for waves of the sensitivity, far from the edges.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class Spectrum:
     cols : ndarray, shape (1025,), float64
         Frequencies along the columns' axis, from −1/2 to 1/2.
     values : ndarray, shape (513, 1025), float64
-        λ(q) from 0 (a wave that no exposure sees) to n. For random noise σ the variance of the
+        λ(q) from 0 (an undetermined wave) to n. For random noise σ the variance of the
         wave's amplitude is proportional to σ²/λ.
     worst : tuple of float
         Frequency (row, col) of the smallest λ away from long waves: a nearly periodic one, whose

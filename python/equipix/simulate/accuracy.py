@@ -116,7 +116,7 @@ class ReducedSystem:
     weights : ndarray, shape (n, rows, cols)
         Weight ω of each measurement.
     corners : ndarray of int, shape (n, 2)
-        First beam cell (row, col) that each exposure sees; the smallest is (0, 0).
+        First beam cell (row, col) of each exposure; the smallest is (0, 0).
     """
 
     def __init__(self, weights: Floats, corners: NDArray[np.int64]) -> None:

@@ -24,7 +24,7 @@ DEAD_RESPONSE = 0.02
 """Sensitivity of a dead pixel."""
 
 HOT_LEVEL = 0.915
-"""Dark level of a hot pixel, as a fraction of full scale: daylight saturates it."""
+"""Dark level of a hot pixel, as a fraction of full scale: with light it saturates."""
 
 MANY_E = 1000.0
 """Electrons from which on a Poisson number is drawn as a normal one."""
@@ -82,7 +82,7 @@ class Camera:
     hot: Pixels = field(default_factory=_no_pixels)
 
     def __post_init__(self) -> None:
-        """Refuse values that no camera has."""
+        """Refuse values out of range."""
         if self.bit_depth not in range(8, 17):
             raise InputError(f"'bit_depth' is {self.bit_depth!r}, expected 8 to 16")
         for name in ("gain_dn_per_e", "full_well_e"):
@@ -184,7 +184,7 @@ class Camera:
             yield self._digitised(frame)
 
     def _is_normal(self, electrons: Floats) -> NDArray[np.bool_]:
-        """Whether so many photons are as good as normally distributed, the well far from full."""
+        """Whether the number of photons is nearly normally distributed, far below the full well."""
         room = self.full_well_e - electrons
         return (electrons >= MANY_E) & (room > WELL_MARGIN * np.sqrt(electrons))
 

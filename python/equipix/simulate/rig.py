@@ -1,4 +1,4 @@
-"""A whole calibration experiment: a camera on a stage before a steady beam, and a hole."""
+"""A virtual calibration experiment: a camera on a stage in a steady beam, and a hole."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VirtualExperiment:
-    """An experiment whose frames are made when they are asked for; see `experiment`.
+    """An experiment whose frames are made on demand; see `experiment`.
 
     Every stream of frames has random numbers of its own and can be drawn again.
 
@@ -81,7 +81,7 @@ class VirtualExperiment:
     hole : callable
         The same beam behind the screen with the hole.
     positions : ndarray, shape (n, 2), float64
-        Where the stage really stands in each exposure, the first at (0, 0).
+        True position of the stage in each exposure, the first (0, 0).
     count, dark_count, aperture_count : int
         Numbers of frames: of an exposure, of the dark, of an image of the hole.
     entropy : int
@@ -244,7 +244,7 @@ def experiment(
     beam : callable
         Beam of amplitude about 1, a function of arrays of row and column coordinates.
     shifts : array_like, shape (n, 2)
-        Shifts (row, col), in pixels, that the stage is told to make; the first is (0, 0).
+        Shifts (row, col), in pixels, that the stage is commanded to make; the first is (0, 0).
     frames, dark_frames, aperture_frames : int
         Numbers of frames of an exposure, of the dark (as many as of an exposure unless given)
         and of each image of the hole.
@@ -320,14 +320,14 @@ def experiment(
 
 
 def _reached(shifts: Floats, stage_error: float, rng: np.random.Generator) -> Floats:
-    """Where the stage gets: each move is off by a random error."""
+    """Positions that the stage reaches: each move has a random error."""
     errors = np.zeros_like(shifts)
     errors[1:] = rng.normal(0, stage_error, errors[1:].shape).cumsum(axis=0)
     return shifts + errors
 
 
 def _behind_hole(beam: Beam, shape: tuple[int, int], positions: Floats) -> Beam:
-    """Put the beam through a round hole in the middle of what every position sees."""
+    """Put the beam through a round hole in the middle of the area common to all positions."""
     low, high = positions.max(axis=0), positions.min(axis=0) + shape
     row, col = (low + high - 1) / 2
     radius = float(min(0.1 * min(shape), 0.35 * (high - low).min()))

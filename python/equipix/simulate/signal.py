@@ -286,7 +286,7 @@ def exposures(
 
 
 def window(beam: Beam, shape: tuple[int, ...], shift: Floats, rotation: float = 0.0) -> Floats:
-    """Evaluate the part of the beam that a sensor of that shape sees, L(u_k(p))."""
+    """Evaluate the part of the beam on a sensor of that shape, L(u_k(p))."""
     turns, rest = divmod(rotation, 90)
     if rest:
         raise InputError(f"'rotation' holds {rotation}°, expected multiples of 90°")

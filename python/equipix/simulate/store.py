@@ -113,13 +113,13 @@ def _manifest(recording: Recording) -> str:
 
 
 class _Counter:
-    """Reports frames as they pass."""
+    """Reports frames as they are written."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress, self._total, self._done = progress, total, 0
 
     def pass_on(self, frames: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-        """Yield the frames, each reported when it has been dealt with."""
+        """Yield the frames, each reported when it has been written."""
         for frame in frames:
             yield frame
             self._done += 1
@@ -128,7 +128,7 @@ class _Counter:
 
 
 def _may_replace(target: Path, force: bool) -> bool:
-    """Whether the target is an empty folder, or an experiment that may go."""
+    """Whether the target is an empty folder, or an experiment that may be replaced."""
     if not target.is_dir():
         return False
     return not any(target.iterdir()) or (force and all(map(_is_ours, target.iterdir())))
