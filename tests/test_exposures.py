@@ -137,8 +137,8 @@ def test_fluxes_are_of_one_kind(given, kind, model):
     ("given", "message"),
     [
         ({"flux": "free"}, "'flux' is 'free', expected numbers, 'fit' or 'linear'"),
-        ({"flux": "fit", "flux_std": 0.1}, "'flux_std' goes with fluxes that are given"),
-        ({"flux": "linear"}, "'time' and flux='linear' go together"),
+        ({"flux": "fit", "flux_std": 0.1}, "'flux_std' is given, but 'flux' is 'fit'"),
+        ({"flux": "linear"}, "'time' and flux='linear' need each other"),
         ({"time": [1, 2, 3]}, "'time' is given but 'flux' is not 'linear'"),
         ({"flux": "linear", "time": [1, 1, 1]}, "not all the same"),
         ({"flux_std": 0.0}, "expected positive numbers"),
