@@ -311,3 +311,15 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         equipix.average(f"{tmp_path}/x*.tif")
     with pytest.raises(FileError, match=r"is a folder.*\*\.tif"):
         equipix.average(tmp_path)
+
+
+def test_a_mask_is_refused_where_it_would_be_lost() -> None:
+    frames = np.ma.masked_greater(np.arange(24.0).reshape(2, 3, 4), 20)
+    with pytest.raises(InputError, match=r"'source' is a masked array.*NaN"):
+        equipix.average(frames)
+
+
+@pytest.mark.parametrize("level", [0, -1, float("nan")])
+def test_a_saturation_level_is_above_0(level: float) -> None:
+    with pytest.raises(InputError, match=r"'saturation' is .*above 0"):
+        equipix.average(np.ones((2, 3, 4)), saturation=level)

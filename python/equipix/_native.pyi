@@ -90,7 +90,7 @@ class Beam:
         coefficients: NDArray[Any] | None,
         origin: tuple[int, int],
         *,
-        tilt: tuple[float, float] | list[float] = (0.0, 0.0),
+        tilt: tuple[float, float] | list[float] = ...,
     ) -> Beam: ...
     @property
     def values(self) -> NDArray[Any]: ...

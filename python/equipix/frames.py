@@ -216,13 +216,17 @@ def _level(saturation: float | None) -> float | None:
         level = float(saturation)
     except (TypeError, ValueError):
         level = math.nan
-    if math.isnan(level):
-        raise InputError(f"'saturation' is {saturation!r}, expected a level in DN or None")
+    if not level > 0:
+        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0 in DN, or None")
     return level
 
 
 def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
     """Paths as a list, an array as it is, other iterables as an iterator."""
+    if np.ma.is_masked(source):
+        raise InputError(
+            "'source' is a masked array, whose mask would be lost: fill the masked samples with NaN"
+        )
     if isinstance(source, np.ndarray):
         return source
     if isinstance(source, str | os.PathLike):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import as_array, as_shifts
-from equipix.errors import InputError, ShiftRoundingWarning
+from equipix.errors import InputError, ShiftRoundingWarning, warn
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -204,12 +203,11 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
     noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
     if noticeable.any():
         worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
-        warnings.warn(
+        warn(
             f"shifts are rounded to whole pixels: that of exposure {worst[0]} (from 0) is "
             f"{np.round(exact[worst[0]], 3).tolist()} (limit {_UNNOTICED:g} from whole): use "
             "method='multiscale', or move the sensor by whole pixels",
             ShiftRoundingWarning,
-            stacklevel=3,
         )
     return whole.astype(np.int64)
 
