@@ -226,7 +226,7 @@ def calibrated(
     verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
-    flags = pixel_flags(weighted, options.fit.tolerance)
+    flags = pixel_flags(weighted, options.fit)
     dark = dark_std(weighted, options.fit)
     found = verdicts.on_fit(weighted, options, test, dark)
     verdicts.say(found)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from equipix._native import Fit
     from equipix._types import Array, Bools
     from equipix.exposures.exposures import Exposures
+    from equipix.exposures.options import FitOptions
 
 _BEYOND = 5.0
 """Standard deviations that normal noise exceeds in one of two million measurements."""
@@ -30,7 +31,7 @@ _ROBUST = 1.4826
 """Standard deviation over median absolute deviation, for normal noise."""
 
 
-def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Bools:
+def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions) -> Bools:
     """Find the measurements to leave out next.
 
     Parameters
@@ -41,8 +42,8 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Boo
         The fit without those that were left out.
     before : ndarray of bool, shape (n, rows, cols)
         Which were left out.
-    floor : float
-        Relative deviation that the solver leaves: a smaller one is none.
+    options : FitOptions
+        Its tolerance is the relative deviation that the solver leaves: a smaller one is none.
 
     Returns
     -------
@@ -56,7 +57,7 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Boo
     only what deviates most in its pixel and in its cell; the next fit shows what remains. A value
     that no longer deviates is used again, and so are those of a pixel that would have no M.
     """
-    new, old = deviations(exposures, fit, before, floor)
+    new, old = deviations(exposures, fit, before, options)
     leading = np.where(before, 0, np.nan_to_num(new))
     by_pixel = leading.max(axis=0)
     by_cell = np.zeros(fit.beam.values.shape, leading.dtype)
@@ -76,7 +77,7 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, floor: float) -> Boo
 
 
 def deviations(
-    exposures: Exposures, fit: Fit, left_out: Bools, floor: float
+    exposures: Exposures, fit: Fit, left_out: Bools, options: FitOptions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """How far each measurement, or the mean of the 3×3 pixels around it, is from the fit.
 
@@ -88,8 +89,8 @@ def deviations(
         Their fit.
     left_out : ndarray of bool, shape (n, rows, cols)
         Which were left out of the fit.
-    floor : float
-        Relative deviation that the solver leaves.
+    options : FitOptions
+        Its tolerance is the relative deviation that the solver leaves: a smaller one is none.
 
     Returns
     -------
@@ -112,7 +113,7 @@ def deviations(
     response = np.nan_to_num(fit.sensitivity).astype(np.float64)
     usable = exposures.usable()
     on_pixels, on_cells = np.zeros(shape), np.zeros(fit.beam.values.shape)
-    seen = [np.nan_to_num(exposures.light(fit, k)) for k in range(len(exposures))]
+    seen = [np.nan_to_num(exposures.light(fit, k, options.workers)) for k in range(len(exposures))]
     weights = [
         _weights(exposures.variance, k, usable[k] & (seen[k] * response != 0))
         for k in range(len(exposures))
@@ -136,7 +137,7 @@ def deviations(
         scaled = (root * (exposures.values[k] - expected))[known] / np.sqrt(spread[known])
         residual[known] = scaled
         used = known & ~left_out[k]
-        least = floor * _median(root * expected, known)
+        least = options.tolerance * _median(root * expected, known)
         residual /= max(_ROBUST * _median(residual, used), least, np.finfo(float).tiny)
         new[k], old[k] = _conspicuous(residual, used, known)
     return new, old

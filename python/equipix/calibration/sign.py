@@ -195,7 +195,7 @@ def _fitted(window: Exposures, noise: float | None, options: FitOptions) -> _Res
     return _Residuals(
         left=left,
         freedom=fit.degrees_of_freedom,
-        squares=window.weighted_squares(np.square(window.residuals(fit))),
+        squares=window.weighted_squares(np.square(window.residuals(fit, options.workers))),
         noise=(left / float(power)) ** 0.5,
         error=float(fit.error_estimate[-1]),
         stuck=fit.ended != "converged",

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from equipix._native import Fit
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
     from equipix.calibration.options import Options
     from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
@@ -53,28 +53,32 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
     fit begins from the one before, the first from `start`.
     """
     options.check(exposures)
-    if exposures.noise:
+    middle = exposures.medians() if exposures.noise else None
+    if middle is not None:
         tolerance = max(options.fit.tolerance, _ROUGH)
         rough = dataclasses.replace(options.fit, tolerance=tolerance)
-        start = modelled(exposures, _at_medians(exposures)).fit(rough, start)
-        exposures = modelled(exposures, expected(exposures, start))
+        at_medians = (c * middle for c in exposures.flux.values)
+        start = modelled(exposures, at_medians).fit(rough, start)
+        exposures = modelled(exposures, expected(exposures, start, middle, options.fit.workers))
     if options.robust:
-        return _robust_fit(exposures, options.fit, start)
+        return _robust_fit(exposures, options.fit, start, middle)
     return Weighted(exposures, exposures.fit(options.fit, start), None)
 
 
-def _robust_fit(exposures: Exposures, options: FitOptions, start: Fit | None) -> Weighted:
+def _robust_fit(
+    exposures: Exposures, options: FitOptions, start: Fit | None, middle: Floats | None
+) -> Weighted:
     """Fit and leave out outliers, until nothing changes."""
     usable = exposures.usable()
     out = np.zeros_like(usable)
     fit = exposures.fit(options, start)
     kept = exposures
     for _ in range(_MOST_ROUNDS):
-        former, out = out, rejected(exposures, fit, out, options.tolerance)
+        former, out = out, rejected(exposures, fit, out, options)
         if np.array_equal(former, out):
             break
-        if exposures.noise:
-            exposures = modelled(exposures, expected(exposures, fit))
+        if middle is not None:
+            exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
         kept = exposures.without(~usable | out)
         fit = kept.fit(options, fit)
     return Weighted(kept, fit, out)
@@ -85,12 +89,10 @@ def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:
     return exposures.weighted(modelled_variances(exposures.noise, signals, exposures.values))
 
 
-def _at_medians(exposures: Exposures) -> Iterator[Array]:
-    return (c * exposures.medians for c in exposures.flux.values)
-
-
-def expected(exposures: Exposures, fit: Fit) -> Iterator[Array]:
-    """Signals c · L · M; the medians where the fit determines none."""
+def expected(
+    exposures: Exposures, fit: Fit, middle: Floats, workers: int | None
+) -> Iterator[Array]:
+    """Signals c · L · M; c times the medians `middle` where the fit determines none."""
     for k, flux in enumerate(exposures.flux.values):
-        signal = exposures.light(fit, k) * fit.sensitivity
-        yield np.where(np.isfinite(signal), signal, flux * exposures.medians)
+        signal = exposures.light(fit, k, workers) * fit.sensitivity
+        yield np.where(np.isfinite(signal), signal, flux * middle)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.calibration.pixel_flags import pixel_flags
 from equipix.errors import InputError
 from equipix.experiment.manifest import find_files
 from equipix.exposures.positions import in_beam, variance_in_beam
@@ -52,16 +51,16 @@ class Equalisation:
     variance: Array
 
     @classmethod
-    def of(cls, weighted: Weighted, tolerance: float) -> Self:
+    def of(cls, weighted: Weighted, flags: Array, workers: int | None = None) -> Self:
         """Take it from the fit of exposures whose dark is known."""
         exposures, fit, _ = weighted
         if exposures.dark is None:
             raise InputError(
                 "'calibration' holds no dark frame: give one that Experiment.run has made"
             )
-        good = usable(pixel_flags(weighted, tolerance))
+        good = usable(flags)
         count = len(exposures)
-        known = fit.information(workers=None) * np.square(fit.sensitivity)
+        known = fit.information(workers=workers) * np.square(fit.sensitivity)
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = weighted.noise_variance * count / max(count - 2, 1) / known
         gain = np.where(good, fit.sensitivity, 1).astype(exposures.values.dtype)

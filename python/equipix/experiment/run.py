@@ -10,6 +10,7 @@ import numpy as np
 from equipix._check import naming_memory
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.options import Options
+from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.weights import weighted_fit
 from equipix.errors import FileError, InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
@@ -159,8 +160,7 @@ class Experiment:
                     "'calibration' was read from a file, which does not hold the measurements: "
                     "give the result of Experiment.run"
                 )
-            tolerance = calibration.metadata["options"]["tolerance"]
-            equalisation = Equalisation.of(calibration.weighted, tolerance)
+            equalisation = Equalisation.of(calibration.weighted, calibration.flags)
         return measured_shifts(self.path, self.manifest, equalisation)
 
     def run(
@@ -228,7 +228,7 @@ class Experiment:
         if moved and method == "multiscale":
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
-            equalisation = Equalisation.of(first, rough.tolerance)
+            equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
             shifts, std = measured_shifts(self.path, self.manifest, equalisation)
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -149,18 +148,18 @@ class Exposures:
                 progress=options.progress,
             )
 
-    def light(self, fit: Fit, exposure: int) -> Floats:
+    def light(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
         """Return c · L(u) on each pixel in an exposure; NaN where the beam was not observed."""
         row, col = fit.shifts[exposure]
         turn = int(self.positions.rotation[exposure])
-        light = fit.beam.light(self.shape, (row, col), turn, workers=None)
+        light = fit.beam.light(self.shape, (row, col), turn, workers=workers)
         return np.asarray(fit.flux[exposure] * light)
 
-    def residuals(self, fit: Fit) -> Floats:
+    def residuals(self, fit: Fit, workers: int | None) -> Floats:
         """Return y − c · L(u) · M(p) − O(p), (n, rows, cols); NaN where nothing is predicted."""
         residuals = np.empty(self.values.shape)
         for k, residual in enumerate(residuals):
-            np.subtract(self.values[k], self.light(fit, k) * fit.sensitivity, out=residual)
+            np.subtract(self.values[k], self.light(fit, k, workers) * fit.sensitivity, out=residual)
             if fit.offset is not None:
                 residual -= fit.offset
         return residuals
@@ -200,9 +199,8 @@ class Exposures:
             progress=options.progress,
         )
 
-    @cached_property
     def medians(self) -> Floats:
-        """Median over the exposures of value/flux in each pixel; NaN where nothing is measured."""
+        """Return the median of value/flux in each pixel; NaN where nothing is measured."""
         result = np.empty(self.shape)
         for start in range(0, len(result), _BLOCK):
             rows = slice(start, start + _BLOCK)

@@ -184,7 +184,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let near = error <= BEFORE_SHIFTS.max(self.options.tolerance)
             && self.search.iterations >= FEWEST_ITERATIONS;
         let Some(prior) = self.shift_prior.take_if(|_| near) else { return false };
-        if self.system.structure() < TOLD {
+        // Of a grid too small for second differences the structure is NaN, which determines nothing.
+        let determined = self.system.structure() >= TOLD;
+        if !determined {
             self.refinement = Refinement::Undetermined;
             return false;
         }
