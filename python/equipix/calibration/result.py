@@ -374,10 +374,6 @@ class Calibration:
         InputError
             If an argument has a wrong shape or value.
 
-        See Also
-        --------
-        residuals : How far frames are from it.
-
         Examples
         --------
         >>> import numpy as np
@@ -470,13 +466,10 @@ class Calibration:
     def _signal(self, shift: list[float], rotation: int, flux: float) -> NDArray[Any]:
         """Frame c · L(u) · M(p) from a position, in the dtype of the sensitivity."""
         row, col = shift
-        light = self._beam.light(self.shape, (row, col), rotation, workers=None)
-        return np.asarray(flux * light * self.sensitivity, self.sensitivity.dtype)
-
-    @property
-    def _beam(self) -> Beam:
         tilt = self.beam_tilt.tolist()
-        return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
+        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
+        light = beam.light(self.shape, (row, col), rotation, workers=None)
+        return np.asarray(flux * light * self.sensitivity, self.sensitivity.dtype)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.
