@@ -83,7 +83,7 @@ pub enum Tie {
     /// They carry next to no weight: they join nothing, but cells that no other pixel sees follow
     /// from it.
     Loose,
-    /// It does not respond: they tell nothing of the beam.
+    /// It does not respond: they contain no information on the beam.
     None,
 }
 

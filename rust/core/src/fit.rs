@@ -90,7 +90,7 @@ impl Fit {
     }
 
     /// The variance of a value of weight 1: 1 where variances were given, else reduced χ², or 1 where
-    /// no residual tells it.
+    /// the residuals do not determine it.
     #[must_use]
     pub fn unit(&self) -> f64 {
         let chi2 = self.reduced_chi2();

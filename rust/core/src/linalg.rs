@@ -32,7 +32,7 @@ impl Cholesky {
 }
 
 /// The inverse of a matrix [a b; b c] without negative eigenvalues; 0 along the direction that one of
-/// rank 1 does not tell, and the matrix over its trace squared along the other.
+/// rank 1 does not determine, and the matrix over its trace squared along the other.
 pub(crate) fn inverse([a, b, c]: [f64; 3]) -> [[f64; 2]; 2] {
     let determinant = a * c - b * b;
     if determinant > SINGULAR * (a + c).powi(2) {

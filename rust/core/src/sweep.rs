@@ -10,7 +10,7 @@
 //! One sweep updates all L, then all M (Stukachev and Kozhevatov 2011, section 2, who take the
 //! method from Vasil'ev 1988). The objective F never rises. Pixel-scale errors of M fade in some
 //! twenty sweeps, an error of the sensor's own size in (size/shift)² sweeps: see
-//! [`convergence`](crate::convergence) for how to tell.
+//! [`convergence`](crate::convergence) for the criterion.
 //!
 //! Both are updated in the form M += Σ w c L r / Σ w c² L² with the residuals r = y − c L M, which
 //! gives F in the same pass and keeps its accuracy when the residuals become small.

@@ -1,6 +1,6 @@
 //! Which fluxes are unknown: ln c = ln c₀ + T θ, with a prior on θ or none.
 //!
-//! Two tilts of ln M cannot be told from fluxes: with M → M·exp(α·p), L → L·exp(−α·u) and
+//! Two tilts of ln M are degenerate with fluxes: with M → M·exp(α·p), L → L·exp(−α·u) and
 //! ln c_k → ln c_k + α·d_k nothing that is measured changes, unless exposures are turned against each
 //! other. So free fluxes are sought where ln c has no part that is affine in the shifts, and what
 //! remains undetermined is left to the gauge. With a prior of weights π the same is done with

@@ -1,4 +1,4 @@
-//! How many unknowns the measurements tell, where a penalty tells the rest.
+//! How many unknowns the measurements determine, where a penalty determines the rest.
 //!
 //! With the penalty the coefficients of the beam are no whole unknowns each: a pattern of wave vector
 //! q counts s/(s + τ g), where S has the symbol s and the fourth differences g (Hastie, Tibshirani,

@@ -31,7 +31,7 @@ pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
 
 /// The components of pixels and cells. Along an axis where all shifts differ by whole numbers of pixels,
 /// a pixel hangs on one value of the beam; else on the two beside it, which is a necessary condition
-/// alone: then a Ritz value near 0 tells of patterns that nothing compares.
+/// alone: then a Ritz value near 0 shows patterns that are not determined.
 pub(crate) fn components<T: Real>(
     system: &System<'_, '_, T>,
     control: &Control,

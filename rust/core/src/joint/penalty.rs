@@ -1,6 +1,6 @@
 //! The penalty on the beam's fourth differences, τ ‖G a‖², along rows and columns.
 //!
-//! It tells what the measurements do not: a spline's finest pattern, and its cells behind the edge.
+//! It determines what the measurements do not: a spline's finest pattern, and its cells behind the edge.
 //! Differences count where all five cells are seen. Since the beam has no scale of its own, the
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.

@@ -35,7 +35,7 @@ pub(crate) struct Preconditioner {
     /// 1/D of cells that are not of the rim, else 0.
     inverse: Vec<f64>,
     rim: Rim,
-    /// 1/D of θ and shifts; 0 for what no measurement tells.
+    /// 1/D of θ and shifts; 0 for what no measurement determines.
     params: Vec<f64>,
     coarse: Coarse,
     /// Cells of a row.

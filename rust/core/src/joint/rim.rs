@@ -1,4 +1,4 @@
-//! The rim of the beam: cells near others that are hardly seen.
+//! The rim of the beam: cells near others of small weight.
 //!
 //! Inside, the normal matrix of a spline is nearly a convolution, whose inverse is a filter. At the rim,
 //! behind the edges of exposures and around holes, it is none: what factors of a few thousandths tell, and
@@ -20,11 +20,11 @@ const NEAR: usize = 2;
 const SHARE: f64 = 1.0 / 6.0;
 /// A rim of more cells than these of each row and column fills the image: then its diagonal has to do.
 pub(crate) const WIDEST: usize = 12;
-/// What is added to the diagonal, as a share of it, for cells that rounding alone tells.
+/// What is added to the diagonal, as a share of it, for cells that rounding alone determines.
 const RIDGE: f64 = 1e-10;
 /// Cells that lie within a spline's reach of each other, along one axis.
 const REACH: usize = 2 * TAPS - 1;
-/// The rim is factorised in tiles of the grid so many cells wide, which hardly know of each other:
+/// The rim is factorised in tiles of the grid so many cells wide, which are almost independent:
 /// each in some hundredths of a second, which nothing interrupts.
 const TILE: usize = 512;
 

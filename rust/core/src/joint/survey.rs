@@ -59,7 +59,7 @@ impl<T: Real> System<'_, '_, T> {
     /// How much the beam's slopes change from place to place, over those of noise: the mean square of
     /// the smoothed slopes' second differences over [`APART`] cells, by that of what smoothing took
     /// away. A beam without structure, such as a Gaussian, has slopes of its own too, but by those
-    /// shifts are hardly told from a bend of M.
+    /// shifts are nearly degenerate with a bend of M.
     pub(crate) fn structure(&self) -> f64 {
         let Shape { rows, cols } = self.pass.grid.geometry.beam;
         let beam = &self.state.beam;

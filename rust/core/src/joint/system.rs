@@ -28,7 +28,7 @@ use crate::frames::Real;
 use crate::geometry::TAPS;
 use crate::parallel::Workers;
 
-/// A determinant that is rounding alone, of two columns that a pixel cannot tell from each other.
+/// A determinant that is rounding alone, of two columns that are degenerate in a pixel.
 const SINGULAR: f64 = 1e-12;
 
 /// The problem at a state.
@@ -201,7 +201,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         Ok((objective, slope))
     }
 
-    /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam that no measurement tells.
+    /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam, which is not determined.
     pub(crate) fn take_scale_out(&self, x: &mut [f64]) {
         let multiple = self.pass.workers.dot(&self.scale, x);
         self.pass.workers.add_multiple(x, -multiple, &self.state.beam);

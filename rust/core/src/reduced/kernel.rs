@@ -55,7 +55,7 @@ impl pulp::NullaryFnOnce for Gather<'_, '_> {
     }
 }
 
-/// signal/weight in place of the signal, 0 where no measurement tells.
+/// signal/weight in place of the signal, 0 without a measurement.
 pub(super) struct Divide<'l> {
     pub(super) signal: &'l mut [f32],
     pub(super) weight: &'l [f32],

@@ -10,7 +10,7 @@ use crate::median::median;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
 
-/// A pixel whose weight D is less than this share of the median has nothing to tell the others.
+/// A pixel whose weight D is less than this share of the median does not constrain the others.
 const LEAST_WEIGHT: f64 = 1e-6;
 /// Pixels that the median is taken from.
 const SAMPLES: usize = 1024;
@@ -245,7 +245,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         }
     }
 
-    /// Finds 1/D, and takes pixels that have nothing to tell out of the system.
+    /// Finds 1/D, and takes pixels of negligible weight out of the system.
     fn invert_diagonal(&mut self, control: &Control) -> Result<()> {
         let (padding, cols) = (self.padding, self.exposures.sensor().cols);
         let mut diagonal = std::mem::take(&mut self.inverse_diagonal);

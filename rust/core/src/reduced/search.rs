@@ -18,7 +18,7 @@ use crate::ritz::Ritz;
 
 /// Values that a thread takes at a time.
 const BLOCK: usize = 1 << 16;
-/// No eigenvalue that matters is smaller than 1/this: single precision could not tell it from 0.
+/// No eigenvalue that matters is smaller than 1/this: single precision cannot distinguish it from 0.
 const LONGEST_STEP: f64 = 1e6;
 
 /// A relative error that is rounding alone.

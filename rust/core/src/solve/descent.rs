@@ -13,7 +13,7 @@ use crate::sweep::Estimate;
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
-/// Sweeps that nobody waits for: what makes so many is no experiment that this method can solve.
+/// Upper limit on sweeps: an experiment that needs more cannot be solved by this method.
 const MOST_SWEEPS: u64 = 1_000_000;
 /// An estimate that may be rounding alone, where some pixels are much brighter than others.
 const TINY_ERROR: f64 = 1e-9;

@@ -18,11 +18,11 @@ use crate::joint::{self, Preconditioner, Search, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
 
-/// Products that nobody waits for.
+/// Upper limit on products.
 const MOST_PRODUCTS: u64 = 5000;
 /// The estimated error of M at which shifts begin to be refined.
 const BEFORE_SHIFTS: f64 = 1e-3;
-/// A beam whose structure is so much larger than noise tells shifts; by the slopes of noise steps
+/// A beam whose structure is so much larger than noise determines shifts; by the slopes of noise steps
 /// would lead nowhere.
 const TOLD: f64 = 10.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.

@@ -22,7 +22,7 @@ use crate::parallel::Workers;
 use crate::reduced::{Scale, Search, Smallest};
 use crate::sweep::Estimate;
 
-/// Products that nobody waits for: what takes so many is no experiment that this method can solve.
+/// Upper limit on products: an experiment that needs more cannot be solved by this method.
 const MOST_PRODUCTS: u64 = 100_000;
 /// How much of the tolerance a step aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.8;

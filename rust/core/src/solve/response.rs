@@ -15,7 +15,7 @@ const SIGMAS: f64 = 6.0;
 /// Pixels, at most, that a median is taken over.
 const SAMPLE: usize = 4096;
 
-/// The pixels that do not respond to light, as far as their measurements can tell: M is small,
+/// The pixels that do not respond to light, within the noise of their measurements: M is small,
 /// and so is M²D with D = Σ w c² L², whose square root is M over its standard error.
 pub(super) fn without_response<T: Real>(
     exposures: &Exposures<'_, T>,

@@ -27,9 +27,9 @@ const AROUND: usize = 4;
 pub struct Estimate<'m, 'a, T> {
     exposures: &'m Exposures<'a, T>,
     workers: &'m Workers,
-    /// M, row by row; 1 where no measurement tells.
+    /// M, row by row; 1 without a measurement.
     pub sensitivity: Vec<f64>,
-    /// L in each of the geometry's views; 0 where no measurement tells.
+    /// L in each of the geometry's views; 0 without a measurement.
     beams: Vec<Vec<f64>>,
 }
 
@@ -166,7 +166,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         (self.sensitivity, beam)
     }
 
-    /// L on the beam grid, row by row; 0 where no measurement tells.
+    /// L on the beam grid, row by row; 0 without a measurement.
     #[must_use]
     pub fn beam(&self) -> Vec<f64> {
         let geometry = &self.exposures.geometry();
@@ -326,7 +326,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         });
     }
 
-    /// L in each of the geometry's views; 0 where no measurement tells.
+    /// L in each of the geometry's views; 0 without a measurement.
     pub(crate) fn beams(&self) -> &[Vec<f64>] {
         &self.beams
     }

@@ -170,7 +170,7 @@ impl<const N: usize> Sums<N> {
     }
 }
 
-/// slope/weight, or 0 where no measurement tells.
+/// slope/weight, or 0 without a measurement.
 #[inline(always)]
 pub(super) fn quotient(slope: f64, weight: f64) -> f64 {
     if weight > 0.0 { slope / weight } else { 0.0 }

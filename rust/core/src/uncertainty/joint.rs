@@ -30,7 +30,7 @@ use crate::memory;
 use crate::parallel::Workers;
 use crate::random;
 
-/// Iterations for one right-hand side that nobody waits for.
+/// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
 
 /// What is drawn besides the noise of exposures.
@@ -46,7 +46,7 @@ enum Functional {
     /// Σ g M.
     Gain(Vec<f64>),
     /// Σ q d, of the shifts (row, column) of all exposures less their mean by the weights of the prior,
-    /// for which no measurement speaks.
+    /// which no measurement determines.
     Shifts(Vec<[f64; 2]>),
     /// b of the least-squares part b M of the offsets' errors: what they have in common.
     Offset,
@@ -280,7 +280,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// With h = M/Σ M² the variance of Σ h O.
     ///
-    /// Where L is hardly different at the positions of a pixel, and fluxes c are fitted, O → O + b M
+    /// Where L is almost the same at the positions of a pixel, and fluxes c are fitted, O → O + b M
     /// is met by L → L − b/c with other c, and no iteration finds that direction. So the search
     /// starts from the best multiple of it: x = (rᵀv/vᵀSv) v for v of
     ///

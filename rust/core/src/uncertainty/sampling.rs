@@ -5,9 +5,9 @@ use crate::error::Result;
 
 /// The relative standard error of the map, root mean square over its pixels, that draws go on to.
 const EXACTNESS: f64 = 0.02;
-/// Draws that tell how many it takes.
+/// Draws that determine how many are needed.
 const FIRST_DRAWS: u64 = 8;
-/// Draws that nobody waits for.
+/// Upper limit on draws.
 const MOST_DRAWS: u64 = 400;
 /// The share of x · b that the solution of a draw may lack. Slow errors are a small part of that and
 /// a large one of the variance: with crosses (5, 7), (11, 19), (23, 41) and (97, 160) the mean
