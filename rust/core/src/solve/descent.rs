@@ -19,7 +19,8 @@ const MOST_SWEEPS: u64 = 1_000_000;
 const TINY_ERROR: f64 = 1e-9;
 
 /// Sweeps until the estimated error of M is at most the tolerance, the sweeps are used up, or the
-/// estimate no longer falls. Returns the pixels too that their measurements leave almost no weight.
+/// estimate no longer falls. Returns the pixels too that their measurements leave almost no weight, and
+/// F at the result.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
@@ -30,7 +31,7 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     start: Option<&Solution<'_>>,
     workers: &'m Workers,
     control: &Control,
-) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>)> {
+) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>, f64)> {
     let limit = options.limit(MOST_SWEEPS)?;
     let mut estimate = Estimate::new(exposures, workers, control);
     if let Some(start) = start {
@@ -41,14 +42,14 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
     loop {
-        estimate.sweep(control)?;
+        let objective = estimate.sweep(control)?;
         sweep += 1;
         if sweep < next_look {
             continue;
         }
-        let look = look(sweep, &mut estimate, scale, &mut search, control)?;
-        looks.push(look);
-        let ended = if look.error <= options.tolerance {
+        let (misfit, error) = look(&mut estimate, scale, &mut search, control)?;
+        looks.push(Look { sweep, objective, error });
+        let ended = if error <= options.tolerance {
             Ended::Converged
         } else if stalled(&looks) {
             Ended::Stalled
@@ -63,23 +64,23 @@ pub(super) fn minimise<'m, 'a, T: Real>(
             continue;
         };
         let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
-        return Ok((estimate, History { looks, ended }, left_out));
+        return Ok((estimate, History { looks, ended }, left_out, misfit));
     }
 }
 
-/// F and the estimated error after a sweep, with L at its closed form for the M of that sweep.
+/// F with L at its closed form for the M of a sweep, which is that of the result, and the estimated
+/// error.
 fn look<T: Real>(
-    sweep: u64,
     estimate: &mut Estimate<'_, '_, T>,
     scale: Scale,
     search: &mut Search<'_, '_, T>,
     control: &Control,
-) -> Result<Look> {
-    let objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
+) -> Result<(f64, f64)> {
+    let misfit = estimate.slopes(scale.slope(), &mut search.residual, control)?;
     search.start(&estimate.sensitivity, estimate.beams(), control)?;
     let mut smallest = Smallest::default();
     while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}
-    Ok(Look { sweep, objective, error: smallest.error(search) })
+    Ok((misfit, smallest.error(search)))
 }
 
 /// Whether the estimate is tiny and no smaller than it was at half the sweeps.

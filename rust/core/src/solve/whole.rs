@@ -34,8 +34,12 @@ pub(super) fn minimise<T: Real>(
     memory::check(bytes_needed(exposures.geometry()), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
-    let (estimate, history, left_out) = match options.method {
-        Method::Multiscale => multiscale::minimise(exposures, options, start, workers, control)?,
+    let (estimate, history, left_out, misfit) = match options.method {
+        Method::Multiscale => {
+            let found = multiscale::minimise(exposures, options, start, workers, control)?;
+            let misfit = found.1.last().objective;
+            (found.0, found.1, found.2, misfit)
+        }
         Method::CoordinateDescent => {
             descent::minimise(exposures, options, start, workers, control)?
         }
@@ -57,7 +61,7 @@ pub(super) fn minimise<T: Real>(
         flags: Vec::new(),
         degrees_of_freedom: degrees_of_freedom(exposures.used(), &components),
         components,
-        misfit: history.last().objective,
+        misfit,
         history,
         variance_is_known: exposures.variance_is_known(),
         refinement: Refinement::None,
