@@ -56,7 +56,7 @@ def test_frames_that_are_all_equal_have_no_model(raw):
 
 def test_exposures_that_saturate_everywhere_are_named(raw):
     averages = [
-        equipix.average(each, saturation=0 if k == 3 else None) for k, each in enumerate(raw)
+        equipix.average(each, saturation=1e-9 if k == 3 else None) for k, each in enumerate(raw)
     ]
     with pytest.raises(errors.InputError, match="every pixel of exposure 3 saturates"):
         equipix.calibrate(averages, CROSS)

@@ -322,7 +322,7 @@ class TestWhatIsUndetermined:
     @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_measurements_that_leave_no_freedom_need_a_variance(self):
         frames = np.ones((2, 4, 5))
-        with pytest.raises(InputError, match="'variance' is None and no residual tells the noise"):
+        with pytest.raises(InputError, match="'variance' is None and the residuals do not determine the noise"):
             equipix.calibrate(frames, [(0, 0), (0, 1)], uncertainty=True)
 
 
@@ -337,7 +337,7 @@ class TestOfAResult:
         np.testing.assert_array_equal(again.tilt_std, cal.tilt_std)
         np.testing.assert_array_equal(again.tilt, cal.tilt)
         assert again.metadata["uncertainty"] == cal.metadata["uncertainty"]
-        with pytest.raises(InputError, match="read from a file, which does not hold"):
+        with pytest.raises(InputError, match="read from a file or unpickled, which does not keep"):
             again.std_of(np.zeros(cal.shape))
 
     def test_is_in_single_precision_for_single_precision(self):
