@@ -322,7 +322,8 @@ class TestWhatIsUndetermined:
     @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_measurements_that_leave_no_freedom_need_a_variance(self):
         frames = np.ones((2, 4, 5))
-        with pytest.raises(InputError, match="'variance' is None and the residuals do not determine the noise"):
+        message = "'variance' is None and the residuals do not determine the noise"
+        with pytest.raises(InputError, match=message):
             equipix.calibrate(frames, [(0, 0), (0, 1)], uncertainty=True)
 
 
