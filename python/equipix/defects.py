@@ -132,7 +132,7 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
     return noisy & seen
 
 
-def odd_responses(
+def response_outliers(
     sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.

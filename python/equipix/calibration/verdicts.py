@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.drift import trend_told
+from equipix.drift import distinct_trend
 from equipix.errors import (
     ConvergenceWarning,
     EquipixWarning,
@@ -86,7 +86,7 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
         return []
-    share = trend_told(positions.shifts, times)
+    share = distinct_trend(positions.shifts, times)
     if share >= _DEGENERATE:
         return []
     text = (

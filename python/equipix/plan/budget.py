@@ -14,7 +14,7 @@ from equipix.drift import tilt_rms, tilt_std
 from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError
 from equipix.plan.identifiability import identify, is_connected
 from equipix.plan.noise import factor, local_variance
-from equipix.plan.order import trend_told
+from equipix.plan.order import distinct_trend
 from equipix.plan.shift_errors import shift_error_effect
 from equipix.plan.spectrum import Spectrum, spectrum
 
@@ -48,7 +48,7 @@ class ErrorBudget:
         ``"shift_error"``. That of noise is far smaller.
     spectrum : Spectrum
         λ(q) and its worst wave.
-    trend_told : float
+    distinct_trend : float
         Share of the variance of a linear trend of the lamp, with the exposures in this order,
         that is distinct from a tilt: see `advise_order`.
     components : int
@@ -61,7 +61,7 @@ class ErrorBudget:
     rms_by_cause: dict[str, float]
     tilt_by_cause: dict[str, tuple[float, float]]
     spectrum: Spectrum
-    trend_told: float
+    distinct_trend: float
     components: int
     _noise: _Noise
 
@@ -205,7 +205,7 @@ def error_budget(
             "shift_error": moved[1],
         },
         spectrum=spectrum(exact, powers),
-        trend_told=trend_told(exact),
+        distinct_trend=distinct_trend(exact),
         components=components,
         _noise=predicted,
     )
