@@ -205,7 +205,7 @@ def calibrate(
         rotation=rotation,
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
-        whole=method == "coordinate-descent",
+        whole=fit_options.whole_shifts,
     )
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 

@@ -225,7 +225,7 @@ class Experiment:
         exposures, noise = self._exposures(shifts, std, flux, fit_options)
         start = None
         moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
-        if moved and method == "multiscale":
+        if moved and not fit_options.whole_shifts:
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
@@ -239,7 +239,7 @@ class Experiment:
         self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
     ) -> tuple[Exposures, NoiseModel | None]:
         """The exposures from averaged frames and the file, and the noise model of one frame."""
-        whole = options.method == "coordinate-descent"
+        whole = options.whole_shifts
         averaged = self._average(options)
         exposures = exposures_of(
             averaged,
