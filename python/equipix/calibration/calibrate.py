@@ -205,8 +205,9 @@ def calibrate(
         rotation=rotation,
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
-        whole=fit_options.whole_shifts,
     )
+    if fit_options.whole_shifts:
+        exposures = exposures.whole()
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 

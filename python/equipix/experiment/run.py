@@ -21,7 +21,6 @@ from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
 from equipix.frames import average
 from equipix.io import as_path, frame_format
-from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -239,19 +238,18 @@ class Experiment:
         self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
     ) -> tuple[Exposures, NoiseModel | None]:
         """The exposures from averaged frames and the file, and the noise model of one frame."""
-        whole = options.whole_shifts
+        refined = std.any() and not options.whole_shifts
         averaged = self._average(options)
         exposures = exposures_of(
             averaged,
-            round_shifts(shifts, std) if whole else shifts,
-            shift_std=std if std.any() and not whole else None,
+            shifts,
+            shift_std=std if refined else None,
             flux=self._column("flux") if flux is None else flux,
             flux_std=self._column("flux_std") if flux is None else None,
             time=self._column("time") if flux == "linear" else None,
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
-            whole=whole,
         )
-        return exposures, averaged.noise
+        return exposures.whole(std) if options.whole_shifts else exposures, averaged.noise
 
     def _average(self, options: FitOptions) -> Averaged:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""

@@ -90,6 +90,10 @@ class Exposures:
         """Return the exposures without some measurements, besides those masked before."""
         return dataclasses.replace(self, mask=mask if self.mask is None else mask | self.mask)
 
+    def whole(self, std: Floats | None = None) -> Self:
+        """Return the exposures at the nearest whole shifts; `std` are errors of the shifts."""
+        return dataclasses.replace(self, positions=self.positions.whole(std))
+
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the exposures."""
         variance, mask = self.variance, self.mask

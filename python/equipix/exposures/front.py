@@ -16,7 +16,6 @@ from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
-from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,24 +38,15 @@ def exposures_of(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     offset: bool = False,
-    whole: bool = False,
 ) -> Exposures:
-    """Check what the caller gave; the arguments are those of `equipix.calibrate`.
-
-    With `whole` the shifts are rounded to whole pixels, with a warning where that matters.
-    """
+    """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
         measured = measured_of(frames, variance, saturation)
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
         return Exposures(
             values=measured.values,
-            positions=Positions.of(
-                round_shifts(shifts) if whole else shifts,
-                rotation=rotation,
-                std=shift_std,
-                count=count,
-            ),
+            positions=Positions.of(shifts, rotation=rotation, std=shift_std, count=count),
             flux=Flux.of(flux, flux_std, time, count),
             mask=union(given, measured.mask),
             variance=measured.variance,
