@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from equipix import Experiment, Flag, FrameStatistics, calibrate, errors, load, simulate
+from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
 from equipix.defects import dead_pixels, hot_pixels
 from equipix.experiment import run as experiment_run
 from equipix.exposures.averaged import Averaged
@@ -404,13 +404,6 @@ def test_variances_are_a_smooth_function_of_the_mean():
     # Standard errors as above, for 30 000 pixels and 7 degrees of freedom; twice for two
     # parameters, five of these.
     np.testing.assert_allclose(variances, expected, rtol=10 * np.sqrt(2 / 7 / 30_000))
-
-
-def test_single_frames_have_no_variance():
-    ones, none = np.ones((4, 4)), np.full((4, 4), np.nan)
-    single = FrameStatistics(ones, none, none, ones.astype(np.uint32), np.zeros((4, 4), np.uint32))
-    with pytest.raises(errors.InputError, match="single frames"):
-        calibrate([single, single], [(0, 0), (0, 1)])
 
 
 @pytest.mark.parametrize("frames", [2, 3, 10, 100])

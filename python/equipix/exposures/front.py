@@ -83,11 +83,6 @@ def measured_of(
     averaged = frames if isinstance(frames, Averaged) else _averaged(frames)
     if averaged is None:
         return _of_arrays(cast("ArrayLike", frames), variance, saturation)
-    if averaged is not frames and variance is None and averaged.noise is None:
-        raise InputError(
-            "'frames' are single frames, from which no noise can be estimated: give 'variance', or "
-            "the means alone for unit weights"
-        )
     return _of_averaged(averaged, variance, saturation)
 
 
