@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -379,7 +380,9 @@ def test_fit_recovers_the_model(frames):
         for level in (0.0, 300.0, 2000.0)
     ]
     # Random-telegraph pixels must not count.
-    exposures[1].variance[:2] *= 1000
+    scattered = exposures[1].variance.copy()
+    scattered[:2] *= 1000
+    exposures[1] = replace(exposures[1], variance=scattered)
     points = np.concatenate(
         [photon_transfer(e.mean, e.variance, e.saturated == 0, frames) for e in exposures]
     )
@@ -429,6 +432,8 @@ def test_faint_light_makes_no_dead_pixels():
 def test_noisy_pixels_are_hot():
     dark = statistics(np.random.default_rng(5), np.zeros((90, 90)), gain=0, read_noise=2, frames=9)
     assert not hot_pixels(dark, NoiseModel(2.0, 0.3)).any()
-    dark.variance[3, 4] *= 60
-    dark.mean[6, 7] += 30
+    variance, mean = dark.variance.copy(), dark.mean.copy()
+    variance[3, 4] *= 60
+    mean[6, 7] += 30
+    dark = replace(dark, variance=variance, mean=mean)
     assert np.argwhere(hot_pixels(dark, NoiseModel(2.0, 0.3))).tolist() == [[3, 4], [6, 7]]

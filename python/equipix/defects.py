@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._readonly import ReadOnly
 from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ _BLOCK = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class Findings(ReadOnly):
     """Bad pixels found in the frames before any fit: maps (rows, cols) of bool, or None.
 
     Attributes

@@ -13,6 +13,7 @@ import numpy as np
 
 from equipix import _native, io
 from equipix._check import as_array, as_floats, naming_memory, positive_workers
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError, UnsupportedFileError
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
 @dataclass(frozen=True, eq=False)
-class FrameStatistics:
-    """Mean and scatter of repeated frames of one scene.
+class FrameStatistics(ReadOnly):
+    """Mean and scatter of repeated frames of one scene, as read-only arrays.
 
     Attributes
     ----------

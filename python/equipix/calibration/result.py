@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix._check import check_count, check_progress, per_exposure
 from equipix._native import Beam
+from equipix._readonly import ReadOnly
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
 from equipix.calibration.saved import read_fields, save_fields
@@ -36,8 +37,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration:
+class Calibration(ReadOnly):
     """Calibrated sensor: the result of `calibrate`.
+
+    Its arrays are read-only. `dataclasses.replace` makes a calibration with others.
 
     Attributes
     ----------

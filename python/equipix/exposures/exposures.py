@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import naming_memory
+from equipix._readonly import ReadOnly
 from equipix.defects import Findings
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ _BLOCK = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Exposures:
-    """Exposures of one beam.
+class Exposures(ReadOnly):
+    """Exposures of one beam, as read-only arrays.
 
     Attributes
     ----------

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, as_shifts, check_count, per_exposure
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError
 from equipix.shifts import round_shifts
 
@@ -40,7 +41,7 @@ _BEYOND = 2**31
 
 
 @dataclass(frozen=True, eq=False)
-class Positions:
+class Positions(ReadOnly):
     """Positions of the sensor in the beam: pixel p is at u = A p + t + d.
 
     Attributes
