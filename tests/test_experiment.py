@@ -321,7 +321,10 @@ def write_tiff(path, array):
     [
         (np.zeros((2, 10, 12), np.uint16), r"\(10, 12\).*\(64, 80\)"),
         (np.zeros((2, *SHAPE), np.uint8), r"uint8.*uint16"),
-        (np.full((2, *SHAPE), 4095, np.uint16), r"every pixel of 'p1' reaches .* 4095 DN"),
+        (
+            np.full((2, *SHAPE), 4095, np.uint16),
+            r"experiment\.toml: .* 100\.0% .* exposure 1 \('p1'\) reach .* 4095 DN .* expose less",
+        ),
         (b"", r"empty"),
         (b"II*\0 nothing more", r"bad\.tif"),
     ],

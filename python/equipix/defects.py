@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._readonly import ReadOnly
+from equipix.errors import InputError
 from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
@@ -52,6 +53,33 @@ class Findings(ReadOnly):
     dead: Bools | None = None
     hot: Bools | None = None
     noisy: Bools | None = None
+
+
+def refuse_saturated(which: str, values: Array, saturates: Bools, level: float | None) -> None:
+    """Refuse an exposure whose saturated values leave none to measure with.
+
+    Parameters
+    ----------
+    which : str
+        The exposure, in words.
+    values : ndarray, shape (rows, cols)
+        Its values.
+    saturates : ndarray of bool, shape (rows, cols)
+        Which of them saturate.
+    level : float or None
+        The saturation level in DN, where it is known.
+
+    Raises
+    ------
+    InputError
+        If pixels saturate, and no other one holds a finite value.
+    """
+    if saturates.any() and not (np.isfinite(values) & ~saturates).any():
+        raise InputError(
+            f"'frames': {np.mean(saturates):.1%} of the pixels of {which} reach the saturation "
+            f"level{'' if level is None else f' of {level:g} DN'} and none is left to measure "
+            "with: expose less, or correct 'saturation'"
+        )
 
 
 def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:

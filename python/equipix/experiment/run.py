@@ -257,9 +257,14 @@ class Experiment:
         with naming_memory("averaging"):
             dark = self._statistics("dark", self.manifest.dark.frames, None, options)
             gain = self.manifest.sensor.gain_dn_per_e
-            averaged = Averaged(len(exposures), dtype=np.float32, gain=gain)
+            level = self.manifest.sensor.saturation_level
+            averaged = Averaged(len(exposures), dtype=np.float32, gain=gain, saturation=level)
             for each in exposures:
-                averaged.add(self._statistics(each.name, each.frames, dark, options))
+                statistics = self._statistics(each.name, each.frames, dark, options)
+                try:
+                    averaged.add(statistics, each.name)
+                except InputError as error:
+                    raise FileError(f"{self.path}: {error}") from error
         return averaged
 
     def _statistics(
@@ -275,16 +280,7 @@ class Experiment:
 
         level = self.manifest.sensor.saturation_level
         files = find_files(self.path, entry)
-        frames = average(
-            files, dark=dark, saturation=level, workers=options.workers, progress=report
-        )
-        if (frames.saturated > 0).all():
-            reached = "the largest value" if level is None else f"{level:g} DN"
-            raise FileError(
-                f"{self.path}: every pixel of '{name}' reaches the saturation level, {reached}: "
-                "correct 'bit_depth' or 'saturation' in [sensor], or expose less"
-            )
-        return frames
+        return average(files, dark=dark, saturation=level, workers=options.workers, progress=report)
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""

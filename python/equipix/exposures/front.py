@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from equipix._check import as_array, as_floats, check_count, naming_memory, number
-from equipix.defects import Findings
+from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.exposures import Exposures
@@ -169,11 +169,7 @@ def _saturated(values: Array, saturation: float) -> Bools:
         raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
-        if each.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {k} reaches the 'saturation' level {level:g}: "
-                "expose less, or correct the level"
-            )
+        refuse_saturated(f"exposure {k}", values[k], each, level)
     return saturated
 
 
