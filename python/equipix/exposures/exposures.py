@@ -76,11 +76,11 @@ class Exposures(ReadOnly):
         rows, cols = self.values.shape[1:]
         return rows, cols
 
-    def usable(self) -> Bools:
-        """Return which measurements may be used, shape (n, rows, cols)."""
-        usable: Bools = np.isfinite(self.values)
+    def usable(self, exposure: int | slice = slice(None)) -> Bools:
+        """Return which measurements may be used, of all exposures or of one."""
+        usable: Bools = np.isfinite(self.values[exposure])
         if self.mask is not None:
-            usable &= ~self.mask
+            usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
         return usable
 
     def weighted(self, variance: Array | None) -> Self:
