@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from equipix import _native
-from equipix._check import as_array, as_shifts
+from equipix._check import as_array, as_level, as_shifts
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -235,8 +235,4 @@ def _saturation(values: ArrayLike, saturation: float | None) -> float | None:
     if saturation is None:
         dtype = np.asarray(values).dtype
         return float(np.iinfo(dtype).max) if dtype.kind in "iu" else None
-    if isinstance(saturation, bool) or not isinstance(saturation, int | float | np.number):
-        raise InputError(f"'saturation' is {saturation!r}, expected a level in DN or None")
-    if np.isnan(saturation):
-        raise InputError("'saturation' is NaN, expected a level in DN or None")
-    return float(saturation)
+    return as_level(saturation)

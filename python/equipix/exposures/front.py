@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from equipix._check import as_array, as_floats, check_count, naming_memory, number
+from equipix._check import as_array, as_floats, as_level, check_count, naming_memory
 from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged
@@ -131,9 +131,10 @@ def _of_arrays(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), values)
-    if saturation is None:
+    level = as_level(saturation)
+    if level is None:
         return Measured(values, None, variances, models, Findings())
-    saturated = _saturated(values, saturation)
+    saturated = _saturated(values, level)
     findings = Findings(saturated=np.any(saturated, axis=0))
     return Measured(values, saturated, variances, models, findings)
 
@@ -162,11 +163,8 @@ def as_models(variance: object, count: int) -> list[NoiseModel]:
     return models
 
 
-def _saturated(values: Array, saturation: float) -> Bools:
-    """Which values reach the level `saturation`."""
-    level = number("saturation", saturation)
-    if not level > 0:
-        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")
+def _saturated(values: Array, level: float) -> Bools:
+    """Which values reach the saturation level."""
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
         refuse_saturated(f"exposure {k}", values[k], each, level)
