@@ -48,7 +48,7 @@ LAYERS = (
     {"frames", "shifts"},
     {"drift", "flags", "maps"},
     {"io"},
-    {"_check"},
+    {"_check", "_readonly"},
     {"_types"},
     {"errors"},
     {"_native"},

@@ -16,6 +16,7 @@ __all__ = [
     "average_files",
     "file_format",
     "locate_spots",
+    "needs_whole_shifts",
     "planned_components",
     "read_file",
 ]
@@ -187,6 +188,7 @@ def locate_spots(
     after: NDArray[Any],
     saturations: tuple[float | None, float | None],
 ) -> tuple[_Spot, _Spot]: ...
+def needs_whole_shifts(method: str) -> bool: ...
 def planned_components(
     shape: tuple[int, int],
     shifts: NDArray[Any],

@@ -60,7 +60,8 @@ def calibrate(
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
         `FrameStatistics` contain their noise: the weights come from a noise model fitted over all
-        pixels, not from each pixel's own sample variance. A mean with saturated samples is left
+        pixels, not from each pixel's own sample variance; single frames show no noise, and without
+        `variance` all their weights are 1. A mean with saturated samples is left
         out of its exposure, and the pixel is flagged ``SATURATED``; it keeps the sensitivity that
         the other exposures determine. Dead, hot and noisy pixels are masked and flagged, the hot
         ones where `equipix.average` was given the dark frames as `FrameStatistics`.
@@ -205,8 +206,9 @@ def calibrate(
         rotation=rotation,
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
-        whole=method == "coordinate-descent",
     )
+    if fit_options.whole_shifts:
+        exposures = exposures.whole()
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 

@@ -148,25 +148,7 @@ def functional_std(
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:
-    """Weights of a functional as (m, rows, cols), 0 wherever ln M is undetermined.
-
-    Parameters
-    ----------
-    weights : array_like, shape (rows, cols) or (m, rows, cols)
-        Weights of the pixels.
-    determined : ndarray of bool, shape (rows, cols)
-        Where ln M is known.
-
-    Returns
-    -------
-    ndarray, shape (m, rows, cols), float64
-        The weights.
-
-    Raises
-    ------
-    InputError
-        If they do not fit the sensor, or are not finite, or not 0 in such a pixel.
-    """
+    """Weights of functionals as (m, rows, cols), which must be 0 where ln M is undetermined."""
     array = as_array("weights", weights, ndim=(2, 3)).astype(np.float64, copy=False)
     if array.shape[-2:] != determined.shape:
         raise InputError(f"'weights' has shape {array.shape}, the sensor {determined.shape}")

@@ -88,6 +88,13 @@ impl PyExposures {
     }
 }
 
+/// Whether a method takes whole shifts alone.
+#[pyfunction]
+pub(crate) fn needs_whole_shifts(py: Python<'_>, method: &str) -> PyResult<bool> {
+    let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
+    Ok(method.needs_whole_shifts())
+}
+
 fn method_named(name: &str) -> Result<Method> {
     match name {
         "multiscale" => Ok(Method::Multiscale),

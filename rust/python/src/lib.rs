@@ -29,7 +29,7 @@ mod _native {
     #[pymodule_export]
     use crate::centroid::locate_spots;
     #[pymodule_export]
-    use crate::exposures::PyExposures;
+    use crate::exposures::{PyExposures, needs_whole_shifts};
     #[pymodule_export]
     use crate::fit::{PyBeam, PyFit, PyUncertainty};
     #[pymodule_export]

@@ -1,6 +1,6 @@
 //! What does not go together.
 
-use super::options::{Method, Options};
+use super::options::Options;
 use crate::error::{Error, Result};
 use crate::exposures::Exposures;
 use crate::frames::Real;
@@ -26,7 +26,7 @@ pub(super) fn check<T: Real>(exposures: &Exposures<'_, T>, options: &Options) ->
 
 /// Refuses what coordinate descent cannot fit.
 fn check_method<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Result<()> {
-    if options.method == Method::Multiscale || exposures.are_whole() {
+    if !options.method.needs_whole_shifts() || exposures.are_whole() {
         return Ok(());
     }
     let problem = if exposures.seek_more() || exposures.positions().std.is_some() {
