@@ -101,8 +101,6 @@ impl BorrowedBeam<'_> {
 pub(crate) struct PyFit {
     data: Arc<Data>,
     #[pyo3(get)]
-    exposures: Py<PyAny>,
-    #[pyo3(get)]
     sensitivity: Py<PyArray2<f64>>,
     #[pyo3(get)]
     beam: Py<PyBeam>,
@@ -192,16 +190,15 @@ impl PyFit {
 }
 
 impl PyFit {
-    /// The result of a fit of `exposures`.
-    pub(crate) fn new(exposures: &Bound<'_, PyAny>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
-        let (py, sensor) = (exposures.py(), data.checked.sensor());
+    /// The result of a fit of the exposures of these arrays.
+    pub(crate) fn new(py: Python<'_>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
+        let sensor = data.checked.sensor();
         let (unit, is_joint) = (fit.unit(), fit.is_joint());
         let History { looks, ended } = fit.history;
         let column = |value: fn(&Look) -> f64| looks.iter().map(value).collect::<Vec<_>>();
         let sweeps: Vec<_> = looks.iter().map(|look| look.sweep).collect();
         Ok(Self {
             data,
-            exposures: exposures.clone().unbind(),
             sensitivity: image(py, fit.sensitivity, sensor)?,
             beam: Py::new(py, PyBeam::of(py, fit.beam)?)?,
             flags: image(py, fit.flags, sensor)?,
