@@ -1,6 +1,6 @@
 //! `Fit`, `Beam` and `Uncertainty`: what a calibration found, and what can be asked of it.
 //!
-//! Large arrays move into NumPy without a copy; a question views them again.
+//! Large arrays move into NumPy without a copy, read-only; a question views them again.
 //!
 //! | argument | dtype and rank | here | how |
 //! |---|---|---|---|
@@ -14,10 +14,10 @@ use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
     Uncertainty, Workers,
 };
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 
-use crate::arrays::{either, image, rotation, shape_of};
+use crate::arrays::{either, image, read_only, rotation, shape_of};
 use crate::data::Data;
 use crate::run;
 
@@ -207,9 +207,9 @@ impl PyFit {
             flux: fit.flux,
             shifts: fit.shifts,
             offset: fit.offset.map(|offset| image(py, offset, sensor)).transpose()?,
-            sweeps: sweeps.into_pyarray(py).unbind(),
-            objective: column(|look| look.objective).into_pyarray(py).unbind(),
-            error_estimate: column(|look| look.error).into_pyarray(py).unbind(),
+            sweeps: read_only(py, sweeps)?,
+            objective: read_only(py, column(|look| look.objective))?,
+            error_estimate: read_only(py, column(|look| look.error))?,
             ended: ended_code(ended),
             misfit: fit.misfit,
             degrees_of_freedom: fit.degrees_of_freedom,
@@ -268,7 +268,7 @@ impl PyUncertainty {
             std: answers.map.map(|map| image(py, map.std, sensor)).transpose()?,
             draws,
             exactness,
-            variances: answers.variances.map(|values| values.into_pyarray(py).unbind()),
+            variances: answers.variances.map(|values| read_only(py, values)).transpose()?,
             shift_variances: answers.shifts,
             offset_variances: answers.offset.map(Into::into),
         })
