@@ -112,15 +112,15 @@ def deviations(
     shape, flux = exposures.shape, fit.flux
     response = np.nan_to_num(fit.sensitivity).astype(np.float64)
     usable = exposures.usable()
-    on_pixels, on_cells = np.zeros(shape), np.zeros(fit.beam.values.shape)
+    on_pixels = fit.information(workers=options.workers)
+    on_cells = np.zeros(fit.beam.values.shape)
     seen = [np.nan_to_num(exposures.light(fit, k, options.workers)) for k in range(len(exposures))]
     weights = [
         _weights(exposures.variance, k, usable[k] & (seen[k] * response != 0))
         for k in range(len(exposures))
     ]
-    for k, light in enumerate(seen):
-        weight = np.where(left_out[k], 0, weights[k])
-        on_pixels += weight * light**2
+    for k, each in enumerate(weights):
+        weight = np.where(left_out[k], 0, each)
         exposures.cells(on_cells, fit, k)[:] += weight * (flux[k] * response) ** 2
     new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
     for k, light in enumerate(seen):
