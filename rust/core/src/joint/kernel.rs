@@ -123,7 +123,7 @@ impl<'s> Row<'s> {
 /// ```
 ///
 /// Without an offset O = 0 and M = Σ w e y / Σ w e².
-pub(crate) struct Solve<'s> {
+pub(crate) struct Eliminate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
@@ -135,7 +135,7 @@ pub(crate) struct Solve<'s> {
     pub(crate) singular: f64,
 }
 
-impl pulp::NullaryFnOnce for Solve<'_> {
+impl pulp::NullaryFnOnce for Eliminate<'_> {
     type Output = f64;
 
     #[inline(always)]

@@ -15,7 +15,7 @@
 use std::ops::Range;
 
 use super::flux::Fluxes;
-use super::kernel::{Follow, Solve};
+use super::kernel::{Eliminate, Follow};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
@@ -133,7 +133,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.pass.flux = self.fluxes.at(&self.state.theta);
         let beam = std::mem::take(&mut self.state.beam);
         let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
-        let found = self.solve_pixels(&beam, &mut pull, control);
+        let found = self.eliminate_pixels(&beam, &mut pull, control);
         self.state.beam = beam;
         let found = found?;
         self.append(&found, &mut pull);
@@ -155,7 +155,12 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// M and O at their closed forms, and what they leave pulls at the cells.
-    fn solve_pixels(&mut self, beam: &[f64], pull: &mut [f64], control: &Control) -> Result<Sums> {
+    fn eliminate_pixels(
+        &mut self,
+        beam: &[f64],
+        pull: &mut [f64],
+        control: &Control,
+    ) -> Result<Sums> {
         let views = self.pass.views_of(beam);
         self.pass.run(pull, control, |pass, row_index, row, room, found| {
             room.values().clear();
@@ -168,8 +173,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see_slopes(&views, row_index, room);
             let (weights, values, sums) = room.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
-            let solve = Solve { row, fluxes, weights, values, sums, singular };
-            found.objective += pulp::Arch::new().dispatch(solve);
+            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular };
+            found.objective += pulp::Arch::new().dispatch(eliminate);
         })
     }
 
@@ -246,16 +251,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// The pixels whose measurements do not distinguish an offset from a gain, where one is sought.
     pub(crate) fn without_offset(&self) -> Vec<usize> {
-        let (mut untold, mut first) = (Vec::new(), 0);
+        let (mut undetermined, mut first) = (Vec::new(), 0);
         if self.pass.with_offset {
             self.pass.for_rows(|[_, gain, _, _, beside, _]| {
                 let pixels = gain.iter().zip(beside).enumerate();
-                let told = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
-                untold.extend(told.map(|(col, _)| first + col));
+                let alone = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
+                undetermined.extend(alone.map(|(col, _)| first + col));
                 first += gain.len();
             });
         }
-        untold
+        undetermined
     }
 
     /// S x, and the change of M that goes with x in each [`Row`]; returns the largest size of that less

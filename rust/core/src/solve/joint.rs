@@ -14,7 +14,7 @@ use crate::exposures::{Exposures, FluxKind};
 use crate::fit::{Fit, Refinement, Solution};
 use crate::frames::Real;
 use crate::gauge;
-use crate::joint::{self, Preconditioner, Search, ShiftPrior, System};
+use crate::joint::{self, ConjugateGradients, Preconditioner, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
 
@@ -24,7 +24,7 @@ const MOST_PRODUCTS: u64 = 5000;
 const BEFORE_SHIFTS: f64 = 1e-3;
 /// A beam whose structure is so much larger than noise determines shifts; by the slopes of noise steps
 /// would lead nowhere.
-const TOLD: f64 = 10.0;
+const STRUCTURED: f64 = 10.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
@@ -65,7 +65,7 @@ pub(super) fn minimise<T: Real>(
 /// Steps towards the minimum.
 struct Steps<'m, 'a, T> {
     system: System<'m, 'a, T>,
-    search: Search,
+    search: ConjugateGradients,
     options: &'m Options,
     /// The most passes.
     limit: u64,
@@ -103,7 +103,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         Ok(Self {
             system,
-            search: Search::default(),
+            search: ConjugateGradients::default(),
             options,
             limit,
             swept,
@@ -185,14 +185,14 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             && self.search.iterations >= FEWEST_ITERATIONS;
         let Some(prior) = self.shift_prior.take_if(|_| near) else { return false };
         // Of a grid too small for second differences the structure is NaN, which determines nothing.
-        let determined = self.system.structure() >= TOLD;
+        let determined = self.system.structure() >= STRUCTURED;
         if !determined {
             self.refinement = Refinement::Undetermined;
             return false;
         }
         self.refinement = Refinement::Done;
         self.system.seek_shifts(Some(prior));
-        (self.search, self.taken, self.looks) = (Search::default(), None, Vec::new());
+        (self.search, self.taken, self.looks) = (ConjugateGradients::default(), None, Vec::new());
         true
     }
 

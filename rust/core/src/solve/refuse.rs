@@ -17,8 +17,9 @@ pub(super) fn check<T: Real>(exposures: &Exposures<'_, T>, options: &Options) ->
         return Err(Error::value("shifts", problem));
     }
     if exposures.offset() && exposures.are_one_level() {
-        let problem = "is 'fit' with one flux for all exposures, where offset and gain are degenerate: \
-                       take exposures at two or more levels and give their 'flux', or subtract a dark";
+        let problem = "is 'fit' with one flux for all exposures, where offset and gain are \
+                       degenerate: take exposures at two or more levels and give their 'flux', or \
+                       subtract a dark";
         return Err(Error::value("dark", problem));
     }
     Ok(())
@@ -30,8 +31,8 @@ fn check_method<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Res
         return Ok(());
     }
     let problem = if exposures.seek_more() || exposures.positions().std.is_some() {
-        "is 'coordinate-descent', which supports only whole shifts and given fluxes: use 'multiscale' \
-         to fit fluxes, shifts or the dark"
+        "is 'coordinate-descent', which supports only whole shifts and given fluxes: use \
+         'multiscale' to fit fluxes, shifts or the dark"
     } else {
         "is 'coordinate-descent', which supports only whole shifts: round them, or use 'multiscale'"
     };

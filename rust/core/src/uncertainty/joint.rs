@@ -25,7 +25,9 @@ use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
-use crate::joint::{self, Fluxes, Follow, Grid, Preconditioner, Search, ShiftPrior, State, System};
+use crate::joint::{
+    self, ConjugateGradients, Fluxes, Follow, Grid, Preconditioner, ShiftPrior, State, System,
+};
 use crate::memory;
 use crate::parallel::Workers;
 use crate::random;
@@ -56,7 +58,7 @@ enum Functional {
 pub(super) struct JointCovariance<'m, 'a, T> {
     system: System<'m, 'a, T>,
     preconditioner: Preconditioner,
-    search: Search,
+    search: ConjugateGradients,
     tilts: Tilts,
     /// The shifts that are uncertain though they were not refined.
     considered: Option<ShiftPrior>,
@@ -93,7 +95,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             tilts: Tilts::of(&system, &valid),
             system,
             preconditioner,
-            search: Search::default(),
+            search: ConjugateGradients::default(),
             considered,
             determined,
             valid,
@@ -103,7 +105,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let sampled = Sampled::of(self, control)?;
         let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
             true => (self.scale * sampled.variance(pixel)).sqrt(),
@@ -140,7 +142,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if !self.system.pass.with_offset {
             return Ok(None);
         }
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
         Ok(Some([along, self.mean_variance_of_offset_alone()]))
     }
@@ -150,7 +152,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         functionals: impl ExactSizeIterator<Item = Functional>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let total = functionals.len() as u64;
         let found = (0..).zip(functionals).map(|(index, functional)| {
             control.report("uncertainty", index, total);
@@ -209,7 +211,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             })?;
             slope.iter_mut().zip(pulled).for_each(|(slope, pulled)| *slope -= pulled);
         }
-        self.solve(slope, lack, control)?;
+        self.apply_inverse(slope, lack, control)?;
         let x = std::mem::take(&mut self.search.x);
         product(&mut self.system, &x, control)?;
         add_change(&self.system, &mut change);
@@ -234,7 +236,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let own = self.system.centred_pulls(shifts);
                 let others = pull.len() - own.as_flattened().len();
                 pull[others..].copy_from_slice(own.as_flattened());
-                self.solve(pull, lack, control)?;
+                self.apply_inverse(pull, lack, control)?;
                 Ok(self.search.energy)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
@@ -266,7 +268,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             pull[cells] += workers.dot(drift, &gain);
         }
         let seen = if self.considered.is_some() { pull.split_off(others) } else { Vec::new() };
-        self.solve(pull, lack, control)?;
+        self.apply_inverse(pull, lack, control)?;
         variance += self.search.energy;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
@@ -312,7 +314,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             found = height * height / size;
             workers.add_multiple(&mut pull, -height / size, &pulled);
         }
-        self.solve(pull, lack, control)?;
+        self.apply_inverse(pull, lack, control)?;
         Ok(variance + found + self.search.energy)
     }
 
@@ -329,8 +331,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         result
     }
 
-    /// Solves S x = b.
-    fn solve(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
+    /// S⁻¹ b, left in the search.
+    fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
         search.begin(system, preconditioner, b, control)?;
         let mut earlier = 0.0;
