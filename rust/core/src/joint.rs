@@ -25,13 +25,13 @@ mod pass;
 mod penalty;
 mod preconditioner;
 mod rim;
-mod room;
 mod survey;
 mod system;
 #[cfg(test)]
 mod tests;
 mod unknowns;
 mod wide;
+mod workspace;
 
 pub(crate) use conjugate_gradients::ConjugateGradients;
 pub(crate) use first_beam::{Source, first_beam};
@@ -43,6 +43,6 @@ pub(crate) use outcome::{coefficients, components, freedom, unknowns, values_at_
 pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
-pub(crate) use room::Room;
 pub(crate) use system::System;
 pub(crate) use unknowns::{ShiftPrior, State};
+pub(crate) use workspace::Workspace;

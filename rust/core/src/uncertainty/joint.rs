@@ -361,9 +361,9 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let mut of_penalty = self.other_signs(draw, Other::Penalty);
         let mut of_priors = self.other_signs(draw, Other::Priors);
         let system = &mut self.system;
-        let mut slope = pull_by(system, control, |pass, row_index, row, room| {
+        let mut slope = pull_by(system, control, |pass, row_index, row, workspace| {
             let cols = pass.exposures.sensor().cols;
-            let (weights, values, sums) = room.parts();
+            let (weights, values, sums) = workspace.parts();
             for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let mut sign = random::signs(streams[k] + row_index as u64);
                 let pixels = weights.iter().zip(&*row.sensitivity);
