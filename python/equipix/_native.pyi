@@ -18,6 +18,7 @@ __all__ = [
     "locate_spots",
     "planned_components",
     "read_file",
+    "slope_pixels",
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
@@ -192,3 +193,4 @@ def planned_components(
     rotation: list[int],
     mask: NDArray[Any] | None,
 ) -> tuple[NDArray[Any], list[int], int]: ...
+def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[Any]: ...

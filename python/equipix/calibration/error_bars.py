@@ -8,8 +8,7 @@ import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
 from equipix.errors import InputError
-from equipix.flags import determined, usable
-from equipix.maps import tilt_weights
+from equipix.maps import slope_pixels, tilt_weights
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -51,7 +50,7 @@ def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBa
     """Standard deviations of sensitivity, tilt and shifts, in one set-up of the linear problem."""
     exposures, fit, _ = weighted
     scale = noise_scale(weighted)
-    weights = tilt_weights(usable(flags) & determined(fit.sensitivity, flags))
+    weights = tilt_weights(slope_pixels(fit.sensitivity, flags))
     asks_tilt = not fit.leaves_tilt and bool(np.isfinite(weights).all())
     refined = fit.refinement == "refined"
     with naming_memory("the error map"):

@@ -64,6 +64,7 @@ impl Fit {
     pub fn solution(&self) -> Solution<'_> {
         Solution {
             sensitivity: &self.sensitivity,
+            flags: &self.flags,
             beam: self.beam.view(),
             flux: &self.flux,
             shifts: &self.shifts,
@@ -132,6 +133,8 @@ impl Fit {
 pub struct Solution<'s> {
     /// M in the gauge mean(M) = 1, row by row; NaN where undetermined.
     pub sensitivity: &'s [f64],
+    /// Bits of [`flag`](crate::frames::flag) for each pixel.
+    pub flags: &'s [u32],
     /// The beam L.
     pub beam: Beam<&'s [f64]>,
     /// The flux c of each exposure.
@@ -153,6 +156,7 @@ impl Solution<'_> {
         if self.flux.len() == count
             && self.shifts.len() == count
             && self.sensitivity.len() == pixels
+            && self.flags.len() == pixels
         {
             return Ok(());
         }

@@ -211,6 +211,7 @@ pub use error::{Error, Result};
 pub use exposures::{Checked, Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
 pub use fit::{Fit, Refinement, Solution};
 pub use frames::{Real, Shape, Stack};
+pub use gauge::slope_pixels;
 pub use geometry::Rotation;
 pub use joint::SMOOTHING;
 pub use parallel::Workers;

@@ -6,6 +6,7 @@
 //! |---|---|---|---|
 //! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
 //! | functionals | float64, 3 | `&[f64]` | view |
+//! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view |
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;
@@ -223,8 +224,13 @@ impl PyFit {
 
     /// The arrays of the solution, borrowed.
     pub(crate) fn borrow<'py>(&'py self, py: Python<'py>) -> BorrowedFit<'py> {
-        let sensitivity = self.sensitivity.bind(py).readonly();
-        BorrowedFit { fit: self, sensitivity, beam: self.beam.get().borrow(py) }
+        let (sensitivity, flags) = (self.sensitivity.bind(py), self.flags.bind(py));
+        BorrowedFit {
+            fit: self,
+            sensitivity: sensitivity.readonly(),
+            flags: flags.readonly(),
+            beam: self.beam.get().borrow(py),
+        }
     }
 }
 
@@ -232,6 +238,7 @@ impl PyFit {
 pub(crate) struct BorrowedFit<'py> {
     fit: &'py PyFit,
     sensitivity: PyReadonlyArray2<'py, f64>,
+    flags: PyReadonlyArray2<'py, u32>,
     beam: BorrowedBeam<'py>,
 }
 
@@ -239,6 +246,7 @@ impl BorrowedFit<'_> {
     pub(crate) fn solution(&self) -> PyResult<Solution<'_>> {
         Ok(Solution {
             sensitivity: self.sensitivity.as_slice()?,
+            flags: self.flags.as_slice()?,
             beam: self.beam.view()?,
             flux: &self.fit.flux,
             shifts: &self.fit.shifts,
@@ -247,6 +255,16 @@ impl BorrowedFit<'_> {
             unit: self.fit.unit,
         })
     }
+}
+
+/// Which pixels count for the slope of ln M.
+#[pyfunction]
+pub(crate) fn slope_pixels(
+    sensitivity: PyReadonlyArray2<'_, f64>,
+    flags: PyReadonlyArray2<'_, u32>,
+) -> PyResult<Py<PyArray2<bool>>> {
+    let counted = equipix_core::slope_pixels(sensitivity.as_slice()?, flags.as_slice()?);
+    image(sensitivity.py(), counted, shape_of(&sensitivity))
 }
 
 /// Answers, in units of the variance of a value of weight 1; `None` for what was not asked.

@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
 use crate::fit::{Fit, Refinement, Solution};
 use crate::frames::Real;
-use crate::gauge;
+use crate::gauge::FluxGauge;
 use crate::joint::{self, ConjugateGradients, Preconditioner, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
@@ -249,7 +249,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
     }
 
-    /// What was found, with the fluxes in their gauge.
+    /// What was found, and what the fluxes leave to the gauge.
     fn finish(self, ended: Ended, control: &Control) -> Result<Found> {
         let system = &self.system;
         let exposures = system.pass.exposures;
@@ -258,14 +258,16 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let smallest = self.search.smallest;
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
-        if matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_)) {
-            let theta = system.state.theta.first().copied().unwrap_or_default();
-            let drift = system.fluxes.slope.map(|slope| theta * slope);
-            let rotation = exposures.positions().rotations[0];
-            gauge::fix_fluxes(&mut fit, drift, &system.fluxes.open, rotation, exposures.sensor());
-        }
+        let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
+        let theta = system.state.theta.first().copied().unwrap_or_default();
+        let fluxes = fitted.then(|| FluxGauge {
+            drift: system.fluxes.slope.map(|slope| theta * slope),
+            open: system.fluxes.open.clone(),
+            rotation: exposures.positions().rotations[0],
+            sensor: exposures.sensor(),
+        });
         let left_out = without_offset.clone();
-        Ok(Found { fit, left_out, dead: Vec::new(), without_offset })
+        Ok(Found { fit, left_out, dead: Vec::new(), without_offset, fluxes })
     }
 }
 

@@ -92,7 +92,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
         let (valid, scale) = valid(&system, &determined);
         Ok(Self {
-            tilts: Tilts::of(&system, &valid),
+            tilts: Tilts::of(&system, solution, &valid),
             system,
             preconditioner,
             search: ConjugateGradients::default(),
