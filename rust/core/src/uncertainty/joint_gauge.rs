@@ -82,6 +82,23 @@ impl Tilts {
     }
 }
 
+/// 1 in the determined pixels that have a weight, and their mean D⁻¹.
+pub(super) fn valid<T: Real>(system: &System<'_, '_, T>, determined: &[bool]) -> (Vec<f32>, f64) {
+    let mut valid = vec![0.0; determined.len()];
+    let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
+    system.pass.for_rows(|[_, inverse, ..]| {
+        for (pixel, inverse) in (first..).zip(inverse) {
+            if *inverse > 0.0 && determined[pixel] {
+                valid[pixel] = 1.0;
+                sum += inverse;
+                count += 1.0;
+            }
+        }
+        first += inverse.len();
+    });
+    (valid, sum / count)
+}
+
 /// How many pixels are valid.
 pub(super) fn count(valid: &[f32]) -> f64 {
     valid.iter().map(|valid| f64::from(*valid)).sum()
