@@ -74,7 +74,7 @@ CHAIN = (
     {"fit"},
     {"joint", "reduced"},
     {"beam", "coarse", "convergence", "ritz", "sweep"},
-    {"connectivity"},
+    {"connectivity", "information"},
     {"exposures"},
     {"padded"},
     {"geometry"},

@@ -19,6 +19,7 @@ __all__ = [
     "needs_whole_shifts",
     "planned_components",
     "read_file",
+    "slope_pixels",
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
@@ -115,8 +116,6 @@ class Fit:
     """What was found. `refinement` is "none", "not tried", "undetermined" or "refined"."""
 
     @property
-    def exposures(self) -> Exposures: ...
-    @property
     def sensitivity(self) -> NDArray[Any]: ...
     @property
     def beam(self) -> Beam: ...
@@ -196,3 +195,4 @@ def planned_components(
     rotation: list[int],
     mask: NDArray[Any] | None,
 ) -> tuple[NDArray[Any], list[int], int]: ...
+def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[Any]: ...

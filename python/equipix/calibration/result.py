@@ -19,8 +19,8 @@ from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
 from equipix.exposures.positions import Positions
-from equipix.flags import determined, usable
-from equipix.maps import tilt
+from equipix.flags import determined
+from equipix.maps import slope_pixels, tilt
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -212,12 +212,12 @@ class Calibration(ReadOnly):
 
     @property
     def tilt(self) -> NDArray[Any]:
-        """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
+        """Least-squares slope of ln M, edge to edge (row, col); NaN where it is undetermined.
 
-        Valid are pixels without ``DO_NOT_USE``; NaN where they determine no slope.
+        Pixels count whose M is determined, from half to twice the mean of such, and not flagged
+        ``UNRELIABLE_FLAT``. Where free fluxes leave the tilt undetermined it is 0.
         """
-        valid = usable(self.flags) & determined(self.sensitivity, self.flags)
-        return tilt(self.sensitivity, valid)
+        return tilt(self.sensitivity, slope_pixels(self.sensitivity, self.flags))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the compiled fit, which cannot be pickled."""

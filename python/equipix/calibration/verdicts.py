@@ -127,11 +127,16 @@ def on_fit(
     return [verdict for verdict in found if verdict is not None]
 
 
+def is_too_far(fit: Fit) -> bool:
+    """Whether a fit is too far from its minimum for standard deviations."""
+    return fit.is_joint and not float(fit.error_estimate[-1]) <= _NOT_FOUND
+
+
 def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
     """Verdict on a fit that is too far from its minimum for standard deviations."""
-    error = float(fit.error_estimate[-1])
-    if not options.uncertainty or not fit.is_joint or error <= _NOT_FOUND:
+    if not (options.uncertainty and is_too_far(fit)):
         return None
+    error = float(fit.error_estimate[-1])
     return Verdict(
         "uncertainty",
         "no standard deviations: the fit is too far from its minimum (estimated error "

@@ -84,7 +84,7 @@ impl PyExposures {
                 calibrate(&exposures, &options, start.as_ref(), &workers, control)
             })
         })?;
-        PyFit::new(slf.as_any(), Arc::clone(data), fit)
+        PyFit::new(py, Arc::clone(data), fit)
     }
 }
 

@@ -31,7 +31,7 @@ mod _native {
     #[pymodule_export]
     use crate::exposures::{PyExposures, needs_whole_shifts};
     #[pymodule_export]
-    use crate::fit::{PyBeam, PyFit, PyUncertainty};
+    use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
     #[pymodule_export]
     use crate::plan::planned_components;
 
