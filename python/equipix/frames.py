@@ -32,6 +32,7 @@ _PAGES = {
     "count": np.uint32,
     "saturated": np.uint32,
 }
+_COUNTS = ("count", "saturated")
 _DARK = "dark_"  # before the names of the dark's pages
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
@@ -75,6 +76,7 @@ def average(
     *,
     dark: FrameStatistics | ArrayLike | None = None,
     saturation: float | None = None,
+    mask: ArrayLike | None = None,
     workers: int | None = None,
     progress: Callable[[int, int, str], object] | None = None,
 ) -> FrameStatistics:
@@ -85,7 +87,8 @@ def average(
     source : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
         The frames, in DN. Of files, every page counts: grey TIFF, PNG, PGM and BMP, all of one
         shape and depth. An iterable is taken one frame at a time and never collected, and files
-        are read in small batches, so memory does not grow with the number of frames.
+        are read in small batches, so memory does not grow with the number of frames. Masked
+        samples of `numpy.ma` arrays do not count.
     dark : FrameStatistics or array of shape (rows, cols), optional
         Dark mean, subtracted from the mean, in DN; the variance of a `FrameStatistics` dark mean
         is added to that of the mean.
@@ -93,6 +96,8 @@ def average(
         Samples at or above this level are counted as saturated, in DN. By default the largest
         value of an integer dtype (give 4095 for 12 bits in a 16-bit file); floating-point frames
         are not tested then.
+    mask : array_like of bool, shape (rows, cols), optional
+        True = do not use: mean and variances of the pixel become NaN, its counts 0.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
     progress : callable, optional
@@ -148,7 +153,7 @@ def average(
             maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
         mean, variance, count, saturated = maps
         statistics = FrameStatistics(mean, variance, variance / count, count, saturated)
-        return _subtract(statistics, offset)
+        return _masked(_subtract(statistics, offset), mask)
 
 
 def save_statistics(
@@ -223,12 +228,8 @@ def _level(saturation: float | None) -> float | None:
 
 def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
     """Paths as a list, an array as it is, other iterables as an iterator."""
-    if np.ma.is_masked(source):
-        raise InputError(
-            "'source' is a masked array, whose mask would be lost: fill the masked samples with NaN"
-        )
     if isinstance(source, np.ndarray):
-        return source
+        return source if np.ma.is_masked(source) else np.asarray(source)
     if isinstance(source, str | os.PathLike):
         return [source]
     try:
@@ -272,11 +273,17 @@ def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
         size = _batch_size(frames[0])
         yield from (frames[start : start + size] for start in range(0, len(frames), size))
         return
-    first = as_array("source[0]", next(frames), ndim=2)
-    batch = np.empty((_batch_size(first), *first.shape), first.dtype)
+    first = _frame(0, next(frames))
+    empty = np.ma.empty if isinstance(first, np.ma.MaskedArray) else np.empty
+    batch = empty((_batch_size(first), *first.shape), first.dtype)
     filled = 0
     for index, item in enumerate(itertools.chain([first], frames)):
-        frame = as_array(f"source[{index}]", item, ndim=2)
+        frame = _frame(index, item)
+        if type(frame) is not type(first):
+            raise InputError(
+                f"'source[{index}]' is a {type(frame).__name__}, expected a {type(first).__name__}"
+                " like the first: give all frames as masked arrays, or none"
+            )
         if frame.shape != first.shape or frame.dtype != first.dtype:
             raise InputError(
                 f"'source[{index}]' is {frame.dtype} of shape {frame.shape}, expected"
@@ -291,6 +298,13 @@ def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
         yield batch[:filled]
 
 
+def _frame(index: int, item: Any) -> NDArray[Any]:
+    """Check one frame of an iterable; a masked array stays one."""
+    name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
+    frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
+    return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
+
+
 def _batch_size(frame: NDArray[Any]) -> int:
     return max(1, min(_BATCH, _BATCH_BYTES // max(1, frame.nbytes)))
 
@@ -303,24 +317,55 @@ def _average_batches(
     total: int,
 ) -> tuple[NDArray[Any], ...]:
     first = next(batches)
-    dtype = _sum_dtype(first.dtype)
+    dtype = _sum_dtype(first)
     if level is None and first.dtype.kind in "iu":
         level = float(np.iinfo(first.dtype).max)
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, workers)
     done = 0
     for batch in itertools.chain([first], batches):
-        sums.add(np.ascontiguousarray(batch, dtype=dtype))
+        sums.add(np.ascontiguousarray(_unmasked(batch, dtype), dtype=dtype))
         done += len(batch)
         if progress is not None:
             progress(done, max(done, total), "average")
     return sums.finish()
 
 
-def _sum_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Choose the dtype that frames are summed in: their own, or float64."""
+def _sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
+    """Choose the dtype that frames are summed in: their own, or float64.
+
+    Masked samples are summed as NaN, which does not count, so whole numbers need float64.
+    """
+    dtype = frames.dtype
     if dtype.kind not in "buif":
         raise InputError(f"'source' has dtype {dtype}, expected real numbers")
-    return np.dtype(dtype.name if dtype.name in _SUMMABLE else "float64")
+    masked = isinstance(frames, np.ma.MaskedArray) and dtype.kind != "f"
+    return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
+
+
+def _unmasked(batch: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return a batch with NaN in the place of masked samples."""
+    if not isinstance(batch, np.ma.MaskedArray):
+        return batch
+    return np.where(np.ma.getmaskarray(batch), dtype.type(np.nan), np.ma.getdata(batch))
+
+
+def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatistics:
+    """Return averages without the pixels of a mask."""
+    if mask is None:
+        return statistics
+    array = as_array("mask", mask, ndim=2)
+    shape = statistics.mean.shape
+    if array.dtype != np.bool_ or array.shape != shape:
+        raise InputError(
+            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}: True "
+            "= do not use"
+        )
+    if array.all():
+        raise InputError("'mask' is True in every pixel, expected some pixels to use")
+    maps = {name: values.copy() for name, values in statistics.maps.items()}
+    for name, values in maps.items():
+        values[array] = 0 if name in _COUNTS else np.nan
+    return FrameStatistics(**maps, dark=statistics.dark)
 
 
 def _subtract(

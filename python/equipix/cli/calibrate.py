@@ -13,6 +13,7 @@ from equipix.calibration.result import Calibration
 from equipix.cli.options import (
     Force,
     Json,
+    Mask,
     MaxSweeps,
     Picture,
     Tolerance,
@@ -24,7 +25,7 @@ from equipix.comparison import compare as compare_calibrations
 from equipix.correction.protocol import Correction
 from equipix.experiment.run import Experiment
 from equipix.flags import Flag
-from equipix.io import SUFFIXES, refuse_inputs
+from equipix.io import SUFFIXES, read_mask, refuse_inputs
 from equipix.loading import load, load_calibration
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
@@ -46,6 +47,7 @@ def calibrate(
         FluxModel | None,
         typer.Option(help="Fluxes to find: one an exposure, or linear in the file's times."),
     ] = None,
+    mask: Mask = None,
     tolerance: Tolerance = 1e-6,
     max_sweeps: MaxSweeps = None,
     uncertainty: Uncertainty = False,
@@ -56,10 +58,11 @@ def calibrate(
     """Calibrate a sensor from the images of an experiment."""
     check_output(output, force=force, suffixes=SUFFIXES)
     loaded = Experiment.load(experiment)
-    refuse_inputs([output], [experiment, *loaded.files()])
+    refuse_inputs([output], [experiment, *loaded.files(), *([mask] if mask else [])])
     with progress_bars() as progress:
         calibration = loaded.run(
             flux=flux,
+            mask=None if mask is None else read_mask(mask),
             robust=robust,
             method=method,
             tolerance=tolerance,

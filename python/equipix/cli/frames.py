@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -9,12 +10,12 @@ import numpy as np
 import typer
 
 from equipix._types import Flagged
-from equipix.cli.options import Force, Json, Saturation, Workers
+from equipix.cli.options import Force, Json, Mask, Saturation, Workers
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import correct_files, is_folder
 from equipix.frames import average as average_frames
 from equipix.frames import save_statistics
-from equipix.io import SUFFIXES, find_files, refuse_inputs
+from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
 commands = typer.Typer()
@@ -26,27 +27,35 @@ def average(
     output: Annotated[Path, typer.Option("--output", "-o", help="Statistics: .tif or .npz.")],
     dark: Annotated[list[str] | None, typer.Option(help="Dark frames, to be subtracted.")] = None,
     saturation: Saturation = None,
+    mask: Mask = None,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Mean and variance of every pixel over many frames."""
     check_output(output, force=force, suffixes=SUFFIXES)
-    refuse_inputs([output], find_files([*source, *(dark or [])]))
+    inputs = find_files([*source, *(dark or []), *([mask] if mask else [])])
+    refuse_inputs([output], inputs)
+    excluded = None if mask is None else read_mask(mask)
     with progress_bars() as progress:
         offset = None
         if dark:
             offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
         frames = average_frames(
-            source, dark=offset, saturation=saturation, workers=workers, progress=progress
+            source,
+            dark=offset,
+            saturation=saturation,
+            mask=excluded,
+            workers=workers,
+            progress=progress,
         )
     save_statistics(output, frames, force=force)
     result = {
         "output": str(output),
         "shape": list(frames.mean.shape),
         "frames": int(frames.count.max()),
-        "mean": float(frames.mean.mean()),
-        "variance": float(frames.variance.mean()),
+        "mean": float(np.nanmean(frames.mean)),
+        "variance": float(np.nanmean(frames.variance)) if (frames.count > 1).any() else math.nan,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
     }
     show_result(result, as_json=as_json)

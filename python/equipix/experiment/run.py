@@ -15,9 +15,10 @@ from equipix.calibration.weights import weighted_fit
 from equipix.errors import FileError, InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.manifest import find_files, read_manifest
+from equipix.experiment.mask import excluded_pixels
 from equipix.experiment.provenance import provenance
 from equipix.exposures.averaged import Averaged
-from equipix.exposures.front import exposures_of
+from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
 from equipix.frames import average
 from equipix.io import as_path, frame_format
@@ -28,9 +29,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
-    from equipix._types import Floats, FluxModel, Method, Progress
+    from equipix._types import Bools, Floats, FluxModel, Method, Progress
     from equipix.calibration.result import Calibration
     from equipix.experiment.manifest import Manifest
     from equipix.exposures.exposures import Exposures
@@ -59,7 +60,8 @@ class Experiment:
     Notes
     -----
     Frames, dark frames and aperture images are named relative to the file: one file (a
-    multi-page TIFF holds many frames), a glob or a list. The position of an exposure is either
+    multi-page TIFF holds many frames), a glob or a list. ``[sensor]`` may exclude pixels by a mask
+    file and by regions. The position of an exposure is either
     ``shift = [row, col]`` in pixels, or computed from the position before it and from images of
     a small aperture in the beam, taken before and after the move.
     """
@@ -94,6 +96,12 @@ class Experiment:
 
     def files(self) -> list[Path]:
         """All image files of the experiment, each once."""
+        mask = self.manifest.sensor.mask
+        masks = [] if mask is None else find_files(self.path, mask)
+        return list(dict.fromkeys([*self._images(), *masks]))
+
+    def _images(self) -> list[Path]:
+        """The files of frames and of images of the aperture, each once."""
         entries: list[str | list[str] | None] = [self.manifest.dark.frames]
         for exposure in self.manifest.exposure:
             entries += [exposure.frames, exposure.aperture_before, exposure.aperture_after]
@@ -108,7 +116,7 @@ class Experiment:
         FileError
             If a file cannot be read or differs from the first dark frames.
         """
-        first, *others = self.files()
+        first, *others = self._images()
         wanted, wanted_dtype = frame_format(first)
         for file in others:
             shape, dtype = frame_format(file)
@@ -167,6 +175,7 @@ class Experiment:
         self,
         *,
         flux: FluxModel | None = None,
+        mask: ArrayLike | None = None,
         robust: bool = False,
         method: Method = "multiscale",
         tolerance: float = 1e-6,
@@ -182,6 +191,8 @@ class Experiment:
         flux : {"fit", "linear"}, optional
             Fluxes to find: one for each exposure, or linear in the file's ``time``. Unless given
             they are those of the file, as known or, with ``flux_std``, as a prior.
+        mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+            True = do not use, besides the pixels that the file excludes.
         robust : bool
             Whether to leave out measurements that disagree with the others.
         method : {"multiscale", "coordinate-descent"}
@@ -221,8 +232,9 @@ class Experiment:
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
         self.check_formats()
+        excluded = self._excluded(mask)
         shifts, std = self.measure_shifts()
-        exposures, noise = self._exposures(shifts, std, flux, fit_options)
+        exposures, noise = self._exposures(shifts, std, flux, excluded, fit_options)
         start = None
         moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
         if moved and method == "multiscale":
@@ -235,8 +247,21 @@ class Experiment:
         origin = provenance(self.path, self.manifest, self.files(), shifts, std, noise)
         return calibrated(exposures, options, start=start, provenance=origin)
 
+    def _excluded(self, mask: ArrayLike | None) -> Bools | None:
+        """Pixels that the file or the caller excludes."""
+        (_, *shape), _ = frame_format(self._images()[0])
+        given = None
+        if mask is not None:
+            given = as_mask(mask, (len(self.manifest.exposure), *shape))
+        return union(given, excluded_pixels(self.path, self.manifest, (shape[0], shape[1])))
+
     def _exposures(
-        self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
+        self,
+        shifts: Floats,
+        std: Floats,
+        flux: FluxModel | None,
+        mask: Bools | None,
+        options: FitOptions,
     ) -> tuple[Exposures, NoiseModel | None]:
         """The exposures from averaged frames and the file, and the noise model of one frame."""
         whole = options.method == "coordinate-descent"
@@ -244,6 +269,7 @@ class Experiment:
         exposures = exposures_of(
             averaged,
             round_shifts(shifts, std) if whole else shifts,
+            mask=mask,
             shift_std=std if std.any() and not whole else None,
             flux=self._column("flux") if flux is None else flux,
             flux_std=self._column("flux_std") if flux is None else None,

@@ -1,6 +1,7 @@
 """Frames, arrays and metadata to and from files."""
 
 from equipix.io.images import frame_format, read_frames, stream_frames
+from equipix.io.masks import read_mask
 from equipix.io.names import as_path, find_files, refuse_inputs
 from equipix.io.pages import SUFFIXES, check_format, check_pages, load_pages, save_pages
 from equipix.io.tiff import description, write_frames
@@ -17,6 +18,7 @@ __all__ = [
     "frame_format",
     "load_pages",
     "read_frames",
+    "read_mask",
     "refuse_inputs",
     "replace_folder",
     "save_pages",
