@@ -13,11 +13,12 @@ import numpy as np
 
 from equipix import _native, io
 from equipix._check import as_array, as_floats, naming_memory, positive_workers
-from equipix.errors import InputError, UnsupportedFileError
+from equipix.errors import FileError, InputError, UnsupportedFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from os import PathLike
+    from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -56,6 +57,8 @@ class FrameStatistics:
     dark : FrameStatistics or None
         The dark frames whose mean was subtracted, where they were given as statistics. They show
         which pixels are hot, and how noisy a frame without light is.
+    saturation : float or None
+        The level that samples were compared with, in DN; None if there was none.
     """
 
     mean: NDArray[Any]
@@ -64,11 +67,32 @@ class FrameStatistics:
     count: NDArray[Any]
     saturated: NDArray[Any]
     dark: FrameStatistics | None = None
+    saturation: float | None = None
 
     @property
     def maps(self) -> dict[str, NDArray[Any]]:
         """The five maps by their names."""
         return {name: getattr(self, name) for name in _PAGES}
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        `equipix.average`, experiment.toml and the command line take the file in the place of the
+        frames.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        save_statistics(path, self, force=force)
 
 
 def average(
@@ -86,9 +110,9 @@ def average(
     ----------
     source : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
         The frames, in DN. Of files, every page counts: grey TIFF, PNG, PGM and BMP, all of one
-        shape and depth. An iterable is taken one frame at a time and never collected, and files
-        are read in small batches, so memory does not grow with the number of frames. Masked
-        samples of `numpy.ma` arrays do not count.
+        shape and depth; the file of a saved average gives that average. An iterable is taken one
+        frame at a time and never collected, and files are read in small batches, so memory does not
+        grow with the number of frames. Masked samples of `numpy.ma` arrays do not count.
     dark : FrameStatistics or array of shape (rows, cols), optional
         Dark mean, subtracted from the mean, in DN; the variance of a `FrameStatistics` dark mean
         is added to that of the mean.
@@ -148,11 +172,10 @@ def average(
     frames = _paths_or_frames(source)
     with naming_memory("averaging"):
         if isinstance(frames, list):
-            maps = _average_files(frames, level, workers, progress)
+            statistics = _average_files(frames, level, workers, progress)
         else:
-            maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
-        mean, variance, count, saturated = maps
-        statistics = FrameStatistics(mean, variance, variance / count, count, saturated)
+            batches = _batches(frames)
+            statistics = _average_batches(batches, level, workers, progress, _length(source))
         return _masked(_subtract(statistics, offset), mask)
 
 
@@ -175,10 +198,13 @@ def save_statistics(
     FileError
         If the file exists and `force` is not set, or cannot be written.
     """
-    pages = dict(statistics.maps)
-    if statistics.dark is not None:
-        pages |= {_DARK + name: values for name, values in statistics.dark.maps.items()}
-    io.save_pages(path, pages, {"format": _FORMAT, "kind": _KIND}, force=force)
+    pages, dark = dict(statistics.maps), statistics.dark
+    content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
+    content["saturation"] = statistics.saturation
+    if dark is not None:
+        pages |= {_DARK + name: values for name, values in dark.maps.items()}
+        content[_DARK + "saturation"] = dark.saturation
+    io.save_pages(path, pages, content, force=force)
 
 
 def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
@@ -199,19 +225,43 @@ def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
     FileError
         If the file is not readable or holds something else.
     """
-    pages, metadata = io.load_pages(path)
-    io.check_format(path, metadata, _KIND, _FORMAT)
+    return read_statistics(path, *io.load_pages(path))
+
+
+def read_statistics(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> FrameStatistics:
+    """Make averages of the arrays and metadata of the file that `save_statistics` wrote."""
+    io.check_format(path, content, _KIND, _FORMAT)
     io.check_pages(path, pages, _PAGES)
     dark = None
     if _DARK + "mean" in pages:
         io.check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
-        dark = _of_pages(pages, _DARK)
-    return dataclasses.replace(_of_pages(pages), dark=dark)
+        dark = _of_pages(pages, content, _DARK)
+    return dataclasses.replace(_of_pages(pages, content), dark=dark)
 
 
-def _of_pages(pages: dict[str, NDArray[Any]], before: str = "") -> FrameStatistics:
+def _of_pages(
+    pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
+) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    return FrameStatistics(mean, variance, of_mean, count, saturated)
+    level = content.get(before + "saturation")
+    return FrameStatistics(mean, variance, of_mean, count, saturated, saturation=level)
+
+
+def saved_shape(path: Path) -> tuple[int, int] | None:
+    """Rows and columns of the averages that a file holds; None if it holds something else.
+
+    Files of whole numbers, which cameras write, are not searched for averages.
+    """
+    if path.suffix.lower() not in io.SUFFIXES:
+        return None
+    if path.suffix.lower() != ".npz" and io.frame_format(path)[1] != np.float64:
+        return None
+    if io.kind_of(path) != _KIND:
+        return None
+    rows, cols = load_statistics(path).mean.shape
+    return rows, cols
 
 
 def _level(saturation: float | None) -> float | None:
@@ -253,14 +303,48 @@ def _average_files(
     level: float | None,
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
-) -> tuple[NDArray[Any], ...]:
+) -> FrameStatistics:
     paths = io.find_files(names)
+    if any(path.suffix.lower() == ".npz" for path in paths):
+        return _saved(paths, level)
     try:
-        return _native.average_files(paths, level, workers, progress)
+        maps = _native.average_files(paths, level, workers, progress)
+        return _statistics(maps, _level_of(io.frame_format(paths[0])[1], level))
     except UnsupportedFileError:
+        if any(saved_shape(path) for path in paths):
+            return _saved(paths, level)
         stream = io.stream_frames(paths, workers=workers)
         batches = _batches(frame for _, frames in stream for frame in frames)
         return _average_batches(batches, level, workers, progress, len(paths))
+
+
+def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
+    """Read the one average that is given in the place of frames."""
+    path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
+    if others:
+        raise FileError(
+            f"{path}: holds averaged frames, which cannot be averaged with other files: name one "
+            "saved average alone, or the frames of all"
+        )
+    statistics = load_statistics(path)
+    if level is not None and statistics.saturation not in (None, level):
+        raise FileError(
+            f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
+            f"{level:g}: average the frames again with this level"
+        )
+    return statistics
+
+
+def _statistics(maps: tuple[NDArray[Any], ...], level: float | None) -> FrameStatistics:
+    mean, variance, count, saturated = maps
+    return FrameStatistics(mean, variance, variance / count, count, saturated, saturation=level)
+
+
+def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
+    """Saturation level of samples of a dtype: the largest whole number, unless given."""
+    if level is None and dtype.kind in "iu":
+        return float(np.iinfo(dtype).max)
+    return level
 
 
 def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
@@ -315,11 +399,9 @@ def _average_batches(
     workers: int | None,
     progress: Callable[[int, int, str], object] | None,
     total: int,
-) -> tuple[NDArray[Any], ...]:
+) -> FrameStatistics:
     first = next(batches)
-    dtype = _sum_dtype(first)
-    if level is None and first.dtype.kind in "iu":
-        level = float(np.iinfo(first.dtype).max)
+    dtype, level = _sum_dtype(first), _level_of(first.dtype, level)
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, workers)
     done = 0
     for batch in itertools.chain([first], batches):
@@ -327,7 +409,7 @@ def _average_batches(
         done += len(batch)
         if progress is not None:
             progress(done, max(done, total), "average")
-    return sums.finish()
+    return _statistics(sums.finish(), level)
 
 
 def _sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
@@ -365,7 +447,7 @@ def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatist
     maps = {name: values.copy() for name, values in statistics.maps.items()}
     for name, values in maps.items():
         values[array] = 0 if name in _COUNTS else np.nan
-    return FrameStatistics(**maps, dark=statistics.dark)
+    return FrameStatistics(**maps, dark=statistics.dark, saturation=statistics.saturation)
 
 
 def _subtract(
@@ -373,6 +455,13 @@ def _subtract(
 ) -> FrameStatistics:
     if dark is None:
         return statistics
+    if statistics.dark is not None:
+        if isinstance(dark, FrameStatistics) and same_statistics(statistics.dark, dark):
+            return statistics
+        raise InputError(
+            "'source' is an average from which another dark than 'dark' is subtracted already: "
+            "give the frames, or the dark that was subtracted"
+        )
     mean = dark.mean if isinstance(dark, FrameStatistics) else dark
     if mean.shape != statistics.mean.shape:
         raise InputError(
@@ -386,4 +475,13 @@ def _subtract(
         statistics.count,
         statistics.saturated,
         dark if isinstance(dark, FrameStatistics) else None,
+        statistics.saturation,
     )
+
+
+def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
+    """Whether two averages are the same measurement: one object, or equal to the last bit."""
+    if one is None or other is None or one is other:
+        return one is other
+    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)

@@ -20,7 +20,7 @@ from equipix.experiment.provenance import provenance
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
-from equipix.frames import average
+from equipix.frames import average, saved_shape
 from equipix.io import as_path, frame_format
 from equipix.shifts import round_shifts
 
@@ -60,7 +60,8 @@ class Experiment:
     Notes
     -----
     Frames, dark frames and aperture images are named relative to the file: one file (a
-    multi-page TIFF holds many frames), a glob or a list. ``[sensor]`` may exclude pixels by a mask
+    multi-page TIFF holds many frames; a saved average stands for the frames that it was made of), a
+    glob or a list. ``[sensor]`` may exclude pixels by a mask
     file and by regions. The position of an exposure is either
     ``shift = [row, col]`` in pixels, or computed from the position before it and from images of
     a small aperture in the beam, taken before and after the move.
@@ -117,13 +118,14 @@ class Experiment:
             If a file cannot be read or differs from the first dark frames.
         """
         first, *others = self._images()
-        wanted, wanted_dtype = frame_format(first)
+        wanted, wanted_dtype = _format(first)
         for file in others:
-            shape, dtype = frame_format(file)
-            if shape[1:] != wanted[1:] or dtype != wanted_dtype:
+            shape, dtype = _format(file)
+            wanted_dtype = wanted_dtype or dtype
+            if shape != wanted or dtype not in (None, wanted_dtype):
                 raise FileError(
-                    f"{file}: holds {dtype} frames of shape {shape[1:]}, expected {wanted_dtype} "
-                    f"of shape {wanted[1:]} as in {first}"
+                    f"{file}: holds {dtype or 'averaged'} frames of shape {shape}, expected "
+                    f"{wanted_dtype or 'averaged'} of shape {wanted} as in {first}"
                 )
 
     def measure_shifts(
@@ -249,11 +251,11 @@ class Experiment:
 
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:
         """Pixels that the file or the caller excludes."""
-        (_, *shape), _ = frame_format(self._images()[0])
+        shape, _ = _format(self._images()[0])
         given = None
         if mask is not None:
             given = as_mask(mask, (len(self.manifest.exposure), *shape))
-        return union(given, excluded_pixels(self.path, self.manifest, (shape[0], shape[1])))
+        return union(given, excluded_pixels(self.path, self.manifest, shape))
 
     def _exposures(
         self,
@@ -318,3 +320,12 @@ class Experiment:
         """The values of a key that all exposures have, or none."""
         values = [getattr(exposure, key) for exposure in self.manifest.exposure]
         return [value for value in values if value is not None] or None
+
+
+def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
+    """Rows, columns and dtype of the frames of a file; no dtype of frames averaged before."""
+    saved = saved_shape(file)
+    if saved is not None:
+        return saved, None
+    (_, rows, cols), dtype = frame_format(file)
+    return (rows, cols), dtype

@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix.defects import Findings, dead_pixels, hot_pixels, noisy_pixels
 from equipix.errors import InputError
+from equipix.frames import same_statistics
 from equipix.noise import NoiseModel, photon_transfer
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class Averaged:
             raise InputError(
                 f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
             )
-        if not _same(frames.dark, self.dark):
+        if not same_statistics(frames.dark, self.dark):
             raise InputError(
                 f"'frames': exposure {exposure} has another dark than the first: average all with "
                 "one 'dark'"
@@ -135,14 +136,6 @@ class Averaged:
         measured = np.isfinite(self.values).any(axis=0)
         dead: Bools = dead_pixels(self.values, models) & measured
         return dead
-
-
-def _same(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
-    """Whether two darks are the same measurement: one object, or equal to the last bit."""
-    if one is None or other is None or one is other:
-        return one is other
-    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

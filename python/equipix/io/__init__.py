@@ -3,7 +3,7 @@
 from equipix.io.images import frame_format, read_frames, stream_frames
 from equipix.io.masks import read_mask
 from equipix.io.names import as_path, find_files, refuse_inputs
-from equipix.io.pages import SUFFIXES, check_format, check_pages, load_pages, save_pages
+from equipix.io.pages import SUFFIXES, check_format, check_pages, kind_of, load_pages, save_pages
 from equipix.io.tiff import description, write_frames
 from equipix.io.whole import folder_beside, replace_folder, write_whole
 
@@ -16,6 +16,7 @@ __all__ = [
     "find_files",
     "folder_beside",
     "frame_format",
+    "kind_of",
     "load_pages",
     "read_frames",
     "read_mask",
