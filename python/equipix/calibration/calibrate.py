@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix import _native
 from equipix.calibration import verdicts
+from equipix.calibration.coverage import with_coverage
 from equipix.calibration.error_bars import dark_std, error_bars
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.pixel_flags import pixel_flags
@@ -143,9 +144,10 @@ def calibrate(
     ShiftRoundingWarning
         If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if free
-        fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly degenerate
-        with the sensitivity.
+        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
+        than half of the pixels that are not masked are determined (`Calibration.is_partial`); if
+        free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly
+        degenerate with the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
     MisfitWarning
@@ -228,7 +230,7 @@ def calibrated(
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     dark = dark_std(weighted, options.fit)
-    found = verdicts.on_fit(weighted, options, test, dark)
+    found = with_coverage(verdicts.on_fit(weighted, options, test, dark), weighted, flags)
     verdicts.say(found)
     wanted = options.uncertainty and all(verdict.kind != "uncertainty" for verdict in found)
     bars = error_bars(weighted, flags, options.fit) if wanted else None

@@ -42,6 +42,7 @@ _DEGENERATE = 0.1
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "order": IdentifiabilityWarning,
+    "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,
     "pattern": IdentifiabilityWarning,

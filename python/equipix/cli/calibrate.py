@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -22,11 +23,15 @@ from equipix.cli.options import (
 from equipix.cli.summary import of_calibration, summary
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.comparison import compare as compare_calibrations
+from equipix.errors import EquipixError
 from equipix.experiment.run import Experiment
 from equipix.io import SUFFIXES, read_mask, refuse_inputs
 from equipix.loading import load, load_calibration
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
+
+if TYPE_CHECKING:
+    from equipix.calibration.result import Calibration
 
 commands = typer.Typer()
 
@@ -49,6 +54,12 @@ def calibrate(
     tolerance: Tolerance = 1e-6,
     max_sweeps: MaxSweeps = None,
     uncertainty: Uncertainty = False,
+    partial: Annotated[
+        bool,
+        typer.Option(
+            "--partial", help="Save a result that determines less than half of the pixels."
+        ),
+    ] = False,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
@@ -57,6 +68,9 @@ def calibrate(
     check_output(output, force=force, suffixes=SUFFIXES)
     loaded = Experiment.load(experiment)
     refuse_inputs([output], [experiment, *loaded.files(), *([mask] if mask else [])])
+    if not partial:
+        # `_refuse_partial` says the same as an error.
+        warnings.filterwarnings("ignore", "the exposures determine only")
     with progress_bars() as progress:
         calibration = loaded.run(
             flux=flux,
@@ -69,8 +83,19 @@ def calibrate(
             workers=workers,
             progress=progress,
         )
+    if not partial:
+        _refuse_partial(calibration, output)
     calibration.save(output, force=force)
     show_result({"output": str(output), **of_calibration(calibration)}, as_json=as_json)
+
+
+def _refuse_partial(calibration: Calibration, output: Path) -> None:
+    """Refuse a result that determines less than half of the unmasked pixels."""
+    for verdict in calibration.verdicts:
+        if verdict.kind == "partial":
+            raise EquipixError(
+                f"'{output}' is not written (--partial writes it): {verdict.message}"
+            )
 
 
 @commands.command(epilog="Example: equipix inspect cal.tif")
