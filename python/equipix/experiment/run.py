@@ -12,6 +12,7 @@ from equipix.calibration.calibrate import calibrated
 from equipix.calibration.options import Options
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.weights import weighted_fit
+from equipix.defects import hot_pixels
 from equipix.errors import FileError, InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.manifest import find_files, read_manifest
@@ -171,7 +172,19 @@ class Experiment:
                     "give the result of Experiment.run"
                 )
             equalisation = Equalisation.of(calibration.weighted, calibration.flags)
-        return measured_shifts(self.path, self.manifest, equalisation)
+        hot = self._hot(FitOptions()) if self._is_moved() else None
+        return measured_shifts(self.path, self.manifest, equalisation, hot=hot)
+
+    def _is_moved(self) -> bool:
+        """Whether a move is measured from images of the aperture."""
+        return any(exposure.shift is None for exposure in self.manifest.exposure[1:])
+
+    def _hot(self, options: FitOptions) -> Bools:
+        """Pixels that the dark frames show to be hot."""
+        return hot_pixels(self._dark(options), None)
+
+    def _dark(self, options: FitOptions) -> FrameStatistics:
+        return self._statistics("dark", self.manifest.dark.frames, None, options)
 
     def run(
         self,
@@ -235,15 +248,16 @@ class Experiment:
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
         self.check_formats()
         excluded = self._excluded(mask)
-        shifts, std = self.measure_shifts()
-        exposures, noise = self._exposures(shifts, std, flux, excluded, fit_options)
+        dark = self._dark(fit_options)
+        hot = hot_pixels(dark, None)
+        shifts, std = measured_shifts(self.path, self.manifest, hot=hot)
+        exposures, noise = self._exposures(dark, shifts, std, flux, excluded, fit_options)
         start = None
-        moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
-        if moved and method == "multiscale":
+        if self._is_moved() and method == "multiscale":
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
-            shifts, std = measured_shifts(self.path, self.manifest, equalisation)
+            shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
         origin = provenance(self.path, self.manifest, self.files(), shifts, std, noise)
@@ -259,6 +273,7 @@ class Experiment:
 
     def _exposures(
         self,
+        dark: FrameStatistics,
         shifts: Floats,
         std: Floats,
         flux: FluxModel | None,
@@ -267,7 +282,7 @@ class Experiment:
     ) -> tuple[Exposures, NoiseModel | None]:
         """The exposures from averaged frames and the file, and the noise model of one frame."""
         whole = options.method == "coordinate-descent"
-        averaged = self._average(options)
+        averaged = self._average(dark, options)
         exposures = exposures_of(
             averaged,
             round_shifts(shifts, std) if whole else shifts,
@@ -281,11 +296,10 @@ class Experiment:
         )
         return exposures, averaged.noise
 
-    def _average(self, options: FitOptions) -> Averaged:
+    def _average(self, dark: FrameStatistics, options: FitOptions) -> Averaged:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""
         exposures = self.manifest.exposure
         with naming_memory("averaging"):
-            dark = self._statistics("dark", self.manifest.dark.frames, None, options)
             gain = self.manifest.sensor.gain_dn_per_e
             averaged = Averaged(len(exposures), dtype=np.float32, gain=gain)
             for each in exposures:
