@@ -13,6 +13,7 @@ from equipix.errors import (
     EquipixWarning,
     IdentifiabilityWarning,
     MisfitWarning,
+    SaturationWarning,
     ShiftSignWarning,
     warn,
 )
@@ -42,6 +43,7 @@ _DEGENERATE = 0.1
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "order": IdentifiabilityWarning,
+    "saturation": SaturationWarning,
     "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,

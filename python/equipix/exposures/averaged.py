@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix.defects import Findings, dead_pixels, hot_pixels, noisy_pixels
 from equipix.errors import InputError
+from equipix.exposures.clipping import Clipping, clipping_of, highest
 from equipix.frames import same_statistics
 from equipix.noise import NoiseModel, photon_transfer
 
@@ -52,6 +53,7 @@ class Averaged:
         self._frames: list[int] = []
         self._of_dark: list[float] = []
         self._points: list[Array] = []
+        self._clipped: list[Clipping | None] = []
 
     @classmethod
     def of(cls, frames: Sequence[FrameStatistics]) -> Self:
@@ -90,6 +92,7 @@ class Averaged:
                 f"'frames': every pixel of exposure {exposure} saturates: expose less, or correct "
                 "the 'saturation' that they were averaged with"
             )
+        self._clipped.append(clipping_of(frames))
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
@@ -108,6 +111,11 @@ class Averaged:
             points.append(_dark_points(self.dark))
             known |= self.gain is not None and len(points[-1]) > 0
         return NoiseModel.fit(np.concatenate(points), gain=self.gain) if known else None
+
+    @property
+    def clipped(self) -> Clipping | None:
+        """A saturation level that was not given, if the values show one."""
+        return highest(self._clipped)
 
     def models(self, noise: NoiseModel) -> list[NoiseModel]:
         """Noise model of each mean frame, from that of one frame."""
