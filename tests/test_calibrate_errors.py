@@ -51,7 +51,7 @@ def with_value(array, place, value):
         ({"shifts": with_value(CROSS, (3, 0), np.inf)}, "'shifts' of exposure 3 is .*inf"),
         ({"shifts": with_value(CROSS, (4, 0), 8)}, "'shifts' of exposure 4 is .* row part"),
         ({"shifts": with_value(CROSS, (4, 1), -1e300)}, "'shifts' of exposure 4 .* column part"),
-        ({"frames": np.full((5, 8, 9), np.nan)}, "'mask' leaves no measurement"),
+        ({"frames": np.full((5, 8, 9), np.nan)}, "'frames' holds no finite number"),
         ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
         ({"mask": np.zeros((9, 8), bool)}, r"'mask' has shape \(9, 8\), expected \(8, 9\) or"),

@@ -133,9 +133,22 @@ def test_inspect_says_what_is_no_calibration(run, experiment, tmp_path):
     frames, mean = experiment.parent / "frames/p0.tif", tmp_path / "mean.tif"
     assert run("average", frames, "-o", mean)[0] == 0
     np.savez(tmp_path / "arrays.npz", values=np.ones(3))
-    refused(run("inspect", mean), mean, "holds frame statistics, expected calibration")
+    refused(run("compare", mean, mean), mean, "holds frame statistics, expected calibration")
     for other in (frames, tmp_path / "arrays.npz"):
         refused(run("inspect", other), other, "holds neither a calibration", "did not write it")
+
+
+def test_inspect_shows_an_average(run, experiment, tmp_path):
+    frames, dark = experiment.parent / "frames/p0.tif", experiment.parent / "dark/dark.tif"
+    mean = tmp_path / "mean.npz"
+    run("average", frames, "--dark", dark, "--saturation", "4095", "-o", mean)
+    status, out, _ = run("inspect", mean, "--json")
+    told = json.loads(out)
+    assert status == 0
+    assert (told["shape"], told["frames"], told["saturation"]) == (list(SHAPE), 6, 4095)
+    assert told["dark_frames"] == load(mean).dark.count.max()
+    assert told["mean"] == pytest.approx(load(mean).mean.mean())
+    assert "saturated pixels" in run("inspect", mean)[1]
 
 
 def test_average_writes_statistics(run, experiment, tmp_path):

@@ -13,7 +13,6 @@ from equipix import Flag, cli, io, loading, simulate
 from equipix.correction.apply import apply
 from equipix.correction.files import correct_files
 from equipix.errors import FileError, InputError
-from equipix.frames import save_statistics
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -163,22 +162,38 @@ class TestLoad:
     def test_refuses_an_unknown_kind_by_name(self, bent, tmp_path, monkeypatch):
         bent.save(tmp_path / "bent.npz")
         monkeypatch.delitem(loading.READERS, "bent response")
-        with pytest.raises(FileError, match="holds bent response, expected calibration that equ"):
+        with pytest.raises(
+            FileError, match="holds bent response, expected calibration or frame st"
+        ):
             equipix.load(tmp_path / "bent.npz")
 
     @pytest.mark.parametrize("content", [{}, {"kind": None}, {"kind": ["calibration"]}, [1], 3])
     def test_refuses_what_has_no_kind(self, tmp_path, content):
         path = tmp_path / "other.npz"
         np.savez(path, metadata=np.array(json.dumps(content)), values=np.ones((3, 3)))
-        with pytest.raises(FileError, match="holds .*, expected calibration that equipix has"):
+        with pytest.raises(
+            FileError, match="holds .*, expected calibration or frame statistics that equipix has"
+        ):
             equipix.load(path)
 
-    def test_says_what_frame_statistics_are(self, tmp_path):
-        save_statistics(tmp_path / "mean.tif", equipix.average(raw_frames()))
+    @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+    def test_gives_back_averaged_frames(self, tmp_path, suffix):
+        frames = raw_frames()
+        dark = equipix.average(frames[:1], saturation=4000)
+        mean = equipix.average(frames, dark=dark, saturation=4095)
+        mean.save(tmp_path / f"mean{suffix}")
+        read = equipix.load(tmp_path / f"mean{suffix}")
+        for old, new in ((mean, read), (dark, read.dark)):
+            assert old.saturation == new.saturation
+            for name, values in old.maps.items():
+                np.testing.assert_array_equal(new.maps[name], values)
+
+    def test_says_what_frame_statistics_are_where_they_are_no_correction(self, tmp_path):
+        equipix.average(raw_frames()).save(tmp_path / "mean.tif")
         with pytest.raises(
             FileError, match="holds frame statistics, .*mean and variance of av.*--"
         ):
-            equipix.load(tmp_path / "mean.tif")
+            loading.load_correction(tmp_path / "mean.tif")
 
     def test_names_the_kind_of_a_damaged_file(self, bent, tmp_path):
         path = tmp_path / "bent.tif"

@@ -121,8 +121,8 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     """Six sensors in a narrow beam; calibrated with the shifts as measured once, and twice."""
     measured = experiment_run.measured_shifts
 
-    def once(path, manifest, *_):
-        return measured(path, manifest)
+    def once(path, manifest, *_, hot):
+        return measured(path, manifest, hot=hot)
 
     errors_of, scores, blocks = ([], []), [], ([], [], [])
     for seed in range(6):

@@ -58,6 +58,10 @@ class AlreadyCorrectedWarning(EquipixWarning):
     """Frames to correct have been corrected before."""
 
 
+class SaturationWarning(EquipixWarning):
+    """Values that probably saturate count as valid."""
+
+
 class MisfitWarning(EquipixWarning):
     """Residuals are larger than the variances given explain."""
 

@@ -1,4 +1,4 @@
-"""Corrections of any kind, read from the files that they were saved to."""
+"""Corrections of any kind and averaged frames, read from the files that they were saved to."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ if TYPE_CHECKING:
 
 READERS = {
     "calibration": ("equipix.calibration.result", "read_calibration"),
+    "frame statistics": ("equipix.frames", "read_statistics"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes
-a correction of ``(path, pages, metadata)``."""
+the content of ``(path, pages, metadata)``."""
 
 _NO_CORRECTIONS = {
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
     "themselves: equipix correct subtracts them as --dark",
 }
-"""Other kinds of files that equipix writes, and what they are."""
+"""Kinds of files that are no corrections, and what they are."""
 
 
-def load(path: str | PathLike[str]) -> Correction:
-    """Read a correction from the file that its `save` wrote.
+def load(path: str | PathLike[str]) -> Any:
+    """Read a correction or averaged frames from the file that their `save` wrote.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ def load(path: str | PathLike[str]) -> Correction:
 
     Returns
     -------
-    Correction
+    Calibration, another Correction, or FrameStatistics
         As it was saved, bit by bit: from a file that `Calibration.save` wrote a `Calibration`.
 
     Raises
@@ -46,7 +47,16 @@ def load(path: str | PathLike[str]) -> Correction:
     FileError
         If the file cannot be read, holds something else, or was written in a newer format.
     """
-    correction: Correction = _load(path, READERS)
+    return _load(path, READERS)
+
+
+def load_correction(path: str | PathLike[str]) -> Correction:
+    """Read a correction of any kind, and refuse averaged frames.
+
+    The parameters and errors are those of `load`.
+    """
+    readers = {kind: reader for kind, reader in READERS.items() if kind not in _NO_CORRECTIONS}
+    correction: Correction = _load(path, readers)
     return correction
 
 

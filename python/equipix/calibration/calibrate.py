@@ -9,7 +9,9 @@ import numpy as np
 
 from equipix import _native
 from equipix.calibration import verdicts
+from equipix.calibration.coverage import with_coverage
 from equipix.calibration.error_bars import standard_deviations
+from equipix.calibration.input_verdicts import on_input
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.result import Calibration
@@ -79,7 +81,7 @@ def calibrate(
         True = do not use.
     saturation : float, optional
         Level, in the units of frames given as arrays: a value at or above it counts as masked, and
-        its pixel is flagged.
+        its pixel is flagged. By default the largest value of a dtype of whole numbers.
     flux : array_like, shape (n,), "fit" or "linear", optional
         Known relative flux of each exposure, 1 unless given; or what is to be found: a flux for
         each exposure, or ln c linear in `time`.
@@ -144,13 +146,17 @@ def calibrate(
     ShiftRoundingWarning
         If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if free
-        fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly degenerate
-        with the sensitivity.
+        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
+        than half of the pixels that are not masked are determined (`Calibration.is_partial`); if
+        free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly
+        degenerate with the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
     MisfitWarning
         If residuals are more than twice as large as the variances predict.
+    SaturationWarning
+        If many values are exactly at the highest one, and no saturation level is given or a higher
+        one.
     ShiftSignWarning
         If the data contradict the sign of the shifts.
 
@@ -224,14 +230,14 @@ def calibrated(
     The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    advice = verdicts.on_plan(exposures)
+    advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
     verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
     bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
-    found = verdicts.on_fit(weighted, options, test, dark)
+    found = with_coverage(verdicts.on_fit(weighted, options, test, dark), weighted, flags)
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(

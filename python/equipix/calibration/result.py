@@ -200,6 +200,15 @@ class Calibration(ReadOnly):
         rows, cols = self.sensitivity.shape
         return rows, cols
 
+    @property
+    def is_partial(self) -> bool:
+        """Whether less than half of the pixels that are not masked are determined.
+
+        The verdict of kind ``"partial"`` contains the cause. `equipix calibrate` writes such a
+        result only with ``--partial``.
+        """
+        return any(verdict.kind == "partial" for verdict in self.verdicts)
+
     def __repr__(self) -> str:
         """Short form: sizes and how far the solver came."""
         state = "converged" if self.converged else "not converged"

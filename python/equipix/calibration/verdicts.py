@@ -13,6 +13,7 @@ from equipix.errors import (
     EquipixWarning,
     IdentifiabilityWarning,
     MisfitWarning,
+    SaturationWarning,
     ShiftRoundingWarning,
     ShiftSignWarning,
     warn,
@@ -44,6 +45,8 @@ _DEGENERATE = 0.1
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "rounding": ShiftRoundingWarning,
     "order": IdentifiabilityWarning,
+    "saturation": SaturationWarning,
+    "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,
     "pattern": IdentifiabilityWarning,

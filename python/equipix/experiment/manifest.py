@@ -21,6 +21,13 @@ _WANTED = {
     "bit_depth": "a whole number from 1 to 16",
     "saturation": "a positive number (DN)",
     "gain_dn_per_e": "a positive number (DN per electron)",
+    "mask": "an image file",
+    "region": "tables [[sensor.region]]",
+    "rows": "[first, end], two whole numbers from 0 on, the first below the end",
+    "cols": "[first, end], two whole numbers from 0 on, the first below the end",
+    "centre": "[row, col] in pixels",
+    "radius": "a positive number of pixels",
+    "outside": "true or false",
     "dark": "a table",
     "exposure": "two or more tables [[exposure]]",
     "name": "a text",
@@ -38,19 +45,45 @@ _WANTED = {
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Text = Annotated[str, Field(min_length=1)]
 Files = Text | Annotated[list[Text], Field(min_length=1)]
+Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+class Region(_Table):
+    """One ``[[sensor.region]]``: a rectangle or a circle of pixels that must not be used."""
+
+    rows: Span | None = None
+    cols: Span | None = None
+    centre: Pair | None = None
+    radius: Positive | None = None
+    outside: bool = False
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        if (self.centre is None) != (self.radius is None):
+            raise _problem("give both 'centre' and 'radius'")
+        spans = [span for span in (self.rows, self.cols) if span is not None]
+        if bool(spans) == (self.centre is not None):
+            raise _problem("give 'rows', 'cols' or both, or 'centre' and 'radius'")
+        for first, end in spans:
+            if first >= end:
+                raise _problem(f"{[first, end]} holds no pixel: the first must be below the end")
+        return self
+
+
 class Sensor(_Table):
-    """Table ``[sensor]``: levels in DN."""
+    """Table ``[sensor]``: levels in DN, and pixels that must not be used."""
 
     name: str = ""
     bit_depth: Annotated[int, Field(ge=1, le=16)] | None = None
     saturation: Positive | None = None
     gain_dn_per_e: Positive | None = None
+    mask: Text | None = None
+    region: Annotated[list[Region], Field(min_length=1)] | None = None
 
     @property
     def saturation_level(self) -> float | None:
@@ -73,7 +106,7 @@ class Exposure(_Table):
     frames: Files
     aperture_before: Files | None = None
     aperture_after: Files | None = None
-    shift: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    shift: Pair | None = None
     shift_std: (
         Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
         | None
@@ -163,7 +196,8 @@ def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]
         exposure = next((part for part in location if isinstance(part, int)), None)
         names = [part for part in location if isinstance(part, str)]
         kinds = {"manifest": detail["msg"], "extra_forbidden": "unknown", "missing": "missing"}
-        mistake = (kinds.get(detail["type"], "value"), *names[:2])
+        depth = 3 if names[:2] == ["sensor", "region"] else 2
+        mistake = (kinds.get(detail["type"], "value"), *names[:depth])
         found.setdefault(mistake, {}).setdefault(exposure, _sentence(detail, content))
     sentences = [list(alike.values()) for alike in found.values()]
     return [
@@ -178,6 +212,8 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     match location:
         case ["exposure", int(index), *_]:
             place = f" in exposure {index}{_name(content['exposure'][index])}"
+        case ["sensor", "region", int(index), *_]:
+            place = f" in [[sensor.region]] {index}"
         case [table, _, *_]:
             place = f" in [{table}]"
         case _:

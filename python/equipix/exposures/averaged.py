@@ -15,6 +15,8 @@ from equipix.defects import (
     refuse_saturated,
 )
 from equipix.errors import InputError
+from equipix.exposures.clipping import Clipping, clipping_of, highest
+from equipix.frames import same_statistics
 from equipix.noise import NoiseModel, photon_transfer
 
 if TYPE_CHECKING:
@@ -64,6 +66,7 @@ class Averaged:
         self._frames: list[int] = []
         self._of_dark: list[float] = []
         self._points: list[Array] = []
+        self._clipped: list[Clipping | None] = []
 
     @classmethod
     def of(cls, frames: Sequence[FrameStatistics]) -> Self:
@@ -93,13 +96,14 @@ class Averaged:
             raise InputError(
                 f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
             )
-        if not _same(frames.dark, self.dark):
+        if not same_statistics(frames.dark, self.dark):
             raise InputError(
                 f"'frames': exposure {exposure} has another dark than the first: average all with "
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
         self._refuse_saturated(f"exposure {exposure}{f' ({name!r})' if name else ''}", frames)
+        self._clipped.append(clipping_of(frames))
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
@@ -118,6 +122,11 @@ class Averaged:
             points.append(_dark_points(self.dark))
             known |= self.gain is not None and len(points[-1]) > 0
         return NoiseModel.fit(np.concatenate(points), gain=self.gain) if known else None
+
+    @property
+    def clipped(self) -> Clipping | None:
+        """A saturation level that was not given, if the values show one."""
+        return highest(self._clipped)
 
     def models(self, noise: NoiseModel) -> list[NoiseModel]:
         """Noise model of each mean frame, from that of one frame."""
@@ -149,14 +158,6 @@ class Averaged:
         measured = np.isfinite(self.values).any(axis=0)
         dead: Bools = dead_pixels(self.values, models) & measured
         return dead
-
-
-def _same(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
-    """Whether two darks are the same measurement: one object, or equal to the last bit."""
-    if one is None or other is None or one is other:
-        return one is other
-    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
+    from equipix.exposures.clipping import Clipping
     from equipix.exposures.flux import Flux
     from equipix.exposures.options import FitOptions
     from equipix.exposures.positions import Positions
@@ -54,6 +55,8 @@ class Exposures(ReadOnly):
         Bad pixels found before any fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
+    clipped : Clipping or None
+        A saturation level that was not given, if the values show one.
     """
 
     values: Array
@@ -65,6 +68,7 @@ class Exposures(ReadOnly):
     offset: bool = False
     findings: Findings = field(default_factory=Findings)
     dark: Array | None = None
+    clipped: Clipping | None = None
 
     def __len__(self) -> int:
         """Return the number of exposures."""

@@ -11,8 +11,10 @@ from equipix._check import as_array, as_floats, as_level, check_count, naming_me
 from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged
+from equipix.exposures.clipping import Clipping, clipping, highest
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
+from equipix.exposures.nothing import refuse_nothing
 from equipix.exposures.positions import Positions
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
@@ -44,7 +46,7 @@ def exposures_of(
         measured = measured_of(frames, variance, saturation)
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
-        return Exposures(
+        exposures = Exposures(
             values=measured.values,
             positions=Positions.of(shifts, rotation=rotation, std=shift_std, count=count),
             flux=Flux.of(flux, flux_std, time, count),
@@ -54,7 +56,10 @@ def exposures_of(
             offset=offset,
             findings=measured.findings,
             dark=measured.dark,
+            clipped=measured.clipped,
         )
+        refuse_nothing(exposures, given)
+        return exposures
 
 
 class Measured(NamedTuple):
@@ -66,6 +71,7 @@ class Measured(NamedTuple):
     models: Sequence[NoiseModel]
     findings: Findings
     dark: Array | None = None
+    clipped: Clipping | None = None
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -113,6 +119,7 @@ def _of_averaged(
         models,
         findings,
         None if dark is None else dark.mean.astype(averaged.values.dtype),
+        averaged.clipped,
     )
 
 
@@ -131,12 +138,24 @@ def _of_arrays(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), values)
-    level = as_level(saturation)
+    level = _largest(frames) if saturation is None else as_level(saturation)
     if level is None:
-        return Measured(values, None, variances, models, Findings())
+        clipped = highest(clipping(each) for each in values)
+        return Measured(values, None, variances, models, Findings(), clipped=clipped)
     saturated = _saturated(values, level)
+    clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
+    if saturation is None and not saturated.any():
+        return Measured(values, None, variances, models, Findings(), clipped=clipped)
     findings = Findings(saturated=np.any(saturated, axis=0))
-    return Measured(values, saturated, variances, models, findings)
+    return Measured(values, saturated, variances, models, findings, clipped=clipped)
+
+
+def _largest(frames: ArrayLike) -> float | None:
+    """Largest value of arrays of whole numbers, which counts as saturated unless given."""
+    arrays = frames if isinstance(frames, list | tuple) else [frames]
+    dtypes = {getattr(each, "dtype", None) for each in arrays}
+    dtype = dtypes.pop() if len(dtypes) == 1 else None
+    return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
 
 
 def _averaged(frames: object) -> Averaged | None:

@@ -101,6 +101,27 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     return pages, metadata
 
 
+def kind_of(path: Path) -> str | None:
+    """Kind of content in a file that `save_pages` wrote, of which no array is read; else None.
+
+    Raises
+    ------
+    FileError
+        If the file is not readable.
+    """
+    read = _DESCRIPTIONS.get(path.suffix.lower())
+    if read is None:
+        return None
+    with reading(path):
+        description = read(path)
+    try:
+        content = json.loads(description)
+    except ValueError:
+        return None
+    kind = content.get("kind") if isinstance(content, dict) else None
+    return kind if isinstance(kind, str) else None
+
+
 def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:
     """Refuse the metadata of another kind of file than `kind`, or of a format above `newest`.
 
@@ -172,8 +193,18 @@ def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     return pages, str(pages.pop("metadata", ""))
 
 
+def _description_of_npz(path: Path) -> str:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        return str(file["metadata"]) if "metadata" in file.files else ""
+
+
 SUFFIXES = (".tif", ".tiff", ".npz")
 """Formats of `save_pages`."""
 
 _WRITERS = {".tif": tiff.write_pages, ".tiff": tiff.write_pages, ".npz": _write_npz}
 _READERS = {".tif": tiff.read_pages, ".tiff": tiff.read_pages, ".npz": _read_npz}
+_DESCRIPTIONS = {
+    ".tif": tiff.description,
+    ".tiff": tiff.description,
+    ".npz": _description_of_npz,
+}
