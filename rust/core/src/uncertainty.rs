@@ -6,6 +6,7 @@
 
 mod ask;
 mod joint;
+mod joint_dark;
 mod joint_gauge;
 mod joint_pulls;
 mod reduced;
