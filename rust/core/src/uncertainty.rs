@@ -11,6 +11,7 @@ mod joint_gauge;
 mod joint_pulls;
 mod reduced;
 mod sampling;
+mod smoothed;
 
 pub use ask::Uncertainty;
 pub use sampling::ErrorMap;

@@ -16,13 +16,16 @@
 //! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
 //! out the mean of M, and the tilt where free fluxes leave it undetermined.
 //!
+//! On larger sensors the squares of C x are smoothed (`smoothed.rs`).
+//!
 //! The noise of a dark that was subtracted from all exposures is a fourth (`joint_dark.rs`).
 
 use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
-use super::joint_pulls::{add_change, product, pull_by, pull_of};
+use super::joint_pulls::{add_change, product, pull_by, pull_of, variance_by_cells};
 use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
 use super::sampling::{NEGLIGIBLE, mean_misfit};
+use super::smoothed::{Change, Smooth, is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
@@ -145,7 +148,12 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
         self.search = ConjugateGradients::default();
-        let sampled = Sampled::of(self, control)?;
+        let sensor = self.system.pass.exposures.sensor();
+        let sampled = if is_smoothed(sensor) {
+            smoothed(self, sensor, control)?
+        } else {
+            Sampled::of(self, control)?
+        };
         let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
             true => (self.scale * sampled.variance(pixel)).sqrt(),
             false => f64::NAN,
@@ -216,25 +224,21 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         variance.collect()
     }
 
-    /// Adds the square of the change of M in one draw.
-    fn add_square(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
+    /// The change of M in one draw, in the units of the map.
+    fn drawn_change(&mut self, draw: u64, control: &Control) -> Result<Change> {
         let slope = self.draw(draw, control)?;
         let mut sign = self.other_signs(draw, Other::Shifts);
         let variances = self.considered_variances().into_iter();
         let wrong: Vec<f64> = variances.map(|variance| sign() * variance.sqrt()).collect();
-        let change = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
-        for (square, change) in squares.iter_mut().zip(&change) {
-            *square += (change * change / self.scale) as f32;
-        }
+        let mut sampled = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
+        let mut followed = Vec::new();
         if let Some(dark) = &self.dark {
-            let exposures = self.system.pass.exposures;
-            let mut followed = dark.follow(draw, exposures.sensor());
+            followed = dark.follow(draw, self.system.pass.exposures.sensor());
             self.tilts.gauge.apply(&mut followed, self.system.pass.workers);
-            for ((square, change), followed) in squares.iter_mut().zip(&change).zip(&followed) {
-                *square += (2.0 * change * followed / self.scale) as f32;
-            }
         }
-        Ok(())
+        let unit = self.scale.sqrt();
+        sampled.iter_mut().chain(&mut followed).for_each(|change| *change /= unit);
+        Ok(Change { sampled, followed })
     }
 
     /// The change of M, in the gauge, with S x = b − S_d δ where considered shifts are wrong by δ, solved
@@ -545,6 +549,36 @@ impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
     }
 
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        self.add_square(draw, squares, control)
+        let Change { sampled, followed } = self.drawn_change(draw, control)?;
+        for (square, change) in squares.iter_mut().zip(&sampled) {
+            *square += (change * change) as f32;
+        }
+        for ((square, change), followed) in squares.iter_mut().zip(&sampled).zip(&followed) {
+            *square += (2.0 * change * followed) as f32;
+        }
+        Ok(())
+    }
+}
+
+impl<T: Real> Smooth for JointCovariance<'_, '_, T> {
+    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
+        Ok(self.known_part())
+    }
+
+    /// Σ_k (D⁻¹ w e c M)² V with the variance V of the beam's cells by themselves: what they do to M.
+    fn local(&mut self, control: &Control) -> Result<Vec<f64>> {
+        let mut local = variance_by_cells(&mut self.system, control)?;
+        for (local, valid) in local.iter_mut().zip(&self.valid) {
+            *local *= f64::from(*valid) / self.scale;
+        }
+        Ok(local)
+    }
+
+    fn followed(&self) -> &[f32] {
+        Drawn::followed(self)
+    }
+
+    fn change(&mut self, draw: u64, control: &Control) -> Result<Change> {
+        self.drawn_change(draw, control)
     }
 }

@@ -4,11 +4,11 @@ use crate::control::Control;
 use crate::error::Result;
 
 /// The relative standard error of the map, root mean square over its pixels, that draws go on to.
-const EXACTNESS: f64 = 0.02;
+pub(super) const EXACTNESS: f64 = 0.02;
 /// Draws that determine how many are needed.
-const FIRST_DRAWS: u64 = 8;
+pub(super) const FIRST_DRAWS: u64 = 8;
 /// Upper limit on draws.
-const MOST_DRAWS: u64 = 400;
+pub(super) const MOST_DRAWS: u64 = 400;
 /// The share of x · b that the solution of a draw may lack. Slow errors are a small part of that and
 /// a large one of the variance: with crosses (5, 7), (11, 19), (23, 41) and (97, 160) the mean
 /// variance was 2, 3, 5 and 14 in 10 000 too small with this, 2, 36, 242 and 934 with 1e-3.
@@ -53,7 +53,7 @@ pub(super) struct Sampled {
     pub(super) known: Vec<f32>,
     pub(super) squares: Vec<f32>,
     pub(super) draws: u64,
-    exactness: f64,
+    pub(super) exactness: f64,
 }
 
 impl Sampled {
