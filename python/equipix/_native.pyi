@@ -163,6 +163,8 @@ class Fit:
         offset: bool,
         workers: int | None,
         progress: _Progress | None,
+        dark_variance: NDArray[Any] | None = None,
+        dark_misfit: bool = False,
     ) -> Uncertainty: ...
 
 @final
@@ -181,6 +183,8 @@ class Uncertainty:
     def shift_variances(self) -> list[list[float]] | None: ...
     @property
     def offset_variances(self) -> tuple[float, float] | None: ...
+    @property
+    def dark_misfit(self) -> float | None: ...
 
 def locate_spots(
     before: NDArray[Any],

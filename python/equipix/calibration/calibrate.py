@@ -10,7 +10,7 @@ import numpy as np
 from equipix import _native
 from equipix.calibration import verdicts
 from equipix.calibration.coverage import with_coverage
-from equipix.calibration.error_bars import standard_deviations
+from equipix.calibration.error_bars import standard_deviations, with_dark_misfit
 from equipix.calibration.input_verdicts import on_input
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.pixel_flags import pixel_flags
@@ -47,6 +47,7 @@ def calibrate(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     dark: Literal["subtracted", "fit"] = "subtracted",
+    dark_variance: ArrayLike | None = None,
     robust: bool = False,
     method: Method = "multiscale",
     tolerance: float = 1e-6,
@@ -100,6 +101,11 @@ def calibrate(
     dark : {"subtracted", "fit"}
         Whether the dark is already subtracted, or to be found as an offset of each pixel: for
         exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.
+    dark_variance : float or array_like, shape (rows, cols), optional
+        Variance of the dark mean that was subtracted from all frames, in the units of the frames
+        squared: that of a dark frame over the number of dark frames. Its error is common to all
+        exposures, so `variance` must be without it; it enters the error bars and `reduced_chi2`, not
+        the weights. `FrameStatistics` with a dark contain it, unless `variance` holds numbers.
     robust : bool
         Whether to leave out measurements that disagree with the others, such as a particle or a
         reflection in one exposure only. Left out is what is more than five standard deviations
@@ -212,6 +218,7 @@ def calibrate(
         rotation=rotation,
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
+        dark_variance=dark_variance,
     )
     if fit_options.whole_shifts:
         exposures = exposures.whole()
@@ -232,7 +239,7 @@ def calibrated(
     started = datetime.now(UTC)
     advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
     verdicts.say(advice)
-    weighted = weighted_fit(exposures, options, start)
+    weighted = with_dark_misfit(weighted_fit(exposures, options, start), options.fit)
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
@@ -258,7 +265,7 @@ def _metadata(
     bars: ErrorBars | None,
 ) -> dict[str, Any]:
     """Versions, options and times, as JSON values."""
-    exposures, fit, rejected = weighted
+    exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
     chosen: dict[str, Any] = {
         "method": options.fit.method,
         "tolerance": options.fit.tolerance,

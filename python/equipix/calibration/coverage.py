@@ -54,7 +54,7 @@ def _wanted(exposures: Exposures) -> Bools:
 
 def _cause(weighted: Weighted, missing: Bools, flags: Array) -> str:
     """Return what most of the missing pixels have in common, and the remedy."""
-    exposures, fit, _ = weighted
+    exposures, fit = weighted.exposures, weighted.fit
     if _most(missing, exposures.findings.saturated):
         return (
             "most of the others reach the saturation level: expose less, or correct the level "

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from equipix.exposures.options import FitOptions
 
 
+_NOT_FOUND = 0.1
+"""Largest estimated error of M for which noise determines the residuals."""
+
+
 class ErrorBars(NamedTuple):
     """Standard deviations; see the attributes of `equipix.Calibration`."""
 
@@ -54,7 +58,7 @@ def standard_deviations(
     That of a dark which was fitted together with fluxes is always given: a verdict needs it. All
     are questions of one call, which sets up the linear problem once.
     """
-    exposures, fit, _ = weighted
+    exposures, fit = weighted.exposures, weighted.fit
     asks_dark = exposures.offset and exposures.flux.kind != "known"
     if asks_dark and not wanted and not np.isfinite(weighted.noise_variance):
         return None, DarkStd(None, None)
@@ -72,6 +76,7 @@ def standard_deviations(
             offset=asks_dark,
             workers=options.workers,
             progress=options.progress if wanted else None,
+            dark_variance=_relative(exposures.dark_variance, scale),
         )
     dark = _of_dark(weighted, answer, scale) if asks_dark else None
     return _error_bars(weighted, answer, scale) if wanted else None, dark
@@ -79,7 +84,7 @@ def standard_deviations(
 
 def _error_bars(weighted: Weighted, answer: Uncertainty, scale: float) -> ErrorBars:
     """Standard deviations of sensitivity, tilt and shifts from the answers for unit weights."""
-    exposures, fit, _ = weighted
+    exposures, fit = weighted.exposures, weighted.fit
     std = scale * cast("Floats", answer.std)
     unknown = np.full(2, np.inf if fit.leaves_tilt else np.nan)
     refined = answer.shift_variances is not None
@@ -95,6 +100,26 @@ def _of_dark(weighted: Weighted, answer: Uncertainty, scale: float) -> DarkStd:
     """Uncertainty of a fitted dark from the answers for unit weights."""
     along, alone = _std(scale, answer.offset_variances).tolist()
     return DarkStd(along if weighted.fit.ended == "converged" else None, alone)
+
+
+def with_dark_misfit(weighted: Weighted, options: FitOptions) -> Weighted:
+    """Add what the noise of the dark adds to F, unless the fit is too far from its minimum."""
+    exposures, fit = weighted.exposures, weighted.fit
+    found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= _NOT_FOUND
+    if exposures.dark_variance is None or not found:
+        return weighted
+    with naming_memory("the misfit of the dark"):
+        answer = fit.uncertainty(
+            error_map=False,
+            functionals=None,
+            shifts=False,
+            offset=False,
+            workers=options.workers,
+            progress=None,
+            dark_variance=exposures.dark_variance,
+            dark_misfit=True,
+        )
+    return weighted._replace(dark_misfit=cast("float", answer.dark_misfit))
 
 
 def noise_scale(weighted: Weighted) -> float:
@@ -120,6 +145,11 @@ def of_logarithm(weights: Floats, fit: Fit) -> Floats:
     return np.asarray(np.divide(weights, fit.sensitivity, where=weights != 0, out=none))
 
 
+def _relative(dark_variance: Floats | None, scale: float) -> Floats | None:
+    """Variance of the dark in units of that of a value of weight 1."""
+    return None if dark_variance is None else dark_variance / scale**2
+
+
 def _std(scale: float, variances: ArrayLike | None) -> Floats:
     """Standard deviations from variances, scaled."""
     return np.asarray(scale * np.sqrt(np.asarray(cast("ArrayLike", variances))))
@@ -135,7 +165,7 @@ def functional_std(
     """Standard deviation of the sum of weights · ln M, for each of a stack (m, rows, cols).
 
     With g = weights/M the variance is gᵀ S⁻¹ g, in the gauge mean(M) = 1: the solution of one
-    linear problem, to 1e-4 of the variance.
+    linear problem, to 1e-4 of the variance. The noise of a dark adds its own.
     """
     scale = noise_scale(weighted)
     with naming_memory("the standard deviation"):
@@ -146,6 +176,7 @@ def functional_std(
             offset=False,
             workers=positive_workers(workers),
             progress=progress,
+            dark_variance=_relative(weighted.exposures.dark_variance, scale),
         )
     return _std(scale, answer.variances)
 

@@ -21,7 +21,7 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
     Flagged are pixels that the solver left undetermined, those found before the fit, outliers of
     the response, and pixels whose measurements contradict each other.
     """
-    exposures, fit, rejected = weighted
+    exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
     flags: Array = fit.flags.copy()
     sensitivity = fit.sensitivity.astype(exposures.values.dtype, copy=False)
     dead, hot = response_outliers(sensitivity, lambda: _std(weighted, options.workers))
@@ -36,7 +36,16 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
 
 
 def _std(weighted: Weighted, workers: int | None) -> Array:
-    """Standard deviation of M, that of the beam left out: 1/√D."""
+    """Standard deviation of M, that of the beam left out: 1/√D.
+
+    The noise of a dark adds at most v Σw/D, which it adds where all exposures show the same light.
+    """
+    exposures = weighted.exposures
     information = weighted.fit.information(workers=workers)
+    variance: float | Array = weighted.noise_variance
+    if exposures.dark_variance is not None:
+        ones = np.where(np.isfinite(exposures.values), 1.0, np.nan)
+        weights = np.nansum(exposures.weighted_squares(ones), axis=0)
+        variance = variance + exposures.dark_variance * weights
     with np.errstate(divide="ignore"):
-        return np.asarray(1 / np.sqrt(information / weighted.noise_variance))
+        return np.asarray(1 / np.sqrt(information / variance))

@@ -71,8 +71,9 @@ class Calibration(ReadOnly):
     objective : float
         Objective F at the end.
     reduced_chi2 : float
-        F over the degrees of freedom: 1 on average where the variances given are right, and the
-        variance of one value where none were given. NaN without any degree of freedom.
+        F over its expectation, the degrees of freedom and what the noise of the dark adds: 1 on
+        average where the variances given are right. Where none were given, the variance of one
+        value. NaN without any degree of freedom.
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
         A pixel that does not respond connects no parts; nor does one whose measurements have
@@ -162,7 +163,7 @@ class Calibration(ReadOnly):
         metadata: dict[str, Any],
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
-        exposures, fit, rejected = weighted
+        exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
         dtype = exposures.values.dtype
         return cls(
             sensitivity=fit.sensitivity.astype(dtype, copy=False),

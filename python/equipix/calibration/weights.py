@@ -27,17 +27,29 @@ _MOST_ROUNDS = 20
 
 
 class Weighted(NamedTuple):
-    """Exposures with their final weights, their fit, and the measurements left out."""
+    """Exposures with their final weights, their fit, and the measurements left out.
+
+    `dark_misfit` is what the noise of the dark adds to F on average.
+    """
 
     exposures: Exposures
     fit: Fit
     rejected: Bools | None
+    dark_misfit: float = 0.0
 
     @property
     def reduced_chi2(self) -> float:
-        """F over the degrees of freedom; NaN without any."""
+        """F over its expectation, or the variance of a value of weight 1; NaN where undetermined.
+
+        The expectation of F is the degrees of freedom and what the noise of the dark adds.
+        """
         freedom = self.fit.degrees_of_freedom
-        return self.fit.misfit / freedom if freedom > 0 else float("nan")
+        if freedom <= 0:
+            return float("nan")
+        if self.exposures.variance is not None:
+            return self.fit.misfit / (freedom + self.dark_misfit)
+        left = self.fit.misfit - self.dark_misfit
+        return left / freedom if left > 0 or self.dark_misfit == 0 else float("nan")
 
     @property
     def noise_variance(self) -> float:

@@ -54,7 +54,7 @@ class Equalisation:
     @classmethod
     def of(cls, weighted: Weighted, flags: Array, workers: int | None = None) -> Self:
         """Take it from the fit of exposures whose dark is known."""
-        exposures, fit, _ = weighted
+        exposures, fit = weighted.exposures, weighted.fit
         if exposures.dark is None:
             raise InputError(
                 "'calibration' holds no dark frame: give one that Experiment.run has made"

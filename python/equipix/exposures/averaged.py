@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import DTypeLike
 
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
     from equipix.frames import FrameStatistics
 
 
@@ -129,12 +129,18 @@ class Averaged:
         return highest(self._clipped)
 
     def models(self, noise: NoiseModel) -> list[NoiseModel]:
-        """Noise model of each mean frame, from that of one frame."""
-        of_dark = self._of_dark
+        """Noise model of each mean frame without that of the dark, from that of one frame."""
+        return [noise.of_mean(frames) for frames in self._frames]
+
+    def dark_variance(self, noise: NoiseModel) -> Floats | None:
+        """Variance of the dark that was subtracted from all, from the noise of one frame.
+
+        Of a dark that is not kept it is what the averages state; None without any.
+        """
         if self.dark is not None:
-            of_dark = [float(noise.variance(0.0)) / int(self.dark.count.max())] * self.count
-        pairs = zip(self._frames, of_dark, strict=True)
-        return [noise.of_mean(frames, dark_variance=variance) for frames, variance in pairs]
+            return np.asarray(noise.variance(0.0) / np.maximum(self.dark.count, 1))
+        stated = float(np.mean(self._of_dark))
+        return np.full(self.saturated.shape, stated) if stated > 0 else None
 
     def findings(self, noise: NoiseModel | None) -> Findings:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
@@ -154,10 +160,16 @@ class Averaged:
 
     def _dead(self, noise: NoiseModel | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""
-        models = None if noise is None else self.models(noise)
+        models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
         dead: Bools = dead_pixels(self.values, models) & measured
         return dead
+
+    def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
+        """Noise model of each mean frame less the dark, for one exposure by itself."""
+        of_dark = self.dark_variance(noise)
+        variance = 0.0 if of_dark is None else float(np.median(of_dark))
+        return [noise.of_mean(frames, dark_variance=variance) for frames in self._frames]
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

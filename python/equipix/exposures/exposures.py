@@ -55,6 +55,9 @@ class Exposures(ReadOnly):
         Bad pixels found before any fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
+    dark_variance : ndarray, shape (rows, cols), float64, or None
+        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are without
+        it. None where it is unknown, or where an offset is sought, which takes all of it.
     clipped : Clipping or None
         A saturation level that was not given, if the values show one.
     """
@@ -68,6 +71,7 @@ class Exposures(ReadOnly):
     offset: bool = False
     findings: Findings = field(default_factory=Findings)
     dark: Array | None = None
+    dark_variance: Floats | None = None
     clipped: Clipping | None = None
 
     def __len__(self) -> int:
@@ -130,6 +134,7 @@ class Exposures(ReadOnly):
             mask=None if mask is None else np.ascontiguousarray(mask[part]),
             findings=Findings(),
             dark=None,
+            dark_variance=None,
         )
 
     def reversed(self) -> Self:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array, Bools, FluxModel
+    from equipix._types import Array, Bools, Floats, FluxModel
 
 
 def exposures_of(
@@ -40,6 +40,7 @@ def exposures_of(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     offset: bool = False,
+    dark_variance: ArrayLike | None = None,
 ) -> Exposures:
     """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
@@ -56,10 +57,32 @@ def exposures_of(
             offset=offset,
             findings=measured.findings,
             dark=measured.dark,
+            dark_variance=_of_dark(dark_variance, measured, offset=offset),
             clipped=measured.clipped,
         )
         refuse_nothing(exposures, given)
         return exposures
+
+
+def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
+    """Variance of the dark that was subtracted from all exposures, given or that of the averages."""
+    if given is not None and offset:
+        raise InputError(
+            "'dark_variance' is that of a dark that was subtracted, but 'dark' is 'fit': give one "
+            "of the two"
+        )
+    if offset:
+        return None
+    if given is None:
+        return measured.dark_variance
+    shape = measured.values.shape[1:]
+    variance = as_array("dark_variance", given, ndim=(0, 2)).astype(np.float64)
+    if variance.ndim and variance.shape != shape:
+        raise InputError(f"'dark_variance' has shape {variance.shape}, expected {shape} or ()")
+    wrong = variance[~(np.isfinite(variance) & (variance >= 0))]
+    if wrong.size:
+        raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")
+    return np.array(np.broadcast_to(variance, shape))
 
 
 class Measured(NamedTuple):
@@ -71,6 +94,7 @@ class Measured(NamedTuple):
     models: Sequence[NoiseModel]
     findings: Findings
     dark: Array | None = None
+    dark_variance: Floats | None = None
     clipped: Clipping | None = None
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
@@ -110,7 +134,8 @@ def _of_averaged(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), averaged.values)
-    findings = averaged.findings(noise if isinstance(noise, NoiseModel) else None)
+    model = noise if isinstance(noise, NoiseModel) else None
+    findings = averaged.findings(model)
     dark = averaged.dark
     return Measured(
         averaged.values,
@@ -119,6 +144,7 @@ def _of_averaged(
         models,
         findings,
         None if dark is None else dark.mean.astype(averaged.values.dtype),
+        None if model is None else averaged.dark_variance(model),
         averaged.clipped,
     )
 

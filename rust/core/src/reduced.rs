@@ -19,6 +19,7 @@
 
 mod blocks;
 mod conjugate_gradients;
+mod dark;
 mod kernel;
 mod noise;
 mod operator;
@@ -27,6 +28,6 @@ mod two_level;
 mod two_level_kernel;
 
 pub(crate) use conjugate_gradients::{ConjugateGradients, bytes_needed};
-pub(crate) use operator::{Reduced, Scale};
+pub(crate) use operator::{Draw, Reduced, Scale};
 pub(crate) use smallest::Smallest;
 pub(crate) use two_level::TwoLevel;

@@ -100,6 +100,18 @@ impl<'s> Row<'s> {
         (exposures + if with_offset { 6 } else { 3 }) * cols
     }
 
+    /// The same row for a shorter time.
+    pub(crate) fn again(&mut self) -> Row<'_> {
+        let [offset, i12, i22] = &mut self.offset;
+        Row {
+            light: self.light,
+            sensitivity: self.sensitivity,
+            inverse: self.inverse,
+            change: self.change,
+            offset: [offset, i12, i22],
+        }
+    }
+
     pub(crate) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
         let (light, rest) = values.split_at_mut(exposures * cols);
         let mut parts = rest.chunks_exact_mut(cols);

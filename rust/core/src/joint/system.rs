@@ -303,10 +303,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<Sums> {
-        let (cells, params) = (beam.len(), self.fluxes.columns.len());
-        let logs = self.fluxes.spread(&x[cells..cells + params]);
-        let shares: Vec<f64> =
-            logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect();
+        let cells = beam.len();
+        let shares = self.shares(&x[cells..]);
         let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(beam));
         self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
             pass.weigh_row(row_index, workspace);
@@ -318,6 +316,49 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let follow = Follow { row, fluxes, weights, values, sums, share };
             found.largest = found.largest.max(pulp::Arch::new().dispatch(follow));
         })
+    }
+
+    /// Changes of ln c, divided by c, of changes of θ and what stands behind them.
+    fn shares(&self, x: &[f64]) -> Vec<f64> {
+        let logs = self.fluxes.spread(&x[..self.fluxes.columns.len()]);
+        logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect()
+    }
+
+    /// 1ᵀ w Q J x of each pixel: what a change of all its measurements alike does to the slope along x.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn follow_common(&mut self, x: &[f64], control: &Control) -> Result<Vec<f64>> {
+        let cells = self.state.beam.len();
+        let shares = self.shares(&x[cells..]);
+        let moves = self.centred(&x[cells + self.fluxes.columns.len()..]);
+        let beam = std::mem::take(&mut self.state.beam);
+        let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(&beam));
+        let mut pull = vec![0.0; cells];
+        let done = self.pass.run(&mut pull, control, |pass, row_index, mut row, workspace, _| {
+            pass.weigh_row(row_index, workspace);
+            pass.see_slopes(&beams, row_index, workspace);
+            workspace.begin(row.light, &shares, &moves);
+            pass.see(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
+            let fluxes = &pass.flux[..];
+            let follow = Follow { row: row.again(), fluxes, weights, values, sums, share: 0.0 };
+            pulp::Arch::new().dispatch(follow);
+            row.change.fill(0.0);
+            for (k, flux) in pass.flux.iter().enumerate() {
+                let pulls = values.of(k).iter().zip(&*row.sensitivity);
+                for (sum, (pull, m)) in row.change.iter_mut().zip(pulls) {
+                    // A pixel without response pulls at nothing.
+                    *sum += if *m == 0.0 { 0.0 } else { pull / (flux * m) };
+                }
+            }
+        });
+        drop((views, beams));
+        self.state.beam = beam;
+        done?;
+        let mut common = Vec::new();
+        self.pass.for_rows(|[_, _, sums, ..]| common.extend_from_slice(sums));
+        Ok(common)
     }
 
     /// The priors' weights of the parameters.

@@ -11,7 +11,7 @@
 //! standard deviation everywhere and only its signs are drawn: a bit for each measurement.
 
 use super::kernel::{NoiseSlope, Sign, TwoTerms};
-use super::operator::{ExposureScratch, Reduced, RowWeight, Shown};
+use super::operator::{Draw, ExposureScratch, Reduced, RowWeight, Shown};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -19,11 +19,16 @@ use crate::padded::{BAND, LANES};
 use crate::random::{self, Streams};
 
 impl<T: Real> Reduced<'_, '_, T> {
-    /// Writes the b of draw number `draw` to `slope`.
+    /// Writes the b of a draw to `slope`; returns Σ w c² e (e − M h), what F is once L has followed it.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn draw(&mut self, draw: u64, slope: &mut [f32], control: &Control) -> Result<()> {
+    pub(crate) fn draw(
+        &mut self,
+        draw: Draw,
+        slope: &mut [f32],
+        control: &Control,
+    ) -> Result<f64> {
         self.hide(Shown::Noise(draw), control);
         self.for_each_row(slope, control, |row, slope| {
             let [mut scratch, mut of_noise] = [self.scratch(), self.scratch()];
@@ -42,7 +47,7 @@ impl<T: Real> Reduced<'_, '_, T> {
                 noise: &noise,
                 sensitivity,
                 slope,
-            });
+            })
         })
     }
 
@@ -62,26 +67,32 @@ impl<T: Real> Reduced<'_, '_, T> {
                 inverse_diagonal: self.padding.row(&self.inverse_diagonal, row),
                 variance,
             });
-        })
+            0.0
+        })?;
+        Ok(())
     }
 
-    /// Calls `work(row, values)` for each row of an image.
-    fn for_each_row(
+    /// Calls `work(row, values)` for each row of an image; returns the sum of its results.
+    pub(super) fn for_each_row(
         &self,
         image: &mut [f32],
         control: &Control,
-        work: impl Fn(usize, &mut [f32]) + Send + Sync,
-    ) -> Result<()> {
+        work: impl Fn(usize, &mut [f32]) -> f64 + Send + Sync,
+    ) -> Result<f64> {
         let width = self.padding.width;
-        self.workers.map_blocks(self.padding.body_mut(image), BAND * width, |band, rows| {
+        let body = self.padding.body_mut(image);
+        let sums = self.workers.map_blocks(body, BAND * width, |band, rows| {
+            let mut sum = 0.0;
             for (index, values) in rows.chunks_exact_mut(width).enumerate() {
                 if control.is_cancelled() {
-                    return;
+                    return sum;
                 }
-                work(band * BAND + index, values);
+                sum += work(band * BAND + index, values);
             }
+            sum
         });
-        control.check()
+        control.check()?;
+        Ok(sums.into_iter().sum())
     }
 
     /// The noise of a row of pixels in one draw and exposure, with zeros before and after. Behind its last
@@ -90,23 +101,38 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// Each row has random numbers of its own, so that any thread may ask for any row.
     pub(super) fn noise<'s>(
         &self,
-        draw: u64,
+        draw: Draw,
         exposure: usize,
         row: usize,
         weight: RowWeight<'_>,
         noise: &'s mut Vec<f32>,
     ) -> &'s [f32] {
+        noise.resize(2 * self.padding.lead + self.padding.width, 0.0);
+        let padded = &mut noise[self.padding.lead..];
+        match draw {
+            Draw::Measurements(draw) => self.sign_each(draw, exposure, row, weight, padded),
+            Draw::Dark(draw) => self.dark_left(draw, exposure, row, padded),
+        }
+        noise
+    }
+
+    /// ±1/√w, with a sign for each measurement.
+    fn sign_each(
+        &self,
+        draw: u64,
+        exposure: usize,
+        row: usize,
+        weight: RowWeight<'_>,
+        noise: &mut [f32],
+    ) {
         let (sensor, count) = (self.exposures.sensor(), self.exposures.count());
         let mut bits = random::bits(Streams::new(count, sensor.rows).number(draw, exposure, row));
         let signs: Vec<u32> = (0..sensor.cols.div_ceil(LANES)).map(|_| bits()).collect();
-        noise.resize(2 * self.padding.lead + self.padding.width, 0.0);
-        let padded = &mut noise[self.padding.lead..];
         pulp::Arch::new().dispatch(Sign {
             weight: weight.at(&self.padding),
             signs: &signs,
-            noise: &mut padded[..self.padding.width],
+            noise: &mut noise[..self.padding.width],
         });
-        noise
     }
 }
 
@@ -164,7 +190,7 @@ mod tests {
                 let energy = reduced.multiply(&x, &mut product, &control).unwrap();
                 let heights: Vec<f64> = (0..DRAWS)
                     .map(|draw| {
-                        reduced.draw(draw, &mut b, &control).unwrap();
+                        reduced.draw(Draw::Measurements(draw), &mut b, &control).unwrap();
                         dot(&x, &b) / energy.sqrt()
                     })
                     .collect();

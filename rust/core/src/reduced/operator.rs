@@ -1,5 +1,6 @@
 //! The operator S: products, its diagonal, and the pixels that leave it.
 
+use super::dark::Dark;
 use super::kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
 use crate::control::Control;
 use crate::error::Result;
@@ -37,9 +38,11 @@ pub(crate) struct Reduced<'m, 'a, T> {
     pub(crate) mean: f64,
     left_out: Vec<LeftOut>,
     /// (L/scale)² in each view; 0 where unobserved.
-    light: Vec<Vec<f32>>,
+    pub(super) light: Vec<Vec<f32>>,
     /// h in each view: room for the first half of a product.
     hidden: Vec<Vec<f32>>,
+    /// The noise of a dark that was subtracted from all exposures, where it is known.
+    pub(super) dark: Option<Dark>,
 }
 
 /// A pixel that its measurements leave almost no weight.
@@ -80,6 +83,11 @@ impl Scale {
         1.0 / (self.weight * self.light * self.light)
     }
 
+    /// What a standard deviation of measurements is multiplied by to become one of the noise there.
+    pub(super) fn noise(&self) -> f64 {
+        self.weight.sqrt()
+    }
+
     /// The standard deviation of an M where that of the linear problem is 1.
     pub(crate) fn deviation(&self) -> f64 {
         self.slope().sqrt()
@@ -109,6 +117,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             left_out: Vec::new(),
             light: of_views(),
             hidden: of_views(),
+            dark: None,
         }
     }
 
@@ -364,8 +373,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                 let first = self.padding.row_before(&self.sensitivity, pixel_row, place.col);
                 let second = match shown {
                     Shown::Step(x) => self.padding.row_before(x, pixel_row, place.col),
-                    Shown::Noise(draw) => {
-                        let row = self.noise(draw, exposure, pixel_row, weight, noise);
+                    Shown::Noise(noise_of) => {
+                        let row = self.noise(noise_of, exposure, pixel_row, weight, noise);
                         &row[self.padding.lead - place.col..][..self.padding.width]
                     }
                     Shown::Weight => first,
@@ -435,13 +444,22 @@ pub(super) struct WeightScratch {
     padded: Vec<f32>,
 }
 
+/// A draw of noise, by its number.
+#[derive(Clone, Copy)]
+pub(crate) enum Draw {
+    /// Of each measurement by itself.
+    Measurements(u64),
+    /// Of the dark, less what M follows of it (`dark.rs`).
+    Dark(u64),
+}
+
 /// What the pixels of each exposure show to the cells that they see.
 #[derive(Clone, Copy)]
 pub(super) enum Shown<'x> {
     /// The step x.
     Step(&'x [f32]),
     /// The noise of a draw, in place of M h.
-    Noise(u64),
+    Noise(Draw),
     /// Nothing: in place of h stands 1/Σ w c² M².
     Weight,
 }

@@ -15,10 +15,17 @@
 //! (`joint/flux.rs`): its covariance is added. Shifts that have a prior but were not refined are wrong by
 //! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
 //! out the mean of M, and the tilt where free fluxes leave it undetermined.
+//!
+//! On larger sensors the squares of C x are smoothed (`smoothed.rs`).
+//!
+//! The noise of a dark that was subtracted from all exposures is a fourth (`joint_dark.rs`).
 
+use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
-use super::joint_pulls::{add_change, product, pull_by, pull_of};
+use super::joint_pulls::{add_change, product, pull_by, pull_of, variance_by_cells};
 use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
+use super::sampling::{NEGLIGIBLE, mean_misfit};
+use super::smoothed::{Change, Smooth, is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
@@ -71,6 +78,8 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     valid: Vec<f32>,
     /// The mean of D⁻¹: in these units squares have no extreme values.
     scale: f64,
+    /// The noise of a dark that was subtracted from all exposures.
+    dark: Option<Dark>,
 }
 
 impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
@@ -103,13 +112,48 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             determined,
             valid,
             scale,
+            dark: None,
         })
+    }
+
+    /// Takes the noise of the dark into account, of these variances. A sought offset takes all of it.
+    pub(super) fn set_dark(&mut self, variance: &[f64], control: &Control) -> Result<()> {
+        if self.system.pass.with_offset {
+            return Ok(());
+        }
+        let mut dark = Dark::of(&mut self.system, variance, control)?;
+        let followed: Vec<f64> = dark.followed().collect();
+        let in_gauge = self.tilts.gauge.diagonal(&followed);
+        dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
+        self.dark = Some(dark);
+        Ok(())
+    }
+
+    /// What the noise of the dark adds to F, on average; 0 without a dark.
+    pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
+        let Some(left) = self.dark.as_ref().map(|dark| dark.left) else { return Ok(0.0) };
+        let pixels = count(&self.valid);
+        if left <= NEGLIGIBLE * pixels {
+            return Ok(left);
+        }
+        self.search = ConjugateGradients::default();
+        let followed = mean_misfit(pixels, |draw| {
+            let slope = self.pulls_of_noise(draw, false, control)?;
+            self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
+            Ok(self.search.energy)
+        })?;
+        Ok(left - followed)
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
         self.search = ConjugateGradients::default();
-        let sampled = Sampled::of(self, control)?;
+        let sensor = self.system.pass.exposures.sensor();
+        let sampled = if is_smoothed(sensor) {
+            smoothed(self, sensor, control)?
+        } else {
+            Sampled::of(self, control)?
+        };
         let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
             true => (self.scale * sampled.variance(pixel)).sqrt(),
             false => f64::NAN,
@@ -166,41 +210,35 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// The part of the variance that is known: the diagonal of P D⁻¹ Pᵀ, and what S does not see.
     fn known_part(&self) -> Vec<f32> {
-        let own = self.own();
-        let parts = &self.tilts.gauge.parts;
-        let dot = |a: &[f64], b: &[f64]| -> f64 {
-            a.iter().zip(b).zip(&own).map(|((a, b), own)| a * b * own).sum()
-        };
-        // (1 − U Wᵀ) V (1 − W Uᵀ) = V − U Wᵀ V − V W Uᵀ + U (Wᵀ V W) Uᵀ.
-        let mixed: Vec<Vec<f64>> =
-            parts.iter().map(|[_, w]| parts.iter().map(|[_, v]| dot(w, v)).collect()).collect();
-        let variance = |pixel: usize| {
-            let mut variance = own[pixel];
-            for ([u, w], mixed) in parts.iter().zip(&mixed) {
-                variance -= 2.0 * u[pixel] * own[pixel] * w[pixel];
-                for ([v, _], mixed) in parts.iter().zip(mixed) {
-                    variance += u[pixel] * mixed * v[pixel];
-                }
-            }
+        let mut own = self.own();
+        if let Some(dark) = &self.dark {
+            own.iter_mut().zip(dark.followed()).for_each(|(own, followed)| *own += followed);
+        }
+        let in_gauge = self.tilts.gauge.diagonal(&own).enumerate();
+        let variance = in_gauge.map(|(pixel, mut variance)| {
             if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
                 variance += form(covariance, [tilts[0][pixel], tilts[1][pixel]]);
             }
             (variance / self.scale) as f32
-        };
-        (0..own.len()).map(variance).collect()
+        });
+        variance.collect()
     }
 
-    /// Adds the square of the change of M in one draw.
-    fn add_square(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
+    /// The change of M in one draw, in the units of the map.
+    fn drawn_change(&mut self, draw: u64, control: &Control) -> Result<Change> {
         let slope = self.draw(draw, control)?;
         let mut sign = self.other_signs(draw, Other::Shifts);
         let variances = self.considered_variances().into_iter();
         let wrong: Vec<f64> = variances.map(|variance| sign() * variance.sqrt()).collect();
-        let change = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
-        for (square, change) in squares.iter_mut().zip(&change) {
-            *square += (change * change / self.scale) as f32;
+        let mut sampled = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
+        let mut followed = Vec::new();
+        if let Some(dark) = &self.dark {
+            followed = dark.follow(draw, self.system.pass.exposures.sensor());
+            self.tilts.gauge.apply(&mut followed, self.system.pass.workers);
         }
-        Ok(())
+        let unit = self.scale.sqrt();
+        sampled.iter_mut().chain(&mut followed).for_each(|change| *change /= unit);
+        Ok(Change { sampled, followed })
     }
 
     /// The change of M, in the gauge, with S x = b − S_d δ where considered shifts are wrong by δ, solved
@@ -235,6 +273,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         Ok(change)
     }
 
+    /// What the noise of the dark adds to the variance of a functional, Σ g M or with g = 0 another one,
+    /// once S x = its pull is solved.
+    fn variance_by_dark(&mut self, gain: &[f64], control: &Control) -> Result<f64> {
+        let Some(dark) = &self.dark else { return Ok(0.0) };
+        let influence = self.system.follow_common(&self.search.x, control)?;
+        Ok(dark.variance_of(gain, &influence))
+    }
+
     /// The variance of a functional, in the gauge of the result, solved until it lacks at most this
     /// share of what S has in it. A g must be 0 where M is undetermined.
     fn variance_of(&mut self, functional: Functional, lack: f64, control: &Control) -> Result<f64> {
@@ -246,7 +292,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let others = pull.len() - own.as_flattened().len();
                 pull[others..].copy_from_slice(own.as_flattened());
                 self.apply_inverse(pull, lack, control)?;
-                Ok(self.search.energy)
+                let no_gain = vec![0.0; self.valid.len()];
+                Ok(self.search.energy + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -269,7 +316,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (pull, seen) = self.pull_of_gain(&gain, control)?;
         let others = pull.len();
         self.apply_inverse(pull, lack, control)?;
-        variance += self.search.energy;
+        variance += self.search.energy + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
             x.resize(others + seen.len(), 0.0);
@@ -372,26 +419,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
     fn draw(&mut self, draw: u64, control: &Control) -> Result<Vec<f64>> {
-        let streams: Vec<u64> =
-            (0..self.system.pass.exposures.count()).map(|k| self.stream(draw, k, 0)).collect();
+        let mut slope = self.pulls_of_noise(draw, true, control)?;
         let mut of_penalty = self.other_signs(draw, Other::Penalty);
         let mut of_priors = self.other_signs(draw, Other::Priors);
         let system = &mut self.system;
-        let mut slope = pull_by(system, control, |pass, row_index, row, workspace| {
-            let cols = pass.exposures.sensor().cols;
-            let (weights, values, sums) = workspace.parts();
-            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
-                let mut sign = random::signs(streams[k] + row_index as u64);
-                let pixels = weights.iter().zip(&*row.sensitivity);
-                for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
-                    // As a change of the light, which a pixel without response does not show.
-                    let shown = weight.sqrt() * flux * m;
-                    *value = if shown == 0.0 { 0.0 } else { sign() / shown };
-                }
-            }
-            let fluxes = &pass.flux[..];
-            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
-        })?;
         let cells = system.state.beam.len();
         if let Some(penalty) = &system.penalty {
             let beam = &system.state.beam;
@@ -404,6 +435,36 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let priors = pulls.iter().chain(of_shifts.as_flattened());
         slope[cells..].iter_mut().zip(priors).for_each(|(slope, pull)| *slope += pull);
         Ok(slope)
+    }
+
+    /// Jᵀ w Q of noise ε of variance 1/w, if that is drawn, and of the dark's noise.
+    fn pulls_of_noise(&mut self, draw: u64, of_each: bool, control: &Control) -> Result<Vec<f64>> {
+        let streams: Vec<u64> =
+            (0..self.system.pass.exposures.count()).map(|k| self.stream(draw, k, 0)).collect();
+        let Self { system, dark, .. } = self;
+        let sensor = system.pass.exposures.sensor();
+        pull_by(system, control, |pass, row_index, row, workspace| {
+            let cols = pass.exposures.sensor().cols;
+            let errors = dark.iter().flat_map(|dark| dark.errors(draw, row_index, sensor));
+            let errors: Vec<f64> = errors.collect();
+            let (weights, values, sums) = workspace.parts();
+            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
+                let mut sign = random::signs(streams[k] + row_index as u64);
+                let pixels = weights.iter().zip(&*row.sensitivity);
+                let values = values.of_mut(k);
+                for (value, (weight, m)) in values.iter_mut().zip(pixels) {
+                    // As a change of the light, which a pixel without response does not show.
+                    let shown = weight.sqrt() * flux * m;
+                    *value = if shown == 0.0 || !of_each { 0.0 } else { sign() / shown };
+                }
+                for ((value, error), m) in values.iter_mut().zip(&errors).zip(&*row.sensitivity) {
+                    let shown = flux * m;
+                    *value += if shown == 0.0 { 0.0 } else { error / shown };
+                }
+            }
+            let fluxes = &pass.flux[..];
+            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
+        })
     }
 
     /// The number of a stream of signs: of a row of an exposure, or behind those of what else is drawn.
@@ -483,7 +544,41 @@ impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
         Ok(self.known_part())
     }
 
+    fn followed(&self) -> &[f32] {
+        self.dark.as_ref().map_or(&[], |dark| &dark.in_gauge)
+    }
+
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        self.add_square(draw, squares, control)
+        let Change { sampled, followed } = self.drawn_change(draw, control)?;
+        for (square, change) in squares.iter_mut().zip(&sampled) {
+            *square += (change * change) as f32;
+        }
+        for ((square, change), followed) in squares.iter_mut().zip(&sampled).zip(&followed) {
+            *square += (2.0 * change * followed) as f32;
+        }
+        Ok(())
+    }
+}
+
+impl<T: Real> Smooth for JointCovariance<'_, '_, T> {
+    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
+        Ok(self.known_part())
+    }
+
+    /// Σ_k (D⁻¹ w e c M)² V with the variance V of the beam's cells by themselves: what they do to M.
+    fn local(&mut self, control: &Control) -> Result<Vec<f64>> {
+        let mut local = variance_by_cells(&mut self.system, control)?;
+        for (local, valid) in local.iter_mut().zip(&self.valid) {
+            *local *= f64::from(*valid) / self.scale;
+        }
+        Ok(local)
+    }
+
+    fn followed(&self) -> &[f32] {
+        Drawn::followed(self)
+    }
+
+    fn change(&mut self, draw: u64, control: &Control) -> Result<Change> {
+        self.drawn_change(draw, control)
     }
 }
