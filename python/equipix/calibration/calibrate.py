@@ -11,9 +11,9 @@ from equipix import _native
 from equipix.calibration import verdicts
 from equipix.calibration.error_bars import dark_std, error_bars
 from equipix.calibration.options import Options, is_to_be_fitted
+from equipix.calibration.orientation import orientation_test
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.result import Calibration
-from equipix.calibration.sign import shift_sign
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -151,7 +151,7 @@ def calibrate(
     MisfitWarning
         If residuals are more than twice as large as the variances predict.
     ShiftSignWarning
-        If the data contradict the sign of the shifts.
+        If the data contradict the orientation of the shifts: a sign, or the order of the axes.
 
     Notes
     -----
@@ -166,12 +166,15 @@ def calibrate(
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
     Gauss-Newton steps in which M is eliminated by its closed form.
 
-    The sign of the shifts is tested with at most twelve exposures and with the central pixels: four
-    times as many along each axis as the largest shift, or fewer where that is more than 80. They
-    are fitted with the shifts as given and with all of them reversed, fluxes free in both. The
-    lower F must be lower by 6·√(2/dof) of itself, in two thirds of all places. The sign is not
-    tested, and undetermined, with fewer than three exposures or a thousand degrees of freedom,
-    with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
+    The orientation of the shifts is tested with at most twelve exposures, as far apart as possible,
+    and with the central pixels: four times as many along each axis as the largest shift, or fewer
+    where that is more than 80. They are fitted with both signs along each axis and with the axes
+    exchanged, where exposures are turned also with the opposite turns; fluxes are free in all. An
+    orientation is excluded if its F is higher than the lowest by 6·√(2/dof) of itself, in two
+    thirds of all places, and by a misfit of more than 0.5 % of the signal; and only if the
+    residuals of the lowest F are white, or the misfit is 30 times what correlates in them. Nothing
+    is tested, and all undetermined, with fewer than three exposures or a thousand degrees of
+    freedom, with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
 
     References
     ----------
@@ -217,7 +220,7 @@ def calibrated(
     start: Fit | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars.
+    """Calibrate from exposures: weights, fit, orientation, flags, verdicts, error bars.
 
     The fit starts from `start`; `provenance` is added to the metadata.
     """
@@ -225,7 +228,7 @@ def calibrated(
     advice = verdicts.on_plan(exposures)
     verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)
-    test = shift_sign(weighted.exposures, weighted.fit, options.fit)
+    test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     dark = dark_std(weighted, options.fit)
     found = verdicts.on_fit(weighted, options, test, dark)
@@ -236,7 +239,7 @@ def calibrated(
     return Calibration.of(
         weighted,
         flags=flags,
-        sign=test.sign,
+        orientation=test,
         verdicts=(*advice, *found),
         bars=bars,
         metadata=metadata | (provenance or {}),

@@ -12,11 +12,13 @@ from equipix._check import check_count, check_progress, per_exposure
 from equipix._native import Beam
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
+from equipix.calibration.orientation import OrientationTest
 from equipix.calibration.saved import read_fields, save_fields
 from equipix.calibration.verdicts import Verdict
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
+from equipix.exposures.orientation import Orientation
 from equipix.exposures.positions import Positions
 from equipix.flags import determined, usable
 from equipix.maps import tilt
@@ -117,8 +119,11 @@ class Calibration:
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
-        Whether the data confirm the sign of the shifts, contradict it, or do neither, as those
-        of a Gaussian beam, whatever its width; see `calibrate`.
+        Whether the data confirm the signs and the order of the shifts' axes, contradict them, or do
+        neither, as those of a Gaussian beam, whatever its width; see `calibrate`.
+    orientation : OrientationTest or None
+        The same for each axis, with the best orientation and, in ``words``, what to do; None if
+        read from a file of an older version.
     """
 
     sensitivity: NDArray[Any]
@@ -147,6 +152,7 @@ class Calibration:
     weighted: Weighted | None = field(default=None, compare=False)
     rejected: NDArray[np.bool_] | None = None
     shift_sign: ShiftSign = "undetermined"
+    orientation: OrientationTest | None = None
     verdicts: tuple[Verdict, ...] = ()
 
     @classmethod
@@ -155,7 +161,7 @@ class Calibration:
         weighted: Weighted,
         *,
         flags: NDArray[Any],
-        sign: ShiftSign,
+        orientation: OrientationTest,
         verdicts: tuple[Verdict, ...],
         bars: ErrorBars | None,
         metadata: dict[str, Any],
@@ -189,7 +195,8 @@ class Calibration:
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
             rejected=rejected,
-            shift_sign=sign,
+            shift_sign=orientation.sign,
+            orientation=orientation,
             verdicts=verdicts,
         )
 
@@ -497,4 +504,15 @@ def read_calibration(
     """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
     fields = read_fields(path, pages, content)
     verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
-    return Calibration(**{**fields, "history": History(**fields["history"]), "verdicts": verdicts})
+    made = {
+        "history": History(**fields["history"]),
+        "orientation": _read_orientation(fields["orientation"]),
+        "verdicts": verdicts,
+    }
+    return Calibration(**{**fields, **made})
+
+
+def _read_orientation(content: dict[str, Any] | None) -> OrientationTest | None:
+    if content is None:
+        return None
+    return OrientationTest(**{**content, "best": Orientation(**content["best"])})

@@ -123,6 +123,7 @@ def read_fields(
         "verdicts": numbers["verdicts"],
         "reduced_chi2": float("nan") if chi2 is None else chi2,
         "shift_sign": numbers.get("shift_sign", "undetermined"),
+        "orientation": numbers.get("orientation"),
         "history": _history(numbers["history"]),
         "rejected": None if rejected is None else rejected.astype(bool),
         "metadata": content["metadata"],
@@ -155,7 +156,9 @@ def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Collect the rest as JSON values, which have neither NaN nor infinity."""
     chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
-    history = fields["history"]
+    history, orientation = fields["history"], fields["orientation"]
+    if orientation is not None:
+        orientation = {**vars(orientation), "best": vars(orientation.best)}
     return {
         "beam_origin": list(fields["beam_origin"]),
         "shifts": fields["shifts"].tolist(),
@@ -166,6 +169,7 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
         "reduced_chi2": chi2 if np.isfinite(chi2) else None,
         "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
         "shift_sign": fields["shift_sign"],
+        "orientation": orientation,
         "tilt_std": None
         if tilt_std is None
         else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from equipix._native import Fit
     from equipix.calibration.error_bars import DarkStd
     from equipix.calibration.options import Options
-    from equipix.calibration.sign import SignTest
+    from equipix.calibration.orientation import OrientationTest
     from equipix.calibration.weights import Weighted
     from equipix.exposures.exposures import Exposures
 
@@ -98,7 +98,7 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
 
 
 def on_fit(
-    weighted: Weighted, options: Options, test: SignTest, dark: DarkStd | None
+    weighted: Weighted, options: Options, test: OrientationTest, dark: DarkStd | None
 ) -> list[Verdict]:
     """Verdicts on a fit, the most important first."""
     found = [
@@ -126,15 +126,14 @@ def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
     )
 
 
-def _on_sign(test: SignTest) -> Verdict | None:
+def _on_sign(test: OrientationTest) -> Verdict | None:
     if test.sign != "contradicted":
         return None
     return Verdict(
         "sign",
-        "the data contradict the sign of the shifts: with all shifts reversed and free fluxes the "
-        f"squared residuals are {test.reversed / test.given:.2g} times as large. A shift grows "
-        "when the sensor moves towards larger rows and columns: give 'shifts' with the other "
-        "sign, or exchange the aperture images before and after the moves",
+        f"{test.words}; as given and with free fluxes the squared residuals are {test.ratio:.2g} "
+        "times as large. A shift grows when the sensor moves towards larger rows and columns: "
+        "give 'shifts' so, or exchange the aperture images before and after the moves",
     )
 
 
