@@ -117,7 +117,7 @@ def orientation_test(exposures: Exposures, fit: Fit, options: FitOptions) -> Ori
     F is accurate where the estimated error of M is below 0.3 of the relative noise that the fit
     leaves (it was then at most 2e-4 of itself above its minimum); else it is reduced by the square
     of error over noise. Only the higher F must be accurate, since the lower one can only decrease.
-    Outliers of the best fit, such as dust, are left out of all.
+    Outliers of one of the fits, such as dust, are left out of all.
     """
     if exposures.offset:
         return OrientationTest(reason="it is not tested where the dark is fitted; " + _REMEDY)
@@ -200,7 +200,7 @@ def _fits(
     """Fits in every orientation, as exact as necessary."""
     fits = {way: WindowFit.of(window, options) for way, window in windows.items()}
     for _ in range(_ROUNDS):
-        odd = fits[_best(fits)].odd()
+        odd = np.any([fit.odd() for fit in fits.values()], axis=0)
         if odd.any():
             windows = {way: window.without(odd) for way, window in windows.items()}
             fits = {way: WindowFit.of(window, options) for way, window in windows.items()}

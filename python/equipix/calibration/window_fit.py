@@ -30,6 +30,10 @@ _FEWEST = 1000
 _ODD = 30.0
 """Median absolute residuals, 20 standard deviations: no noise, nor the waves of a wrong sign."""
 
+_RARE = 0.02
+"""Share of outliers up to which they are those of dust. In fine structure a wrong orientation has
+as large residuals, everywhere."""
+
 _BLOCK, _MOST = 4, 2 / 3
 """Pixels along a block, and the share of blocks where the better fit must be better. A grain of
 dust changes F by more than noise does, but in few blocks only."""
@@ -123,7 +127,7 @@ class WindowFit:
     @property
     def final(self) -> bool:
         """Whether another fit would not be more exact."""
-        return self.settled or self.fit.ended != "converged"
+        return self.settled or self.fit.ended not in ("converged", "sweeps used")
 
     @property
     def least(self) -> float:
@@ -167,9 +171,10 @@ class WindowFit:
         return bool(np.mean(blocks[measured] > 0) > _MOST)
 
     def odd(self) -> Bools:
-        """Outliers, such as measurements of dust."""
+        """Outliers, such as measurements of dust; none where there are so many that it is not."""
         squares: Array = np.square(self.residuals)
-        return np.asarray(squares > _ODD**2 * np.nanmedian(squares))
+        odd = np.asarray(squares > _ODD**2 * np.nanmedian(squares))
+        return np.asarray(odd & (odd.mean() < _RARE))
 
 
 def _named(progress: Progress) -> Progress:
