@@ -10,9 +10,12 @@ import numpy as np
 from equipix import _native
 from equipix.calibration import verdicts
 from equipix.calibration.error_bars import dark_std, error_bars
+from equipix.calibration.lamp_drift import lamp_drift
+from equipix.calibration.misfit import misfit
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.orientation import orientation_test
 from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
@@ -148,8 +151,11 @@ def calibrate(
         with the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
+    DriftWarning
+        If the data contradict the fluxes given: the lamp has drifted, which hides a tilt.
     MisfitWarning
-        If residuals are more than twice as large as the variances predict.
+        If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
+        neighbouring pixels are correlated. The message names the likely cause.
     ShiftSignWarning
         If the data contradict the orientation of the shifts: a sign, or the order of the axes.
 
@@ -231,15 +237,18 @@ def calibrated(
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     dark = dark_std(weighted, options.fit)
-    found = verdicts.on_fit(weighted, options, test, dark)
+    residuals = sampled(weighted, workers=options.fit.workers)
+    drift = lamp_drift(weighted, residuals)
+    found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
     verdicts.say(found)
     wanted = options.uncertainty and all(verdict.kind != "uncertainty" for verdict in found)
-    bars = error_bars(weighted, flags, options.fit) if wanted else None
+    bars = error_bars(weighted, flags, drift, options.fit) if wanted else None
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,
         flags=flags,
         orientation=test,
+        drift=drift,
         verdicts=(*advice, *found),
         bars=bars,
         metadata=metadata | (provenance or {}),

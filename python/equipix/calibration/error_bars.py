@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats, Progress
+    from equipix.calibration.lamp_drift import Drift
     from equipix.calibration.weights import Weighted
     from equipix.exposures.options import FitOptions
 
@@ -47,8 +48,13 @@ class DarkStd(NamedTuple):
     of_a_pixel: float | None
 
 
-def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBars:
-    """Standard deviations of sensitivity, tilt and shifts, in one set-up of the linear problem."""
+def error_bars(
+    weighted: Weighted, flags: Array, drift: Drift | None, options: FitOptions
+) -> ErrorBars:
+    """Standard deviations of sensitivity, tilt and shifts, in one set-up of the linear problem.
+
+    The tilt that a drift of the lamp hides is part of them.
+    """
     exposures, fit, _ = weighted
     scale = noise_scale(weighted)
     weights = tilt_weights(usable(flags) & determined(fit.sensitivity, flags))
@@ -65,6 +71,9 @@ def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBa
         )
     std = scale * cast("Floats", answer.std)
     tilt = _std(scale, answer.variances) if asks_tilt else None
+    if drift is not None and drift.is_added:
+        std = np.hypot(std, fit.sensitivity * np.sqrt(drift.variance_map(fit.sensitivity)))
+        tilt = None if tilt is None else np.hypot(tilt, drift.tilt_std)
     shifts = _std(scale, answer.shift_variances) if refined else exposures.positions.std
     return ErrorBars(
         sensitivity=np.asarray(std, exposures.values.dtype),
@@ -125,6 +134,7 @@ def _std(scale: float, variances: ArrayLike | None) -> Floats:
 def functional_std(
     weighted: Weighted,
     weights: Floats,
+    drift: Drift | None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -144,7 +154,10 @@ def functional_std(
             workers=positive_workers(workers),
             progress=progress,
         )
-    return _std(scale, answer.variances)
+    std = _std(scale, answer.variances)
+    if drift is not None and drift.is_added:
+        std = np.hypot(std, np.sqrt(drift.variance_of(weights, weighted.fit.sensitivity)))
+    return std
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

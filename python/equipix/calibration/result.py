@@ -12,19 +12,16 @@ from equipix._check import check_count, check_progress, per_exposure
 from equipix._native import Beam
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
-from equipix.calibration.orientation import OrientationTest
-from equipix.calibration.saved import read_fields, save_fields
-from equipix.calibration.verdicts import Verdict
+from equipix.calibration.saved import save_fields
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
-from equipix.exposures.orientation import Orientation
 from equipix.exposures.positions import Positions
 from equipix.flags import determined, usable
 from equipix.maps import tilt
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from os import PathLike
     from typing import Self
 
@@ -32,6 +29,9 @@ if TYPE_CHECKING:
 
     from equipix._types import Flagged, Progress, ShiftSign
     from equipix.calibration.error_bars import ErrorBars
+    from equipix.calibration.lamp_drift import Drift
+    from equipix.calibration.orientation import OrientationTest
+    from equipix.calibration.verdicts import Verdict
     from equipix.calibration.weights import Weighted
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
@@ -124,6 +124,12 @@ class Calibration:
     orientation : OrientationTest or None
         The same for each axis, with the best orientation and, in ``words``, what to do; None if
         read from a file of an older version.
+    drift : Drift or None
+        What the data say of fluxes that were given: the size of the lamp's drift about them, its
+        standard error, the degrees of freedom, and the tilt that it hides, which is part of
+        `sensitivity_std`, `tilt_std` and `std_of` where the data show a drift. Errors of the tilt
+        over `tilt_std` then follow Student's t with so many degrees of freedom. None where fluxes
+        were fitted or have a prior, and where no combination of them leaves a residual.
     """
 
     sensitivity: NDArray[Any]
@@ -153,6 +159,7 @@ class Calibration:
     rejected: NDArray[np.bool_] | None = None
     shift_sign: ShiftSign = "undetermined"
     orientation: OrientationTest | None = None
+    drift: Drift | None = None
     verdicts: tuple[Verdict, ...] = ()
 
     @classmethod
@@ -163,6 +170,7 @@ class Calibration:
         flags: NDArray[Any],
         orientation: OrientationTest,
         verdicts: tuple[Verdict, ...],
+        drift: Drift | None,
         bars: ErrorBars | None,
         metadata: dict[str, Any],
     ) -> Self:
@@ -197,6 +205,7 @@ class Calibration:
             rejected=rejected,
             shift_sign=orientation.sign,
             orientation=orientation,
+            drift=drift,
             verdicts=verdicts,
         )
 
@@ -295,7 +304,7 @@ class Calibration:
             )
         check_progress(progress)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
-        std = functional_std(self.weighted, stack, workers=workers, progress=progress)
+        std = functional_std(self.weighted, stack, self.drift, workers=workers, progress=progress)
         return float(std[0]) if np.ndim(weights) == 2 else std
 
     def correct(
@@ -496,23 +505,3 @@ class Calibration:
             If the suffix is unknown.
         """
         save_fields(path, vars(self), force=force)
-
-
-def read_calibration(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
-) -> Calibration:
-    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
-    fields = read_fields(path, pages, content)
-    verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
-    made = {
-        "history": History(**fields["history"]),
-        "orientation": _read_orientation(fields["orientation"]),
-        "verdicts": verdicts,
-    }
-    return Calibration(**{**fields, **made})
-
-
-def _read_orientation(content: dict[str, Any] | None) -> OrientationTest | None:
-    if content is None:
-        return None
-    return OrientationTest(**{**content, "best": Orientation(**content["best"])})
