@@ -369,7 +369,7 @@ class TestFrameStatistics:
         raw = np.rint(frames[:, None] * 200).astype(np.uint8)
         raw[2, :, 5, 6] = 255
         averages = [equipix.average(each) for each in raw]
-        cal = equipix.calibrate(averages, CROSS, variance=np.ones(5))
+        cal = equipix.calibrate(averages, CROSS, variance=np.full(5, 1 / 12))
         assert np.argwhere(cal.flags == Flag.SATURATED).tolist() == [[5, 6]]
         # The other four exposures determine the pixel, to the rounding of 200 DN.
         assert cal.sensitivity[5, 6] == pytest.approx(truth[5, 6], abs=5 / 200)

@@ -106,6 +106,7 @@ def test_inspect_shows_the_calibration(run, calibration):
     for line in (r"shape +64 × 80", r"converged +yes", r"flagged pixels +DO_NOT_USE 8"):
         assert re.search(line, out)
     assert re.search(r"shift sign +undetermined", out)
+    assert re.search(r"orientation +the data do not determine.*compare the axes of the stage", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
     assert json.loads(out)["metadata"]["sensor"]["bit_depth"] == 12

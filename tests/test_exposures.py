@@ -16,6 +16,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
+from equipix.exposures.orientation import Orientation
 from equipix.exposures.positions import Positions, in_beam, variance_in_beam
 from equipix.noise import NoiseModel
 
@@ -76,10 +77,11 @@ def test_a_window_of_exposures_has_the_sensitivity_of_its_part():
 
 def test_reversed_exposures_differ_in_the_sign_of_shifts_alone():
     exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2.5)])
-    other = exposures.reversed()
+    back = Orientation(rows=True, cols=True)
+    other = exposures.oriented(back)
     np.testing.assert_array_equal(other.positions.shifts, -exposures.positions.shifts)
     assert other.values is exposures.values
-    np.testing.assert_array_equal(other.reversed().positions.shifts, exposures.positions.shifts)
+    np.testing.assert_array_equal(other.oriented(back).positions.shifts, exposures.positions.shifts)
 
 
 def test_masks_add_up():

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from equipix.correction.protocol import Correction
 
 READERS = {
-    "calibration": ("equipix.calibration.result", "read_calibration"),
+    "calibration": ("equipix.calibration.reading", "read_calibration"),
     "frame statistics": ("equipix.frames", "read_statistics"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes

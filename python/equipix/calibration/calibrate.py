@@ -12,10 +12,13 @@ from equipix.calibration import verdicts
 from equipix.calibration.coverage import with_coverage
 from equipix.calibration.error_bars import standard_deviations, with_dark_misfit
 from equipix.calibration.input_verdicts import on_input
+from equipix.calibration.lamp_drift import lamp_drift
+from equipix.calibration.misfit import misfit
 from equipix.calibration.options import Options, is_to_be_fitted
+from equipix.calibration.orientation import orientation_test
 from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
-from equipix.calibration.sign import shift_sign
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -158,13 +161,16 @@ def calibrate(
         degenerate with the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
+    DriftWarning
+        If the data contradict the fluxes given: the lamp has drifted, which hides a tilt.
     MisfitWarning
-        If residuals are more than twice as large as the variances predict.
+        If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
+        neighbouring pixels are correlated. The message names the likely cause.
     SaturationWarning
         If many values are exactly at the highest one, and no saturation level is given or a higher
         one.
     ShiftSignWarning
-        If the data contradict the sign of the shifts.
+        If the data contradict the orientation of the shifts: a sign, or the order of the axes.
 
     Notes
     -----
@@ -179,12 +185,15 @@ def calibrate(
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
     Gauss-Newton steps in which M is eliminated by its closed form.
 
-    The sign of the shifts is tested with at most twelve exposures and with the central pixels: four
-    times as many along each axis as the largest shift, or fewer where that is more than 80. They
-    are fitted with the shifts as given and with all of them reversed, fluxes free in both. The
-    lower F must be lower by 6·√(2/dof) of itself, in two thirds of all places. The sign is not
-    tested, and undetermined, with fewer than three exposures or a thousand degrees of freedom,
-    with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
+    The orientation of the shifts is tested with at most twelve exposures, as far apart as possible,
+    and with the central pixels: four times as many along each axis as the largest shift, or fewer
+    where that is more than 80. They are fitted with both signs along each axis and with the axes
+    exchanged, where exposures are turned also with the opposite turns; fluxes are free in all. An
+    orientation is excluded if its F is higher than the lowest by 6·√(2/dof) of itself, in two
+    thirds of all places, and by a misfit of more than 0.5 % of the signal; and only if the
+    residuals of the lowest F are white, or the misfit is 30 times what correlates in them. Nothing
+    is tested, and all undetermined, with fewer than three exposures or a thousand degrees of
+    freedom, with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
 
     References
     ----------
@@ -232,7 +241,7 @@ def calibrated(
     start: Fit | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from exposures: weights, fit, sign, flags, error bars, verdicts.
+    """Calibrate from exposures: weights, fit, orientation, flags, error bars, verdicts.
 
     The fit starts from `start`; `provenance` is added to the metadata.
     """
@@ -240,17 +249,21 @@ def calibrated(
     advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
     verdicts.say(advice)
     weighted = with_dark_misfit(weighted_fit(exposures, options, start), options.fit)
-    test = shift_sign(weighted.exposures, weighted.fit, options.fit)
+    test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
+    residuals = sampled(weighted, workers=options.fit.workers)
+    drift = lamp_drift(weighted, residuals)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
-    bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
-    found = with_coverage(verdicts.on_fit(weighted, options, test, dark), weighted, flags)
+    bars, dark = standard_deviations(weighted, flags, drift, options.fit, wanted=wanted)
+    found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
+    found = with_coverage(found, weighted, flags)
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,
         flags=flags,
-        sign=test.sign,
+        orientation=test,
+        drift=drift,
         verdicts=(*advice, *found),
         bars=bars,
         metadata=metadata | (provenance or {}),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from equipix._native import Fit, Uncertainty
     from equipix._types import Array, Bools, Floats, Progress
+    from equipix.calibration.lamp_drift import Drift
     from equipix.calibration.weights import Weighted
     from equipix.exposures.options import FitOptions
 
@@ -51,12 +52,13 @@ class DarkStd(NamedTuple):
 
 
 def standard_deviations(
-    weighted: Weighted, flags: Array, options: FitOptions, *, wanted: bool
+    weighted: Weighted, flags: Array, drift: Drift | None, options: FitOptions, *, wanted: bool
 ) -> tuple[ErrorBars | None, DarkStd | None]:
     """Standard deviations of sensitivity, tilt and shifts if `wanted`, and of a fitted dark.
 
-    That of a dark which was fitted together with fluxes is always given: a verdict needs it. All
-    are questions of one call, which sets up the linear problem once.
+    The tilt that a drift of the lamp hides is part of the former. That of a dark which was fitted
+    together with fluxes is always given: a verdict needs it. All are questions of one call, which
+    sets up the linear problem once.
     """
     exposures, fit = weighted.exposures, weighted.fit
     asks_dark = exposures.offset and exposures.flux.kind != "known"
@@ -79,18 +81,24 @@ def standard_deviations(
             dark_variance=_relative(exposures.dark_variance, scale),
         )
     dark = _of_dark(weighted, answer, scale) if asks_dark else None
-    return _error_bars(weighted, answer, scale) if wanted else None, dark
+    return _error_bars(weighted, answer, drift, scale) if wanted else None, dark
 
 
-def _error_bars(weighted: Weighted, answer: Uncertainty, scale: float) -> ErrorBars:
+def _error_bars(
+    weighted: Weighted, answer: Uncertainty, drift: Drift | None, scale: float
+) -> ErrorBars:
     """Standard deviations of sensitivity, tilt and shifts from the answers for unit weights."""
     exposures, fit = weighted.exposures, weighted.fit
     std = scale * cast("Floats", answer.std)
     unknown = np.full(2, np.inf if fit.leaves_tilt else np.nan)
+    tilt = unknown if answer.variances is None else _std(scale, answer.variances)
+    if drift is not None and drift.is_added:
+        std = np.hypot(std, fit.sensitivity * np.sqrt(drift.variance_map(fit.sensitivity)))
+        tilt = np.hypot(tilt, drift.tilt_std)
     refined = answer.shift_variances is not None
     return ErrorBars(
         sensitivity=np.asarray(std, exposures.values.dtype),
-        tilt=unknown if answer.variances is None else _std(scale, answer.variances),
+        tilt=tilt,
         shifts=_std(scale, answer.shift_variances) if refined else exposures.positions.std,
         exactness={"draws": answer.draws, "relative_standard_error": answer.exactness},
     )
@@ -158,6 +166,7 @@ def _std(scale: float, variances: ArrayLike | None) -> Floats:
 def functional_std(
     weighted: Weighted,
     weights: Floats,
+    drift: Drift | None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -178,7 +187,10 @@ def functional_std(
             progress=progress,
             dark_variance=_relative(weighted.exposures.dark_variance, scale),
         )
-    return _std(scale, answer.variances)
+    std = _std(scale, answer.variances)
+    if drift is not None and drift.is_added:
+        std = np.hypot(std, np.sqrt(drift.variance_of(weights, weighted.fit.sensitivity)))
+    return std
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

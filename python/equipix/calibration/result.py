@@ -13,8 +13,7 @@ from equipix._native import Beam
 from equipix._readonly import ReadOnly
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
-from equipix.calibration.saved import read_fields, save_fields
-from equipix.calibration.verdicts import Verdict
+from equipix.calibration.saved import save_fields
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
@@ -23,7 +22,7 @@ from equipix.flags import determined
 from equipix.maps import slope_pixels, tilt
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from os import PathLike
     from typing import Self
 
@@ -31,6 +30,9 @@ if TYPE_CHECKING:
 
     from equipix._types import Flagged, Progress, ShiftSign
     from equipix.calibration.error_bars import ErrorBars
+    from equipix.calibration.lamp_drift import Drift
+    from equipix.calibration.orientation import OrientationTest
+    from equipix.calibration.verdicts import Verdict
     from equipix.calibration.weights import Weighted
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
@@ -119,8 +121,17 @@ class Calibration(ReadOnly):
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
-        Whether the data confirm the sign of the shifts, contradict it, or do neither, as those
-        of a Gaussian beam, whatever its width; see `calibrate`.
+        Whether the data confirm the signs and the order of the shifts' axes, contradict them, or do
+        neither, as those of a Gaussian beam, whatever its width; see `calibrate`.
+    orientation : OrientationTest or None
+        The same for each axis, with the best orientation and, in ``words``, what to do; None if
+        read from a file of an older version.
+    drift : Drift or None
+        What the data say of fluxes that were given: the size of the lamp's drift about them, its
+        standard error, the degrees of freedom, and the tilt that it hides, which is part of
+        `sensitivity_std`, `tilt_std` and `std_of` where the data show a drift. Errors of the tilt
+        over `tilt_std` then follow Student's t with so many degrees of freedom. None where fluxes
+        were fitted or have a prior, and where no combination of them leaves a residual.
     """
 
     sensitivity: NDArray[Any]
@@ -149,6 +160,8 @@ class Calibration(ReadOnly):
     weighted: Weighted | None = field(default=None, compare=False)
     rejected: NDArray[np.bool_] | None = None
     shift_sign: ShiftSign = "undetermined"
+    orientation: OrientationTest | None = None
+    drift: Drift | None = None
     verdicts: tuple[Verdict, ...] = ()
 
     @classmethod
@@ -157,8 +170,9 @@ class Calibration(ReadOnly):
         weighted: Weighted,
         *,
         flags: NDArray[Any],
-        sign: ShiftSign,
+        orientation: OrientationTest,
         verdicts: tuple[Verdict, ...],
+        drift: Drift | None,
         bars: ErrorBars | None,
         metadata: dict[str, Any],
     ) -> Self:
@@ -191,7 +205,9 @@ class Calibration(ReadOnly):
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
             rejected=rejected,
-            shift_sign=sign,
+            shift_sign=orientation.sign,
+            orientation=orientation,
+            drift=drift,
             verdicts=verdicts,
         )
 
@@ -299,7 +315,7 @@ class Calibration(ReadOnly):
             )
         check_progress(progress)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
-        std = functional_std(self.weighted, stack, workers=workers, progress=progress)
+        std = functional_std(self.weighted, stack, self.drift, workers=workers, progress=progress)
         return float(std[0]) if np.ndim(weights) == 2 else std
 
     def correct(
@@ -499,12 +515,3 @@ class Calibration(ReadOnly):
             If the suffix is unknown.
         """
         save_fields(path, vars(self), force=force)
-
-
-def read_calibration(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
-) -> Calibration:
-    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
-    fields = read_fields(path, pages, content)
-    verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
-    return Calibration(**{**fields, "history": History(**fields["history"]), "verdicts": verdicts})

@@ -54,6 +54,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
     """Collect the main figures of a calibration."""
     sensitivity = calibration.sensitivity
     options = calibration.metadata.get("options", {})
+    orientation = calibration.orientation
     return {
         "shape": list(calibration.shape),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
@@ -65,6 +66,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         _misfit_name(options): calibration.reduced_chi2,
         "components": calibration.components,
         "shift_sign": calibration.shift_sign,
+        **({"orientation": orientation.words} if orientation else {}),
         "fluxes": options.get("flux", "known"),
         "flagged_pixels": flagged(calibration),
     }

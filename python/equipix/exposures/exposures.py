@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from equipix.exposures.clipping import Clipping
     from equipix.exposures.flux import Flux
     from equipix.exposures.options import FitOptions
+    from equipix.exposures.orientation import Orientation
     from equipix.exposures.positions import Positions
     from equipix.noise import NoiseModel
 
@@ -137,9 +138,9 @@ class Exposures(ReadOnly):
             dark_variance=None,
         )
 
-    def reversed(self) -> Self:
-        """Return the exposures with all shifts of the other sign."""
-        return dataclasses.replace(self, positions=self.positions.reversed())
+    def oriented(self, orientation: Orientation) -> Self:
+        """Return the exposures with shifts and rotations in another orientation."""
+        return dataclasses.replace(self, positions=self.positions.oriented(orientation))
 
     def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
         """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
