@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, as_shifts, check_count, per_exposure
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError
+from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
     from equipix._types import Array, Floats
     from equipix.exposures.orientation import Orientation
+    from equipix.shifts import Rounding
 
 _TURNS = {
     0: ((1, 0), (0, 1)),
@@ -39,7 +42,7 @@ _BEYOND = 2**31
 
 
 @dataclass(frozen=True, eq=False)
-class Positions:
+class Positions(ReadOnly):
     """Positions of the sensor in the beam: pixel p is at u = A p + t + d.
 
     Attributes
@@ -50,11 +53,14 @@ class Positions:
         How far the sensor is turned, in degrees: 0, 90, 180 or 270. It determines A and t.
     std : ndarray, shape (n, 2), float64, or None
         Prior standard deviations of the shifts, in pixels; None: the shifts are exact.
+    rounding : Rounding or None
+        The largest noticeable rounding, where the shifts were rounded to whole pixels.
     """
 
     shifts: Floats
     rotation: NDArray[np.int64]
     std: Floats | None = None
+    rounding: Rounding | None = None
 
     @classmethod
     def of(
@@ -88,6 +94,11 @@ class Positions:
             rotation=orientation.rotation(self.rotation),
             std=std if std is None or not orientation.exchanged else std[:, ::-1],
         )
+
+    def whole(self, std: ArrayLike | None = None) -> Self:
+        """Return the positions at the nearest whole shifts; `std` are errors of the shifts."""
+        shifts, rounding = round_shifts(self.shifts, std)
+        return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
         """Return the same exposures at other shifts, measured with standard deviations `std`."""

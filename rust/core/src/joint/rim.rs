@@ -65,7 +65,7 @@ impl Rim {
 
     /// Adds (N + τ GᵀG)⁻¹ r on the rim.
     pub(crate) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
-        let found = workers.map(self.parts.len(), |index| self.parts[index].solve(r));
+        let found = workers.map(self.parts.len(), |index| self.parts[index].apply(r));
         self.cells().zip(found.into_iter().flatten()).for_each(|(cell, value)| z[cell] += value);
     }
 }
@@ -103,10 +103,11 @@ impl Part {
         Self { cells: cells.to_vec(), factor, inverse }
     }
 
-    fn solve(&self, r: &[f64]) -> Vec<f64> {
+    /// (N + τ GᵀG)⁻¹ r.
+    fn apply(&self, r: &[f64]) -> Vec<f64> {
         let mut values: Vec<f64> = self.cells.iter().map(|&cell| r[cell as usize]).collect();
         match &self.factor {
-            Some(factor) => factor.solve(&mut values),
+            Some(factor) => factor.substitute(&mut values),
             None => values.iter_mut().zip(&self.inverse).for_each(|(value, i)| *value *= i),
         }
         values

@@ -126,7 +126,7 @@ impl<'m> TwoLevel<'m> {
         }
         let right = self.heights.clone();
         match &self.coarse {
-            Some(coarse) => coarse.solve(&mut self.heights, DAMPING),
+            Some(coarse) => coarse.correct(&mut self.heights, DAMPING),
             None => self.heights.fill(0.0),
         }
         self.spread();
