@@ -15,8 +15,10 @@ from equipix.calibration.misfit import misfit
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.orientation import orientation_test
 from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.priors import widened
 from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
+from equipix.calibration.sample_variances import steadied
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -233,9 +235,11 @@ def calibrated(
     The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    advice = verdicts.on_plan(exposures)
+    exposures, frames = steadied(exposures)
+    advice = verdicts.on_plan(exposures, frames)
     verdicts.say(advice)
     weighted = weighted_fit(exposures, options, start)
+    weighted, widths = widened(weighted, options)
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)
@@ -245,6 +249,7 @@ def calibrated(
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
     found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
+    found += verdicts.on_priors(widths)
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(

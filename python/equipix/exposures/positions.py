@@ -31,7 +31,7 @@ _TURNS = {
 }
 """A of each rotation, in degrees: the exposure is ``numpy.rot90(window, rotation / 90)``."""
 
-_WIDEST = 0.3
+WIDEST = 0.3
 """Largest prior standard deviation of a shift, in pixels: a fit moves it by less than a pixel."""
 
 _ROUNDING = 1e-6
@@ -162,9 +162,9 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> Floats:
     std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
-    if std.max() > _WIDEST:
+    if std.max() > WIDEST:
         raise InputError(
-            f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined "
+            f"'shift_std' holds {std.max():g}, expected at most {WIDEST}: shifts are refined "
             "within a pixel of where they were measured: measure them more accurately"
         )
     return std
