@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import simulate
+from equipix import Flag, simulate
 from equipix.calibration.sample_variances import sampled_frames
 from equipix.errors import EquipixWarning, MisfitWarning
 
@@ -104,3 +104,37 @@ class TestSampleVariances:
         own = np.random.default_rng(4).chisquare(4, SENSOR) * np.ones((5, 1, 1))
         assert sampled_frames(own) is None
         assert sampled_frames(np.ones(5)) is sampled_frames(None) is None
+
+
+class TestFalsePixels:
+    @staticmethod
+    def experiment(seed, share):
+        rng = np.random.default_rng([5, seed])
+        truth = simulate.cosine_sensitivity(SENSOR, rng=rng)
+        frames = noisy(simulate.exposures(truth, simulate.wavy_beam(SENSOR, rng=seed), CROSS), rng)
+        stuck = rng.random(SENSOR) < share
+        stuck[30, 40] = True
+        frames[:, stuck] = rng.choice([0.1, 3.0], stuck.sum())
+        return frames, stuck, truth
+
+    @pytest.mark.parametrize("share", [0, 1e-3])
+    def test_neighbours_of_constant_pixels_are_as_good_as_others(self, share):
+        for seed in range(3):
+            frames, stuck, truth = self.experiment(seed, share)
+            cal, kinds = calibrated(frames, CROSS, variance=np.full(5, NOISE**2), uncertainty=True)
+            flags = (cal.flags & (Flag.HOT | Flag.DEAD)) != 0
+            np.testing.assert_array_equal(flags, stuck)
+            good = np.where(stuck, np.nan, truth)
+            z = simulate.relative_error(cal.sensitivity, good) / cal.sensitivity_std
+            # The largest of 6144 normal values is above 5.5 in one of 4000 cases.
+            assert np.nanmax(np.abs(z * truth)) < 5.5
+            assert kinds == []
+
+    def test_a_pixel_of_twice_the_response_keeps_its_sensitivity(self):
+        rng = np.random.default_rng(6)
+        truth = simulate.cosine_sensitivity(SENSOR, rng=rng)
+        truth[20, 30], truth[40, 50] = 2.5, 0.3
+        frames = noisy(simulate.exposures(truth, simulate.wavy_beam(SENSOR, rng=6), CROSS), rng)
+        cal, _ = calibrated(frames, CROSS, variance=np.full(5, NOISE**2))
+        error = simulate.relative_error(cal.sensitivity, truth)
+        assert np.abs(error[[20, 40], [30, 50]]).max() < 5e-3

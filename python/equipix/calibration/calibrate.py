@@ -10,6 +10,7 @@ import numpy as np
 from equipix import _native
 from equipix.calibration import verdicts
 from equipix.calibration.error_bars import standard_deviations, with_hidden_tilt
+from equipix.calibration.false_pixels import without_false_pixels
 from equipix.calibration.lamp_drift import lamp_drift
 from equipix.calibration.misfit import misfit
 from equipix.calibration.options import Options, is_to_be_fitted
@@ -238,7 +239,7 @@ def calibrated(
     exposures, frames = steadied(exposures)
     advice = verdicts.on_plan(exposures, frames)
     verdicts.say(advice)
-    weighted = weighted_fit(exposures, options, start)
+    weighted = without_false_pixels(weighted_fit(exposures, options, start), options)
     weighted, widths = widened(weighted, options)
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
