@@ -47,12 +47,15 @@ class Findings(ReadOnly):
         A high dark level or much dark noise: see `hot_pixels`.
     noisy : ndarray of bool or None
         More scatter between frames than the noise explains: see `noisy_pixels`.
+    contradictory : ndarray of bool or None
+        Another response before than after some moment, as under dust that fell.
     """
 
     saturated: Bools | None = None
     dead: Bools | None = None
     hot: Bools | None = None
     noisy: Bools | None = None
+    contradictory: Bools | None = None
 
 
 def refuse_saturated(which: str, values: Array, saturates: Bools, level: float | None) -> None:

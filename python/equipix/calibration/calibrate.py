@@ -10,15 +10,22 @@ import numpy as np
 from equipix import _native
 from equipix.calibration import verdicts
 from equipix.calibration.coverage import with_coverage
-from equipix.calibration.error_bars import standard_deviations, with_dark_misfit
+from equipix.calibration.error_bars import (
+    standard_deviations,
+    with_dark_misfit,
+    with_hidden_tilt,
+)
+from equipix.calibration.false_pixels import without_false_pixels
 from equipix.calibration.input_verdicts import on_input
 from equipix.calibration.lamp_drift import lamp_drift
 from equipix.calibration.misfit import misfit
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.orientation import orientation_test
 from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.priors import widened
 from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
+from equipix.calibration.sample_variances import steadied
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -246,16 +253,22 @@ def calibrated(
     The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
+    exposures, frames = steadied(exposures)
+    advice = [*on_input(exposures), *verdicts.on_plan(exposures, frames)]
     verdicts.say(advice)
-    weighted = with_dark_misfit(weighted_fit(exposures, options, start), options.fit)
+    weighted = without_false_pixels(weighted_fit(exposures, options, start), options)
+    weighted, widths = widened(weighted, options)
+    weighted = with_dark_misfit(weighted, options.fit)
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)
     drift = lamp_drift(weighted, residuals)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
-    bars, dark = standard_deviations(weighted, flags, drift, options.fit, wanted=wanted)
+    bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
+    if bars is not None and drift is not None:
+        bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
     found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
+    found += verdicts.on_priors(widths)
     found = with_coverage(found, weighted, flags)
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)

@@ -52,13 +52,12 @@ class DarkStd(NamedTuple):
 
 
 def standard_deviations(
-    weighted: Weighted, flags: Array, drift: Drift | None, options: FitOptions, *, wanted: bool
+    weighted: Weighted, flags: Array, options: FitOptions, *, wanted: bool
 ) -> tuple[ErrorBars | None, DarkStd | None]:
     """Standard deviations of sensitivity, tilt and shifts if `wanted`, and of a fitted dark.
 
-    The tilt that a drift of the lamp hides is part of the former. That of a dark which was fitted
-    together with fluxes is always given: a verdict needs it. All are questions of one call, which
-    sets up the linear problem once.
+    That of a dark which was fitted together with fluxes is always given: a verdict needs it. All
+    are questions of one call, which sets up the linear problem once.
     """
     exposures, fit = weighted.exposures, weighted.fit
     asks_dark = exposures.offset and exposures.flux.kind != "known"
@@ -81,24 +80,18 @@ def standard_deviations(
             dark_variance=_relative(exposures.dark_variance, scale),
         )
     dark = _of_dark(weighted, answer, scale) if asks_dark else None
-    return _error_bars(weighted, answer, drift, scale) if wanted else None, dark
+    return _error_bars(weighted, answer, scale) if wanted else None, dark
 
 
-def _error_bars(
-    weighted: Weighted, answer: Uncertainty, drift: Drift | None, scale: float
-) -> ErrorBars:
+def _error_bars(weighted: Weighted, answer: Uncertainty, scale: float) -> ErrorBars:
     """Standard deviations of sensitivity, tilt and shifts from the answers for unit weights."""
     exposures, fit = weighted.exposures, weighted.fit
     std = scale * cast("Floats", answer.std)
     unknown = np.full(2, np.inf if fit.leaves_tilt else np.nan)
-    tilt = unknown if answer.variances is None else _std(scale, answer.variances)
-    if drift is not None and drift.is_added:
-        std = np.hypot(std, fit.sensitivity * np.sqrt(drift.variance_map(fit.sensitivity)))
-        tilt = np.hypot(tilt, drift.tilt_std)
     refined = answer.shift_variances is not None
     return ErrorBars(
         sensitivity=np.asarray(std, exposures.values.dtype),
-        tilt=tilt,
+        tilt=unknown if answer.variances is None else _std(scale, answer.variances),
         shifts=_std(scale, answer.shift_variances) if refined else exposures.positions.std,
         exactness={"draws": answer.draws, "relative_standard_error": answer.exactness},
     )
@@ -145,6 +138,15 @@ def noise_scale(weighted: Weighted) -> float:
             "more measurements than unknowns: give the variance of the values"
         )
     return float(np.sqrt(variance))
+
+
+def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
+    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
+    if not drift.is_added:
+        return bars
+    hidden = response * np.sqrt(drift.variance_map(response))
+    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
+    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
 
 
 def of_logarithm(weights: Floats, fit: Fit) -> Floats:

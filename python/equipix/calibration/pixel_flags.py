@@ -10,7 +10,7 @@ from equipix.defects import response_outliers
 from equipix.flags import set_bits
 
 if TYPE_CHECKING:
-    from equipix._types import Array
+    from equipix._types import Array, Bools
     from equipix.calibration.weights import Weighted
     from equipix.exposures.options import FitOptions
 
@@ -23,9 +23,8 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
     """
     exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
     flags: Array = fit.flags.copy()
-    sensitivity = fit.sensitivity.astype(exposures.values.dtype, copy=False)
-    dead, hot = response_outliers(sensitivity, lambda: _std(weighted, options.workers))
-    set_bits(flags, "dead", dead | (sensitivity <= options.tolerance))
+    dead, hot = odd_pixels(weighted, options)
+    set_bits(flags, "dead", dead)
     set_bits(flags, "hot", hot)
     for finding, pixels in vars(exposures.findings).items():
         set_bits(flags, finding, pixels)
@@ -33,6 +32,13 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
         kept = exposures.usable().sum(axis=0)
         set_bits(flags, "contradictory", rejected.sum(axis=0) > kept)
     return flags
+
+
+def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
+    """Pixels of a much smaller and of a much larger response than their neighbours: dead, hot."""
+    sensitivity = weighted.fit.sensitivity.astype(weighted.exposures.values.dtype, copy=False)
+    dead, hot = response_outliers(sensitivity, lambda: _std(weighted, options.workers))
+    return dead | (sensitivity <= options.tolerance), hot
 
 
 def _std(weighted: Weighted, workers: int | None) -> Array:

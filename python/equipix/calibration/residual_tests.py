@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _CLIPPED = 4.0
 """Standard deviations at which residuals are cut off, so that a few false values do not decide."""
 
-_ROBUST = 1.4826
+ROBUST = 1.4826
 """Standard deviation over median absolute deviation, for normal noise."""
 
 
@@ -75,7 +75,7 @@ def _correlation(products: Floats, square: float, share: float) -> Correlation:
 def clipped(residuals: NDArray[np.floating]) -> Floats:
     """Residuals cut off at four standard deviations of their exposure, the first axis."""
     axes = tuple(range(1, residuals.ndim))
-    scale = _ROBUST * nanmedian_abs(residuals)
+    scale = ROBUST * nanmedian_abs(residuals)
     limits = _CLIPPED * scale.reshape((-1, *(1 for _ in axes)))
     return np.asarray(np.clip(residuals, -limits, limits), np.float64)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.calibration import sample_variances
 from equipix.calibration.lamp_drift import WARNED
 from equipix.drift import distinct_trend
 from equipix.errors import (
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from equipix.calibration.misfit import Misfit
     from equipix.calibration.options import Options
     from equipix.calibration.orientation import OrientationTest
+    from equipix.calibration.priors import Contradiction
     from equipix.calibration.weights import Weighted
     from equipix.exposures.exposures import Exposures
 
@@ -55,6 +57,8 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "dark": IdentifiabilityWarning,
     "misfit": MisfitWarning,
     "drift": DriftWarning,
+    "prior": MisfitWarning,
+    "variance": MisfitWarning,
     "convergence": ConvergenceWarning,
     "uncertainty": ConvergenceWarning,
 }
@@ -88,10 +92,16 @@ def say(verdicts: Iterable[Verdict]) -> None:
         warn(verdict.message, _CATEGORIES[verdict.kind])
 
 
-def on_plan(exposures: Exposures) -> list[Verdict]:
-    """Verdicts before any fit."""
-    found = [_on_rounding(exposures), _on_order(exposures)]
+def on_plan(exposures: Exposures, frames: float | None = None) -> list[Verdict]:
+    """Verdicts before any fit; `frames` is the number whose sample variances were given."""
+    variances = None if frames is None else Verdict("variance", sample_variances.words(frames))
+    found = [_on_rounding(exposures), _on_order(exposures), variances]
     return [verdict for verdict in found if verdict is not None]
+
+
+def on_priors(contradictions: Iterable[Contradiction]) -> list[Verdict]:
+    """Verdicts on priors that the data contradict."""
+    return [Verdict("prior", each.words) for each in contradictions]
 
 
 def _on_rounding(exposures: Exposures) -> Verdict | None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix.calibration.fallen_dust import without_fallen_dust
 from equipix.calibration.robust import rejected
 from equipix.noise import modelled_variances
 
@@ -83,6 +84,8 @@ def _robust_fit(
     exposures: Exposures, options: FitOptions, fit: Fit, middle: Floats | None
 ) -> Weighted:
     """Leave out outliers and fit again, until nothing changes."""
+    given = exposures.usable()
+    exposures, fit = without_fallen_dust(exposures, fit, options)
     usable = exposures.usable()
     out = np.zeros_like(usable)
     kept = exposures
@@ -94,7 +97,7 @@ def _robust_fit(
             exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
         kept = exposures.without(~usable | out)
         fit = kept.fit(options, fit)
-    return Weighted(kept, fit, out)
+    return Weighted(kept, fit, out | (given & ~usable))
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:

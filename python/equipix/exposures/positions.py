@@ -31,7 +31,7 @@ _TURNS = {
 }
 """A of each rotation, in degrees: the exposure is ``numpy.rot90(window, rotation / 90)``."""
 
-_WIDEST = 0.3
+WIDEST = 0.3
 """Largest prior standard deviation of a shift, in pixels: a fit moves it by less than a pixel."""
 
 _ROUNDING = 1e-6
@@ -85,11 +85,6 @@ class Positions(ReadOnly):
         """Return the number of exposures."""
         return len(self.shifts)
 
-    def whole(self, std: ArrayLike | None = None) -> Self:
-        """Return the positions at the nearest whole shifts; `std` are errors of the shifts."""
-        shifts, rounding = round_shifts(self.shifts, std)
-        return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
-
     def oriented(self, orientation: Orientation) -> Self:
         """Return the positions with shifts and rotations in another orientation."""
         std = self.std
@@ -99,6 +94,11 @@ class Positions(ReadOnly):
             rotation=orientation.rotation(self.rotation),
             std=std if std is None or not orientation.exchanged else std[:, ::-1],
         )
+
+    def whole(self, std: ArrayLike | None = None) -> Self:
+        """Return the positions at the nearest whole shifts; `std` are errors of the shifts."""
+        shifts, rounding = round_shifts(self.shifts, std)
+        return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
         """Return the same exposures at other shifts, measured with standard deviations `std`."""
@@ -162,9 +162,9 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> Floats:
     std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
-    if std.max() > _WIDEST:
+    if std.max() > WIDEST:
         raise InputError(
-            f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined "
+            f"'shift_std' holds {std.max():g}, expected at most {WIDEST}: shifts are refined "
             "within a pixel of where they were measured: measure them more accurately"
         )
     return std
