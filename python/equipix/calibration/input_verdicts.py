@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from equipix.calibration.verdicts import Verdict
 from equipix.exposures.clipping import clipping_advice
+from equipix.exposures.reach import micrometre_step
 
 if TYPE_CHECKING:
     from equipix.exposures.exposures import Exposures
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 def on_input(exposures: Exposures) -> list[Verdict]:
     """Verdicts on exposures that the values given contradict."""
-    found = [_on_clipping(exposures)]
+    found = [_on_clipping(exposures), _on_units(exposures)]
     return [verdict for verdict in found if verdict is not None]
 
 
@@ -22,3 +23,17 @@ def _on_clipping(exposures: Exposures) -> Verdict | None:
     if exposures.clipped is None:
         return None
     return Verdict("saturation", clipping_advice(exposures.clipped))
+
+
+def _on_units(exposures: Exposures) -> Verdict | None:
+    """Verdict on shifts that look like micrometres."""
+    shifts = exposures.positions.shifts
+    step = micrometre_step(shifts, exposures.shape)
+    if step is None:
+        return None
+    return Verdict(
+        "unit",
+        f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
+        f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
+        "pitch, see 'From micrometres to pixels' in README",
+    )

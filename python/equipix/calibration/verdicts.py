@@ -49,6 +49,7 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "rounding": ShiftRoundingWarning,
     "order": IdentifiabilityWarning,
     "saturation": SaturationWarning,
+    "unit": IdentifiabilityWarning,
     "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,

@@ -34,7 +34,7 @@ _WANTED = {
     "frames": "a file, a glob or a list of them",
     "aperture_before": "a file, a glob or a list of them",
     "aperture_after": "a file, a glob or a list of them",
-    "shift": "[row, col] in pixels",
+    "shift": "[row, col] in pixels, without a unit: divide micrometres by the pixel pitch",
     "shift_std": "[row, col] in pixels, not negative",
     "flux": "a positive number",
     "flux_std": "a positive number, relative to the flux",
@@ -221,7 +221,10 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     if detail["type"] == "manifest":
         return detail["msg"] + place
     if detail["type"] == "extra_forbidden":
-        return f"unknown key '{location[-1]}'{place}"
+        hint = ""
+        if str(location[-1]).startswith(("shift", "position")):
+            hint = ": 'shift' is in pixels: divide micrometres by the pixel pitch"
+        return f"unknown key '{location[-1]}'{place}{hint}"
     if detail["type"] == "missing":
         return f"key '{location[-1]}' is missing{place}"
     key = next(key for key in reversed(location) if key in _WANTED)

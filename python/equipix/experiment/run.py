@@ -17,7 +17,8 @@ from equipix.errors import FileError, InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.manifest import find_files, read_manifest
 from equipix.experiment.mask import excluded_pixels
-from equipix.experiment.provenance import provenance
+from equipix.experiment.provenance import provenance, sha256_of
+from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
@@ -88,11 +89,12 @@ class Experiment:
         ------
         FileError
             If the file cannot be read, has an unknown key or a wrong value, or names a file that
-            does not exist.
+            does not exist, or one file for two measurements.
         """
         file = as_path("path", path)
         experiment = cls(file, read_manifest(file))
         experiment.files()
+        refuse_repeats(file, experiment.manifest)
         return experiment
 
     def files(self) -> list[Path]:
@@ -231,7 +233,8 @@ class Experiment:
         Raises
         ------
         FileError
-            If a file cannot be read, or the images differ in size or depth.
+            If a file cannot be read, the images differ in size or depth, or two files have the same
+            content.
         InputError
             If an option is out of range, or the exposures do not make a calibration.
         InsufficientMemoryError
@@ -247,6 +250,8 @@ class Experiment:
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
         self.check_formats()
         excluded = self._excluded(mask)
+        hashes = sha256_of([self.path, *self.files()])
+        refuse_repeats(self.path, self.manifest, hashes)
         dark = self._dark(fit_options)
         hot = hot_pixels(dark, None)
         shifts, std = measured_shifts(self.path, self.manifest, hot=hot)
@@ -259,7 +264,7 @@ class Experiment:
             shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
-        origin = provenance(self.path, self.manifest, self.files(), shifts, std, noise)
+        origin = provenance(self.path, self.manifest, hashes, shifts, std, noise)
         return calibrated(exposures, options, start=start, provenance=origin)
 
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:

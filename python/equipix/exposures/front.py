@@ -16,6 +16,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.nothing import refuse_nothing
 from equipix.exposures.positions import Positions
+from equipix.exposures.reach import check_reach
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
 
@@ -47,9 +48,12 @@ def exposures_of(
         measured = measured_of(frames, variance, saturation)
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
+        positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
+        rows, cols = measured.values.shape[1:]
+        check_reach(shifts, positions, (rows, cols))
         exposures = Exposures(
             values=measured.values,
-            positions=Positions.of(shifts, rotation=rotation, std=shift_std, count=count),
+            positions=positions,
             flux=Flux.of(flux, flux_std, time, count),
             mask=union(given, measured.mask),
             variance=measured.variance,
