@@ -142,7 +142,6 @@ class Averaged:
         dead: Bools = dead_pixels(self.values, models) & measured
         return dead
 
-
     def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
         """Noise model of each mean frame less the dark, for one exposure by itself."""
         of_dark = self.dark_variance(noise)

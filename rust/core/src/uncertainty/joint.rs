@@ -23,8 +23,8 @@
 use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
 use super::joint_pulls::{add_change, product, pull_by, pull_of, variance_by_cells};
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
-use super::sampling::{NEGLIGIBLE, mean_misfit};
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
+use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
 use super::smoothed::{Change, Smooth, is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
@@ -201,9 +201,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     ) -> Result<Vec<f64>> {
         self.search = ConjugateGradients::default();
         let total = functionals.len() as u64;
+        let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
             control.report("uncertainty", index, total);
-            self.variance_of(functional, LACK_OF_FUNCTIONAL, control)
+            self.variance_of(functional, lack, control)
         });
         found.collect()
     }

@@ -20,8 +20,8 @@
 //! variance of a e is known; r and its product with a e are sampled, in the same draws. To a functional
 //! it adds Σ_p v (Σ_k h_k)², h_k = w c L (x − M h) being the influence of measurement k with S x = g.
 
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
-use super::sampling::{mean_misfit, NEGLIGIBLE};
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
+use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
@@ -95,7 +95,17 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         let slope = padding.zeros(exposures.sensor().rows, workers, control);
         let smallest = Smallest::default();
         let followed = Vec::new();
-        Ok(Self { exposures, workers, search, smallest, valid, count, slope, followed, undetermined })
+        Ok(Self {
+            exposures,
+            workers,
+            search,
+            smallest,
+            valid,
+            count,
+            slope,
+            followed,
+            undetermined,
+        })
     }
 
     /// Takes the noise of the dark into account, of these variances.
@@ -195,7 +205,9 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             *g -= mean as f32 * valid;
         }
         search.residual.copy_from_slice(slope);
-        self.apply_inverse(LACK_OF_FUNCTIONAL, control)?;
+        let with_dark = search.reduced.has_dark();
+        let lack = if with_dark { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
+        self.apply_inverse(lack, control)?;
         let Self { search, slope, workers, .. } = self;
         let by_dark = search.reduced.variance_by_dark(&search.x, control)?;
         let variance = dot(slope, &search.x, workers) + by_dark;
