@@ -93,7 +93,8 @@ pub(super) fn variance_by_cells<T: Real>(
         for (k, flux) in pass.flux.iter().enumerate() {
             let (weights, light) = (&weights[k * cols..][..cols], &row.light[k * cols..][..cols]);
             for (col, variance) in values.of_mut(k).iter_mut().enumerate() {
-                let share = row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
+                let share =
+                    row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
                 row.change[col] += share * share * variance.max(0.0);
                 *variance = 0.0;
             }

@@ -171,13 +171,15 @@ mod tests {
     #[test]
     fn a_window_ends_at_the_edges_of_the_sensor() {
         let sensor = Shape::new(11, 13);
-        let mut image: Vec<f64> = (0..sensor.len()).map(|pixel| (pixel * pixel % 17) as f64).collect();
+        let mut image: Vec<f64> =
+            (0..sensor.len()).map(|pixel| (pixel * pixel % 17) as f64).collect();
         let whole = image.clone();
         over_windows(&mut image, sensor);
         for (pixel, sum) in image.iter().enumerate() {
             let near = |a: usize, b: usize| a.abs_diff(b) <= SIDE / 2;
             let inside = |other: &usize| {
-                near(pixel / sensor.cols, other / sensor.cols) && near(pixel % sensor.cols, other % sensor.cols)
+                near(pixel / sensor.cols, other / sensor.cols)
+                    && near(pixel % sensor.cols, other % sensor.cols)
             };
             let wanted: f64 = (0..sensor.len()).filter(inside).map(|other| whole[other]).sum();
             // Sums of small whole numbers are exact.
