@@ -1,8 +1,8 @@
-"""How errors compare with their standard deviations if the dark is noisy: ``python docs/dark_noise.py``.
+"""Compare errors and their standard deviations if the dark is noisy: ``python docs/dark_noise.py``.
 
-Forty frames of each exposure, a read noise of 6 DN, and few or many dark frames. Printed: z, the rms
-error over the standard deviation, and reduced χ², as means over experiments with their standard
-errors.
+Forty frames of each exposure, a read noise of 6 DN, and few or many dark frames. Printed: z, the
+rms error over the standard deviation, and reduced χ², as means over experiments with their
+standard errors.
 """
 
 from __future__ import annotations

@@ -54,8 +54,8 @@ class Exposures:
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
     dark_variance : ndarray, shape (rows, cols), float64, or None
-        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are without
-        it. None where it is unknown, or where an offset is sought, which takes all of it.
+        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are
+        without it. None where it is unknown, or where an offset is sought, which takes all of it.
     """
 
     values: Array

@@ -70,7 +70,7 @@ def exposures_of(
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
-    """Variance of the dark that was subtracted from all exposures, given or that of the averages."""
+    """Variance of the dark that was subtracted from all, given or that of the averages."""
     if given is not None and offset:
         raise InputError(
             "'dark_variance' is that of a dark that was subtracted, but 'dark' is 'fit': give one "

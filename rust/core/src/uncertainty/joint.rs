@@ -404,7 +404,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             search.product(system, control)?;
             if !search.step(system, preconditioner)
                 || iteration >= FEWEST_ITERATIONS
-                    && search.square / search.smallest <= lack * search.energy
+                    && search.square / search.lowest.expected() <= lack * search.energy
             {
                 break;
             }
