@@ -6,7 +6,7 @@ use crate::error::Result;
 /// The relative standard error of the map, root mean square over its pixels, that draws go on to.
 pub(super) const EXACTNESS: f64 = 0.02;
 /// Draws that determine how many are needed.
-pub(super) const FIRST_DRAWS: u64 = 8;
+const FIRST_DRAWS: u64 = 8;
 /// Upper limit on draws.
 pub(super) const MOST_DRAWS: u64 = 400;
 /// The share of x · b that the solution of a draw may lack. Slow errors are a small part of that and
