@@ -237,7 +237,7 @@ def calibrated(
     flags = pixel_flags(weighted, options.fit)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
     bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
-    found = verdicts.on_fit(weighted, options, test, dark)
+    found = [*verdicts.on_fit(weighted, options, test, dark), *verdicts.on_bars(bars)]
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.calibration.error_bars import incomplete_searches
 from equipix.drift import trend_told
 from equipix.errors import (
     ConvergenceWarning,
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from equipix._native import Fit
-    from equipix.calibration.error_bars import DarkStd
+    from equipix.calibration.error_bars import DarkStd, ErrorBars
     from equipix.calibration.options import Options
     from equipix.calibration.sign import SignTest
     from equipix.calibration.weights import Weighted
@@ -129,6 +130,12 @@ def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
         "no standard deviations: the fit is too far from its minimum (estimated error "
         f"{error:.1e}, limit {_NOT_FOUND:g})",
     )
+
+
+def on_bars(bars: ErrorBars | None) -> list[Verdict]:
+    """Verdict on error bars some of whose searches ended early."""
+    count = 0 if bars is None else bars.exactness["incomplete_searches"]
+    return [Verdict("uncertainty", incomplete_searches(count))] if count else []
 
 
 def _on_sign(test: SignTest) -> Verdict | None:

@@ -48,7 +48,11 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     /// The variance of what M follows of the dark at once, in the gauge; empty without a dark.
     followed: Vec<f32>,
     undetermined: Vec<bool>,
+    incomplete: u64,
 }
+
+/// Upper limit on iterations for one right-hand side.
+const MOST_ITERATIONS: u64 = 1000;
 
 impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
     /// # Errors
@@ -105,6 +109,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             slope,
             followed,
             undetermined,
+            incomplete: 0,
         })
     }
 
@@ -151,21 +156,32 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         let Self { search, smallest, .. } = self;
         search.begin(control)?;
         let (mut iterations, mut earlier) = (0, 0.0);
+        // What single precision holds.
+        let nothing = NOTHING * lack.max(LACK_OF_DRAW);
         while smallest.iterate(search, control)? {
             iterations += 1;
             if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
                 break;
             }
+            if iterations == MOST_ITERATIONS {
+                self.incomplete += 1;
+                break;
+            }
             // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
             // iterations brought tells.
             if iterations % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= NOTHING * lack * search.energy {
+                if search.energy - earlier <= nothing * search.energy {
                     break;
                 }
                 earlier = search.energy;
             }
         }
         Ok(())
+    }
+
+    /// Searches that ended before their answer was as exact as it should be.
+    pub(super) const fn incomplete(&self) -> u64 {
+        self.incomplete
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
