@@ -1,9 +1,9 @@
-"""How exact the error map of a joint fit is, for docs/method.md: ``python docs/error_map.py [ROWS COLS]``.
+"""How exact the error map of a joint fit is: ``python docs/error_map.py [ROWS COLS]``.
 
-The map is smoothed over windows. Here it is compared, in single pixels, with the standard deviation of
-ln M in that pixel, which is one linear problem each, to 1e-4 of the variance. Printed for each case: draws,
-the stated relative standard error, the measured one over random pixels and over pixels beside a masked
-one, and the time in fits.
+On larger sensors the map is smoothed over windows. Here it is compared, in single pixels, with the
+standard deviation of ln M in that pixel, which is one linear problem each, to 1e-4 of the variance.
+Printed for each case: draws, the stated relative standard error, the measured one over random
+pixels and over pixels beside a masked one, and the time in fits.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def measured(
     stated = cal.metadata["uncertainty"]
     print(
         f"  draws {stated['draws']:3d}, stated {stated['relative_standard_error']:.2%}, "
-        f"random pixels {found[0]}, beside masked ones {found[1]}, {bars / fit:.1f} fits of {fit:.2f} s"
+        f"random pixels {found[0]}, beside masked ones {found[1]}, "
+        f"{bars / fit:.1f} fits of {fit:.2f} s"
     )
 
 

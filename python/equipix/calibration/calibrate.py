@@ -114,8 +114,9 @@ def calibrate(
     dark_variance : float or array_like, shape (rows, cols), optional
         Variance of the dark mean that was subtracted from all frames, in the units of the frames
         squared: that of a dark frame over the number of dark frames. Its error is common to all
-        exposures, so `variance` must be without it; it enters the error bars and `reduced_chi2`, not
-        the weights. `FrameStatistics` with a dark contain it, unless `variance` holds numbers.
+        exposures, so `variance` must be without it. It enters the error bars and `reduced_chi2`,
+        not the weights. `FrameStatistics` with a dark contain it, unless `variance` is given as
+        numbers.
     robust : bool
         Whether to leave out measurements that disagree with the others, such as a particle or a
         reflection in one exposure only. Left out is what is more than five standard deviations
@@ -268,7 +269,7 @@ def calibrated(
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
     found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
-    found += verdicts.on_priors(widths)
+    found += [*verdicts.on_priors(widths), *verdicts.on_bars(bars)]
     found = with_coverage(found, weighted, flags)
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)

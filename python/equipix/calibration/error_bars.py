@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
-from equipix.errors import InputError
+from equipix.errors import ConvergenceWarning, InputError, warn
 from equipix.maps import slope_pixels, tilt_weights
 
 if TYPE_CHECKING:
@@ -93,7 +93,11 @@ def _error_bars(weighted: Weighted, answer: Uncertainty, scale: float) -> ErrorB
         sensitivity=np.asarray(std, exposures.values.dtype),
         tilt=unknown if answer.variances is None else _std(scale, answer.variances),
         shifts=_std(scale, answer.shift_variances) if refined else exposures.positions.std,
-        exactness={"draws": answer.draws, "relative_standard_error": answer.exactness},
+        exactness={
+            "draws": answer.draws,
+            "relative_standard_error": answer.exactness,
+            "incomplete_searches": answer.incomplete,
+        },
     )
 
 
@@ -189,10 +193,21 @@ def functional_std(
             progress=progress,
             dark_variance=_relative(weighted.exposures.dark_variance, scale),
         )
+    if answer.incomplete:
+        warn(incomplete_searches(answer.incomplete), ConvergenceWarning)
     std = _std(scale, answer.variances)
     if drift is not None and drift.is_added:
         std = np.hypot(std, np.sqrt(drift.variance_of(weights, weighted.fit.sensitivity)))
     return std
+
+
+def incomplete_searches(count: int) -> str:
+    """Message on searches that ended before their variance was found."""
+    return (
+        f"{count} of the searches for standard deviations ended early: the measurements barely "
+        "constrain some pattern of the sensitivity, and standard deviations that it is part of are "
+        "too small: choose less regular shifts, or give a smaller 'shift_std'"
+    )
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration import sample_variances
+from equipix.calibration.error_bars import incomplete_searches
 from equipix.calibration.lamp_drift import WARNED
 from equipix.drift import distinct_trend
 from equipix.errors import (
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from equipix._native import Fit
-    from equipix.calibration.error_bars import DarkStd
+    from equipix.calibration.error_bars import DarkStd, ErrorBars
     from equipix.calibration.lamp_drift import Drift
     from equipix.calibration.misfit import Misfit
     from equipix.calibration.options import Options
@@ -163,6 +164,12 @@ def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
         "no standard deviations: the fit is too far from its minimum (estimated error "
         f"{error:.1e}, limit {_NOT_FOUND:g})",
     )
+
+
+def on_bars(bars: ErrorBars | None) -> list[Verdict]:
+    """Verdict on error bars some of whose searches ended early."""
+    count = 0 if bars is None else bars.exactness["incomplete_searches"]
+    return [Verdict("uncertainty", incomplete_searches(count))] if count else []
 
 
 def _on_sign(test: OrientationTest) -> Verdict | None:

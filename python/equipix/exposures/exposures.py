@@ -57,8 +57,8 @@ class Exposures(ReadOnly):
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
     dark_variance : ndarray, shape (rows, cols), float64, or None
-        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are without
-        it. None where it is unknown, or where an offset is sought, which takes all of it.
+        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are
+        without it. None where it is unknown, or where an offset is sought, which takes all of it.
     clipped : Clipping or None
         A saturation level that was not given, if the values show one.
     """

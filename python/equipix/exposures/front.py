@@ -69,7 +69,7 @@ def exposures_of(
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
-    """Variance of the dark that was subtracted from all exposures, given or that of the averages."""
+    """Variance of the dark that was subtracted from all, given or that of the averages."""
     if given is not None and offset:
         raise InputError(
             "'dark_variance' is that of a dark that was subtracted, but 'dark' is 'fit': give one "
@@ -81,8 +81,10 @@ def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Fl
         return measured.dark_variance
     shape = measured.values.shape[1:]
     variance = as_array("dark_variance", given, ndim=(0, 2)).astype(np.float64)
-    if variance.ndim and variance.shape != shape:
-        raise InputError(f"'dark_variance' has shape {variance.shape}, expected {shape} or ()")
+    if variance.shape not in ((1,), shape):  # as_array makes one number an array of one
+        raise InputError(
+            f"'dark_variance' has shape {variance.shape}, expected {shape} or one number"
+        )
     wrong = variance[~(np.isfinite(variance) & (variance >= 0))]
     if wrong.size:
         raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")

@@ -281,6 +281,7 @@ pub(crate) struct PyUncertainty {
     shift_variances: Option<Vec<[f64; 2]>>,
     offset_variances: Option<(f64, f64)>,
     dark_misfit: Option<f64>,
+    incomplete: u64,
 }
 
 impl PyUncertainty {
@@ -295,6 +296,7 @@ impl PyUncertainty {
             shift_variances: answers.shifts,
             offset_variances: answers.offset.map(Into::into),
             dark_misfit: answers.dark_misfit,
+            incomplete: answers.incomplete,
         })
     }
 }
@@ -317,6 +319,7 @@ struct Answers {
     shifts: Option<Vec<[f64; 2]>>,
     offset: Option<[f64; 2]>,
     dark_misfit: Option<f64>,
+    incomplete: u64,
 }
 
 impl Questions<'_> {
@@ -331,13 +334,15 @@ impl Questions<'_> {
         if let Some(variance) = self.dark {
             bars = bars.with_dark(variance)?;
         }
-        Ok(Answers {
+        let answers = Answers {
             map: self.error_map.then(|| bars.error_map()).transpose()?,
             variances: self.functionals.map(|stack| bars.variances(stack)).transpose()?,
             shifts: if self.shifts { bars.shift_variances()? } else { None },
             offset: if self.offset { bars.offset_variances()? } else { None },
             dark_misfit: self.dark_misfit.then(|| bars.misfit_by_dark()).transpose()?,
-        })
+            incomplete: 0,
+        };
+        Ok(Answers { incomplete: bars.incomplete(), ..answers })
     }
 }
 

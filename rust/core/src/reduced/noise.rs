@@ -23,12 +23,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn draw(
-        &mut self,
-        draw: Draw,
-        slope: &mut [f32],
-        control: &Control,
-    ) -> Result<f64> {
+    pub(crate) fn draw(&mut self, draw: Draw, slope: &mut [f32], control: &Control) -> Result<f64> {
         self.hide(Shown::Noise(draw), control);
         self.for_each_row(slope, control, |row, slope| {
             let [mut scratch, mut of_noise] = [self.scratch(), self.scratch()];

@@ -132,7 +132,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         };
         self.search.begin(&self.system, &preconditioner, slope, control)?;
         let first = self.search.product(&mut self.system, control)?;
-        let error = first / self.search.smallest;
+        let error = first / self.search.lowest.expected();
         self.looks.push(Look { sweep: self.products(), objective, error });
         if self.begins_to_refine(error) {
             return Ok(None);
@@ -213,7 +213,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             control.check()?;
             let size = self.search.product(&mut self.system, control)?;
             let aim = AIM * self.options.tolerance;
-            let near = size <= reachable || size / self.search.smallest <= aim;
+            let near = size <= reachable || size / self.search.lowest.expected() <= aim;
             if near && self.search.iterations >= FEWEST_ITERATIONS {
                 break;
             }
@@ -255,7 +255,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let exposures = system.pass.exposures;
         let without_offset = system.without_offset();
         let history = History { looks: self.looks, ended };
-        let smallest = self.search.smallest;
+        let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));

@@ -75,6 +75,16 @@ impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
         }
     }
 
+    /// How many searches of the answers so far ended before they were as exact as they should be: the
+    /// measurements barely constrain some pattern, and variances that it is part of are too small.
+    #[must_use]
+    pub fn incomplete(&self) -> u64 {
+        match &self.problem {
+            Problem::Reduced(problem) => problem.incomplete(),
+            Problem::Joint(problem) => problem.incomplete(),
+        }
+    }
+
     /// The standard deviation of M in each pixel.
     ///
     /// # Errors

@@ -23,8 +23,8 @@
 use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
 use super::joint_pulls::{add_change, product, pull_by, pull_of, variance_by_cells};
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
-use super::sampling::{NEGLIGIBLE, mean_misfit};
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
+use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
 use super::smoothed::{Change, Smooth, is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
@@ -44,6 +44,11 @@ mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
+
+/// Iterations over which a search must find something.
+const PATIENCE: u64 = 50;
+/// The share of what a search may lack that it aims at: the smallest Ritz value is above the eigenvalue.
+const AIM: f64 = 0.5;
 
 /// What is drawn besides the noise of exposures.
 enum Other {
@@ -80,6 +85,7 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     scale: f64,
     /// The noise of a dark that was subtracted from all exposures.
     dark: Option<Dark>,
+    incomplete: u64,
 }
 
 impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
@@ -113,6 +119,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             valid,
             scale,
             dark: None,
+            incomplete: 0,
         })
     }
 
@@ -201,9 +208,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     ) -> Result<Vec<f64>> {
         self.search = ConjugateGradients::default();
         let total = functionals.len() as u64;
+        let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
             control.report("uncertainty", index, total);
-            self.variance_of(functional, LACK_OF_FUNCTIONAL, control)
+            self.variance_of(functional, lack, control)
         });
         found.collect()
     }
@@ -398,23 +406,29 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
         search.begin(system, preconditioner, b, control)?;
-        let mut earlier = 0.0;
+        let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
-            if !search.step(system, preconditioner)
-                || iteration >= FEWEST_ITERATIONS
-                    && search.square / search.smallest <= lack * search.energy
-            {
-                break;
+            let goes_on = search.step(system, preconditioner);
+            let left = search.square / search.lowest.expected();
+            if !goes_on || iteration >= FEWEST_ITERATIONS && left <= AIM * lack * search.energy {
+                return Ok(());
             }
-            if iteration % FEWEST_ITERATIONS == 0 {
+            if iteration % PATIENCE == 0 {
                 if search.energy - earlier <= NOTHING * lack * search.energy {
                     break;
                 }
                 earlier = search.energy;
             }
         }
+        // Rounding may leave a Ritz value next to 0, but then the residual is rounding too.
+        self.incomplete += u64::from(search.square > NOTHING * lack * first);
         Ok(())
+    }
+
+    /// Searches that ended before their answer was as exact as it should be.
+    pub(super) const fn incomplete(&self) -> u64 {
+        self.incomplete
     }
 
     /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.

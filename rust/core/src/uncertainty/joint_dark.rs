@@ -41,22 +41,24 @@ impl Dark {
         control: &Control,
     ) -> Result<Self> {
         let mut no_pull = vec![0.0; system.state.beam.len()];
-        let found = system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, found| {
-            pass.weigh_row(row_index, workspace);
-            workspace.values().clear();
-            let cols = row.change.len();
-            let variance = &variance[row_index * cols..];
-            for col in 0..cols {
-                let [mut sum, mut along] = [0.0; 2];
-                let exposures = workspace.weights.chunks_exact(cols).zip(row.light.chunks_exact(cols));
-                for (weights, light) in exposures.filter(|_| row.inverse[col] > 0.0) {
-                    sum += weights[col];
-                    along += weights[col] * light[col];
+        let found =
+            system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, found| {
+                pass.weigh_row(row_index, workspace);
+                workspace.values().clear();
+                let cols = row.change.len();
+                let variance = &variance[row_index * cols..];
+                for col in 0..cols {
+                    let [mut sum, mut along] = [0.0; 2];
+                    let exposures =
+                        workspace.weights.chunks_exact(cols).zip(row.light.chunks_exact(cols));
+                    for (weights, light) in exposures.filter(|_| row.inverse[col] > 0.0) {
+                        sum += weights[col];
+                        along += weights[col] * light[col];
+                    }
+                    row.change[col] = row.inverse[col] * along;
+                    found.objective += variance[col] * (sum - row.change[col] * along);
                 }
-                row.change[col] = row.inverse[col] * along;
-                found.objective += variance[col] * (sum - row.change[col] * along);
-            }
-        })?;
+            })?;
         let mut follows = vec![0.0; variance.len()];
         add_change(system, &mut follows);
         let std = variance.iter().map(|v| v.sqrt()).collect();

@@ -79,11 +79,10 @@ pub(super) fn variance_by_cells<T: Real>(
     system: &mut System<'_, '_, T>,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let inverse = |weight: &f64| if *weight > 0.0 { 1.0 / weight } else { 0.0 };
-    let of_cells: Vec<f64> = system.weights.iter().map(inverse).collect();
+    let of_cells = std::mem::take(&mut system.weights);
     let views = system.pass.views_of(&of_cells);
     let mut no_pull = vec![0.0; of_cells.len()];
-    system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, _| {
+    let done = system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, _| {
         pass.weigh_row(row_index, workspace);
         workspace.values().clear();
         pass.see(&views, row_index, workspace);
@@ -92,13 +91,17 @@ pub(super) fn variance_by_cells<T: Real>(
         row.change.fill(0.0);
         for (k, flux) in pass.flux.iter().enumerate() {
             let (weights, light) = (&weights[k * cols..][..cols], &row.light[k * cols..][..cols]);
-            for (col, variance) in values.of_mut(k).iter_mut().enumerate() {
-                let share = row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
-                row.change[col] += share * share * variance.max(0.0);
-                *variance = 0.0;
+            for (col, weight) in values.of_mut(k).iter_mut().enumerate() {
+                let share =
+                    row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
+                row.change[col] += if *weight > 0.0 { share * share / *weight } else { 0.0 };
+                *weight = 0.0;
             }
         }
-    })?;
+    });
+    drop(views);
+    system.weights = of_cells;
+    done?;
     let mut variance = vec![0.0; system.pass.exposures.sensor().len()];
     add_change(system, &mut variance);
     Ok(variance)

@@ -20,8 +20,8 @@
 //! variance of a e is known; r and its product with a e are sampled, in the same draws. To a functional
 //! it adds Σ_p v (Σ_k h_k)², h_k = w c L (x − M h) being the influence of measurement k with S x = g.
 
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
-use super::sampling::{mean_misfit, NEGLIGIBLE};
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
+use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
@@ -48,7 +48,11 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     /// The variance of what M follows of the dark at once, in the gauge; empty without a dark.
     followed: Vec<f32>,
     undetermined: Vec<bool>,
+    incomplete: u64,
 }
+
+/// Upper limit on iterations for one right-hand side.
+const MOST_ITERATIONS: u64 = 1000;
 
 impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
     /// # Errors
@@ -95,7 +99,18 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         let slope = padding.zeros(exposures.sensor().rows, workers, control);
         let smallest = Smallest::default();
         let followed = Vec::new();
-        Ok(Self { exposures, workers, search, smallest, valid, count, slope, followed, undetermined })
+        Ok(Self {
+            exposures,
+            workers,
+            search,
+            smallest,
+            valid,
+            count,
+            slope,
+            followed,
+            undetermined,
+            incomplete: 0,
+        })
     }
 
     /// Takes the noise of the dark into account, of these variances.
@@ -141,21 +156,32 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         let Self { search, smallest, .. } = self;
         search.begin(control)?;
         let (mut iterations, mut earlier) = (0, 0.0);
+        // What single precision holds.
+        let nothing = NOTHING * lack.max(LACK_OF_DRAW);
         while smallest.iterate(search, control)? {
             iterations += 1;
             if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
                 break;
             }
+            if iterations == MOST_ITERATIONS {
+                self.incomplete += 1;
+                break;
+            }
             // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
             // iterations brought tells.
             if iterations % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= NOTHING * lack * search.energy {
+                if search.energy - earlier <= nothing * search.energy {
                     break;
                 }
                 earlier = search.energy;
             }
         }
         Ok(())
+    }
+
+    /// Searches that ended before their answer was as exact as it should be.
+    pub(super) const fn incomplete(&self) -> u64 {
+        self.incomplete
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
@@ -195,7 +221,9 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             *g -= mean as f32 * valid;
         }
         search.residual.copy_from_slice(slope);
-        self.apply_inverse(LACK_OF_FUNCTIONAL, control)?;
+        let with_dark = search.reduced.has_dark();
+        let lack = if with_dark { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
+        self.apply_inverse(lack, control)?;
         let Self { search, slope, workers, .. } = self;
         let by_dark = search.reduced.variance_by_dark(&search.x, control)?;
         let variance = dot(slope, &search.x, workers) + by_dark;

@@ -6,7 +6,7 @@ use crate::error::Result;
 /// The relative standard error of the map, root mean square over its pixels, that draws go on to.
 pub(super) const EXACTNESS: f64 = 0.02;
 /// Draws that determine how many are needed.
-pub(super) const FIRST_DRAWS: u64 = 8;
+const FIRST_DRAWS: u64 = 8;
 /// Upper limit on draws.
 pub(super) const MOST_DRAWS: u64 = 400;
 /// The share of x · b that the solution of a draw may lack. Slow errors are a small part of that and
@@ -15,6 +15,8 @@ pub(super) const MOST_DRAWS: u64 = 400;
 pub(super) const LACK_OF_DRAW: f64 = 1e-5;
 /// That of a functional, which is the share of its variance itself.
 pub(super) const LACK_OF_FUNCTIONAL: f64 = 1e-4;
+/// That of a functional to which a dark adds a square of the solution, whose error is the root of it.
+pub(super) const LACK_WITH_DARK: f64 = 1e-8;
 /// A search that finds no more than this share of what it may lack in ten iterations is at its end.
 pub(super) const NOTHING: f64 = 1e-2;
 

@@ -5,15 +5,17 @@
 //! pixels takes the place of that over many draws. Draws are correlated over large scales, which no window
 //! averages: how exact the map is follows from the scatter of the smoothed draws.
 
-use super::sampling::{EXACTNESS, FIRST_DRAWS, MOST_DRAWS, Sampled};
+use super::sampling::{EXACTNESS, MOST_DRAWS, Sampled};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Shape;
 
 /// Pixels along each side of a window.
-const SIDE: usize = 9;
+const SIDE: usize = 7;
+/// The fewest draws: so many average what is common to the pixels of a window.
+const FIRST_DRAWS: u64 = 24;
 /// The fewest windows along each side of the sensor: the ratio changes at the sensor's edges.
-const FEWEST_WINDOWS: usize = 8;
+const FEWEST_WINDOWS: usize = 10;
 
 /// What one draw finds in each pixel, in the gauge of the result.
 pub(super) struct Change {
@@ -171,13 +173,15 @@ mod tests {
     #[test]
     fn a_window_ends_at_the_edges_of_the_sensor() {
         let sensor = Shape::new(11, 13);
-        let mut image: Vec<f64> = (0..sensor.len()).map(|pixel| (pixel * pixel % 17) as f64).collect();
+        let mut image: Vec<f64> =
+            (0..sensor.len()).map(|pixel| (pixel * pixel % 17) as f64).collect();
         let whole = image.clone();
         over_windows(&mut image, sensor);
         for (pixel, sum) in image.iter().enumerate() {
             let near = |a: usize, b: usize| a.abs_diff(b) <= SIDE / 2;
             let inside = |other: &usize| {
-                near(pixel / sensor.cols, other / sensor.cols) && near(pixel % sensor.cols, other % sensor.cols)
+                near(pixel / sensor.cols, other / sensor.cols)
+                    && near(pixel % sensor.cols, other % sensor.cols)
             };
             let wanted: f64 = (0..sensor.len()).filter(inside).map(|other| whole[other]).sum();
             // Sums of small whole numbers are exact.
