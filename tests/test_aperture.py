@@ -54,7 +54,7 @@ def test_variances_are_those_of_n_measurements_that_determine_the_beam_too(count
     """n/(n − 2) over Σ w c²L² M², the relative variance with a known beam."""
     variance = 1e-6 * (1 + np.arange(count))
     weighted = fitted(CROSS[:count], variance=variance)
-    exposures, fit, _ = weighted
+    exposures, fit = weighted.exposures, weighted.fit
     strength = sum(
         (c * light_of(fit, shift)) ** 2 / v
         for c, shift, v in zip(exposures.flux.values, CROSS, variance, strict=False)
