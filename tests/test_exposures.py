@@ -224,7 +224,7 @@ class TestThreads:
 
     @pytest.mark.parametrize(
         "options",
-        [{}, {"robust": True}, {"variance": NoiseModel(1e-3, 1e-6)}],
+        [{}, {"robust": True}, {"variance": NoiseModel(1e-3, 1e-9)}],
         ids=lambda options: "-".join(options) or "sign",
     )
     def test_are_those_of_the_caller_throughout(self, monkeypatch, options):

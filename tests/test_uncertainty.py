@@ -141,6 +141,8 @@ def check_scores(squares):
 class TestAgainstSimulatedExperiments:
     """Four sensors of 120 rows and 160 columns, fifty experiments each."""
 
+    # One of a thousand right experiments shows a drift.
+    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
     @pytest.mark.parametrize("masked", [0, 0.02])
     def test_z_scores(self, masked):
         squares = np.array([self.mean_squares(seed, masked) for seed in range(4)])

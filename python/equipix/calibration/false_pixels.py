@@ -29,7 +29,10 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
     if not (dead | hot).any():
         return weighted
     squares = _mean_squares(weighted, options.fit.workers)
-    false = (dead | hot) & (squares > _CONTRADICTORY * np.nanmedian(squares))
+    # Without noise, only what the tolerance leaves would be compared.
+    power = np.square(weighted.exposures.values, dtype=np.float64)
+    solver = options.fit.tolerance**2 * np.nanmean(weighted.exposures.weighted_squares(power))
+    false = (dead | hot) & (squares > _CONTRADICTORY * max(np.nanmedian(squares), solver))
     if not false.any():
         return weighted
     exposures = weighted.exposures
