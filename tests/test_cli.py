@@ -438,21 +438,33 @@ class TestPlan:
         status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
         assert status == 0
         found = json.loads(out)["patterns"]
-        assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(3, 1)}
+        assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(5, 1)}
 
-    def test_warns_of_drift_that_was_given(self, run):
-        command = ("plan", "--shape", 64, 80, "--max-shift", 9, 9)
-        status, out, err = run(*command)
-        assert (status, err) == (0, "")
+    def test_judges_each_pattern_that_it_finds(self, run):
+        status, out, err = run("plan", "--shape", 300, 400, "--max-shift", 9, 9)
+        assert status == 0
         assert "tilt from lamp drift" in out
-        err = run(*command, "--drift", "1e-4")[2]
-        assert err.startswith("equipix: warning: lamp drift will tilt")
+        warned = re.findall(r"^equipix: warning: pattern (\d): lamp drift will", err, re.MULTILINE)
+        assert warned == ["1", "2", "3"]
+
+    def test_judges_shifts_between_pixels(self, run):
+        shifts = "0,0 0,11.4 0,19.7 11.2,0 19.5,0"
+        status, out, err = run(
+            "plan", "--shape", 64, 80, "--shifts", shifts, "--drift", 0, "--json"
+        )
+        assert (status, err) == (0, "")
+        assert json.loads(out)["patterns"][0]["components"] == 1
+        _, _, err = run(
+            "plan", "--shape", 64, 80, "--drift", 0,
+            "--shifts", "0,0 0,2.5 0,7.5 2.5,0 7.5,0",
+        )  # fmt: skip
+        assert "do not constrain a wave of (0." in err
 
     def test_a_single_row(self, run, tmp_path):
         command = ("plan", "--shape", 1, 40, "-o", tmp_path / "plan.png", "--drift", 0, "--json")
         status, out, err = run(*command, "--max-shift", 5, 5)
         assert (status, err) == (0, "")
-        assert json.loads(out)["patterns"][0]["shifts"] == [[0, 0], [0, 1]]
+        assert json.loads(out)["patterns"][0]["components"] == 1
 
     @pytest.mark.parametrize(
         ("arguments", "words"),

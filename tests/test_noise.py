@@ -84,7 +84,7 @@ class TestSaturatedExposures:
 
 SATURATES = (
     "'frames': {}% of the pixels of {} reach the saturation level{} and none is left to measure "
-    "with: expose less, or correct 'saturation'"
+    "with: expose less, or correct 'saturation' or 'bit_depth'"
 )
 
 

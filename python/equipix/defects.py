@@ -81,7 +81,7 @@ def refuse_saturated(which: str, values: Array, saturates: Bools, level: float |
         raise InputError(
             f"'frames': {np.mean(saturates):.1%} of the pixels of {which} reach the saturation "
             f"level{'' if level is None else f' of {level:g} DN'} and none is left to measure "
-            "with: expose less, or correct 'saturation'"
+            "with: expose less, or correct 'saturation' or 'bit_depth'"
         )
 
 

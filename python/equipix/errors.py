@@ -58,6 +58,10 @@ class AlreadyCorrectedWarning(EquipixWarning):
     """Frames to correct have been corrected before."""
 
 
+class UnusedInputWarning(EquipixWarning):
+    """Part of what is given is not used."""
+
+
 class SaturationWarning(EquipixWarning):
     """Values that probably saturate count as valid."""
 

@@ -135,6 +135,7 @@ def compare(
             "rms": float(result.rms[k]),
             "block_rms": float(result.block_rms[k]),
             "largest": float(result.largest[k]),
+            "tilt_compared": not result.open_tilt[k],
             "predicted_rms": None
             if result.predicted_rms is None
             else float(result.predicted_rms[k]),
@@ -146,7 +147,13 @@ def compare(
         show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
     else:
         _show_pairs(pairs)
-        show_result({"pixels compared": pixels, "picture": str(output or "none")}, as_json=False)
+        words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
+        if result.open_tilt.any():
+            left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}
+            words["tilt"] = "left out: free fluxes leave it undetermined in one or more of " + (
+                ", ".join(sorted(map(str, left_out)))
+            )
+        show_result(words, as_json=False)
 
 
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:

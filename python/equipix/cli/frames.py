@@ -12,11 +12,15 @@ from equipix.cli.options import Force, Json, Mask, Saturation, Workers
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import correct_files, is_folder
+from equipix.errors import InputError
 from equipix.frames import average as average_frames
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load_correction
 
 commands = typer.Typer()
+
+_OTHER_FORMATS = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
+"""Formats of images that `correct` does not write."""
 
 
 @commands.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")
@@ -69,6 +73,7 @@ def correct(
     as_json: Json = False,
 ) -> None:
     """Divide frames by the sensitivity, their dark level subtracted."""
+    _refuse_image(output)
     check_output(output, force=force, folder=is_folder(output))
     refuse_inputs([output], [calibration])
     with progress_bars() as progress:
@@ -82,3 +87,12 @@ def correct(
             progress=progress,
         )
     show_result({"output": str(output), "frames": done}, as_json=as_json)
+
+
+def _refuse_image(output: Path) -> None:
+    """Refuse a folder that is named like a file of another format."""
+    if output.suffix.lower() in _OTHER_FORMATS and not output.is_dir():
+        raise InputError(
+            f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif: name "
+            "a .tif file, or a folder for a .tif of each input"
+        )

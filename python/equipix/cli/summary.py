@@ -11,6 +11,7 @@ from equipix.flags import Flag
 from equipix.frames import FrameStatistics
 
 if TYPE_CHECKING:
+    from equipix._types import Array
     from equipix.correction.protocol import Correction
 
 
@@ -88,4 +89,11 @@ def _uncertainty(calibration: Calibration) -> dict[str, Any]:
         "sensitivity_std_is_exact_to": exactness,
         "tilt": dict(zip(("rows", "cols"), calibration.tilt.tolist(), strict=True)),
         "tilt_std": dict(zip(("rows", "cols"), tilt_std.tolist(), strict=True)),
+        "tilt_is": _tilt_in_words(tilt_std),
     }
+
+
+def _tilt_in_words(std: Array) -> str:
+    """Say which tilts are undetermined: JSON has no infinite standard deviation."""
+    names = [name for name, each in zip(("rows", "cols"), std, strict=True) if np.isinf(each)]
+    return f"undetermined along {' and '.join(names)}, and set to 0" if names else "determined"

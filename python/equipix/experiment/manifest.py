@@ -163,7 +163,7 @@ class Manifest(_Table):
 def read_manifest(path: Path) -> Manifest:
     """Read and check the file `path`."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -229,6 +229,8 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
         return f"key '{location[-1]}' is missing{place}"
     key = next(key for key in reversed(location) if key in _WANTED)
     value = detail["input"]
+    if key == "exposure" and isinstance(value, dict):
+        return "[exposure] is one table: write [[exposure]], with two brackets, for each exposure"
     return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"
 
 

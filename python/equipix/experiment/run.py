@@ -13,7 +13,7 @@ from equipix.calibration.options import Options
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.weights import weighted_fit
 from equipix.defects import hot_pixels
-from equipix.errors import FileError, InputError
+from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.manifest import find_files, read_manifest
 from equipix.experiment.mask import excluded_pixels
@@ -240,6 +240,11 @@ class Experiment:
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 
+        Warns
+        -----
+        UnusedInputWarning
+            If the file has ``flux`` or ``time`` that `flux` leaves without use.
+
         Notes
         -----
         Shifts with a standard error are refined, with it as their prior: see `calibrate`. Those
@@ -248,6 +253,7 @@ class Experiment:
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
+        self._warn_of_unused(flux)
         self.check_formats()
         excluded = self._excluded(mask)
         hashes = sha256_of([self.path, *self.files()])
@@ -266,6 +272,20 @@ class Experiment:
             start = first.fit
         origin = provenance(self.path, self.manifest, hashes, shifts, std, noise)
         return calibrated(exposures, options, start=start, provenance=origin)
+
+    def _warn_of_unused(self, flux: FluxModel | None) -> None:
+        """Warn of values in the file that the fluxes to find leave without use."""
+        if flux is not None and self._column("flux") is not None:
+            warn(
+                f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
+                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
+                UnusedInputWarning,
+            )
+        if flux != "linear" and self._column("time") is not None:
+            warn(
+                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
+                UnusedInputWarning,
+            )
 
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:
         """Pixels that the file or the caller excludes."""

@@ -13,8 +13,12 @@ from equipix.io.reading import reading
 
 if TYPE_CHECKING:
     from os import PathLike
+    from pathlib import Path
 
     from numpy.typing import NDArray
+
+_MAGIC = b"\x93NUMPY"
+"""First bytes of an .npy file."""
 
 
 def read_mask(path: str | PathLike[str]) -> NDArray[np.bool_]:
@@ -48,6 +52,9 @@ def read_mask(path: str | PathLike[str]) -> NDArray[np.bool_]:
     return mask
 
 
-def _array(file: Any) -> NDArray[Any]:
-    with reading(file):
-        return np.asarray(np.load(file, allow_pickle=False))
+def _array(file: Path) -> NDArray[Any]:
+    with reading(file), file.open("rb") as stream:
+        if stream.read(len(_MAGIC)) != _MAGIC:
+            raise FileError(f"{file}: is no .npy file, whatever its name says")
+        stream.seek(0)
+        return np.asarray(np.load(stream, allow_pickle=False))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -89,7 +90,9 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     path = as_path("path", path)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise InputError(f"'path' is {str(path)!r}, expected the suffix .tif or .npz")
+        raise InputError(
+            f"{path}: ends in '{path.suffix}', expected a .tif or .npz file that equipix has saved"
+        )
     with reading(path):
         pages, description = read(path)
     try:
@@ -187,13 +190,21 @@ def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) 
         np.savez(file, allow_pickle=False, metadata=np.array(description), **pages)
 
 
+def _check_npz(path: Path) -> None:
+    """Refuse another kind of file before NumPy takes it for pickled objects."""
+    if not zipfile.is_zipfile(path):
+        raise FileError(f"{path}: is no .npz file, whatever its name says")
+
+
 def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    _check_npz(path)
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         pages = {name: file[name] for name in file.files}
     return pages, str(pages.pop("metadata", ""))
 
 
 def _description_of_npz(path: Path) -> str:
+    _check_npz(path)
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         return str(file["metadata"]) if "metadata" in file.files else ""
 
