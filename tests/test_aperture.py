@@ -90,8 +90,8 @@ def test_images_are_corrected_but_in_pixels_that_are_not_to_be_used():
 
 
 def test_a_fit_without_a_dark_is_refused():
-    exposures, fit, _ = fitted()
-    weighted = Weighted(dataclasses.replace(exposures, dark=None), fit, None)
+    weighted = fitted()
+    weighted = weighted._replace(exposures=dataclasses.replace(weighted.exposures, dark=None))
     with pytest.raises(InputError, match="holds no dark frame"):
         Equalisation.of(weighted, np.zeros(SHAPE, np.uint32))
 

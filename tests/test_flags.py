@@ -28,9 +28,9 @@ def weighted():
 
 
 def with_findings(**found):
-    exposures, fit, rejected = weighted()
-    findings = Findings(**found)
-    return type(weighted())(dataclasses.replace(exposures, findings=findings), fit, rejected)
+    fitted = weighted()
+    exposures = dataclasses.replace(fitted.exposures, findings=Findings(**found))
+    return fitted._replace(exposures=exposures)
 
 
 def test_every_finding_has_bits_and_all_bits_have_a_finding():
@@ -58,9 +58,10 @@ def test_findings_add_up():
 
 
 def test_most_measurements_left_out_contradict_each_other():
-    exposures, fit, _ = weighted()
+    fitted = weighted()
     left_out = np.zeros((5, 20, 24), bool)
     left_out[:3, 4, 4] = left_out[:2, 8, 8] = True
-    flags = pixel_flags(type(weighted())(exposures.without(left_out), fit, left_out), FitOptions())
+    exposures = fitted.exposures.without(left_out)
+    flags = pixel_flags(fitted._replace(exposures=exposures, rejected=left_out), FitOptions())
     assert np.argwhere(flags == BITS["contradictory"]).tolist() == [[4, 4]]
     assert np.count_nonzero(flags) == 1

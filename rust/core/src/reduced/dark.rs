@@ -12,23 +12,11 @@
 //! sees the same light in all exposures.
 
 use super::kernel::Common;
-use super::operator::{Reduced, Shown};
+use super::operator::{Dark, Reduced, Shown};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::random;
-
-/// The noise of the dark, in the units of the linear problem.
-pub(crate) struct Dark {
-    /// The standard deviation of e.
-    std: Vec<f32>,
-    /// a; 0 in pixels without measurement and in those that have left the system.
-    follows: Vec<f32>,
-    /// Σ w c L.
-    sums: Vec<f32>,
-    /// 1/c of each exposure.
-    factors: Vec<f32>,
-}
 
 impl<T: Real> Reduced<'_, '_, T> {
     /// Takes the dark's noise into account, of these variances by pixel. The system must be
