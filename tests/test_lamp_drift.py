@@ -126,7 +126,13 @@ def test_the_covariance_of_slopes_has_their_standard_deviations():
 
 @pytest.mark.parametrize(
     ("value", "freedom", "tail"),
-    [(3.841459, 1, 0.05), (9.210340, 2, 0.01), (7.814728, 3, 0.05), (23.209251, 10, 0.01), (0, 3, 1)],
+    [
+        (3.841459, 1, 0.05),
+        (9.21034, 2, 0.01),
+        (7.814728, 3, 0.05),
+        (23.209251, 10, 0.01),
+        (0, 3, 1),
+    ],
 )
 def test_the_tail_of_chi_square(value, freedom, tail):
     """Quantiles from tables, given to six digits."""

@@ -12,7 +12,6 @@ from equipix import simulate
 from equipix.calibration import verdicts
 from equipix.calibration.options import Options
 from equipix.calibration.orientation import OrientationTest
-from equipix.calibration.residual_tests import lag_one
 from equipix.calibration.weights import Weighted
 from equipix.calibration.window_fit import WindowFit
 from equipix.errors import ConvergenceWarning, MisfitWarning
@@ -121,7 +120,7 @@ def window_fit(left, freedom, *, rng):
     """A settled fit of a window with residuals of that mean square."""
     fit = SimpleNamespace(error_estimate=np.array([1e-9]), ended="converged")
     residuals = np.sqrt(left) * rng.choice([-1.0, 1.0], (3, 8, 8))
-    return WindowFit(fit, left, freedom, 1.0, 1.0, residuals, lag_one(residuals, 1.0))
+    return WindowFit(fit, left, freedom, 1.0, 1.0, residuals)
 
 
 @pytest.mark.parametrize("freedom", [1000, 7200, 10**6])

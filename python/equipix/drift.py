@@ -75,7 +75,7 @@ def slope_covariance(shifts: NDArray[Any], flux_std: float, times: ArrayLike | N
     Returns
     -------
     ndarray, shape (2, 2), float64
-        ε² (XᵀX)⁻¹ for the two columns of the shifts, X being 1, the shifts, and the times.
+        Part of ε² (XᵀX)⁻¹ for the shifts, the columns of X being 1, the shifts, and the times.
     """
     columns = affine_columns(shifts, times)
     return np.asarray(flux_std**2 * np.linalg.inv(columns.T @ columns)[1:3, 1:3])

@@ -20,8 +20,8 @@ FEWEST = 1000
 EXACT = 0.3
 """Largest `Residuals.inexactness` at which F is as good as at its minimum."""
 
-SAMPLED = 2**19
-"""Measurements of a sample: a correlation of 1 % is then five standard errors."""
+SAMPLED = 2**18
+"""Measurements of a sample: a correlation of 1.2 % is then five standard errors."""
 
 _BAND = 32
 """Rows of a band: several blocks of neighbours, and more than most shifts."""

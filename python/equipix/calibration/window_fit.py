@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,8 +68,6 @@ class WindowFit:
         Mean of w y²: what `left` is compared with.
     residuals : ndarray, shape (n, rows, cols)
         Residuals times √w.
-    neighbours : tuple of Correlation
-        Of neighbouring residuals, along both axes.
     """
 
     fit: Fit
@@ -77,7 +76,6 @@ class WindowFit:
     share: float
     power: float
     residuals: Floats
-    neighbours: tuple[Correlation, Correlation]
 
     @classmethod
     def of(
@@ -106,8 +104,12 @@ class WindowFit:
             share=share,
             power=float(np.nanmean(squares)),
             residuals=scaled,
-            neighbours=lag_one(scaled, share),
         )
+
+    @cached_property
+    def neighbours(self) -> tuple[Correlation, Correlation]:
+        """Correlation of neighbouring residuals, along both axes."""
+        return lag_one(self.residuals, self.share)
 
     @property
     def noise(self) -> float:
