@@ -104,9 +104,9 @@ class TestResiduals:
         rng, truth, beam = sensor((30, 44), seed)
         rotation, flux = [0, 0, 0, 0, 90], [1, 1.1, 0.9, 1, 1.2]
         frames = simulate.exposures(truth, beam, CROSS, rotation=rotation, flux=flux)
-        frames += 1e-3 * rng.standard_normal(frames.shape)
-        frames[2, 5, 6] = np.nan
         variance = rng.uniform(1, 3, 5) * 1e-6
+        frames += np.sqrt(variance)[:, None, None] * rng.standard_normal(frames.shape)
+        frames[2, 5, 6] = np.nan
         plain = equipix.calibrate(frames, CROSS, rotation=rotation, flux=flux)
         weighted = equipix.calibrate(
             frames, CROSS, rotation=rotation, flux=flux, variance=variance, tolerance=1e-9

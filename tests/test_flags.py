@@ -54,7 +54,8 @@ def test_findings_add_up():
     found = np.zeros((20, 24), bool)
     found[5, 7] = True
     flags = pixel_flags(with_findings(**dict.fromkeys(FINDINGS, found)), FitOptions())
-    assert flags[5, 7] == Flag.SATURATED | Flag.DEAD | Flag.HOT | Flag.DO_NOT_USE
+    wanted = Flag.SATURATED | Flag.DEAD | Flag.HOT | Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE
+    assert flags[5, 7] == wanted
 
 
 def test_most_measurements_left_out_contradict_each_other():

@@ -254,10 +254,10 @@ def calibrated(
     The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    exposures, frames = steadied(exposures)
-    advice = [*on_input(exposures), *verdicts.on_plan(exposures, frames)]
+    advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
     verdicts.say(advice)
-    weighted = without_false_pixels(weighted_fit(exposures, options, start), options)
+    weighted, frames = steadied(exposures, weighted_fit(exposures, options, start), options)
+    weighted = without_false_pixels(weighted, options)
     weighted, widths = widened(weighted, options)
     weighted = with_dark_misfit(weighted, options.fit)
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
@@ -269,7 +269,7 @@ def calibrated(
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
     found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
-    found += [*verdicts.on_priors(widths), *verdicts.on_bars(bars)]
+    found += verdicts.on_noise(frames, widths, bars)
     found = with_coverage(found, weighted, flags)
     verdicts.say(found)
     metadata = _metadata(weighted, options, started, dark, bars)

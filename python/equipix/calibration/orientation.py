@@ -200,7 +200,7 @@ def _fits(
     """Fits in every orientation, as exact as necessary."""
     fits = {way: WindowFit.of(window, options) for way, window in windows.items()}
     for _ in range(_ROUNDS):
-        odd = np.any([fit.odd() for fit in fits.values()], axis=0)
+        odd = np.any([fit.outliers() for fit in fits.values()], axis=0)
         if odd.any():
             windows = {way: window.without(odd) for way, window in windows.items()}
             fits = {way: WindowFit.of(window, options) for way, window in windows.items()}

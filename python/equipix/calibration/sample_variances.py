@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.calibration.weights import weighted_fit
 from equipix.noise import NoiseModel, photon_transfer
 
 if TYPE_CHECKING:
     from equipix._types import Array
+    from equipix.calibration.options import Options
+    from equipix.calibration.weights import Weighted
     from equipix.exposures.exposures import Exposures
 
 _MOST_FRAMES = 30
@@ -18,6 +21,9 @@ _MOST_FRAMES = 30
 
 _FEWEST_PIXELS = 1000
 """Least number of pairs of neighbours in an exposure."""
+
+_SLOPE = 0.5
+"""Slope of squared residuals against variances, above which these are no sample variances."""
 
 _LIKE = 0.1
 """Relative difference of the fourth moment from that of sample variances."""
@@ -57,21 +63,45 @@ def sampled_frames(variance: Array | None) -> float | None:
     return frames if abs(fourth - 1) < _LIKE else None
 
 
-def steadied(exposures: Exposures) -> tuple[Exposures, float | None]:
-    """Replace variances that scatter like sample variances by a noise model of each exposure.
+def steadied(
+    exposures: Exposures, weighted: Weighted, options: Options
+) -> tuple[Weighted, float | None]:
+    """Fit with a noise model of each exposure, where the variances scatter like sample variances.
 
     Also returns the number of frames that they seem to be of; None where they are left as they are.
     """
     frames = None if exposures.offset else sampled_frames(exposures.variance)
     variance = exposures.variance
-    if frames is None or variance is None:
-        return exposures, None
+    if frames is None or variance is None or _explains_residuals(weighted, options.fit.workers):
+        return weighted, None
     usable, number = exposures.usable(), max(2, round(frames))
     models = tuple(
         NoiseModel.fit(photon_transfer(exposures.values[k], variance[k], usable[k], number))
         for k in range(len(exposures))
     )
-    return dataclasses.replace(exposures, variance=None, noise=models), frames
+    exposures = dataclasses.replace(exposures, variance=None, noise=models)
+    return weighted_fit(exposures, options, weighted.fit), frames
+
+
+def _explains_residuals(weighted: Weighted, workers: int | None) -> bool:
+    """Whether squared residuals r² follow the scatter of the variances v, as they do true ones.
+
+    The slope of r² against v, from differences of neighbours, is near 1 for true variances, and
+    near 0 for sample variances, whose scatter is independent of that of the mean.
+    """
+    exposures, fit = weighted.exposures, weighted.fit
+    variance = exposures.variance
+    if variance is None or variance.ndim != 3:
+        return True
+    along = square = 0.0
+    for k, values in enumerate(exposures.values):
+        residual = values - exposures.light(fit, k, workers) * fit.sensitivity
+        of_residuals = np.diff(np.square(residual, dtype=np.float64), axis=1)
+        of_variances = np.diff(variance[k].astype(np.float64), axis=1)
+        known = np.isfinite(of_residuals) & np.isfinite(of_variances)
+        along += float(np.sum(of_residuals[known] * of_variances[known]))
+        square += float(np.sum(np.square(of_variances[known])))
+    return along > _SLOPE * square
 
 
 def words(frames: float) -> str:

@@ -94,16 +94,23 @@ def say(verdicts: Iterable[Verdict]) -> None:
         warn(verdict.message, _CATEGORIES[verdict.kind])
 
 
-def on_plan(exposures: Exposures, frames: float | None = None) -> list[Verdict]:
-    """Verdicts before any fit; `frames` is the number whose sample variances were given."""
-    variances = None if frames is None else Verdict("variance", sample_variances.words(frames))
-    found = [_on_rounding(exposures), _on_order(exposures), variances]
+def on_plan(exposures: Exposures) -> list[Verdict]:
+    """Verdicts before any fit."""
+    found = [_on_rounding(exposures), _on_order(exposures)]
     return [verdict for verdict in found if verdict is not None]
 
 
-def on_priors(contradictions: Iterable[Contradiction]) -> list[Verdict]:
-    """Verdicts on priors that the data contradict."""
-    return [Verdict("prior", each.words) for each in contradictions]
+def on_noise(
+    frames: float | None, contradictions: Iterable[Contradiction], bars: ErrorBars | None
+) -> list[Verdict]:
+    """Verdicts on variances and priors that the data contradict, and on the error bars.
+
+    `frames` is the number of frames whose sample variances were given.
+    """
+    found = [] if frames is None else [Verdict("variance", sample_variances.words(frames))]
+    found += [Verdict("prior", each.words) for each in contradictions]
+    count = 0 if bars is None else bars.exactness["incomplete_searches"]
+    return [*found, Verdict("uncertainty", incomplete_searches(count))] if count else found
 
 
 def _on_rounding(exposures: Exposures) -> Verdict | None:
@@ -164,12 +171,6 @@ def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
         "no standard deviations: the fit is too far from its minimum (estimated error "
         f"{error:.1e}, limit {_NOT_FOUND:g})",
     )
-
-
-def on_bars(bars: ErrorBars | None) -> list[Verdict]:
-    """Verdict on error bars some of whose searches ended early."""
-    count = 0 if bars is None else bars.exactness["incomplete_searches"]
-    return [Verdict("uncertainty", incomplete_searches(count))] if count else []
 
 
 def _on_sign(test: OrientationTest) -> Verdict | None:

@@ -170,9 +170,9 @@ class WindowFit:
         excess = np.square(self.residuals) - np.square(low.residuals)
         blocks = in_blocks(np.nansum(excess, axis=0), _BLOCK)
         measured = in_blocks(np.isfinite(excess).any(axis=0).astype(int), _BLOCK) > 0
-        return bool(np.mean(blocks[measured] > 0) > _MOST)
+        return bool(measured.any() and np.mean(blocks[measured] > 0) > _MOST)
 
-    def odd(self) -> Bools:
+    def outliers(self) -> Bools:
         """Outliers, such as measurements of dust; none where there are so many that it is not."""
         squares: Array = np.square(self.residuals)
         odd = np.asarray(squares > _ODD**2 * np.nanmedian(squares))
