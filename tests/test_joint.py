@@ -15,8 +15,8 @@ import pytest
 import equipix
 from equipix import Flag, reference, simulate
 from equipix.errors import (
-    DriftWarning,
     ConvergenceWarning,
+    DriftWarning,
     IdentifiabilityWarning,
     InputError,
     MisfitWarning,
