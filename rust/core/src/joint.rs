@@ -30,6 +30,7 @@ mod survey;
 mod system;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod unknowns;
 mod wide;
 

@@ -2,7 +2,7 @@
 
 use super::flux::Fluxes;
 use super::layout::Grid;
-use super::rim::Rim;
+use super::rim::{NEAR, Rim};
 use super::system::System;
 use super::unknowns::State;
 use crate::control::Control;
@@ -107,8 +107,9 @@ fn the_rim_is_where_a_cell_near_has_less_than_a_sixth() {
         let weight = |row: usize, col: usize| normal[row * cols + col].iter().sum::<f64>();
         let is_rim = |cell: usize| {
             let (row, col) = (cell / cols, cell % cols);
-            let near = |at: usize, size: usize| (at + 1).saturating_sub(3)..(at + 3).min(size);
-            let inside = row >= 2 && col >= 2 && row + 2 < rows && col + 2 < cols;
+            let near = |at: usize, size: usize| at.saturating_sub(NEAR)..(at + NEAR + 1).min(size);
+            let end = |at: usize, size: usize| at < NEAR || at + NEAR >= size;
+            let inside = !end(row, rows) && !end(col, cols);
             let mut around = near(row, rows).flat_map(|r| near(col, cols).map(move |c| (r, c)));
             let own = weight(row, col);
             own > 0.0 && (!inside || around.any(|(r, c)| weight(r, c) < own / 6.0))
