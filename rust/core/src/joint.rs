@@ -32,6 +32,7 @@ mod system;
 mod tests;
 mod tiles;
 mod unknowns;
+mod waves;
 mod wide;
 
 pub(crate) use first_beam::{Source, first_beam};

@@ -15,6 +15,11 @@ const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
 const BAND: usize = 32;
 
+/// The symbol of GᵀG along one axis.
+pub(super) fn bent(q: f64) -> f64 {
+    (2.0 * (q / 2.0).sin()).powi(8)
+}
+
 pub(crate) struct Penalty {
     shape: Shape,
     pub(crate) tau: f64,
