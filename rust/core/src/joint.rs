@@ -16,6 +16,8 @@ mod bands;
 mod first_beam;
 mod flux;
 mod freedom;
+mod fused;
+mod fused_kernel;
 mod kernel;
 mod layout;
 mod memory;
