@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 import equipix
 from equipix import io
+from equipix._types import Method
 from equipix.calibration.saved import FORMAT
 from equipix.errors import ConvergenceWarning, FileError, InputError, ShiftRoundingWarning
+from equipix.exposures.options import FitOptions
+from equipix.exposures.positions import Positions
+from equipix.shifts import Rounding
 
 CROSS = equipix.cross_pattern(2, 3)
 
@@ -111,12 +117,29 @@ def test_an_unmet_tolerance_says_what_would_meet_it():
 
 def test_a_rounded_shift_is_named_with_what_to_do():
     with pytest.warns(ShiftRoundingWarning, match=r"exposure 2 \(from 0\) is .*0\.3.* move the"):
-        equipix.calibrate(
+        cal = equipix.calibrate(
             frames(),
             with_value(CROSS, (2, 0), 0.3),
             method="coordinate-descent",
             tolerance=1e-3,
         )
+    assert [verdict.kind for verdict in cal.verdicts] == ["rounding"]
+    np.testing.assert_array_equal(cal.shifts, with_value(CROSS, (2, 0), 0))
+
+
+@pytest.mark.parametrize(
+    ("shift", "std", "noticeable"),
+    [(0.019, 0, False), (0.021, 0, True), (0.059, 0.02, False), (0.061, 0.02, True)],
+)
+def test_a_rounding_within_0_02_pixel_or_three_standard_errors_is_none(shift, std, noticeable):
+    positions = Positions.of(with_value(CROSS, (3, 1), shift))
+    rounding = positions.whole(np.full((5, 2), std)).rounding
+    assert rounding == (Rounding(3, [CROSS[3, 0], shift]) if noticeable else None)
+
+
+def test_the_core_decides_which_method_needs_whole_shifts():
+    needs = {method: FitOptions(method).whole_shifts for method in get_args(Method)}
+    assert needs == {"multiscale": False, "coordinate-descent": True}
 
 
 def test_any_number_of_sweeps_may_be_allowed():

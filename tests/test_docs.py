@@ -24,7 +24,7 @@ from pydantic import BaseModel
 import equipix
 from equipix import simulate
 from equipix.calibration.verdicts import _CATEGORIES as CATEGORIES
-from equipix.cli import app
+from equipix.cli.app import app
 from equipix.experiment.manifest import Manifest
 
 if TYPE_CHECKING:

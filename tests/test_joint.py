@@ -132,7 +132,7 @@ class TestReference:
     @pytest.mark.parametrize("flux", [None, np.full(5, 2.0)])
     def test_one_level_cannot_tell_gain_from_offset(self, flux):
         frames, measured = small(2, SMALL_CROSS)
-        with pytest.raises(InputError, match="offset and gain cannot be told apart"):
+        with pytest.raises(InputError, match="offset and gain are degenerate"):
             equipix.calibrate(frames, SMALL_CROSS, flux=flux, dark="fit", **measured)
 
     def test_a_pixel_with_one_measurement_tells_no_offset(self):
@@ -290,6 +290,23 @@ class TestFluxes:
         tilt = slope(np.log(steady.sensitivity / truth))
         # What is not affine leaves residuals, not tilts, but for some percent at edges.
         np.testing.assert_allclose(tilt, -affine, atol=0.1 * np.abs(affine).max())
+
+    def test_the_tilt_of_the_gauge_is_that_of_the_result(self):
+        # A part of weak response and a dead pixel count for neither.
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        truth[:16, :16] *= 0.3
+        truth[30, 40] = 0
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.01, 0.99, 1.02, 0.98]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        frames += 1e-3 * np.random.default_rng(4).standard_normal(frames.shape)
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit")
+        assert (cal.flags[:16, :16] == 0).all()
+        assert (cal.sensitivity[:16, :16] < 0.5).all()
+        assert cal.flags[30, 40] != 0
+        # Sums of 3072 terms of size 1, in double precision.
+        assert np.abs(cal.tilt).max() < 1e-13
 
     def test_a_monitor_limits_the_tilt(self):
         monitor = 1e-4

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -141,3 +142,33 @@ equipix.calibrate(frames, {CROSS.tolist()}, tolerance=1e-3, workers=1)
 """
     done = run(code)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("options", "stacks", "masks", "images"),
+    [
+        ({"variance": equipix.NoiseModel(1e-3, 1e-9)}, 2, 0, 6),
+        ({"robust": True}, 2, 5, 12),
+        ({"variance": equipix.NoiseModel(1e-3, 1e-9), "robust": True}, 4, 5, 12),
+    ],
+    ids=["noise model", "robust", "both"],
+)
+def test_numpy_takes_little_beside_the_data(options, stacks, masks, images):
+    """Weights that depend on the fit take a few arrays of the data's size, the rest one by one.
+
+    Beside the data: `stacks` of its size and dtype (variances at two fits; the deviations of values
+    used and left out), `masks` of its size, and `images` of one exposure in float64.
+    """
+    shape, shifts = (320, 400), equipix.cross_pattern(5, 7)
+    beam = equipix.simulate.gaussian_beam(shape)
+    frames = equipix.simulate.exposures(np.ones(shape), beam, shifts)
+    frames += 1e-3 * np.random.default_rng(1).standard_normal(frames.shape)
+    frames = frames.astype(np.float32)
+    tracemalloc.start()
+    try:
+        equipix.calibrate(frames, shifts, tolerance=1e-2, **options)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    ceiling = stacks * frames.nbytes + masks * frames.size + images * 8 * frames[0].size
+    assert stacks * frames.nbytes < peak < ceiling

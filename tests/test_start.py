@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pickle
 import resource
+import signal
 import subprocess
 import sys
+import time
 from importlib import import_module
 
 import numpy as np
@@ -13,13 +15,14 @@ import pytest
 from typer.main import get_command as typer_command
 
 import equipix
-from equipix.cli import app, main
-from equipix.cli.app import COMMANDS
+from equipix.cli import main
+from equipix.cli.app import COMMANDS, app
 from equipix.cli.app import command as real_command
 
 HELP = "from equipix.cli import main; main(['--help'])"
 EAGER = """
 import sys
+import time
 before = set(sys.modules)
 {}
 print(*sorted(set(sys.modules) - before))
@@ -92,9 +95,22 @@ def test_the_help_costs_little_more_than_numpy():
     assert cpu_seconds(HELP) <= 2.5 * cpu_seconds("import numpy")
 
 
-def test_the_import_loads_numpy_and_the_extension_only():
-    found = {name for name in loaded_by("import equipix") if name.split(".")[0] != "numpy"}
-    assert found == {"equipix", "equipix._native"}
+def test_the_import_loads_nothing_else():
+    assert loaded_by("import equipix") == {"equipix"}
+
+
+COMMAND = "import sys\nfrom equipix.cli import main\nsys.exit(main(['--help']))"
+
+
+@pytest.mark.parametrize("after_s", np.arange(0, 0.4, 0.05))
+def test_ctrl_c_while_the_command_starts_leaves_no_traceback(after_s):
+    """Before line 2 is reached Python itself starts, and writes its own traceback."""
+    with subprocess.Popen([sys.executable, "-c", COMMAND], stderr=subprocess.PIPE) as process:
+        time.sleep(after_s)
+        process.send_signal(signal.SIGINT)
+        _, written = process.communicate(timeout=60)
+    assert b'"<string>", line 2' not in written
+    assert b"equipix" not in written
 
 
 def test_the_help_loads_no_command():

@@ -1,17 +1,20 @@
 """Pixel sensitivity of image sensors, measured without a uniform light source.
 
-Importing the package loads NumPy and the compiled part; every public name is loaded on first use.
+Importing the package loads nothing else; every public name is loaded on first use.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
-from equipix._native import __version__
+TYPE_CHECKING = False
+"""As `typing.TYPE_CHECKING`, whose import would take longer than all else here."""
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from equipix import errors, plan, simulate, uncertainty
+    from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
     from equipix.calibration.result import Calibration
@@ -35,6 +38,7 @@ _HOMES = {
     "NoiseModel": "noise",
     "ShiftMeasurement": "shifts",
     "Spot": "shifts",
+    "__version__": "_native",
     "average": "frames",
     "calibrate": "calibration.calibrate",
     "compare": "comparison",

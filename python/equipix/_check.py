@@ -118,6 +118,16 @@ def number(name: str, value: float) -> float:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
 
 
+def as_level(saturation: float | None) -> float | None:
+    """The saturation level, checked; None where there is none."""
+    if saturation is None:
+        return None
+    level = number("saturation", saturation)
+    if not level > 0:
+        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0 in DN, or None")
+    return level
+
+
 def as_tolerance(value: float) -> float:
     """The largest relative error of the sensitivity, checked: it is below 1."""
     checked = number("tolerance", value)

@@ -16,8 +16,10 @@ __all__ = [
     "average_files",
     "file_format",
     "locate_spots",
+    "needs_whole_shifts",
     "planned_components",
     "read_file",
+    "slope_pixels",
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
@@ -114,8 +116,6 @@ class Fit:
     """What was found. `refinement` is "none", "not tried", "undetermined" or "refined"."""
 
     @property
-    def exposures(self) -> Exposures: ...
-    @property
     def sensitivity(self) -> NDArray[Any]: ...
     @property
     def beam(self) -> Beam: ...
@@ -187,6 +187,7 @@ def locate_spots(
     after: NDArray[Any],
     saturations: tuple[float | None, float | None],
 ) -> tuple[_Spot, _Spot]: ...
+def needs_whole_shifts(method: str) -> bool: ...
 def planned_components(
     shape: tuple[int, int],
     shifts: NDArray[Any],
@@ -194,3 +195,4 @@ def planned_components(
     rotation: list[int],
     mask: NDArray[Any] | None,
 ) -> tuple[NDArray[Any], list[int], int]: ...
+def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[Any]: ...

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._readonly import ReadOnly
+from equipix.errors import InputError
 from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ _BLOCK = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class Findings(ReadOnly):
     """Bad pixels found in the frames before any fit: maps (rows, cols) of bool, or None.
 
     Attributes
@@ -51,6 +53,33 @@ class Findings:
     dead: Bools | None = None
     hot: Bools | None = None
     noisy: Bools | None = None
+
+
+def refuse_saturated(which: str, values: Array, saturates: Bools, level: float | None) -> None:
+    """Refuse an exposure whose saturated values leave none to measure with.
+
+    Parameters
+    ----------
+    which : str
+        The exposure, in words.
+    values : ndarray, shape (rows, cols)
+        Its values.
+    saturates : ndarray of bool, shape (rows, cols)
+        Which of them saturate.
+    level : float or None
+        The saturation level in DN, where it is known.
+
+    Raises
+    ------
+    InputError
+        If pixels saturate, and no other one holds a finite value.
+    """
+    if saturates.any() and not (np.isfinite(values) & ~saturates).any():
+        raise InputError(
+            f"'frames': {np.mean(saturates):.1%} of the pixels of {which} reach the saturation "
+            f"level{'' if level is None else f' of {level:g} DN'} and none is left to measure "
+            "with: expose less, or correct 'saturation'"
+        )
 
 
 def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:
@@ -132,7 +161,7 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
     return noisy & seen
 
 
-def odd_responses(
+def response_outliers(
     sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.

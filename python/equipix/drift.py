@@ -91,7 +91,7 @@ def tilt_rms(tilt: ArrayLike) -> Floats:
     return np.asarray(np.hypot(along_rows, along_cols) / np.sqrt(12))
 
 
-def trend_told(shifts: NDArray[Any], times: NDArray[Any]) -> float:
+def distinct_trend(shifts: NDArray[Any], times: NDArray[Any]) -> float:
     """Share of the variance of a trend linear in time that is distinguished from a tilt.
 
     Parameters

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,14 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native, io
-from equipix._check import as_array, as_floats, naming_memory, positive_workers
+from equipix._check import as_array, as_floats, as_level, naming_memory, positive_workers
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError, UnsupportedFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
     from os import PathLike
 
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix._types import Progress
 
 _BATCH = 16  # frames handed over at once
 _BATCH_BYTES = 2**26
@@ -37,8 +39,8 @@ _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
 @dataclass(frozen=True, eq=False)
-class FrameStatistics:
-    """Mean and scatter of repeated frames of one scene.
+class FrameStatistics(ReadOnly):
+    """Mean and scatter of repeated frames of one scene, as read-only arrays.
 
     Attributes
     ----------
@@ -76,7 +78,7 @@ def average(
     dark: FrameStatistics | ArrayLike | None = None,
     saturation: float | None = None,
     workers: int | None = None,
-    progress: Callable[[int, int, str], object] | None = None,
+    progress: Progress | None = None,
 ) -> FrameStatistics:
     r"""Mean and variance of each pixel over any number of repeated frames.
 
@@ -138,7 +140,7 @@ def average(
     (array([[2., 2.]]), array([[2., 0.]]))
     """
     workers = positive_workers(workers)
-    level = _level(saturation)
+    level = as_level(saturation)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     frames = _paths_or_frames(source)
     with naming_memory("averaging"):
@@ -209,18 +211,6 @@ def _of_pages(pages: dict[str, NDArray[Any]], before: str = "") -> FrameStatisti
     return FrameStatistics(mean, variance, of_mean, count, saturated)
 
 
-def _level(saturation: float | None) -> float | None:
-    if saturation is None:
-        return None
-    try:
-        level = float(saturation)
-    except (TypeError, ValueError):
-        level = math.nan
-    if not level > 0:
-        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0 in DN, or None")
-    return level
-
-
 def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
     """Paths as a list, an array as it is, other iterables as an iterator."""
     if np.ma.is_masked(source):
@@ -251,7 +241,7 @@ def _average_files(
     names: list[Any],
     level: float | None,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: Progress | None,
 ) -> tuple[NDArray[Any], ...]:
     paths = io.find_files(names)
     try:
@@ -299,7 +289,7 @@ def _average_batches(
     batches: Iterator[NDArray[Any]],
     level: float | None,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: Progress | None,
     total: int,
 ) -> tuple[NDArray[Any], ...]:
     first = next(batches)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from equipix import _native
-from equipix._check import as_array, as_shifts
-from equipix.errors import InputError, ShiftRoundingWarning, warn
+from equipix._check import as_array, as_level, as_shifts
+from equipix.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -171,8 +171,26 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     return np.array([(0, 0), (0, first), (0, second), (first, 0), (second, 0)], dtype=np.int64)
 
 
-def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.int64]:
-    """Shifts rounded to whole pixels, with a warning where that changes them noticeably.
+class Rounding(NamedTuple):
+    """The shift (row, col) of an exposure, in pixels, before it was rounded to whole ones."""
+
+    exposure: int
+    shift: list[float]
+
+    @property
+    def message(self) -> str:
+        """What was rounded, the limit and the remedy."""
+        return (
+            f"shifts are rounded to whole pixels: that of exposure {self.exposure} (from 0) is "
+            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole): use "
+            "method='multiscale', or move the sensor by whole pixels"
+        )
+
+
+def round_shifts(
+    shifts: ArrayLike, std: ArrayLike | None = None
+) -> tuple[NDArray[np.int64], Rounding | None]:
+    """Shifts rounded to whole pixels, and the largest rounding that is noticeable.
 
     Parameters
     ----------
@@ -183,33 +201,25 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
 
     Returns
     -------
-    ndarray, shape (n, 2), int64
+    whole : ndarray, shape (n, 2), int64
         The nearest whole shifts.
+    rounding : Rounding or None
+        Where a shift is more than 0.02 pixel and more than three standard errors from whole.
 
     Raises
     ------
     InputError
         If a shift is not a finite number.
-
-    Warns
-    -----
-    ShiftRoundingWarning
-        If a shift is more than 0.02 pixel and more than three standard errors from whole.
     """
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
     exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
     whole = np.rint(exact)
     known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
-    noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
-    if noticeable.any():
-        worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
-        warn(
-            f"shifts are rounded to whole pixels: that of exposure {worst[0]} (from 0) is "
-            f"{np.round(exact[worst[0]], 3).tolist()} (limit {_UNNOTICED:g} from whole): use "
-            "method='multiscale', or move the sensor by whole pixels",
-            ShiftRoundingWarning,
-        )
-    return whole.astype(np.int64)
+    change = np.abs(exact - whole)
+    change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
+    worst = int(change.max(axis=1).argmax())
+    rounding = Rounding(worst, exact[worst].tolist()) if change[worst].any() else None
+    return whole.astype(np.int64), rounding
 
 
 def _frames(name: str, values: ArrayLike) -> NDArray[Any]:
@@ -225,8 +235,4 @@ def _saturation(values: ArrayLike, saturation: float | None) -> float | None:
     if saturation is None:
         dtype = np.asarray(values).dtype
         return float(np.iinfo(dtype).max) if dtype.kind in "iu" else None
-    if isinstance(saturation, bool) or not isinstance(saturation, int | float | np.number):
-        raise InputError(f"'saturation' is {saturation!r}, expected a level in DN or None")
-    if np.isnan(saturation):
-        raise InputError("'saturation' is NaN, expected a level in DN or None")
-    return float(saturation)
+    return as_level(saturation)

@@ -139,6 +139,24 @@ fn refined_shifts() {
     }
 }
 
+#[test]
+fn refined_shifts_that_cross_a_whole_number() {
+    // There a pixel comes to see other cells, on each side of the margin of its turned view.
+    let truth = [[0.0, 0.0], [0.98, 2.27], [-0.02, 1.98], [1.73, 0.98], [3.38, -0.29]];
+    let measured = [[0.0, 0.0], [1.03, 2.24], [0.03, 2.03], [1.7, 1.03], [3.36, -0.27]];
+    for degrees in [[0, 90, 180, 270, 0], [0, 270, 90, 180, 0]] {
+        let simulation = noisy(LONG, &truth).with_noise(1e-4, 3).turned(&degrees);
+        let simulation = Simulation { beam: rolling, ..simulation };
+        let experiment = Experiment {
+            shifts: measured.to_vec(),
+            shift_std: Some(SHIFT_STD.to_vec()),
+            ..simulation.experiment()
+        };
+        check_one(&experiment);
+        check_shifts(&experiment, &truth);
+    }
+}
+
 /// Refined shifts are off the truth by what their standard deviations say, less what all have in common: the
 /// mean by the prior's weights. Ten values seldom hold one beyond four of them.
 fn check_shifts(experiment: &Experiment, truth: &[[f64; 2]]) {
@@ -246,6 +264,23 @@ fn free_fluxes_leave_the_tilt_to_the_gauge() {
         let logs = DRIFT.iter().zip(&CROSS).map(|(c, d)| c.ln() - along(d));
         check_fluxes(&simulation, &answer, &logs.collect::<Vec<_>>());
     }
+}
+
+#[test]
+fn a_pixel_without_an_offset_does_not_count_for_the_slope_of_the_gauge() {
+    let experiment = noisy(SMALL, &CROSS).at_two_levels().experiment().with_lamp(Lamp::Free);
+    let (pixels, lost) = (SMALL[0] * SMALL[1], 10);
+    // One measurement of a pixel is left, which determines no offset.
+    let mask = (0..experiment.frames.len()).map(|i| i >= pixels && i % pixels == lost).collect();
+    let experiment = Experiment { mask, ..experiment };
+    let answer = fit(&experiment, Options::to(TOLERANCE)).unwrap();
+    assert!(answer.leaves_tilt && answer.sensitivity[lost].is_nan());
+    let known = answer.sensitivity.iter().map(|m| if m.is_finite() { *m } else { 0.0 });
+    let logs: Vec<f64> =
+        answer.sensitivity.iter().map(|m| if m.is_finite() { m.ln() } else { 0.0 }).collect();
+    let slope = Gauge::new(&experiment, &known.collect::<Vec<_>>()).slope(&logs);
+    // Sums of 71 logarithms of up to a tenth, of a normal matrix whose condition is some thousand.
+    assert!(slope.iter().all(|slope| slope.abs() < 1e4 * f64::EPSILON), "{slope:?}");
 }
 
 #[test]

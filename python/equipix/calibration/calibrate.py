@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix import _native
 from equipix.calibration import verdicts
-from equipix.calibration.error_bars import dark_std, error_bars
+from equipix.calibration.error_bars import standard_deviations
 from equipix.calibration.options import Options, is_to_be_fitted
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.result import Calibration
@@ -60,7 +60,8 @@ def calibrate(
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
         `FrameStatistics` contain their noise: the weights come from a noise model fitted over all
-        pixels, not from each pixel's own sample variance. A mean with saturated samples is left
+        pixels, not from each pixel's own sample variance; single frames show no noise, and without
+        `variance` all their weights are 1. A mean with saturated samples is left
         out of its exposure, and the pixel is flagged ``SATURATED``; it keeps the sensitivity that
         the other exposures determine. Dead, hot and noisy pixels are masked and flagged, the hot
         ones where `equipix.average` was given the dark frames as `FrameStatistics`.
@@ -205,8 +206,9 @@ def calibrate(
         rotation=rotation,
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
-        whole=method == "coordinate-descent",
     )
+    if fit_options.whole_shifts:
+        exposures = exposures.whole()
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 
@@ -217,7 +219,7 @@ def calibrated(
     start: Fit | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars.
+    """Calibrate from exposures: weights, fit, sign, flags, error bars, verdicts.
 
     The fit starts from `start`; `provenance` is added to the metadata.
     """
@@ -227,11 +229,10 @@ def calibrated(
     weighted = weighted_fit(exposures, options, start)
     test = shift_sign(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
-    dark = dark_std(weighted, options.fit)
+    wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
+    bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
     found = verdicts.on_fit(weighted, options, test, dark)
     verdicts.say(found)
-    wanted = options.uncertainty and all(verdict.kind != "uncertainty" for verdict in found)
-    bars = error_bars(weighted, flags, options.fit) if wanted else None
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,

@@ -8,13 +8,12 @@ import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
 from equipix.errors import InputError
-from equipix.flags import determined, usable
-from equipix.maps import tilt_weights
+from equipix.maps import slope_pixels, tilt_weights
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from equipix._native import Fit
+    from equipix._native import Fit, Uncertainty
     from equipix._types import Array, Bools, Floats, Progress
     from equipix.calibration.weights import Weighted
     from equipix.exposures.options import FitOptions
@@ -47,51 +46,55 @@ class DarkStd(NamedTuple):
     of_a_pixel: float | None
 
 
-def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBars:
-    """Standard deviations of sensitivity, tilt and shifts, in one set-up of the linear problem."""
+def standard_deviations(
+    weighted: Weighted, flags: Array, options: FitOptions, *, wanted: bool
+) -> tuple[ErrorBars | None, DarkStd | None]:
+    """Standard deviations of sensitivity, tilt and shifts if `wanted`, and of a fitted dark.
+
+    That of a dark which was fitted together with fluxes is always given: a verdict needs it. All
+    are questions of one call, which sets up the linear problem once.
+    """
     exposures, fit, _ = weighted
+    asks_dark = exposures.offset and exposures.flux.kind != "known"
+    if asks_dark and not wanted and not np.isfinite(weighted.noise_variance):
+        return None, DarkStd(None, None)
+    if not (wanted or asks_dark):
+        return None, None
     scale = noise_scale(weighted)
-    weights = tilt_weights(usable(flags) & determined(fit.sensitivity, flags))
-    asks_tilt = not fit.leaves_tilt and bool(np.isfinite(weights).all())
+    weights = tilt_weights(slope_pixels(fit.sensitivity, flags))
+    asks_tilt = wanted and not fit.leaves_tilt and bool(np.isfinite(weights).all())
     refined = fit.refinement == "refined"
-    with naming_memory("the error map"):
+    with naming_memory("the error map" if wanted else "the standard deviation of the dark"):
         answer = fit.uncertainty(
-            error_map=True,
+            error_map=wanted,
             functionals=of_logarithm(weights, fit) if asks_tilt else None,
-            shifts=refined,
-            offset=False,
+            shifts=wanted and refined,
+            offset=asks_dark,
             workers=options.workers,
-            progress=options.progress,
+            progress=options.progress if wanted else None,
         )
+    dark = _of_dark(weighted, answer, scale) if asks_dark else None
+    return _error_bars(weighted, answer, scale) if wanted else None, dark
+
+
+def _error_bars(weighted: Weighted, answer: Uncertainty, scale: float) -> ErrorBars:
+    """Standard deviations of sensitivity, tilt and shifts from the answers for unit weights."""
+    exposures, fit, _ = weighted
     std = scale * cast("Floats", answer.std)
-    tilt = _std(scale, answer.variances) if asks_tilt else None
-    shifts = _std(scale, answer.shift_variances) if refined else exposures.positions.std
+    unknown = np.full(2, np.inf if fit.leaves_tilt else np.nan)
+    refined = answer.shift_variances is not None
     return ErrorBars(
         sensitivity=np.asarray(std, exposures.values.dtype),
-        tilt=np.full(2, np.inf if fit.leaves_tilt else np.nan) if tilt is None else tilt,
-        shifts=shifts,
+        tilt=unknown if answer.variances is None else _std(scale, answer.variances),
+        shifts=_std(scale, answer.shift_variances) if refined else exposures.positions.std,
         exactness={"draws": answer.draws, "relative_standard_error": answer.exactness},
     )
 
 
-def dark_std(weighted: Weighted, options: FitOptions) -> DarkStd | None:
-    """Uncertainty of a dark that was fitted together with fluxes; None for any other."""
-    exposures, fit, _ = weighted
-    if not exposures.offset or exposures.flux.kind == "known":
-        return None
-    if not np.isfinite(weighted.noise_variance):
-        return DarkStd(None, None)
-    with naming_memory("the standard deviation of the dark"):
-        answer = fit.uncertainty(
-            error_map=False,
-            functionals=None,
-            shifts=False,
-            offset=True,
-            workers=options.workers,
-            progress=None,
-        )
-    along, alone = _std(noise_scale(weighted), answer.offset_variances).tolist()
-    return DarkStd(along if fit.ended == "converged" else None, alone)
+def _of_dark(weighted: Weighted, answer: Uncertainty, scale: float) -> DarkStd:
+    """Uncertainty of a fitted dark from the answers for unit weights."""
+    along, alone = _std(scale, answer.offset_variances).tolist()
+    return DarkStd(along if weighted.fit.ended == "converged" else None, alone)
 
 
 def noise_scale(weighted: Weighted) -> float:
@@ -148,25 +151,7 @@ def functional_std(
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:
-    """Weights of a functional as (m, rows, cols), 0 wherever ln M is undetermined.
-
-    Parameters
-    ----------
-    weights : array_like, shape (rows, cols) or (m, rows, cols)
-        Weights of the pixels.
-    determined : ndarray of bool, shape (rows, cols)
-        Where ln M is known.
-
-    Returns
-    -------
-    ndarray, shape (m, rows, cols), float64
-        The weights.
-
-    Raises
-    ------
-    InputError
-        If they do not fit the sensor, or are not finite, or not 0 in such a pixel.
-    """
+    """Weights of functionals as (m, rows, cols), which must be 0 where ln M is undetermined."""
     array = as_array("weights", weights, ndim=(2, 3)).astype(np.float64, copy=False)
     if array.shape[-2:] != determined.shape:
         raise InputError(f"'weights' has shape {array.shape}, the sensor {determined.shape}")

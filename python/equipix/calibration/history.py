@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from equipix._readonly import ReadOnly
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
-class History:
+class History(ReadOnly):
     """The course of a calibration: its state after some of its sweeps.
 
     Attributes

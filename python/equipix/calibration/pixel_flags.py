@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.defects import odd_responses
+from equipix.defects import response_outliers
 from equipix.flags import set_bits
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
     exposures, fit, rejected = weighted
     flags: Array = fit.flags.copy()
     sensitivity = fit.sensitivity.astype(exposures.values.dtype, copy=False)
-    dead, hot = odd_responses(sensitivity, lambda: _std(weighted, options.workers))
+    dead, hot = response_outliers(sensitivity, lambda: _std(weighted, options.workers))
     set_bits(flags, "dead", dead | (sensitivity <= options.tolerance))
     set_bits(flags, "hot", hot)
     for finding, pixels in vars(exposures.findings).items():

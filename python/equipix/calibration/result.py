@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix._check import check_count, check_progress, per_exposure
 from equipix._native import Beam
+from equipix._readonly import ReadOnly
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
 from equipix.calibration.saved import read_fields, save_fields
@@ -18,8 +19,8 @@ from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
 from equipix.exposures.positions import Positions
-from equipix.flags import determined, usable
-from equipix.maps import tilt
+from equipix.flags import determined
+from equipix.maps import slope_pixels, tilt
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration:
-    """Calibrated sensor: the result of `calibrate`.
+class Calibration(ReadOnly):
+    """Calibrated sensor, the result of `calibrate`; its arrays are read-only.
 
     Attributes
     ----------
@@ -211,16 +212,16 @@ class Calibration:
 
     @property
     def tilt(self) -> NDArray[Any]:
-        """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
+        """Least-squares slope of ln M, edge to edge (row, col); NaN where it is undetermined.
 
-        Valid are pixels without ``DO_NOT_USE``; NaN where they determine no slope.
+        Pixels count whose M is determined, from half to twice the mean of such, and not flagged
+        ``UNRELIABLE_FLAT``. Where free fluxes leave the tilt undetermined it is 0.
         """
-        valid = usable(self.flags) & determined(self.sensitivity, self.flags)
-        return tilt(self.sensitivity, valid)
+        return tilt(self.sensitivity, slope_pixels(self.sensitivity, self.flags))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the compiled fit, which cannot be pickled."""
-        return {**vars(self), "weighted": None}
+        return vars(self) | {"weighted": None}
 
     def __copy__(self) -> Self:
         """Return a copy that keeps the fit."""
@@ -465,10 +466,9 @@ class Calibration:
 
     def _signal(self, shift: list[float], rotation: int, flux: float) -> NDArray[Any]:
         """Frame c · L(u) · M(p) from a position, in the dtype of the sensitivity."""
-        row, col = shift
-        tilt = self.beam_tilt.tolist()
-        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
-        light = beam.light(self.shape, (row, col), rotation, workers=None)
+        slope = self.beam_tilt.tolist()
+        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=slope)
+        light = beam.light(self.shape, (shift[0], shift[1]), rotation, workers=None)
         return np.asarray(flux * light * self.sensitivity, self.sensitivity.dtype)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:

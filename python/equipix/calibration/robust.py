@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix._native import Fit
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
     from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 
@@ -58,13 +58,15 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions)
     that no longer deviates is used again, and so are those of a pixel that would have no M.
     """
     new, old = deviations(exposures, fit, before, options)
-    leading = np.where(before, 0, np.nan_to_num(new))
+    result = before & ~(old <= _NEAR)
+    del old
+    leading = np.nan_to_num(new, copy=False)
+    leading[before] = 0
     by_pixel = leading.max(axis=0)
     by_cell = np.zeros(fit.beam.values.shape, leading.dtype)
     for k, each in enumerate(leading):
         seen = exposures.cells(by_cell, fit, k)
         np.maximum(seen, each, out=seen)
-    result = before & ~(old <= _NEAR)
     # A pixel may lose its connections by mistake while larger deviations mask the false values:
     # then all its measurements are used again.
     result[:, np.isnan(fit.sensitivity)] = False
@@ -111,36 +113,48 @@ def deviations(
     """
     shape, flux = exposures.shape, fit.flux
     response = np.nan_to_num(fit.sensitivity).astype(np.float64)
-    usable = exposures.usable()
-    on_pixels, on_cells = np.zeros(shape), np.zeros(fit.beam.values.shape)
-    seen = [np.nan_to_num(exposures.light(fit, k, options.workers)) for k in range(len(exposures))]
-    weights = [
-        _weights(exposures.variance, k, usable[k] & (seen[k] * response != 0))
-        for k in range(len(exposures))
-    ]
-    for k, light in enumerate(seen):
-        weight = np.where(left_out[k], 0, weights[k])
-        on_pixels += weight * light**2
+    on_pixels = fit.information(workers=options.workers)
+    on_cells = np.zeros(fit.beam.values.shape)
+    # Light and weights are computed twice: of all exposures they are four times the data.
+    for k in range(len(exposures)):
+        light, weight = _seen(exposures, fit, k, response, options.workers)
+        weight[left_out[k]] = 0
         exposures.cells(on_cells, fit, k)[:] += weight * (flux[k] * response) ** 2
     new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
-    for k, light in enumerate(seen):
-        shares = (
-            _share(weights[k] * light**2, on_pixels),
-            _share(weights[k] * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
+    for k in range(len(exposures)):
+        light, weight = _seen(exposures, fit, k, response, options.workers)
+        spread = _spread(
+            _share(weight * light**2, on_pixels),
+            _share(weight * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
+            left_out[k],
         )
-        sign = np.where(left_out[k], 1, -1)
-        spread = (1 + sign * shares[0]) * (1 + sign * shares[1])
-        known = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
-        expected = light * response
+        known = (weight > 0) & (spread > _TESTABLE)  # NaN is not
+        light *= response
+        root = np.sqrt(weight, out=weight)
         residual = np.full(shape, np.nan)
-        root = np.sqrt(weights[k])
-        scaled = (root * (exposures.values[k] - expected))[known] / np.sqrt(spread[known])
+        scaled = (root * (exposures.values[k] - light))[known] / np.sqrt(spread[known])
         residual[known] = scaled
         used = known & ~left_out[k]
-        least = options.tolerance * _median(root * expected, known)
+        least = options.tolerance * _median(root * light, known)
         residual /= max(_ROBUST * _median(residual, used), least, np.finfo(float).tiny)
+        del light, weight, root, spread, scaled
         new[k], old[k] = _conspicuous(residual, used, known)
     return new, old
+
+
+def _seen(
+    exposures: Exposures, fit: Fit, exposure: int, response: Floats, workers: int | None
+) -> tuple[Floats, Floats]:
+    """Light on each pixel in an exposure, and the weights of what may be used there."""
+    light = np.nan_to_num(exposures.light(fit, exposure, workers), copy=False)
+    used = exposures.usable(exposure) & (light * response != 0)
+    return light, _weights(exposures.variance, exposure, used)
+
+
+def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
+    """Variances of residuals in σ², from the shares of their noise that M and L take."""
+    sign = np.where(left_out, 1, -1)
+    return np.asarray((1 + sign * of_pixel) * (1 + sign * of_cell))
 
 
 def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
@@ -175,7 +189,7 @@ def _share(own: NDArray[Any], total: NDArray[Any]) -> NDArray[Any]:
 
 def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
     chosen = np.abs(values[where])
-    return float(np.median(chosen)) if chosen.size else 0.0
+    return float(np.median(chosen, overwrite_input=True)) if chosen.size else 0.0
 
 
 def _box(image: NDArray[Any]) -> NDArray[Any]:

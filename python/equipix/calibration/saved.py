@@ -43,24 +43,7 @@ _OPTIONAL = _MAYBE | _SPLINE
 
 
 def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
-    """Write the fields of a `Calibration` to a file that `read_fields` reads.
-
-    Parameters
-    ----------
-    path : path
-        The file; its suffix names the format.
-    fields : mapping
-        The attributes of a `Calibration` by name.
-    force : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `force` is not set, or it cannot be written.
-    InputError
-        If the suffix is unknown.
-    """
+    """Write the attributes of a `Calibration` to a file; see `Calibration.save`."""
     content = {
         "format": FORMAT,
         "kind": KIND,
@@ -73,21 +56,9 @@ def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: 
 def read_fields(
     path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
 ) -> dict[str, Any]:
-    """Make the fields of a `Calibration` of what `save_fields` wrote.
+    """Make the attributes of a `Calibration` of the arrays and metadata that `save_fields` wrote.
 
-    Parameters
-    ----------
-    path : path
-        The file they are from.
-    pages : mapping of str to ndarray
-        Its arrays by name.
-    content : dict
-        Its metadata.
-
-    Returns
-    -------
-    dict
-        The attributes of a `Calibration` by name; ``history`` holds those of a `History`.
+    ``history`` holds the attributes of a `History`.
 
     Raises
     ------

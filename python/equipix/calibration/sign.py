@@ -37,7 +37,7 @@ _FINER, _MOST_FINE = 0.3, 100
 _ROUNDS = 4
 """Rounds of finer fits, and of leaving out outliers."""
 
-_ODD = 30.0
+_OUTLIER = 30.0
 """Median absolute residuals, 20 standard deviations: no noise, nor the waves of a wrong sign."""
 
 _BLOCK, _MOST = 4, 2 / 3
@@ -165,9 +165,9 @@ def _residuals(windows: list[Exposures], options: FitOptions) -> list[_Residuals
 
     found = [fit(0), fit(1)]
     for _ in range(_ROUNDS):
-        odd = _odd(found)
-        if odd.any():
-            windows = [window.without(odd) for window in windows]
+        outliers = _outliers(found)
+        if outliers.any():
+            windows = [window.without(outliers) for window in windows]
             found = [fit(0), fit(1)]
             continue
         unsettled = [k for k in (0, 1) if not (found[k].settled or found[k].stuck)]
@@ -225,13 +225,13 @@ def _sums_of_blocks(image: Array) -> Array:
     return image
 
 
-def _odd(fits: list[_Residuals]) -> Bools:
+def _outliers(fits: list[_Residuals]) -> Bools:
     """Outliers of one of the fits, such as measurements of dust."""
-    limits = [_ODD**2 * np.nanmedian(fit.squares) for fit in fits]
-    odd: Bools = np.any(
+    limits = [_OUTLIER**2 * np.nanmedian(fit.squares) for fit in fits]
+    outliers: Bools = np.any(
         [fit.squares > limit for fit, limit in zip(fits, limits, strict=True)], axis=0
     )
-    return odd
+    return outliers
 
 
 def _named(progress: Progress) -> Progress:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.drift import trend_told
+from equipix.drift import distinct_trend
 from equipix.errors import (
     ConvergenceWarning,
     EquipixWarning,
     IdentifiabilityWarning,
     MisfitWarning,
+    ShiftRoundingWarning,
     ShiftSignWarning,
     warn,
 )
@@ -41,6 +42,7 @@ _DEGENERATE = 0.1
 """Share of the variance of a drift below which the error of its size is over three times larger."""
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
+    "rounding": ShiftRoundingWarning,
     "order": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,
@@ -76,25 +78,36 @@ class Verdict:
 
 
 def say(verdicts: Iterable[Verdict]) -> None:
-    """Raise the warning of each; no other function warns of a result."""
+    """Raise the warning of each; no other function warns of a calibration."""
     for verdict in verdicts:
         warn(verdict.message, _CATEGORIES[verdict.kind])
 
 
 def on_plan(exposures: Exposures) -> list[Verdict]:
-    """Verdicts before any fit: whether a drift in time is degenerate with a tilt."""
+    """Verdicts before any fit."""
+    found = [_on_rounding(exposures), _on_order(exposures)]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def _on_rounding(exposures: Exposures) -> Verdict | None:
+    rounding = exposures.positions.rounding
+    return None if rounding is None else Verdict("rounding", rounding.message)
+
+
+def _on_order(exposures: Exposures) -> Verdict | None:
+    """Verdict on an order in which a drift in time is degenerate with a tilt."""
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
-        return []
-    share = trend_told(positions.shifts, times)
+        return None
+    share = distinct_trend(positions.shifts, times)
     if share >= _DEGENERATE:
-        return []
-    text = (
+        return None
+    return Verdict(
+        "order",
         f"in this order of exposures only {share:.1%} of the variance of a drift linear in time is "
         f"distinguishable from a tilt of the sensitivity (limit {_DEGENERATE:.0%}): take the "
-        "exposures in another order, see equipix.plan.advise_order"
+        "exposures in another order, see equipix.plan.advise_order",
     )
-    return [Verdict("order", text)]
 
 
 def on_fit(
@@ -114,11 +127,16 @@ def on_fit(
     return [verdict for verdict in found if verdict is not None]
 
 
+def is_too_far(fit: Fit) -> bool:
+    """Whether a fit is too far from its minimum for standard deviations."""
+    return fit.is_joint and not float(fit.error_estimate[-1]) <= _NOT_FOUND
+
+
 def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
     """Verdict on a fit that is too far from its minimum for standard deviations."""
-    error = float(fit.error_estimate[-1])
-    if not options.uncertainty or not fit.is_joint or error <= _NOT_FOUND:
+    if not (options.uncertainty and is_too_far(fit)):
         return None
+    error = float(fit.error_estimate[-1])
     return Verdict(
         "uncertainty",
         "no standard deviations: the fit is too far from its minimum (estimated error "

@@ -60,18 +60,19 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
         at_medians = (c * middle for c in exposures.flux.values)
         start = modelled(exposures, at_medians).fit(rough, start)
         exposures = modelled(exposures, expected(exposures, start, middle, options.fit.workers))
+    # The fit before goes, and with it the variances that it refers to.
+    start = exposures.fit(options.fit, start)
     if options.robust:
         return _robust_fit(exposures, options.fit, start, middle)
-    return Weighted(exposures, exposures.fit(options.fit, start), None)
+    return Weighted(exposures, start, None)
 
 
 def _robust_fit(
-    exposures: Exposures, options: FitOptions, start: Fit | None, middle: Floats | None
+    exposures: Exposures, options: FitOptions, fit: Fit, middle: Floats | None
 ) -> Weighted:
-    """Fit and leave out outliers, until nothing changes."""
+    """Leave out outliers and fit again, until nothing changes."""
     usable = exposures.usable()
     out = np.zeros_like(usable)
-    fit = exposures.fit(options, start)
     kept = exposures
     for _ in range(_MOST_ROUNDS):
         former, out = out, rejected(exposures, fit, out, options)

@@ -64,8 +64,8 @@ def command(name: str) -> Any:
     return get_group(module.commands).commands[name]
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; the exit status is 0, 1 (failed), 2 (usage) or 130 (Ctrl-C)."""
+def run(arguments: list[str] | None) -> None:
+    """Run the command line, errors and warnings as one line each."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", EquipixWarning)
         warnings.showwarning = show_warning

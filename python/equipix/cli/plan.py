@@ -11,7 +11,7 @@ from equipix.cli.terminal import check_output, progress_bars, show_result, show_
 from equipix.errors import InputError
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
-from equipix.plan import ErrorBudget, advise_order, error_budget, identify, suggest, trend_told
+from equipix.plan import ErrorBudget, advise_order, distinct_trend, error_budget, identify, suggest
 
 commands = typer.Typer()
 
@@ -105,9 +105,9 @@ def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
         "tilt_by_cause": {name: list(tilt) for name, tilt in budget.tilt_by_cause.items()},
         "worst_wave": list(budget.spectrum.worst),
         "smallest_eigenvalue": budget.spectrum.smallest,
-        "trend_told": budget.trend_told,
+        "distinct_trend": budget.distinct_trend,
         "order": order.tolist(),
-        "trend_told_in_order": trend_told(budget.shifts[order]),
+        "distinct_trend_in_order": distinct_trend(budget.shifts[order]),
     }
 
 
@@ -122,8 +122,8 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
         "equations / unknowns": lambda p: f"{p['equations']} / {p['unknowns']}",
         "worst wave, cycles per pixel": lambda p: "({:.3f}, {:.3f})".format(*p["worst_wave"]),
         "λ of it": lambda p: f"{p['smallest_eigenvalue']:.3f}",
-        "linear trend distinct from tilt": lambda p: f"{p['trend_told']:.1%}",
-        "  in the order advised": lambda p: f"{p['trend_told_in_order']:.1%}",
+        "linear trend distinct from tilt": lambda p: f"{p['distinct_trend']:.1%}",
+        "  in the order advised": lambda p: f"{p['distinct_trend_in_order']:.1%}",
     }
     patterns = [f"pattern {k + 1}" for k in range(len(plans))]
     show_table(

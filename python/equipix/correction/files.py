@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix._types import Flagged, Progress
-from equipix.errors import AlreadyCorrectedWarning, FileError, InputError
+from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
 from equipix.frames import average, load_statistics
 from equipix.io import (
     description,
@@ -136,11 +135,10 @@ def _warn_of_corrected(files: list[Path]) -> None:
     floats = [file for file in files if frame_format(file)[1].kind == "f"]
     if corrected := [file for file in floats if description(file) == _MARK]:
         others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
-        warnings.warn(
+        warn(
             f"{corrected[0]}{others}: corrected already; a second correction divides by the "
             "sensitivity twice: give the raw frames",
             AlreadyCorrectedWarning,
-            stacklevel=3,
         )
 
 

@@ -21,7 +21,6 @@ from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
 from equipix.frames import average
 from equipix.io import as_path, frame_format
-from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -225,7 +224,7 @@ class Experiment:
         exposures, noise = self._exposures(shifts, std, flux, fit_options)
         start = None
         moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
-        if moved and method == "multiscale":
+        if moved and not fit_options.whole_shifts:
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
@@ -239,19 +238,18 @@ class Experiment:
         self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
     ) -> tuple[Exposures, NoiseModel | None]:
         """The exposures from averaged frames and the file, and the noise model of one frame."""
-        whole = options.method == "coordinate-descent"
+        refined = std.any() and not options.whole_shifts
         averaged = self._average(options)
         exposures = exposures_of(
             averaged,
-            round_shifts(shifts, std) if whole else shifts,
-            shift_std=std if std.any() and not whole else None,
+            shifts,
+            shift_std=std if refined else None,
             flux=self._column("flux") if flux is None else flux,
             flux_std=self._column("flux_std") if flux is None else None,
             time=self._column("time") if flux == "linear" else None,
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
-            whole=whole,
         )
-        return exposures, averaged.noise
+        return exposures.whole(std) if options.whole_shifts else exposures, averaged.noise
 
     def _average(self, options: FitOptions) -> Averaged:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""
@@ -259,9 +257,14 @@ class Experiment:
         with naming_memory("averaging"):
             dark = self._statistics("dark", self.manifest.dark.frames, None, options)
             gain = self.manifest.sensor.gain_dn_per_e
-            averaged = Averaged(len(exposures), dtype=np.float32, gain=gain)
+            level = self.manifest.sensor.saturation_level
+            averaged = Averaged(len(exposures), dtype=np.float32, gain=gain, saturation=level)
             for each in exposures:
-                averaged.add(self._statistics(each.name, each.frames, dark, options))
+                statistics = self._statistics(each.name, each.frames, dark, options)
+                try:
+                    averaged.add(statistics, each.name)
+                except InputError as error:
+                    raise FileError(f"{self.path}: {error}") from error
         return averaged
 
     def _statistics(
@@ -277,16 +280,7 @@ class Experiment:
 
         level = self.manifest.sensor.saturation_level
         files = find_files(self.path, entry)
-        frames = average(
-            files, dark=dark, saturation=level, workers=options.workers, progress=report
-        )
-        if (frames.saturated > 0).all():
-            reached = "the largest value" if level is None else f"{level:g} DN"
-            raise FileError(
-                f"{self.path}: every pixel of '{name}' reaches the saturation level, {reached}: "
-                "correct 'bit_depth' or 'saturation' in [sensor], or expose less"
-            )
-        return frames
+        return average(files, dark=dark, saturation=level, workers=options.workers, progress=report)
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.defects import Findings, dead_pixels, hot_pixels, noisy_pixels
+from equipix.defects import (
+    Findings,
+    dead_pixels,
+    hot_pixels,
+    noisy_pixels,
+    refuse_saturated,
+)
 from equipix.errors import InputError
 from equipix.noise import NoiseModel, photon_transfer
 
@@ -32,6 +38,8 @@ class Averaged:
         Of the mean frames that are kept.
     gain : float, optional
         Gain of the camera where it is known, in DN per electron.
+    saturation : float, optional
+        Level that was averaged with, in DN, where it is known; for messages.
 
     Attributes
     ----------
@@ -43,9 +51,14 @@ class Averaged:
     """
 
     def __init__(
-        self, count: int, *, dtype: DTypeLike = np.float64, gain: float | None = None
+        self,
+        count: int,
+        *,
+        dtype: DTypeLike = np.float64,
+        gain: float | None = None,
+        saturation: float | None = None,
     ) -> None:
-        self.count, self.gain = count, gain
+        self.count, self.gain, self.saturation = count, gain, saturation
         self.dark: FrameStatistics | None = None
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
@@ -60,8 +73,8 @@ class Averaged:
             averaged.add(each)
         return averaged
 
-    def add(self, frames: FrameStatistics) -> None:
-        """Add the next exposure.
+    def add(self, frames: FrameStatistics, name: str = "") -> None:
+        """Add the next exposure, which may have a name.
 
         Raises
         ------
@@ -70,6 +83,8 @@ class Averaged:
         """
         exposure, shape = len(self._frames), frames.mean.shape
         if exposure == 0:
+            if frames.dark is not None:
+                self._refuse_saturated("the dark", frames.dark)
             self.values = np.empty((self.count, *shape), self._dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
@@ -84,11 +99,7 @@ class Averaged:
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        if saturates.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {exposure} saturates: expose less, or correct "
-                "the 'saturation' that they were averaged with"
-            )
+        self._refuse_saturated(f"exposure {exposure}{f' ({name!r})' if name else ''}", frames)
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
@@ -128,6 +139,9 @@ class Averaged:
         if noise is not None or self.dark is not None:
             dead = self._dead(noise) & ~hot
         return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
+
+    def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
+        refuse_saturated(which, frames.mean, frames.saturated > 0, self.saturation)
 
     def _dead(self, noise: NoiseModel | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""

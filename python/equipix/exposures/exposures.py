@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import naming_memory
+from equipix._readonly import ReadOnly
 from equipix.defects import Findings
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ _BLOCK = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Exposures:
-    """Exposures of one beam.
+class Exposures(ReadOnly):
+    """Exposures of one beam, as read-only arrays.
 
     Attributes
     ----------
@@ -75,11 +76,11 @@ class Exposures:
         rows, cols = self.values.shape[1:]
         return rows, cols
 
-    def usable(self) -> Bools:
-        """Return which measurements may be used, shape (n, rows, cols)."""
-        usable: Bools = np.isfinite(self.values)
+    def usable(self, exposure: int | slice = slice(None)) -> Bools:
+        """Return which measurements may be used, of all exposures or of one."""
+        usable: Bools = np.isfinite(self.values[exposure])
         if self.mask is not None:
-            usable &= ~self.mask
+            usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
         return usable
 
     def weighted(self, variance: Array | None) -> Self:
@@ -89,6 +90,10 @@ class Exposures:
     def without(self, mask: Bools) -> Self:
         """Return the exposures without some measurements, besides those masked before."""
         return dataclasses.replace(self, mask=mask if self.mask is None else mask | self.mask)
+
+    def whole(self, std: Floats | None = None) -> Self:
+        """Return the exposures at the nearest whole shifts; `std` are errors of the shifts."""
+        return dataclasses.replace(self, positions=self.positions.whole(std))
 
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the exposures."""

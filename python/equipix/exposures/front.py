@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from equipix._check import as_array, as_floats, check_count, naming_memory, number
-from equipix.defects import Findings
+from equipix._check import as_array, as_floats, as_level, check_count, naming_memory
+from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.exposures import Exposures
@@ -16,7 +16,6 @@ from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
-from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,24 +38,15 @@ def exposures_of(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     offset: bool = False,
-    whole: bool = False,
 ) -> Exposures:
-    """Check what the caller gave; the arguments are those of `equipix.calibrate`.
-
-    With `whole` the shifts are rounded to whole pixels, with a warning where that matters.
-    """
+    """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
         measured = measured_of(frames, variance, saturation)
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
         return Exposures(
             values=measured.values,
-            positions=Positions.of(
-                round_shifts(shifts) if whole else shifts,
-                rotation=rotation,
-                std=shift_std,
-                count=count,
-            ),
+            positions=Positions.of(shifts, rotation=rotation, std=shift_std, count=count),
             flux=Flux.of(flux, flux_std, time, count),
             mask=union(given, measured.mask),
             variance=measured.variance,
@@ -93,11 +83,6 @@ def measured_of(
     averaged = frames if isinstance(frames, Averaged) else _averaged(frames)
     if averaged is None:
         return _of_arrays(cast("ArrayLike", frames), variance, saturation)
-    if averaged is not frames and variance is None and averaged.noise is None:
-        raise InputError(
-            "'frames' are single frames, from which no noise can be estimated: give 'variance', or "
-            "the means alone for unit weights"
-        )
     return _of_averaged(averaged, variance, saturation)
 
 
@@ -146,9 +131,10 @@ def _of_arrays(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), values)
-    if saturation is None:
+    level = as_level(saturation)
+    if level is None:
         return Measured(values, None, variances, models, Findings())
-    saturated = _saturated(values, saturation)
+    saturated = _saturated(values, level)
     findings = Findings(saturated=np.any(saturated, axis=0))
     return Measured(values, saturated, variances, models, findings)
 
@@ -177,18 +163,11 @@ def as_models(variance: object, count: int) -> list[NoiseModel]:
     return models
 
 
-def _saturated(values: Array, saturation: float) -> Bools:
-    """Which values reach the level `saturation`."""
-    level = number("saturation", saturation)
-    if not level > 0:
-        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")
+def _saturated(values: Array, level: float) -> Bools:
+    """Which values reach the saturation level."""
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
-        if each.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {k} reaches the 'saturation' level {level:g}: "
-                "expose less, or correct the level"
-            )
+        refuse_saturated(f"exposure {k}", values[k], each, level)
     return saturated
 
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, as_shifts, check_count, per_exposure
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError
+from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from equipix._types import Array, Floats
+    from equipix.shifts import Rounding
 
 _TURNS = {
     0: ((1, 0), (0, 1)),
@@ -38,7 +41,7 @@ _BEYOND = 2**31
 
 
 @dataclass(frozen=True, eq=False)
-class Positions:
+class Positions(ReadOnly):
     """Positions of the sensor in the beam: pixel p is at u = A p + t + d.
 
     Attributes
@@ -49,11 +52,14 @@ class Positions:
         How far the sensor is turned, in degrees: 0, 90, 180 or 270. It determines A and t.
     std : ndarray, shape (n, 2), float64, or None
         Prior standard deviations of the shifts, in pixels; None: the shifts are exact.
+    rounding : Rounding or None
+        The largest noticeable rounding, where the shifts were rounded to whole pixels.
     """
 
     shifts: Floats
     rotation: NDArray[np.int64]
     std: Floats | None = None
+    rounding: Rounding | None = None
 
     @classmethod
     def of(
@@ -77,6 +83,11 @@ class Positions:
     def __len__(self) -> int:
         """Return the number of exposures."""
         return len(self.shifts)
+
+    def whole(self, std: ArrayLike | None = None) -> Self:
+        """Return the positions at the nearest whole shifts; `std` are errors of the shifts."""
+        shifts, rounding = round_shifts(self.shifts, std)
+        return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
 
     def reversed(self) -> Self:
         """Return the positions with all shifts of the other sign."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,10 +10,10 @@ import numpy as np
 
 from equipix._check import as_shifts, check_shape, number, per_exposure
 from equipix.drift import tilt_rms, tilt_std
-from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError
+from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError, warn
 from equipix.plan.identifiability import identify, is_connected
 from equipix.plan.noise import factor, local_variance
-from equipix.plan.order import trend_told
+from equipix.plan.order import distinct_trend
 from equipix.plan.shift_errors import shift_error_effect
 from equipix.plan.spectrum import Spectrum, spectrum
 
@@ -48,7 +47,7 @@ class ErrorBudget:
         ``"shift_error"``. That of noise is far smaller.
     spectrum : Spectrum
         λ(q) and its worst wave.
-    trend_told : float
+    distinct_trend : float
         Share of the variance of a linear trend of the lamp, with the exposures in this order,
         that is distinct from a tilt: see `advise_order`.
     components : int
@@ -61,7 +60,7 @@ class ErrorBudget:
     rms_by_cause: dict[str, float]
     tilt_by_cause: dict[str, tuple[float, float]]
     spectrum: Spectrum
-    trend_told: float
+    distinct_trend: float
     components: int
     _noise: _Noise
 
@@ -205,7 +204,7 @@ def error_budget(
             "shift_error": moved[1],
         },
         spectrum=spectrum(exact, powers),
-        trend_told=trend_told(exact),
+        distinct_trend=distinct_trend(exact),
         components=components,
         _noise=predicted,
     )
@@ -247,23 +246,21 @@ def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
         1 if fits and is_connected(shape, positions) else identify(shape, positions).components
     )
     if components > 1:
-        warnings.warn(
+        warn(
             f"the shifts leave {components} parts of the sensor unconnected: the errors are those "
             "within a part: choose other shifts (equipix.plan.suggest)",
             IdentifiabilityWarning,
-            stacklevel=3,
         )
     return components
 
 
 def warn_of_drift(causes: dict[str, float]) -> None:
-    """Warn of a tilt from drift that exceeds the noise; shown where `error_budget` was called."""
+    """Warn of a tilt from drift that exceeds the noise."""
     if causes["drift"] > causes["noise"] > 0:
-        warnings.warn(
+        warn(
             f"lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
             f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
             "residual: measure the flux, turn one exposure, or use larger shifts "
             "(equipix.plan.suggest)",
             DriftWarning,
-            stacklevel=3,
         )

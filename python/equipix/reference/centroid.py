@@ -1,6 +1,6 @@
 """Centroid of a spot in its plainest form: NumPy, whole arrays, no speed.
 
-The method is told in the docs of the compiled core's module ``centroid``; the steps here bear the
+The docs of the compiled core's module ``centroid`` describe the method; the steps here bear the
 same names and stand in the same order.
 """
 

@@ -25,4 +25,4 @@ pub(crate) use matrix::{Arm, Coarse};
 pub(crate) use modulated::{Modulated, SeenWave, Spot};
 pub(crate) use modulated_kernel::Value;
 pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
-pub(crate) use spectrum::{Complex, Symbol, hardly_told, times};
+pub(crate) use spectrum::{Complex, Symbol, barely_constrained, times};

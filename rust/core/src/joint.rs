@@ -8,11 +8,12 @@
 //! L is a spline of coefficients a where shifts are no whole numbers (`layout.rs`), so its part of the
 //! normal matrix is banded while that of M stays diagonal. Hence M is eliminated, not L as in `reduced`,
 //! and Gauss-Newton steps are taken in (a, ln c, d) (`system.rs`), by conjugate gradients in double
-//! precision (`search.rs`) with a preconditioner on two scales (`preconditioner.rs`). The penalty
+//! precision (`conjugate_gradients.rs`) with a preconditioner on two scales (`preconditioner.rs`). The penalty
 //! (`penalty.rs`) is slight: τ is 1e-5 of the mean weight of a cell. A product is one pass over the
 //! pixels (`pass.rs`).
 
 mod bands;
+mod conjugate_gradients;
 mod first_beam;
 mod flux;
 mod freedom;
@@ -26,8 +27,6 @@ mod pass;
 mod penalty;
 mod preconditioner;
 mod rim;
-mod room;
-mod search;
 mod survey;
 mod system;
 #[cfg(test)]
@@ -36,7 +35,9 @@ mod tiles;
 mod unknowns;
 mod waves;
 mod wide;
+mod workspace;
 
+pub(crate) use conjugate_gradients::ConjugateGradients;
 pub(crate) use first_beam::{Source, first_beam};
 pub(crate) use flux::Fluxes;
 pub(crate) use kernel::{Follow, Row};
@@ -46,7 +47,6 @@ pub(crate) use outcome::{coefficients, components, freedom, unknowns, values_at_
 pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
-pub(crate) use room::Room;
-pub(crate) use search::Search;
 pub(crate) use system::System;
 pub(crate) use unknowns::{ShiftPrior, State};
+pub(crate) use workspace::Workspace;

@@ -126,6 +126,7 @@
 //! ritz            the smallest Ritz value, from conjugate gradients
 //! beam            the light that a sensor sees of the beam from any position
 //! connectivity    what the measurements can compare; connected pixels
+//! information     what the measurements of a pixel say of its M
 //! exposures       measurements, weights, positions, fluxes; the one check of their values
 //! padded          images as rows of one width, with zeros around
 //! geometry        shifts, rotations, the padded grid of the beam, the taps of its spline
@@ -184,6 +185,7 @@ pub mod fit;
 pub mod frames;
 mod gauge;
 pub mod geometry;
+mod information;
 #[cfg(feature = "io")]
 pub mod io;
 mod joint;
@@ -209,6 +211,7 @@ pub use error::{Error, Result};
 pub use exposures::{Checked, Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
 pub use fit::{Fit, Refinement, Solution};
 pub use frames::{Real, Shape, Stack};
+pub use gauge::slope_pixels;
 pub use geometry::Rotation;
 pub use joint::SMOOTHING;
 pub use parallel::Workers;

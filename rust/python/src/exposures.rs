@@ -84,8 +84,15 @@ impl PyExposures {
                 calibrate(&exposures, &options, start.as_ref(), &workers, control)
             })
         })?;
-        PyFit::new(slf.as_any(), Arc::clone(data), fit)
+        PyFit::new(py, Arc::clone(data), fit)
     }
+}
+
+/// Whether a method takes whole shifts alone.
+#[pyfunction]
+pub(crate) fn needs_whole_shifts(py: Python<'_>, method: &str) -> PyResult<bool> {
+    let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
+    Ok(method.needs_whole_shifts())
 }
 
 fn method_named(name: &str) -> Result<Method> {

@@ -1,11 +1,12 @@
 //! `Fit`, `Beam` and `Uncertainty`: what a calibration found, and what can be asked of it.
 //!
-//! Large arrays move into NumPy without a copy; a question views them again.
+//! Large arrays move into NumPy without a copy, read-only; a question views them again.
 //!
 //! | argument | dtype and rank | here | how |
 //! |---|---|---|---|
 //! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
 //! | functionals | float64, 3 | `&[f64]` | view |
+//! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view |
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;
@@ -14,10 +15,10 @@ use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
     Uncertainty, Workers,
 };
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 
-use crate::arrays::{either, image, rotation, shape_of};
+use crate::arrays::{either, image, read_only, rotation, shape_of};
 use crate::data::Data;
 use crate::run;
 
@@ -100,8 +101,6 @@ impl BorrowedBeam<'_> {
 #[pyclass(frozen, module = "equipix._native", name = "Fit")]
 pub(crate) struct PyFit {
     data: Arc<Data>,
-    #[pyo3(get)]
-    exposures: Py<PyAny>,
     #[pyo3(get)]
     sensitivity: Py<PyArray2<f64>>,
     #[pyo3(get)]
@@ -192,16 +191,15 @@ impl PyFit {
 }
 
 impl PyFit {
-    /// The result of a fit of `exposures`.
-    pub(crate) fn new(exposures: &Bound<'_, PyAny>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
-        let (py, sensor) = (exposures.py(), data.checked.sensor());
+    /// The result of a fit of the exposures of these arrays.
+    pub(crate) fn new(py: Python<'_>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
+        let sensor = data.checked.sensor();
         let (unit, is_joint) = (fit.unit(), fit.is_joint());
         let History { looks, ended } = fit.history;
         let column = |value: fn(&Look) -> f64| looks.iter().map(value).collect::<Vec<_>>();
         let sweeps: Vec<_> = looks.iter().map(|look| look.sweep).collect();
         Ok(Self {
             data,
-            exposures: exposures.clone().unbind(),
             sensitivity: image(py, fit.sensitivity, sensor)?,
             beam: Py::new(py, PyBeam::of(py, fit.beam)?)?,
             flags: image(py, fit.flags, sensor)?,
@@ -210,9 +208,9 @@ impl PyFit {
             flux: fit.flux,
             shifts: fit.shifts,
             offset: fit.offset.map(|offset| image(py, offset, sensor)).transpose()?,
-            sweeps: sweeps.into_pyarray(py).unbind(),
-            objective: column(|look| look.objective).into_pyarray(py).unbind(),
-            error_estimate: column(|look| look.error).into_pyarray(py).unbind(),
+            sweeps: read_only(py, sweeps)?,
+            objective: read_only(py, column(|look| look.objective))?,
+            error_estimate: read_only(py, column(|look| look.error))?,
             ended: ended_code(ended),
             misfit: fit.misfit,
             degrees_of_freedom: fit.degrees_of_freedom,
@@ -226,8 +224,13 @@ impl PyFit {
 
     /// The arrays of the solution, borrowed.
     pub(crate) fn borrow<'py>(&'py self, py: Python<'py>) -> BorrowedFit<'py> {
-        let sensitivity = self.sensitivity.bind(py).readonly();
-        BorrowedFit { fit: self, sensitivity, beam: self.beam.get().borrow(py) }
+        let (sensitivity, flags) = (self.sensitivity.bind(py), self.flags.bind(py));
+        BorrowedFit {
+            fit: self,
+            sensitivity: sensitivity.readonly(),
+            flags: flags.readonly(),
+            beam: self.beam.get().borrow(py),
+        }
     }
 }
 
@@ -235,6 +238,7 @@ impl PyFit {
 pub(crate) struct BorrowedFit<'py> {
     fit: &'py PyFit,
     sensitivity: PyReadonlyArray2<'py, f64>,
+    flags: PyReadonlyArray2<'py, u32>,
     beam: BorrowedBeam<'py>,
 }
 
@@ -242,6 +246,7 @@ impl BorrowedFit<'_> {
     pub(crate) fn solution(&self) -> PyResult<Solution<'_>> {
         Ok(Solution {
             sensitivity: self.sensitivity.as_slice()?,
+            flags: self.flags.as_slice()?,
             beam: self.beam.view()?,
             flux: &self.fit.flux,
             shifts: &self.fit.shifts,
@@ -250,6 +255,16 @@ impl BorrowedFit<'_> {
             unit: self.fit.unit,
         })
     }
+}
+
+/// Which pixels count for the slope of ln M.
+#[pyfunction]
+pub(crate) fn slope_pixels(
+    sensitivity: PyReadonlyArray2<'_, f64>,
+    flags: PyReadonlyArray2<'_, u32>,
+) -> PyResult<Py<PyArray2<bool>>> {
+    let counted = equipix_core::slope_pixels(sensitivity.as_slice()?, flags.as_slice()?);
+    image(sensitivity.py(), counted, shape_of(&sensitivity))
 }
 
 /// Answers, in units of the variance of a value of weight 1; `None` for what was not asked.
@@ -271,7 +286,7 @@ impl PyUncertainty {
             std: answers.map.map(|map| image(py, map.std, sensor)).transpose()?,
             draws,
             exactness,
-            variances: answers.variances.map(|values| values.into_pyarray(py).unbind()),
+            variances: answers.variances.map(|values| read_only(py, values)).transpose()?,
             shift_variances: answers.shifts,
             offset_variances: answers.offset.map(Into::into),
         })

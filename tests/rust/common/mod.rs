@@ -93,6 +93,8 @@ pub(crate) struct Look {
 pub(crate) struct Answer {
     /// M; NaN where undetermined.
     pub(crate) sensitivity: Vec<f64>,
+    /// Bits that say what is wrong with a pixel.
+    pub(crate) flags: Vec<u32>,
     /// O, if it was sought.
     pub(crate) offset: Option<Vec<f64>>,
     /// L at the cells of its grid; NaN where unobserved.
@@ -262,6 +264,7 @@ fn ask<R>(
     let [rows, cols] = answer.beam_shape;
     let solution = Solution {
         sensitivity: &answer.sensitivity,
+        flags: &answer.flags,
         beam: Beam {
             values: &answer.beam,
             coefficients: answer.coefficients.as_deref(),
@@ -304,6 +307,7 @@ fn answer(fit: Fit) -> Answer {
         converged: fit.history.ended == Ended::Converged,
         history: looks.map(look).collect(),
         sensitivity: fit.sensitivity,
+        flags: fit.flags,
         offset: fit.offset,
         flux: fit.flux,
         shifts: fit.shifts,

@@ -97,7 +97,7 @@ impl Coarse {
             for (hat, height) in heights.iter_mut().enumerate() {
                 *height *= matrix.diagonal(hat);
             }
-            self.solve(&mut heights, 1.0);
+            self.correct(&mut heights, 1.0);
             let scale: f64 = (0..heights.len())
                 .map(|hat| matrix.diagonal(hat) * heights[hat] * heights[hat])
                 .sum::<f64>()
@@ -110,12 +110,13 @@ impl Coarse {
         quotient < NOTHING
     }
 
-    /// Replaces a right-hand side, one value a hat, by the heights of the hats, times `factor`.
+    /// The coarse correction: replaces a right-hand side, one value a hat, by the heights of the hats,
+    /// times `factor`.
     ///
     /// Constants in a part are left out on either side: they are no error, and what there is of
     /// them is rounding. If rounding in a nearly singular matrix left no factor, the heights are 0
     /// and the first level is left alone.
-    pub(crate) fn solve(&self, values: &mut [f64], factor: f64) {
+    pub(crate) fn correct(&self, values: &mut [f64], factor: f64) {
         let Some(cholesky) = &self.factor else { return values.fill(0.0) };
         for part in &self.parts {
             let (sum, area) = part
@@ -123,7 +124,7 @@ impl Coarse {
                 .fold((0.0, 0.0), |(sum, area), &(hat, share)| (sum + values[hat], area + share));
             part.iter().for_each(|&(hat, share)| values[hat] -= share * sum / area);
         }
-        cholesky.solve(values);
+        cholesky.substitute(values);
         for part in &self.parts {
             let (sum, area) = part.iter().fold((0.0, 0.0), |(sum, area), &(hat, share)| {
                 (sum + share * values[hat], area + share)

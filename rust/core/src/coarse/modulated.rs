@@ -1,4 +1,4 @@
-//! A second coarse space: hats times waves that exposures hardly tell.
+//! A second coarse space: hats times waves that exposures barely constrain.
 //!
 //! The symbol of S is nearly 0 at some wave vectors q besides 0 (`coarse/spectrum.rs`), and around each
 //! there are errors of large scale, modulated by its wave. Their columns are φ_i cos(q·p) and
@@ -9,7 +9,7 @@
 //! yᵀAy = ½ Σ_blocks [ Σ_k Ω_k |z_k|² − |Σ_k Ω_k z_k|² / Σ_k Ω_k ]
 //! ```
 //!
-//! Waves of different q hardly meet: each has a matrix of its own.
+//! Waves of different q are nearly orthogonal: each has a matrix of its own.
 
 use std::ops::Range;
 
@@ -106,10 +106,10 @@ impl<N: Value> Modulated<N> {
         found
     }
 
-    /// Replaces sums by the heights of the hats.
-    pub(crate) fn solve(&self, heights: &mut [f64], workers: &Workers) {
+    /// The coarse correction: replaces sums by the heights of the hats.
+    pub(crate) fn correct(&self, heights: &mut [f64], workers: &Workers) {
         workers.map_blocks(heights, 2 * self.hats.count(), |index, heights| {
-            self.spaces[index].factor.solve(heights);
+            self.spaces[index].factor.substitute(heights);
             heights.iter_mut().for_each(|height| *height *= DAMPING);
         });
     }
@@ -303,7 +303,7 @@ mod tests {
             for height in 0..count {
                 let mut heights = vec![0.0; count];
                 heights[height] = 1.0;
-                space.spaces[wave].factor.solve(&mut heights);
+                space.spaces[wave].factor.substitute(&mut heights);
                 let energy = |cell: usize| {
                     let [row, col] = [(cell / SHAPE.cols) as f64, (cell % SHAPE.cols) as f64];
                     let shown = SHIFTS.map(|[down, right]| {

@@ -1,4 +1,4 @@
-//! The waves that exposures hardly tell: wave vectors q ≠ 0 at which the symbol of S is nearly 0.
+//! The waves that exposures barely constrain: wave vectors q ≠ 0 at which the symbol of S is nearly 0.
 //!
 //! Let h_k be what exposure k makes of a wave of height 1, at a pixel at the origin. What is left once the
 //! unknowns that were eliminated have followed it is, as a share,
@@ -20,14 +20,15 @@ const DEEPEST: f64 = 0.2;
 /// Below, a wave is as good as undetermined, and single precision leaves errors in it.
 const DETERMINED: f64 = 1e-5;
 /// Minima of the scan that are followed further down.
-const MOST_CANDIDATES: usize = 20;
-/// Upper limit on waves: more save few iterations, and each costs one per cent of a product or more.
+const MOST_CANDIDATES: usize = 12;
+/// Upper limit on waves: more save few iterations (docs/method.md, section 5).
 pub(super) const MOST_WAVES: usize = 4;
 /// Steps over the wave vectors along an axis, for each pixel that shifts reach, and at least and at most.
 const STEPS_A_PIXEL: usize = 8;
 const STEPS: [usize; 2] = [16, 512];
-/// How often the steps are halved to come to a minimum.
-const HALVINGS: usize = 5;
+/// How often the steps are halved to come to a minimum: λ is then off by some 1e-7, so that a wave that is not
+/// determined at all is recognised.
+const HALVINGS: usize = 12;
 
 /// What each exposure makes of a wave along one axis, and the penalty on it.
 pub(crate) trait Symbol {
@@ -41,7 +42,7 @@ pub(crate) fn times([a, b]: Complex, [c, d]: Complex) -> Complex {
     [a * c - b * d, a * d + b * c]
 }
 
-/// A wave that exposures hardly tell.
+/// A wave that exposures barely constrain.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Wave {
     /// Its wave vector along rows and columns, from −π to π.
@@ -50,10 +51,9 @@ pub(crate) struct Wave {
     pub(crate) is_alone: bool,
 }
 
-/// The deepest minima of λ, apart from q = 0, for exposures of these shares that reach
-/// so many pixels, and hats so far apart: the hats around one wave hold those that are nearer to it than π
-/// over that.
-pub(crate) fn hardly_told(
+/// The deepest minima of λ, apart from q = 0, for exposures of these shares that reach so many pixels, and
+/// hats so far apart: the hats around one wave hold those that are nearer to it than π over that.
+pub(crate) fn barely_constrained(
     symbol: &impl Symbol,
     shares: &[f64],
     reach: [usize; 2],
@@ -210,7 +210,7 @@ mod tests {
     #[test]
     fn waves_of_a_cross_are_its_deepest_minima() {
         let cross = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
-        let waves = hardly_told(&Shifts(&cross), &[0.2; 5], [19, 19], [57.0, 57.0]);
+        let waves = barely_constrained(&Shifts(&cross), &[0.2; 5], [19, 19], [57.0, 57.0]);
         assert!(waves.len() == MOST_WAVES);
         let depths: Vec<f64> = waves.iter().map(|wave| lambda(&cross, wave.vector)).collect();
         assert!(depths.is_sorted() && depths.iter().all(|depth| (0.0..DEEPEST).contains(depth)));
@@ -232,19 +232,19 @@ mod tests {
     fn what_is_undetermined_is_no_wave() {
         // Of two exposures, and of a lattice that leaves every other pixel out, λ is 0 at waves besides 0.
         let pair = [[0.0, 0.0], [3.0, 5.0]];
-        assert!(hardly_told(&Shifts(&pair), &[0.5; 2], [3, 5], [9.0, 15.0]).is_empty());
+        assert!(barely_constrained(&Shifts(&pair), &[0.5; 2], [3, 5], [9.0, 15.0]).is_empty());
         let even = [[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [4.0, 2.0], [2.0, 6.0]];
-        for wave in hardly_told(&Shifts(&even), &[0.2; 5], [4, 6], [12.0, 18.0]) {
+        for wave in barely_constrained(&Shifts(&even), &[0.2; 5], [4, 6], [12.0, 18.0]) {
             assert!(lambda(&even, wave.vector) > DETERMINED);
         }
     }
 
     #[test]
     fn a_wave_of_alternate_rows_is_its_own_opposite() {
-        // All row shifts even but one, which hardly weighs.
+        // All row shifts even but one, of little weight.
         let shifts = [[0.0, 0.0], [2.0, 1.0], [4.0, 3.0], [2.0, 5.0], [1.0, 2.0]];
         let shares = [0.245, 0.245, 0.245, 0.245, 0.02];
-        let waves = hardly_told(&Shifts(&shifts), &shares, [4, 5], [12.0, 15.0]);
+        let waves = barely_constrained(&Shifts(&shifts), &shares, [4, 5], [12.0, 15.0]);
         let alone = waves.iter().find(|wave| wave.is_alone).unwrap();
         assert!(alone.vector[0].abs() == PI && alone.vector[1] == 0.0);
     }

@@ -21,7 +21,7 @@ use crate::geometry::Taps;
 const WAVES: usize = 64;
 
 /// The mean of s/(s + τ g) over wave vectors, for exposures that weigh `shares` of all.
-pub(crate) fn told(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
+pub(crate) fn determined_share(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
     let mut sum = 0.0;
     for wave in 0..WAVES * WAVES {
         // Not at q = 0 itself, where both symbols are 0.
@@ -37,8 +37,8 @@ pub(crate) fn told(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
             seen += share * (h[0] * h[0] + h[1] * h[1]);
             along = [along[0] + share * h[0], along[1] + share * h[1]];
         }
-        let told = (seen - along[0] * along[0] - along[1] * along[1]).max(0.0);
-        sum += told / (told + tau * (bent(q[0]) + bent(q[1])));
+        let measured = (seen - along[0] * along[0] - along[1] * along[1]).max(0.0);
+        sum += measured / (measured + tau * (bent(q[0]) + bent(q[1])));
     }
     sum / (WAVES * WAVES) as f64
 }
@@ -60,13 +60,13 @@ mod tests {
     use crate::joint::layout::Grid;
 
     #[test]
-    fn without_a_penalty_all_is_told_and_with_a_stiff_one_nothing() {
+    fn without_a_penalty_all_is_determined_and_with_a_stiff_one_nothing() {
         let shifts = [[0.0, 0.0], [0.3, 5.2], [7.4, 0.5]];
         let grid = Grid::new(Shape::new(20, 20), &shifts, &[Rotation::None; 3], false).unwrap();
         let windows = grid.windows(&shifts);
         let shares = [1.0 / 3.0; 3];
-        assert!((told(&windows, &shares, 0.0) - 1.0).abs() < 1e-12);
-        assert!(told(&windows, &shares, 1e12) < 1e-3);
-        assert!(told(&windows, &shares, 1e-5) > 0.9);
+        assert!((determined_share(&windows, &shares, 0.0) - 1.0).abs() < 1e-12);
+        assert!(determined_share(&windows, &shares, 1e12) < 1e-3);
+        assert!(determined_share(&windows, &shares, 1e-5) > 0.9);
     }
 }

@@ -93,13 +93,14 @@ impl Fused {
         self.taps = [(0..count).map(along).collect(), (0..count).map(across).collect()];
         let length = self.length(count);
         pass.workers.map_blocks(&mut self.rows, CONVERTED_ROWS * length, |block, rows| {
-            let mut room = pass.room();
+            let mut workspace = pass.workspace();
             for (index, row) in rows.chunks_exact_mut(length).enumerate() {
                 let index = block * CONVERTED_ROWS + index;
-                pass.weigh_row(index, &mut room);
+                pass.weigh_row(index, &mut workspace);
                 let (lights, rest) = pass.row(index).split_at(count * cols);
                 let (m, inverse) = rest.split_at(cols);
-                let pixels = Found { lights, m, inverse: &inverse[..cols], weights: &room.weights };
+                let pixels =
+                    Found { lights, m, inverse: &inverse[..cols], weights: &workspace.weights };
                 let flux = is_uneven.then_some(&pass.flux[..]);
                 pixels.shorten([weight, light], flux, row.chunks_exact_mut(width));
             }

@@ -19,8 +19,8 @@ pub(crate) struct Combine<'s> {
     pub(crate) rows: [&'s [f64]; TAPS],
     pub(crate) along_rows: [f64; TAPS],
     pub(crate) along_cols: [f64; TAPS],
-    /// Room for a row of values.
-    pub(crate) room: &'s mut [f64],
+    /// The row of values between.
+    pub(crate) line: &'s mut [f64],
     pub(crate) sums: &'s mut [f64],
 }
 
@@ -37,12 +37,12 @@ impl pulp::NullaryFnOnce for Combine<'_> {
     fn call(self) {
         let [s, t, u, v] = self.along_rows;
         let [a, b, c, d] = self.rows;
-        for ((((room, a), b), c), d) in self.room.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *room = s * a + t * b + u * c + v * d;
+        for ((((value, a), b), c), d) in self.line.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *value = s * a + t * b + u * c + v * d;
         }
         let [s, t, u, v] = self.along_cols;
         let cols = self.sums.len();
-        let [a, b, c, d] = [0, 1, 2, 3].map(|from| &self.room[from..from + cols]);
+        let [a, b, c, d] = [0, 1, 2, 3].map(|from| &self.line[from..from + cols]);
         for ((((sum, a), b), c), d) in self.sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
             *sum += s * a + t * b + u * c + v * d;
         }
@@ -123,7 +123,7 @@ impl<'s> Row<'s> {
 /// ```
 ///
 /// Without an offset O = 0 and M = Σ w e y / Σ w e².
-pub(crate) struct Solve<'s> {
+pub(crate) struct Eliminate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
@@ -135,7 +135,7 @@ pub(crate) struct Solve<'s> {
     pub(crate) singular: f64,
 }
 
-impl pulp::NullaryFnOnce for Solve<'_> {
+impl pulp::NullaryFnOnce for Eliminate<'_> {
     type Output = f64;
 
     #[inline(always)]

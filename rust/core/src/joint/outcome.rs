@@ -1,7 +1,7 @@
 //! What a state of the joint problem says besides its unknowns: components, values of the beam at its
 //! cells, and how many numbers the measurements determine.
 
-use super::freedom::told;
+use super::freedom::determined_share;
 use super::layout::Grid;
 use super::penalty::SMOOTHING;
 use super::system::System;
@@ -27,7 +27,7 @@ pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     let total: f64 = weights.iter().sum();
     let shares: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
     let windows = system.pass.grid.windows(&system.state.shifts);
-    (told(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
+    (determined_share(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
 }
 
 /// The components of pixels and cells. Along an axis where all shifts differ by whole numbers of pixels,

@@ -9,7 +9,7 @@
 //! values. χ is 1 but at the rim of the beam, where R takes over (`joint/rim.rs`). The third part is that of
 //! [`coarse`](crate::coarse), with the columns of Φ hats times the beam
 //! (`joint/wide.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
-//! that they could explain is told from theirs by large scales alone.
+//! that they could explain is distinguished from theirs by large scales alone.
 
 use super::rim::Rim;
 use super::survey::Block;
@@ -105,8 +105,8 @@ impl Preconditioner {
         let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
         let weights = &system.weights;
         let least = FAINTEST * weights.iter().sum::<f64>() / weights.len() as f64;
-        let told = |&d: &f64| if d > least { 1.0 / d } else { 0.0 };
-        let mut inverse: Vec<f64> = weights.iter().map(told).collect();
+        let invert_seen = |&d: &f64| if d > least { 1.0 / d } else { 0.0 };
+        let mut inverse: Vec<f64> = weights.iter().map(invert_seen).collect();
         rim.cells().for_each(|cell| inverse[cell] = 0.0);
         let params = whole.into_iter().map(invert).collect();
         let (wide, filters) = (Wide::new(hats, system, control), system.pass.grid.is_spline());
@@ -125,8 +125,8 @@ impl Preconditioner {
         let (of_cells, of_params) = r.split_at(self.inverse.len());
         let mut heights = self.wide.gather(of_cells, workers);
         heights.extend_from_slice(of_params);
-        self.coarse.solve(&mut heights, DAMPING);
-        let lines = self.waves.solve(&self.wide, of_cells, workers);
+        self.coarse.correct(&mut heights, DAMPING);
+        let lines = self.waves.correct(&self.wide, of_cells, workers);
         z.resize(of_cells.len(), 0.0);
         workers.map_blocks(z, BAND * cols, |band, part| {
             let first = band * BAND;
@@ -154,7 +154,7 @@ impl Preconditioner {
     /// The part of waves of P⁻¹ r.
     #[cfg(test)]
     pub(super) fn waves_of<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64]) -> Vec<f64> {
-        let lines = self.waves.solve(&self.wide, r, system.pass.workers);
+        let lines = self.waves.correct(&self.wide, r, system.pass.workers);
         let mut found = vec![0.0; r.len()];
         self.waves.spread(&self.wide, &lines, 0, &mut found);
         found
@@ -173,8 +173,8 @@ impl Preconditioner {
             match inside((first + step).checked_sub(2 * around)).map(of) {
                 Some(row) => {
                     let input = r[row.clone()].iter().zip(&self.inverse[row]);
-                    let told = |(r, d): (&f64, &f64)| if *d > 0.0 { *r } else { 0.0 };
-                    line.iter_mut().zip(input).for_each(|(line, input)| *line = told(input));
+                    let seen = |(r, d): (&f64, &f64)| if *d > 0.0 { *r } else { 0.0 };
+                    line.iter_mut().zip(input).for_each(|(line, input)| *line = seen(input));
                 }
                 None => line.fill(0.0),
             }

@@ -59,7 +59,7 @@ impl Rim {
 
     /// Adds (N + τ GᵀG)⁻¹ r on the rim.
     pub(crate) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
-        let found = workers.map(self.parts.len(), |index| self.parts[index].solve(r));
+        let found = workers.map(self.parts.len(), |index| self.parts[index].apply(r));
         self.cells().zip(found.into_iter().flatten()).for_each(|(cell, value)| z[cell] += value);
     }
 }
@@ -91,11 +91,12 @@ impl Part {
         Self { cells: tile.cells.clone(), factor, inverse }
     }
 
-    fn solve(&self, r: &[f64]) -> Vec<f64> {
+    /// (N + τ GᵀG)⁻¹ r, times the shares on either side.
+    fn apply(&self, r: &[f64]) -> Vec<f64> {
         let own = self.cells.iter().map(|&(cell, share)| share * r[cell as usize]);
         let mut values: Vec<f64> = own.collect();
         match &self.factor {
-            Some(factor) => factor.solve(&mut values),
+            Some(factor) => factor.substitute(&mut values),
             None => values.iter_mut().zip(&self.inverse).for_each(|(value, i)| *value *= i),
         }
         values.iter_mut().zip(&self.cells).for_each(|(value, (_, share))| *value *= share);

@@ -27,21 +27,22 @@ impl<T: Real> System<'_, '_, T> {
         let (down, across) = (sensor.rows.div_ceil(size[0]), sensor.cols.div_ceil(size[1]));
         let beams = self.pass.views_of(&self.state.beam);
         let found = self.pass.workers.map(down, |block_row| {
-            let mut room = self.pass.room();
+            let mut workspace = self.pass.workspace();
             let mut found = vec![Block::default(); across * count];
             for row_index in block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]) {
                 control.check()?;
                 let row = self.pass.row(row_index);
                 let (light, rest) = row.split_at(count * sensor.cols);
-                self.pass.weigh_row(row_index, &mut room);
-                self.pass.see_slopes(&beams, row_index, &mut room);
+                self.pass.weigh_row(row_index, &mut workspace);
+                self.pass.see_slopes(&beams, row_index, &mut workspace);
                 for k in 0..count {
                     for col in 0..sensor.cols {
                         let at = k * sensor.cols + col;
                         let block = &mut found[col / size[1] * count + k];
-                        let (weight, light) = (room.weights[at] * rest[col].powi(2), light[at]);
+                        let (weight, light) =
+                            (workspace.weights[at] * rest[col].powi(2), light[at]);
                         block.weight += weight * light * light;
-                        for (axis, slopes) in room.slopes.iter().enumerate() {
+                        for (axis, slopes) in workspace.slopes.iter().enumerate() {
                             let Some(slope) = slopes.get(at) else { continue };
                             let slope = self.pass.flux[k] * slope;
                             block.slope[axis] += weight * light * slope;

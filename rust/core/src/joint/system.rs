@@ -16,12 +16,12 @@ use std::ops::Range;
 
 use super::flux::Fluxes;
 use super::fused::Fused;
-use super::kernel::{Follow, Solve};
+use super::kernel::{Eliminate, Follow};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
-use super::room::Sums;
 use super::unknowns::{ShiftPrior, State};
+use super::workspace::Sums;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -145,7 +145,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.pass.flux = self.fluxes.at(&self.state.theta);
         let beam = std::mem::take(&mut self.state.beam);
         let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
-        let found = self.solve_pixels(&beam, &mut pull, control);
+        let found = self.eliminate_pixels(&beam, &mut pull, control);
         self.state.beam = beam;
         let found = found?;
         self.append(&found, &mut pull);
@@ -169,21 +169,29 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// M and O at their closed forms, and what they leave pulls at the cells.
-    fn solve_pixels(&mut self, beam: &[f64], pull: &mut [f64], control: &Control) -> Result<Sums> {
+    fn eliminate_pixels(
+        &mut self,
+        beam: &[f64],
+        pull: &mut [f64],
+        control: &Control,
+    ) -> Result<Sums> {
         let views = self.pass.views_of(beam);
-        self.pass.run(pull, control, |pass, row_index, row, room, found| {
-            room.values().clear();
-            pass.see(&views, row_index, room);
+        self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
+            workspace.values().clear();
+            pass.see(&views, row_index, workspace);
             let lights = row.light.chunks_exact_mut(pass.exposures.sensor().cols);
             for (k, (light, flux)) in lights.zip(&pass.flux).enumerate() {
-                light.iter_mut().zip(room.values().of(k)).for_each(|(e, seen)| *e = flux * seen);
+                light
+                    .iter_mut()
+                    .zip(workspace.values().of(k))
+                    .for_each(|(e, seen)| *e = flux * seen);
             }
-            pass.measure(row_index, room);
-            pass.see_slopes(&views, row_index, room);
-            let (weights, values, sums) = room.parts();
+            pass.measure(row_index, workspace);
+            pass.see_slopes(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
-            let solve = Solve { row, fluxes, weights, values, sums, singular };
-            found.objective += pulp::Arch::new().dispatch(solve);
+            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular };
+            found.objective += pulp::Arch::new().dispatch(eliminate);
         })
     }
 
@@ -260,16 +268,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// The pixels whose measurements do not distinguish an offset from a gain, where one is sought.
     pub(crate) fn without_offset(&self) -> Vec<usize> {
-        let (mut untold, mut first) = (Vec::new(), 0);
+        let (mut undetermined, mut first) = (Vec::new(), 0);
         if self.pass.with_offset {
             self.pass.for_rows(|[_, gain, _, _, beside, _]| {
                 let pixels = gain.iter().zip(beside).enumerate();
-                let told = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
-                untold.extend(told.map(|(col, _)| first + col));
+                let alone = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
+                undetermined.extend(alone.map(|(col, _)| first + col));
                 first += gain.len();
             });
         }
-        untold
+        undetermined
     }
 
     /// S x, and the change of M that goes with x in each [`Row`]; returns the largest size of that less
@@ -351,12 +359,12 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let shares: Vec<f64> =
             logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect();
         let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(beam));
-        self.pass.run(pull, control, |pass, row_index, row, room, found| {
-            pass.weigh_row(row_index, room);
-            pass.see_slopes(&beams, row_index, room);
-            room.begin(row.light, &shares, moves);
-            pass.see(&views, row_index, room);
-            let (weights, values, sums) = room.parts();
+        self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
+            pass.weigh_row(row_index, workspace);
+            pass.see_slopes(&beams, row_index, workspace);
+            workspace.begin(row.light, &shares, moves);
+            pass.see(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
             let fluxes = &pass.flux[..];
             let follow = Follow { row, fluxes, weights, values, sums, share };
             found.largest = found.largest.max(pulp::Arch::new().dispatch(follow));
@@ -372,10 +380,10 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
     fn weigh(&mut self, control: &Control) -> Result<()> {
         let mut weights = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
-        self.pass.run(&mut weights, control, |pass, row_index, row, room, _| {
+        self.pass.run(&mut weights, control, |pass, row_index, row, workspace, _| {
             let cols = pass.exposures.sensor().cols;
-            pass.weigh_row(row_index, room);
-            let (weights, values, _) = room.parts();
+            pass.weigh_row(row_index, workspace);
+            let (weights, values, _) = workspace.parts();
             for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let pixels = weights.iter().zip(&*row.sensitivity);
                 for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {

@@ -209,15 +209,14 @@ fn a_product_in_single_precision_is_that_in_double() {
                 system.multiply(&x, &mut single, 0.5, &control).unwrap(),
                 system.multiply_double(&x, &mut double, 0.5, &control).unwrap(),
             ];
-            // The change of the first, less half of itself.
-            assert!((sizes[1] / sizes[0] - 0.5).abs() < ROUNDING);
             // An element is a sum of some 4 · 16 · 4 products, the largest of the size of the largest one.
+            let rounding = 256.0 * f64::from(f32::EPSILON);
+            // The change of the first, less half of itself.
+            assert!((sizes[1] / sizes[0] - 0.5).abs() < rounding);
             let size = double.iter().fold(0.0_f64, |top, value| top.max(value.abs()));
             for (one, other) in single.iter().zip(&double) {
-                assert!((one - other).abs() < ROUNDING * size, "{one} {other}");
+                assert!((one - other).abs() < rounding * size, "{one} {other}");
             }
         });
     }
 }
-
-const ROUNDING: f64 = 256.0 * f32::EPSILON as f64;

@@ -1,4 +1,4 @@
-//! The waves that exposures hardly tell, in the space of the beam's coefficients.
+//! The waves that exposures barely constrain, in the space of the beam's coefficients.
 //!
 //! With the taps t of exposure k a wave e^{iq·u} of coefficients is seen as e^{iq·p} h_k,
 //! h_k = Σ_j t_j e^{iq·(first + j)}, along rows and columns alike. Where exposures are turned against each
@@ -11,7 +11,7 @@ use super::survey::Block;
 use super::system::System;
 use super::wide::Wide;
 use crate::coarse::{
-    Complex, Hats, Modulated, SeenWave, Spot, Symbol, hardly_told, spacing_of_waves, times,
+    Complex, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained, spacing_of_waves, times,
 };
 use crate::frames::Real;
 use crate::geometry::Rotation;
@@ -55,7 +55,7 @@ impl Waves {
     }
 
     /// The lines of the heights that Ψᵀ r has.
-    pub(super) fn solve(&self, wide: &Wide, r: &[f64], workers: &Workers) -> Vec<f64> {
+    pub(super) fn correct(&self, wide: &Wide, r: &[f64], workers: &Workers) -> Vec<f64> {
         if self.space.is_empty() {
             return Vec::new();
         }
@@ -71,7 +71,7 @@ impl Waves {
         for (first, sums) in bands.into_iter().flatten() {
             heights[first..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
         }
-        self.space.solve(&mut heights, workers);
+        self.space.correct(&mut heights, workers);
         self.space.open(&heights, self.cols, workers)
     }
 
@@ -88,7 +88,7 @@ impl Waves {
     }
 }
 
-/// The waves that the exposures hardly tell, as they see them.
+/// The waves that the exposures barely constrain, as they see them.
 fn seen<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
     let windows = &system.pass.windows;
     let is_spline = system.pass.grid.is_spline();
@@ -103,7 +103,7 @@ fn seen<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
         places.clone().max().unwrap_or(0) - places.min().unwrap_or(0)
     });
     let spacing = [hats.rows.spacing, hats.cols.spacing];
-    let waves = hardly_told(&taps, &shares, reach, spacing);
+    let waves = barely_constrained(&taps, &shares, reach, spacing);
     let seen = waves.into_iter().map(|wave| {
         let [q, p] = wave.vector;
         let factor = |k: usize| times(taps.along(0, k, q), taps.along(1, k, p));

@@ -2,8 +2,8 @@
 
 use super::operator::Reduced;
 use crate::coarse::{
-    Arm, Coarse, Complex, Hats, Modulated, SeenWave, Spot, Symbol, hardly_told, spacing_of_waves,
-    times,
+    Arm, Coarse, Complex, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
+    spacing_of_waves, times,
 };
 use crate::control::Control;
 use crate::error::Result;
@@ -13,7 +13,7 @@ use crate::parallel::Workers;
 
 /// Blocks of cells along the distance of two hats.
 const BLOCKS: usize = 3;
-/// The hats with the coarse matrix of S, factorised, and those times waves that exposures hardly tell.
+/// The hats with the coarse matrix of S, factorised, and those times waves that exposures barely constrain.
 ///
 /// # Errors
 /// [`Error::Cancelled`](crate::Error::Cancelled).
@@ -46,7 +46,7 @@ pub(super) fn coarse_spaces<T: Real>(
     Ok((coarse, waves))
 }
 
-/// The waves that the exposures hardly tell, as a cell sees them: e^{−iq·d} of the pixel that sees it.
+/// The waves that the exposures barely constrain, as a cell sees them: e^{−iq·d} of the pixel that sees it.
 fn seen<T: Real>(reduced: &Reduced<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
     let exposures = reduced.exposures;
     let places = Places(&exposures.geometry().placements);
@@ -58,7 +58,7 @@ fn seen<T: Real>(reduced: &Reduced<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
         let along = places.0.iter().map(|place| [place.row, place.col][axis]);
         along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
     });
-    let waves = hardly_told(&places, &shares, reach, [hats.rows.spacing, hats.cols.spacing]);
+    let waves = barely_constrained(&places, &shares, reach, [hats.rows.spacing, hats.cols.spacing]);
     let seen = waves.into_iter().map(|wave| {
         let [q, p] = wave.vector;
         let factor = |k: usize| times(places.along(0, k, q), places.along(1, k, p));

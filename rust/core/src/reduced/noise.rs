@@ -16,7 +16,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::padded::{BAND, LANES};
-use crate::random;
+use crate::random::{self, Streams};
 
 impl<T: Real> Reduced<'_, '_, T> {
     /// Writes the b of draw number `draw` to `slope`.
@@ -32,7 +32,7 @@ impl<T: Real> Reduced<'_, '_, T> {
             let noise: Vec<&[f32]> = drawn
                 .map(|(exposure, ExposureScratch { weight, noise })| {
                     let weight = self.weight(exposure, row, weight);
-                    let noise = self.noise([draw, exposure as u64], row, weight, noise);
+                    let noise = self.noise(draw, exposure, row, weight, noise);
                     &noise[self.padding.lead..][..self.padding.width]
                 })
                 .collect();
@@ -84,19 +84,20 @@ impl<T: Real> Reduced<'_, '_, T> {
         control.check()
     }
 
-    /// The noise of a row of pixels in one draw and exposure, with zeros before and after.
+    /// The noise of a row of pixels in one draw and exposure, with zeros before and after. Behind its last
+    /// pixel it means nothing: M and 1/D are 0 there.
     ///
     /// Each row has random numbers of its own, so that any thread may ask for any row.
     pub(super) fn noise<'s>(
         &self,
-        [draw, exposure]: [u64; 2],
+        draw: u64,
+        exposure: usize,
         row: usize,
         weight: RowWeight<'_>,
         noise: &'s mut Vec<f32>,
     ) -> &'s [f32] {
-        let (sensor, count) = (self.exposures.sensor(), self.exposures.count() as u64);
-        let number = (draw * count + exposure) * sensor.rows as u64 + row as u64;
-        let mut bits = random::bits(number);
+        let (sensor, count) = (self.exposures.sensor(), self.exposures.count());
+        let mut bits = random::bits(Streams::new(count, sensor.rows).number(draw, exposure, row));
         let signs: Vec<u32> = (0..sensor.cols.div_ceil(LANES)).map(|_| bits()).collect();
         noise.resize(2 * self.padding.lead + self.padding.width, 0.0);
         let padded = &mut noise[self.padding.lead..];
@@ -105,7 +106,75 @@ impl<T: Real> Reduced<'_, '_, T> {
             signs: &signs,
             noise: &mut padded[..self.padding.width],
         });
-        padded[sensor.cols..].fill(0.0);
         noise
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposures::{Exposures, Flux, Mask, Measurements, Positions, Variance};
+    use crate::frames::{Shape, Stack};
+    use crate::geometry::{Rotation, View};
+    use crate::parallel::Workers;
+    use crate::reduced::ConjugateGradients;
+
+    const SENSOR: Shape = Shape::new(9, 11);
+    const SHIFTS: [[f64; 2]; 3] = [[0.0, 0.0], [2.0, 3.0], [-1.0, 1.0]];
+    /// So that no weight, and no root of one, is 1.
+    const VARIANCES: [f64; 3] = [4e-6, 9e-5, 5e-7];
+    const DRAWS: u64 = 2000;
+
+    fn dot(a: &[f32], b: &[f32]) -> f64 {
+        a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
+    }
+
+    #[test]
+    fn draws_have_the_covariance_of_the_problem_and_are_independent() {
+        for turned in [Rotation::None, Rotation::Quarter] {
+            let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+            let frames = vec![1.0; SHIFTS.len() * SENSOR.len()];
+            let measurements = Measurements {
+                frames: Stack::new("frames", &frames, SHIFTS.len(), SENSOR).unwrap(),
+                variance: Variance::Exposures(&VARIANCES),
+                mask: Mask::None,
+            };
+            let mut positions = Positions::of_shifts(&SHIFTS);
+            positions.rotations[2] = turned;
+            let flux = Flux::steady(SHIFTS.len());
+            let exposures =
+                Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
+            let mut solver = ConjugateGradients::new(&exposures, &workers, &control);
+            let wave = |i: usize| 1.0 + 0.3 * (i as f64 * 1.7).sin();
+            let sensitivity: Vec<f64> = (0..SENSOR.len()).map(wave).collect();
+            let seen = |view: &View| -> Vec<f64> {
+                let cols = view.shape.cols;
+                let cells = (0..view.shape.len()).map(|i| view.cells.at(i / cols, i % cols));
+                cells.map(wave).collect()
+            };
+            let beams: Vec<Vec<f64>> = exposures.geometry().views.iter().map(seen).collect();
+            solver.linearise(&sensitivity, &beams, &control).unwrap();
+            let (reduced, padding) = (&mut solver.reduced, solver.residual.len());
+            let (mut b, mut product) = (vec![0.0; padding], vec![0.0; padding]);
+            for frequency in [0.3, 1.1, 2.9] {
+                let in_system = reduced.inverse_diagonal.iter().enumerate();
+                let x: Vec<f32> = in_system
+                    .map(|(i, &d)| if d > 0.0 { (i as f32 * frequency).sin() } else { 0.0 })
+                    .collect();
+                let energy = reduced.multiply(&x, &mut product, &control).unwrap();
+                let heights: Vec<f64> = (0..DRAWS)
+                    .map(|draw| {
+                        reduced.draw(draw, &mut b, &control).unwrap();
+                        dot(&x, &b) / energy.sqrt()
+                    })
+                    .collect();
+                // Five standard errors: a square of a normal value scatters by √2, a product of two by 1.
+                let draws = DRAWS as f64;
+                let square = heights.iter().map(|h| h * h).sum::<f64>() / draws;
+                assert!((square - 1.0).abs() < 5.0 * (2.0 / draws).sqrt(), "{square}");
+                let next = heights.windows(2).map(|pair| pair[0] * pair[1]).sum::<f64>() / draws;
+                assert!(next.abs() < 5.0 / draws.sqrt(), "{next}");
+            }
+        }
     }
 }

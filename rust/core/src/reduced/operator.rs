@@ -365,7 +365,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                 let second = match shown {
                     Shown::Step(x) => self.padding.row_before(x, pixel_row, place.col),
                     Shown::Noise(draw) => {
-                        let row = self.noise([draw, exposure as u64], pixel_row, weight, noise);
+                        let row = self.noise(draw, exposure, pixel_row, weight, noise);
                         &row[self.padding.lead - place.col..][..self.padding.width]
                     }
                     Shown::Weight => first,

@@ -1,6 +1,6 @@
 //! The smallest Ritz value of all searches so far, and the error of M that it implies.
 
-use super::search::Search;
+use super::conjugate_gradients::ConjugateGradients;
 use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::error::Result;
@@ -28,7 +28,7 @@ impl Smallest {
     /// One more iteration of `search`; `false` if there was none to make.
     pub(crate) fn iterate<T: Real>(
         &mut self,
-        search: &mut Search<'_, '_, T>,
+        search: &mut ConjugateGradients<'_, '_, T>,
         control: &Control,
     ) -> Result<bool> {
         let went = search.iterate(control)?;
@@ -43,19 +43,19 @@ impl Smallest {
     }
 
     /// The largest error, before the step that `search` has found is made.
-    pub(crate) fn error<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+    pub(crate) fn error<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
         search.found() + self.left(search)
     }
 
     /// The share of b · S⁻¹ b that x · b lacks, at most: what is left is e · S e with e = S⁻¹ r, no more
     /// than r · P⁻¹ r over the smallest eigenvalue of P⁻¹S.
-    pub(crate) fn lack<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+    pub(crate) fn lack<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
         let left = search.square() / self.value;
         left / (search.energy + left)
     }
 
     /// What is left of the error once the step that `search` has found is made.
-    pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+    pub(crate) fn left<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
         search.largest() / self.value
     }
 }

@@ -136,7 +136,7 @@ impl<'m> TwoLevel<'m> {
         }
         let right = self.heights.clone();
         match &self.coarse {
-            Some(coarse) => coarse.solve(&mut self.heights, DAMPING),
+            Some(coarse) => coarse.correct(&mut self.heights, DAMPING),
             None => self.heights.fill(0.0),
         }
         self.spread();
@@ -167,7 +167,7 @@ impl<'m> TwoLevel<'m> {
     fn solve_waves(&mut self, right: Vec<f64>) -> f64 {
         let Some(waves) = &self.waves else { return 0.0 };
         let mut heights = right.clone();
-        waves.solve(&mut heights, self.workers);
+        waves.correct(&mut heights, self.workers);
         self.lines = waves.open(&heights, self.padding.width, self.workers);
         right.iter().zip(&heights).map(|(b, y)| b * y).sum()
     }

@@ -13,8 +13,8 @@ use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
 use crate::fit::{Fit, Refinement, Solution};
 use crate::frames::Real;
-use crate::gauge;
-use crate::joint::{self, Preconditioner, Search, ShiftPrior, System};
+use crate::gauge::FluxGauge;
+use crate::joint::{self, ConjugateGradients, Preconditioner, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
 
@@ -24,7 +24,7 @@ const MOST_PRODUCTS: u64 = 5000;
 const BEFORE_SHIFTS: f64 = 1e-3;
 /// A beam whose structure is so much larger than noise determines shifts; by the slopes of noise steps
 /// would lead nowhere.
-const TOLD: f64 = 10.0;
+const STRUCTURED: f64 = 10.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
@@ -67,7 +67,7 @@ pub(super) fn minimise<T: Real>(
 /// Steps towards the minimum.
 struct Steps<'m, 'a, T> {
     system: System<'m, 'a, T>,
-    search: Search,
+    search: ConjugateGradients,
     options: &'m Options,
     /// The most passes.
     limit: u64,
@@ -105,7 +105,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         Ok(Self {
             system,
-            search: Search::default(),
+            search: ConjugateGradients::default(),
             options,
             limit,
             swept,
@@ -187,14 +187,14 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             && self.search.iterations >= FEWEST_ITERATIONS;
         let Some(prior) = self.shift_prior.take_if(|_| near) else { return false };
         // Of a grid too small for second differences the structure is NaN, which determines nothing.
-        let determined = self.system.structure() >= TOLD;
+        let determined = self.system.structure() >= STRUCTURED;
         if !determined {
             self.refinement = Refinement::Undetermined;
             return false;
         }
         self.refinement = Refinement::Done;
         self.system.seek_shifts(Some(prior));
-        (self.search, self.taken, self.looks) = (Search::default(), None, Vec::new());
+        (self.search, self.taken, self.looks) = (ConjugateGradients::default(), None, Vec::new());
         true
     }
 
@@ -252,7 +252,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
     }
 
-    /// What was found, with the fluxes in their gauge.
+    /// What was found, and what the fluxes leave to the gauge.
     fn finish(self, ended: Ended, control: &Control) -> Result<Found> {
         let system = &self.system;
         let exposures = system.pass.exposures;
@@ -261,14 +261,16 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let smallest = self.search.smallest;
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
-        if matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_)) {
-            let theta = system.state.theta.first().copied().unwrap_or_default();
-            let drift = system.fluxes.slope.map(|slope| theta * slope);
-            let rotation = exposures.positions().rotations[0];
-            gauge::fix_fluxes(&mut fit, drift, &system.fluxes.open, rotation, exposures.sensor());
-        }
+        let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
+        let theta = system.state.theta.first().copied().unwrap_or_default();
+        let fluxes = fitted.then(|| FluxGauge {
+            drift: system.fluxes.slope.map(|slope| theta * slope),
+            open: system.fluxes.open.clone(),
+            rotation: exposures.positions().rotations[0],
+            sensor: exposures.sensor(),
+        });
         let left_out = without_offset.clone();
-        Ok(Found { fit, left_out, dead: Vec::new(), without_offset })
+        Ok(Found { fit, left_out, dead: Vec::new(), without_offset, fluxes })
     }
 }
 

@@ -68,7 +68,7 @@ pub(super) fn minimise<T: Real>(
         leaves_tilt: false,
         smallest_ritz: None,
     };
-    Ok(Found { fit, left_out, dead, without_offset: Vec::new() })
+    Ok(Found { fit, left_out, dead, without_offset: Vec::new(), fluxes: None })
 }
 
 /// What a solver holds beside the measurements at its fullest, in bytes: a search

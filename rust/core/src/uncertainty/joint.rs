@@ -16,7 +16,7 @@
 //! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
 //! out the mean of M, and the tilt where free fluxes leave it undetermined.
 
-use super::joint_gauge::{Hidden, Tilts, count, form};
+use super::joint_gauge::{Hidden, Tilts, count, form, valid};
 use super::joint_pulls::{add_change, product, pull_by, pull_of};
 use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
 use crate::control::Control;
@@ -25,10 +25,15 @@ use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
-use crate::joint::{self, Fluxes, Follow, Grid, Preconditioner, Search, ShiftPrior, State, System};
+use crate::joint::{
+    self, ConjugateGradients, Fluxes, Follow, Grid, Preconditioner, ShiftPrior, State, System,
+};
 use crate::memory;
 use crate::parallel::Workers;
-use crate::random;
+use crate::random::{self, Streams};
+
+#[cfg(test)]
+mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
@@ -56,7 +61,7 @@ enum Functional {
 pub(super) struct JointCovariance<'m, 'a, T> {
     system: System<'m, 'a, T>,
     preconditioner: Preconditioner,
-    search: Search,
+    search: ConjugateGradients,
     tilts: Tilts,
     /// The shifts that are uncertain though they were not refined.
     considered: Option<ShiftPrior>,
@@ -90,10 +95,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
         let (valid, scale) = valid(&system, &determined);
         Ok(Self {
-            tilts: Tilts::of(&system, &valid),
+            tilts: Tilts::of(&system, solution, &valid),
             system,
             preconditioner,
-            search: Search::default(),
+            search: ConjugateGradients::default(),
             considered,
             determined,
             valid,
@@ -103,7 +108,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let sampled = Sampled::of(self, control)?;
         let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
             true => (self.scale * sampled.variance(pixel)).sqrt(),
@@ -140,7 +145,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if !self.system.pass.with_offset {
             return Ok(None);
         }
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
         Ok(Some([along, self.mean_variance_of_offset_alone()]))
     }
@@ -150,7 +155,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         functionals: impl ExactSizeIterator<Item = Functional>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let total = functionals.len() as u64;
         let found = (0..).zip(functionals).map(|(index, functional)| {
             control.report("uncertainty", index, total);
@@ -185,21 +190,30 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         (0..own.len()).map(variance).collect()
     }
 
-    /// Adds the square of the change of M in one draw, solved until it lacks at most this share of
-    /// x · b.
-    fn add_square(
+    /// Adds the square of the change of M in one draw.
+    fn add_square(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
+        let slope = self.draw(draw, control)?;
+        let mut sign = self.other_signs(draw, Other::Shifts);
+        let variances = self.considered_variances().into_iter();
+        let wrong: Vec<f64> = variances.map(|variance| sign() * variance.sqrt()).collect();
+        let change = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
+        for (square, change) in squares.iter_mut().zip(&change) {
+            *square += (change * change / self.scale) as f32;
+        }
+        Ok(())
+    }
+
+    /// The change of M, in the gauge, with S x = b − S_d δ where considered shifts are wrong by δ, solved
+    /// until it lacks at most this share of x · b.
+    fn change(
         &mut self,
-        draw: u64,
+        mut slope: Vec<f64>,
+        wrong: &[f64],
         lack: f64,
-        squares: &mut [f32],
         control: &Control,
-    ) -> Result<()> {
-        let mut slope = self.draw(draw, control)?;
+    ) -> Result<Vec<f64>> {
         let mut change = vec![0.0; self.valid.len()];
         if self.considered.is_some() {
-            // S x = b − S_d δ for shifts that are wrong by δ.
-            let mut sign = self.other_signs(draw, Other::Shifts);
-            let wrong = self.considered_variances().into_iter().map(|v| sign() * v.sqrt());
             let mut moved = vec![0.0; slope.len()];
             moved.extend(wrong);
             let pulled = self.considering(|system| {
@@ -209,7 +223,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             })?;
             slope.iter_mut().zip(pulled).for_each(|(slope, pulled)| *slope -= pulled);
         }
-        self.solve(slope, lack, control)?;
+        self.apply_inverse(slope, lack, control)?;
         let x = std::mem::take(&mut self.search.x);
         product(&mut self.system, &x, control)?;
         add_change(&self.system, &mut change);
@@ -218,10 +232,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             workers.add_multiple(&mut change, x[self.system.state.beam.len()], drift);
         }
         self.tilts.gauge.apply(&mut change, workers);
-        for (square, change) in squares.iter_mut().zip(&change) {
-            *square += (change * change / self.scale) as f32;
-        }
-        Ok(())
+        Ok(change)
     }
 
     /// The variance of a functional, in the gauge of the result, solved until it lacks at most this
@@ -234,7 +245,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let own = self.system.centred_pulls(shifts);
                 let others = pull.len() - own.as_flattened().len();
                 pull[others..].copy_from_slice(own.as_flattened());
-                self.solve(pull, lack, control)?;
+                self.apply_inverse(pull, lack, control)?;
                 Ok(self.search.energy)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
@@ -247,8 +258,6 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         lack: f64,
         control: &Control,
     ) -> Result<f64> {
-        let cells = self.system.state.beam.len();
-        let others = cells + self.system.fluxes.columns.len();
         let workers = self.system.pass.workers;
         self.tilts.gauge.transpose(&mut gain, workers);
         let none = vec![0.0; gain.len()];
@@ -257,16 +266,9 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             let heights = [0, 1].map(|axis| workers.dot(&tilts[axis], &gain));
             variance += form(covariance, heights);
         }
-        let mut pull = if self.considered.is_some() {
-            self.considering(|system| pull_of(system, &gain, &none, control))?
-        } else {
-            pull_of(&mut self.system, &gain, &none, control)?
-        };
-        if let Some(drift) = &self.tilts.drift {
-            pull[cells] += workers.dot(drift, &gain);
-        }
-        let seen = if self.considered.is_some() { pull.split_off(others) } else { Vec::new() };
-        self.solve(pull, lack, control)?;
+        let (pull, seen) = self.pull_of_gain(&gain, control)?;
+        let others = pull.len();
+        self.apply_inverse(pull, lack, control)?;
         variance += self.search.energy;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
@@ -276,6 +278,22 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             variance += left.zip(self.considered_variances()).map(|(h, v)| h * h * v).sum::<f64>();
         }
         Ok(variance)
+    }
+
+    /// Cᵀ g, and what of it considered shifts get, of a functional in the gauge.
+    fn pull_of_gain(&mut self, gain: &[f64], control: &Control) -> Result<(Vec<f64>, Vec<f64>)> {
+        let cells = self.system.state.beam.len();
+        let (others, none) = (self.system.size(), vec![0.0; gain.len()]);
+        let mut pull = if self.considered.is_some() {
+            self.considering(|system| pull_of(system, gain, &none, control))?
+        } else {
+            pull_of(&mut self.system, gain, &none, control)?
+        };
+        if let Some(drift) = &self.tilts.drift {
+            pull[cells] += self.system.pass.workers.dot(drift, gain);
+        }
+        let seen = pull.split_off(others);
+        Ok((pull, seen))
     }
 
     /// With h = M/Σ M² the variance of Σ h O.
@@ -312,7 +330,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             found = height * height / size;
             workers.add_multiple(&mut pull, -height / size, &pulled);
         }
-        self.solve(pull, lack, control)?;
+        self.apply_inverse(pull, lack, control)?;
         Ok(variance + found + self.search.energy)
     }
 
@@ -329,8 +347,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         result
     }
 
-    /// Solves S x = b.
-    fn solve(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
+    /// S⁻¹ b, left in the search.
+    fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
         search.begin(system, preconditioner, b, control)?;
         let mut earlier = 0.0;
@@ -359,9 +377,9 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let mut of_penalty = self.other_signs(draw, Other::Penalty);
         let mut of_priors = self.other_signs(draw, Other::Priors);
         let system = &mut self.system;
-        let mut slope = pull_by(system, control, |pass, row_index, row, room| {
+        let mut slope = pull_by(system, control, |pass, row_index, row, workspace| {
             let cols = pass.exposures.sensor().cols;
-            let (weights, values, sums) = room.parts();
+            let (weights, values, sums) = workspace.parts();
             for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let mut sign = random::signs(streams[k] + row_index as u64);
                 let pixels = weights.iter().zip(&*row.sensitivity);
@@ -390,9 +408,9 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// The number of a stream of signs: of a row of an exposure, or behind those of what else is drawn.
     fn stream(&self, draw: u64, exposure: usize, row: usize) -> u64 {
-        let (rows, count) =
-            (self.system.pass.exposures.sensor().rows, self.system.pass.exposures.count());
-        (draw * (count + OTHERS) as u64 + exposure as u64) * rows as u64 + row as u64
+        let exposures = self.system.pass.exposures;
+        let streams = Streams::new(exposures.count() + OTHERS, exposures.sensor().rows);
+        streams.number(draw, exposure, row)
     }
 
     /// The stream of signs for what else is drawn.
@@ -456,23 +474,6 @@ fn problem<'m, 'a, T: Real>(
     Ok(system)
 }
 
-/// 1 in the determined pixels that have a weight, and their mean D⁻¹.
-fn valid<T: Real>(system: &System<'_, '_, T>, determined: &[bool]) -> (Vec<f32>, f64) {
-    let mut valid = vec![0.0; determined.len()];
-    let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
-    system.pass.for_rows(|[_, inverse, ..]| {
-        for (pixel, inverse) in (first..).zip(inverse) {
-            if *inverse > 0.0 && determined[pixel] {
-                valid[pixel] = 1.0;
-                sum += inverse;
-                count += 1.0;
-            }
-        }
-        first += inverse.len();
-    });
-    (valid, sum / count)
-}
-
 impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
     fn valid(&self) -> &[f32] {
         &self.valid
@@ -483,6 +484,6 @@ impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
     }
 
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        self.add_square(draw, LACK_OF_DRAW, squares, control)
+        self.add_square(draw, squares, control)
     }
 }

@@ -1,6 +1,7 @@
 //! The gauge of a joint fit's result, and the tilts of M that its linear problem does not see.
 
 use crate::exposures::FluxKind;
+use crate::fit::Solution;
 use crate::frames::Real;
 use crate::gauge;
 use crate::geometry::Rotation;
@@ -47,8 +48,12 @@ pub(super) struct Tilts {
 }
 
 impl Tilts {
-    /// Those of a problem, with 1 in the `valid` pixels, whose mean M is 1.
-    pub(super) fn of<T: Real>(system: &System<'_, '_, T>, valid: &[f32]) -> Self {
+    /// Those of a problem at a solution, with 1 in the `valid` pixels, whose mean M is 1.
+    pub(super) fn of<T: Real>(
+        system: &System<'_, '_, T>,
+        solution: &Solution<'_>,
+        valid: &[f32],
+    ) -> Self {
         let exposures = system.pass.exposures;
         let (sensor, rotation) = (exposures.sensor(), exposures.positions().rotations[0]);
         let [m, _] = system.pixels();
@@ -63,8 +68,8 @@ impl Tilts {
             let covariance = turned.map(|row| row.map(|x| x / system.unit));
             hidden = Some(Hidden { tilts, covariance });
         } else if !system.fluxes.open.is_empty() {
-            let labels: Vec<i32> = valid.iter().map(|valid| *valid as i32 - 1).collect();
-            let slopes = gauge::slopes(&m, &labels, sensor);
+            let counted = gauge::slope_pixels(solution.sensitivity, solution.flags);
+            let slopes = gauge::slopes(&counted, sensor);
             for direction in &system.fluxes.open {
                 let direction = rotation.in_sensor(*direction);
                 let mut slope = along(direction, &slopes);
@@ -75,6 +80,23 @@ impl Tilts {
         }
         Self { gauge: Gauge { parts }, hidden, drift }
     }
+}
+
+/// 1 in the determined pixels that have a weight, and their mean D⁻¹.
+pub(super) fn valid<T: Real>(system: &System<'_, '_, T>, determined: &[bool]) -> (Vec<f32>, f64) {
+    let mut valid = vec![0.0; determined.len()];
+    let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
+    system.pass.for_rows(|[_, inverse, ..]| {
+        for (pixel, inverse) in (first..).zip(inverse) {
+            if *inverse > 0.0 && determined[pixel] {
+                valid[pixel] = 1.0;
+                sum += inverse;
+                count += 1.0;
+            }
+        }
+        first += inverse.len();
+    });
+    (valid, sum / count)
 }
 
 /// How many pixels are valid.

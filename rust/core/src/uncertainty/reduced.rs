@@ -27,13 +27,13 @@ use crate::geometry::{Geometry, View};
 use crate::memory;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
-use crate::reduced::{self, Search, Smallest};
+use crate::reduced::{self, ConjugateGradients, Smallest};
 
 /// The covariance at a fit of M and L alone, of its linear problem at the solution.
 pub(super) struct ReducedCovariance<'m, 'a, T> {
     exposures: &'m Exposures<'a, T>,
     workers: &'m Workers,
-    search: Search<'m, 'a, T>,
+    search: ConjugateGradients<'m, 'a, T>,
     smallest: Smallest,
     /// 1 in the pixels whose mean M is 1, else 0.
     valid: Vec<f32>,
@@ -57,7 +57,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
         })?;
         let (sensitivity, beam) = (solution.sensitivity, solution.beam.values);
-        let mut search = Search::new(exposures, workers, control);
+        let mut search = ConjugateGradients::new(exposures, workers, control);
         let finite = |values: &[f64]| -> Vec<f64> {
             values.iter().map(|value| if value.is_finite() { *value } else { 0.0 }).collect()
         };
@@ -94,8 +94,8 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         self.search.reduced.padding.zeros(self.exposures.sensor().rows, self.workers, control)
     }
 
-    /// Solves S x = b, b being the residual, until x · b lacks at most this share.
-    fn solve(&mut self, lack: f64, control: &Control) -> Result<()> {
+    /// S⁻¹ b, left in the search, b being the residual, until x · b lacks at most this share.
+    fn apply_inverse(&mut self, lack: f64, control: &Control) -> Result<()> {
         let Self { search, smallest, .. } = self;
         search.begin(control)?;
         let (mut iterations, mut earlier) = (0, 0.0);
@@ -153,7 +153,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             *g -= mean as f32 * valid;
         }
         search.residual.copy_from_slice(slope);
-        self.solve(LACK_OF_FUNCTIONAL, control)?;
+        self.apply_inverse(LACK_OF_FUNCTIONAL, control)?;
         let Self { search, slope, workers, .. } = self;
         Ok(dot(slope, &search.x, workers) * (largest * search.reduced.scale.deviation()).powi(2))
     }
@@ -220,7 +220,7 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
         let Self { search, slope, .. } = self;
         search.reduced.draw(draw, &mut search.residual, control)?;
         slope.copy_from_slice(&search.residual);
-        self.solve(LACK_OF_DRAW, control)?;
+        self.apply_inverse(LACK_OF_DRAW, control)?;
         let Self { search, slope, workers, valid, count, .. } = self;
         // T x = x − D⁻¹ S x, and S x = b − r.
         let inverse = &search.reduced.inverse_diagonal;

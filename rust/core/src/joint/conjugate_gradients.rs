@@ -10,7 +10,7 @@ use crate::ritz::Ritz;
 
 /// A solution in the making.
 #[derive(Default)]
-pub(crate) struct Search {
+pub(crate) struct ConjugateGradients {
     pub(crate) x: Vec<f64>,
     residual: Vec<f64>,
     direction: Vec<f64>,
@@ -28,7 +28,7 @@ pub(crate) struct Search {
     sees_large_scales: bool,
 }
 
-impl Search {
+impl ConjugateGradients {
     pub(crate) fn begin<T: Real>(
         &mut self,
         system: &System<'_, '_, T>,

@@ -39,7 +39,7 @@ pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
 }
 
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
-pub(crate) struct Search<'m, 'a, T> {
+pub(crate) struct ConjugateGradients<'m, 'a, T> {
     workers: &'m Workers,
     pub(crate) reduced: Reduced<'m, 'a, T>,
     two_level: TwoLevel<'m>,
@@ -57,7 +57,7 @@ pub(crate) struct Search<'m, 'a, T> {
     pub(crate) ritz: Ritz,
 }
 
-impl<'m, 'a, T: Real> Search<'m, 'a, T> {
+impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
     /// Room for a search.
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
