@@ -17,6 +17,8 @@ mod conjugate_gradients;
 mod first_beam;
 mod flux;
 mod freedom;
+mod fused;
+mod fused_kernel;
 mod kernel;
 mod layout;
 mod memory;
@@ -29,7 +31,9 @@ mod survey;
 mod system;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod unknowns;
+mod waves;
 mod wide;
 mod workspace;
 

@@ -10,15 +10,15 @@ use crate::linalg::Cholesky;
 
 /// Hats further apart than this, in rows or columns of the coarse grid, meet only where exposures
 /// are turned against each other.
-const REACH: usize = 2;
+pub(super) const REACH: usize = 2;
 /// Places of a matrix element's row behind its column: the same coarse row, and those below.
-const STENCIL: usize = (REACH + 1) * (2 * REACH + 1);
+pub(super) const STENCIL: usize = (REACH + 1) * (2 * REACH + 1);
 
 /// What is added to the diagonal, as a share of it: less than the eigenvalues of parts that hang
 /// together weakly.
-const RIDGE: f64 = 1e-6;
+pub(super) const RIDGE: f64 = 1e-6;
 /// A share of the diagonal that rounding alone leaves of an eigenvalue.
-const NOTHING: f64 = 1e-10;
+pub(super) const NOTHING: f64 = 1e-10;
 /// What is added if there are such eigenvalues, besides those of constants in a part, divided by the
 /// square of the nodes along a side: a tenth of the smallest eigenvalue of a sensor that hangs
 /// together. Single precision leaves errors in those directions, which must not be magnified.

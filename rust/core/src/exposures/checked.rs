@@ -212,19 +212,36 @@ impl<'a, T: Real> Exposures<'a, T> {
         control: &Control,
         mut visit: impl FnMut(usize, usize, usize),
     ) -> Result<()> {
+        self.for_each_stretch(control, |exposure, row, cols| {
+            cols.for_each(|col| visit(exposure, row, col));
+        })
+    }
+
+    /// Calls `visit(exposure, row, columns)` for the used measurements that stand side by side.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] if `control` asks to stop.
+    pub(crate) fn for_each_stretch(
+        &self,
+        control: &Control,
+        mut visit: impl FnMut(usize, usize, Range<usize>),
+    ) -> Result<()> {
         let Shape { rows, cols } = self.sensor();
         let mut scratch = vec![0.0; cols];
         for exposure in 0..self.count() {
             for row in 0..rows {
                 control.check()?;
-                let stretch = self.stretch(exposure, row, 0..cols, &mut scratch);
-                for col in 0..cols {
-                    let used = match &stretch {
-                        Stretch::Uniform(..) => true,
-                        Stretch::Weighted(_, weights) => weights[col] > 0.0,
-                    };
-                    if used {
-                        visit(exposure, row, col);
+                match self.stretch(exposure, row, 0..cols, &mut scratch) {
+                    Stretch::Uniform(..) => visit(exposure, row, 0..cols),
+                    Stretch::Weighted(_, weights) => {
+                        let mut first = 0;
+                        for alike in weights.chunk_by(|a, b| (*a > 0.0) == (*b > 0.0)) {
+                            let end = first + alike.len();
+                            if alike[0] > 0.0 {
+                                visit(exposure, row, first..end);
+                            }
+                            first = end;
+                        }
                     }
                 }
             }

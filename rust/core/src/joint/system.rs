@@ -15,6 +15,7 @@
 use std::ops::Range;
 
 use super::flux::Fluxes;
+use super::fused::Fused;
 use super::kernel::{Eliminate, Follow};
 use super::layout::Grid;
 use super::pass::Pass;
@@ -50,6 +51,11 @@ pub(crate) struct System<'m, 'a, T> {
     /// D a/(aᵀD a) with these weights D and the coefficients a.
     scale: Vec<f64>,
     pub(crate) penalty: Option<Penalty>,
+    /// A faster product where it serves, and whether it is of the state last linearised.
+    fused: Option<Fused>,
+    is_fused_anew: bool,
+    /// Whether the weights and τ are of the state last linearised.
+    is_weighed_anew: bool,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -73,6 +79,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             weights: Vec::new(),
             scale: Vec::new(),
             penalty: None,
+            fused: None,
+            is_fused_anew: false,
+            is_weighed_anew: false,
             state,
         }
     }
@@ -130,6 +139,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         self.pass.place(&self.state.shifts, control);
+        // Its bands are those of the shifts.
+        self.fused.take_if(|_| self.shift_prior.is_some());
+        (self.is_fused_anew, self.is_weighed_anew) = (false, false);
         self.pass.flux = self.fluxes.at(&self.state.theta);
         let beam = std::mem::take(&mut self.state.beam);
         let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
@@ -149,8 +161,10 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// What [`linearise`](Self::linearise) gives, at weights D and a weight of the penalty of the state
     /// there.
     pub(crate) fn renew(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.penalty = None;
-        self.weigh(control)?;
+        if !self.is_weighed_anew {
+            self.penalty = None;
+            self.weigh(control)?;
+        }
         self.whole(control)
     }
 
@@ -275,6 +289,20 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
+        if self.is_single() {
+            return self.multiply_single(x, product, share, control);
+        }
+        self.multiply_double(x, product, share, control)
+    }
+
+    /// [`multiply`](Self::multiply) in double precision.
+    pub(super) fn multiply_double(
+        &mut self,
+        x: &[f64],
+        product: &mut Vec<f64>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
         let cells = self.state.beam.len();
         let params = self.fluxes.columns.len();
         let moves = self.centred(&x[cells + params..]);
@@ -291,6 +319,29 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let priors = product[cells..].iter_mut().zip(found).zip(self.precisions());
         priors.for_each(|((product, x), precision)| *product += precision * x);
         Ok(sums.largest)
+    }
+
+    /// [`multiply`](Self::multiply) in single precision.
+    fn multiply_single(
+        &mut self,
+        x: &[f64],
+        product: &mut Vec<f64>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
+        let Some(penalty) = &self.penalty else { return Ok(f64::INFINITY) };
+        let fused = self.fused.get_or_insert_with(|| Fused::new(&self.pass, control));
+        if !self.is_fused_anew {
+            fused.renew(&self.pass);
+            self.is_fused_anew = true;
+        }
+        product.resize(x.len(), 0.0);
+        fused.multiply(&mut self.pass, penalty, x, share, product, control)
+    }
+
+    /// Whether products are made in single precision.
+    pub(crate) fn is_single(&self) -> bool {
+        Fused::serves(&self.pass)
     }
 
     /// What a step pulls at the cells once M and O have followed it.
@@ -382,6 +433,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         })?;
         self.weights = weights;
+        self.is_weighed_anew = self.penalty.is_none();
         if self.pass.grid.is_spline() {
             let total: f64 = self.weights.iter().sum();
             let typical = self.pass.workers.dot(&self.weights, &self.weights) / total;

@@ -29,6 +29,8 @@ const STRUCTURED: f64 = 10.0;
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
 const CURVED: [f64; 2] = [1e-8, 0.03];
+/// The most that one step reduces the error by where products are made in single precision.
+const PRECISION: f64 = 1e-5;
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
 /// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
@@ -203,7 +205,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
-        let reachable = first * first.clamp(CURVED[0], CURVED[1]);
+        let least = if self.system.is_single() { PRECISION } else { CURVED[0] };
+        let reachable = first * first.clamp(least, CURVED[1]);
         while self.products() + A_LOOK < self.limit {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
