@@ -143,9 +143,13 @@ def test_averages_with_a_mask_calibrate(mask):
         truth, simulate.gaussian_beam(SHAPE, width=150), SHIFTS, frames=6, dead=0, hot=0, rng=rng
     )
     frames = [list(virtual.frames(k)) for k in range(len(SHIFTS))]
-    masked = equipix.calibrate([equipix.average(each, mask=mask) for each in frames], SHIFTS)
+    dark = equipix.average(virtual.dark())
+    masked = equipix.calibrate(
+        [equipix.average(each, dark=dark, mask=mask) for each in frames], SHIFTS
+    )
     np.testing.assert_array_equal(excluded(masked), mask)
-    given = equipix.calibrate([equipix.average(each) for each in frames], SHIFTS, mask=mask)
+    averages = [equipix.average(each, dark=dark) for each in frames]
+    given = equipix.calibrate(averages, SHIFTS, mask=mask)
     # The noise models differ by the bins of pixels that they are fitted to: some per cent of the
     # weights, which change M by less than a tenth of its noise of 1e-3.
     np.testing.assert_allclose(masked.sensitivity[~mask], given.sensitivity[~mask], rtol=1e-3)

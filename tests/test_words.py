@@ -109,6 +109,18 @@ def test_a_fitted_dark_does_not_blame_what_was_not_given():
     assert "robust" not in str(caught.value)
 
 
+def test_averages_without_a_dark_are_named(manifest):
+    dark = equipix.average(manifest.parent / "dark/dark.tif")
+    files = [manifest.parent / f"frames/p{k}.tif" for k in range(5)]
+    raw = [equipix.average(file, saturation=4095) for file in files]
+    with pytest.warns(errors.MissingDarkWarning, match=r"no dark was subtracted .*--dark"):
+        equipix.calibrate(raw, CROSS, tolerance=1e-3)
+    # A dark that was subtracted, as averages or as an array, raises no warning.
+    for offset in (dark, dark.mean):
+        frames = [equipix.average(file, saturation=4095, dark=offset) for file in files]
+        equipix.calibrate(frames, CROSS, tolerance=1e-3)
+
+
 @pytest.mark.parametrize("dark", [None, True])
 def test_a_dark_that_is_no_choice(dark):
     with pytest.raises(errors.InputError, match=f"'dark' is {dark}, expected 'subtracted' or"):

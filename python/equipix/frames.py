@@ -61,6 +61,8 @@ class FrameStatistics(ReadOnly):
         which pixels are hot, and how noisy a frame without light is.
     saturation : float or None
         The level that samples were compared with, in DN; None if there was none.
+    raw : bool
+        Whether no dark was subtracted from whole numbers, as cameras write them.
     """
 
     mean: NDArray[Any]
@@ -70,6 +72,7 @@ class FrameStatistics(ReadOnly):
     saturated: NDArray[Any]
     dark: FrameStatistics | None = None
     saturation: float | None = None
+    raw: bool = False
 
     @property
     def maps(self) -> dict[str, NDArray[Any]]:
@@ -202,7 +205,7 @@ def save_statistics(
     """
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content["saturation"] = statistics.saturation
+    content |= {"saturation": statistics.saturation, "raw": statistics.raw}
     if dark is not None:
         pages |= {_DARK + name: values for name, values in dark.maps.items()}
         content[_DARK + "saturation"] = dark.saturation
@@ -240,7 +243,8 @@ def read_statistics(
     if _DARK + "mean" in pages:
         io.check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
         dark = _of_pages(pages, content, _DARK)
-    return dataclasses.replace(_of_pages(pages, content), dark=dark)
+    raw = content.get("raw", False)
+    return dataclasses.replace(_of_pages(pages, content), dark=dark, raw=raw)
 
 
 def _of_pages(
@@ -299,7 +303,7 @@ def _average_files(
         return _saved(paths, level)
     try:
         maps = _native.average_files(paths, level, workers, progress)
-        return _statistics(maps, _level_of(io.frame_format(paths[0])[1], level))
+        return _statistics(maps, io.frame_format(paths[0])[1], level)
     except UnsupportedFileError:
         if any(saved_shape(path) for path in paths):
             return _saved(paths, level)
@@ -325,9 +329,19 @@ def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
     return statistics
 
 
-def _statistics(maps: tuple[NDArray[Any], ...], level: float | None) -> FrameStatistics:
+def _statistics(
+    maps: tuple[NDArray[Any], ...], dtype: np.dtype[Any], level: float | None
+) -> FrameStatistics:
     mean, variance, count, saturated = maps
-    return FrameStatistics(mean, variance, variance / count, count, saturated, saturation=level)
+    return FrameStatistics(
+        mean,
+        variance,
+        variance / count,
+        count,
+        saturated,
+        saturation=_level_of(dtype, level),
+        raw=dtype.kind in "iu",
+    )
 
 
 def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
@@ -399,7 +413,7 @@ def _average_batches(
         done += len(batch)
         if progress is not None:
             progress(done, max(done, total), "average")
-    return _statistics(sums.finish(), level)
+    return _statistics(sums.finish(), first.dtype, level)
 
 
 def _sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
@@ -437,7 +451,9 @@ def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatist
     maps = {name: values.copy() for name, values in statistics.maps.items()}
     for name, values in maps.items():
         values[array] = 0 if name in _COUNTS else np.nan
-    return FrameStatistics(**maps, dark=statistics.dark, saturation=statistics.saturation)
+    return FrameStatistics(
+        **maps, dark=statistics.dark, saturation=statistics.saturation, raw=statistics.raw
+    )
 
 
 def _subtract(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def on_input(exposures: Exposures) -> list[Verdict]:
     """Verdicts on exposures that the values given contradict."""
-    found = [_on_clipping(exposures), _on_units(exposures)]
+    found = [_on_clipping(exposures), _on_raw(exposures), _on_units(exposures)]
     return [verdict for verdict in found if verdict is not None]
 
 
@@ -23,6 +23,17 @@ def _on_clipping(exposures: Exposures) -> Verdict | None:
     if exposures.clipped is None:
         return None
     return Verdict("saturation", clipping_advice(exposures.clipped))
+
+
+def _on_raw(exposures: Exposures) -> Verdict | None:
+    """Verdict on averages without a dark."""
+    if not exposures.raw:
+        return None
+    return Verdict(
+        "raw",
+        "no dark was subtracted from the averages, so that an offset of the camera counts as "
+        "light: give 'dark' to equipix.average (--dark), or subtract it before",
+    )
 
 
 def _on_units(exposures: Exposures) -> Verdict | None:

@@ -48,6 +48,8 @@ class Averaged:
     values : ndarray, shape (n, rows, cols)
         Mean frames, the dark subtracted; NaN where a sample saturates, which is left out of that
         exposure alone.
+    raw : bool
+        Whether no dark was subtracted from averages of whole numbers.
     dark : FrameStatistics or None
         The dark frames that were subtracted.
     """
@@ -67,6 +69,7 @@ class Averaged:
         self._of_dark: list[float] = []
         self._points: list[Array] = []
         self._clipped: list[Clipping | None] = []
+        self.raw = True
 
     @classmethod
     def of(cls, frames: Sequence[FrameStatistics]) -> Self:
@@ -104,6 +107,7 @@ class Averaged:
         saturates = frames.saturated > 0
         self._refuse_saturated(f"exposure {exposure}{f' ({name!r})' if name else ''}", frames)
         self._clipped.append(clipping_of(frames))
+        self.raw &= frames.raw
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
         self.saturated |= saturates

@@ -61,6 +61,8 @@ class Exposures(ReadOnly):
         without it. None where it is unknown, or where an offset is sought, which takes all of it.
     clipped : Clipping or None
         A saturation level that was not given, if the values show one.
+    raw : bool
+        Whether the values are averages of whole numbers from which no dark was subtracted.
     """
 
     values: Array
@@ -74,6 +76,7 @@ class Exposures(ReadOnly):
     dark: Array | None = None
     dark_variance: Floats | None = None
     clipped: Clipping | None = None
+    raw: bool = False
 
     def __len__(self) -> int:
         """Return the number of exposures."""

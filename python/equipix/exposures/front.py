@@ -63,6 +63,7 @@ def exposures_of(
             dark=measured.dark,
             dark_variance=_of_dark(dark_variance, measured, offset=offset),
             clipped=measured.clipped,
+            raw=measured.raw and not offset,
         )
         refuse_nothing(exposures, given)
         return exposures
@@ -102,6 +103,7 @@ class Measured(NamedTuple):
     dark: Array | None = None
     dark_variance: Floats | None = None
     clipped: Clipping | None = None
+    raw: bool = False
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -152,6 +154,7 @@ def _of_averaged(
         None if dark is None else dark.mean.astype(averaged.values.dtype),
         None if model is None else averaged.dark_variance(model),
         averaged.clipped,
+        averaged.raw,
     )
 
 
