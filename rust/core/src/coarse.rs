@@ -22,7 +22,8 @@ mod spectrum;
 
 pub(crate) use hats::Hats;
 pub(crate) use matrix::{Arm, Coarse};
-pub(crate) use modulated::{Modulated, SeenWave, Spot};
+pub(crate) use modulated::Modulated;
 pub(crate) use modulated_kernel::Value;
+pub(crate) use modulated_matrix::{SeenWave, Spot};
 pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
 pub(crate) use spectrum::{Complex, Symbol, barely_constrained, times};

@@ -15,25 +15,11 @@ use std::ops::Range;
 
 use super::hats::Hats;
 use super::modulated_kernel::{Accumulate, Close, Columns, Distribute, Open, Value};
-use super::modulated_matrix::Matrix;
+use super::modulated_matrix::{Matrix, SeenWave, Spot};
 use super::spacing::DAMPING;
-use super::spectrum::{Complex, Wave};
+use super::spectrum::Wave;
 use crate::linalg::Cholesky;
 use crate::parallel::Workers;
-
-/// What one exposure shows in a block: its weight there, and the hats that it sees.
-pub(crate) struct Spot {
-    pub(crate) exposure: usize,
-    pub(crate) weight: f64,
-    pub(crate) hats: [(usize, f64); 4],
-}
-
-/// A wave with what each exposure makes of it, and the penalty on it in units of the weights.
-pub(crate) struct SeenWave {
-    pub(crate) wave: Wave,
-    pub(crate) factors: Vec<Complex>,
-    pub(crate) penalty: f64,
-}
 
 /// The coarse space of some waves.
 pub(crate) struct Modulated<N> {
@@ -239,7 +225,7 @@ mod tests {
         Modulated::new(hats, SHAPE.rows, &waves, &blocks, workers)
     }
 
-    fn phase(angle: f64) -> Complex {
+    fn phase(angle: f64) -> [f64; 2] {
         [angle.cos(), angle.sin()]
     }
 

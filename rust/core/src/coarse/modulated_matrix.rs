@@ -10,9 +10,22 @@
 
 use super::hats::Hats;
 use super::matrix::{NOTHING, REACH, RIDGE, STENCIL};
-use super::modulated::{SeenWave, Spot};
-use super::spectrum::{Complex, times};
+use super::spectrum::{Complex, Wave, times};
 use crate::linalg::Cholesky;
+
+/// What one exposure shows in a block: its weight there, and the hats that it sees.
+pub(crate) struct Spot {
+    pub(crate) exposure: usize,
+    pub(crate) weight: f64,
+    pub(crate) hats: [(usize, f64); 4],
+}
+
+/// A wave with what each exposure makes of it, and the penalty on it in units of the weights.
+pub(crate) struct SeenWave {
+    pub(crate) wave: Wave,
+    pub(crate) factors: Vec<Complex>,
+    pub(crate) penalty: f64,
+}
 
 pub(super) struct Matrix {
     cols: usize,

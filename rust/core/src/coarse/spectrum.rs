@@ -219,7 +219,7 @@ mod tests {
             (0..2).any(|axis| folded(q[axis] - other[axis]).abs() * 57.0 >= PI)
         };
         for place in 0..600 * 1200 {
-            let q = [place / 1200, place % 1200].map(|i| TAU * i as f64 / 1200.0);
+            let q = [place / 1200, place % 1200].map(|i| TAU * f64::from(i) / 1200.0);
             let known = |wave: &Wave| !far(q, wave.vector) || !far(q, wave.vector.map(|q| -q));
             if far(q, [0.0; 2]) && !waves.iter().any(known) {
                 // A place of the grid is off a minimum by less than what the deepest left differs by.
