@@ -101,7 +101,7 @@ def _explains_residuals(weighted: Weighted, workers: int | None) -> bool:
         known = np.isfinite(of_residuals) & np.isfinite(of_variances)
         along += float(np.sum(of_residuals[known] * of_variances[known]))
         square += float(np.sum(np.square(of_variances[known])))
-    return along > _SLOPE * square
+    return along >= _SLOPE * square
 
 
 def words(frames: float) -> str:
