@@ -99,6 +99,7 @@ class TestPredict:
 
 
 class TestResiduals:
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     @pytest.mark.parametrize("seed", range(3))
     def test_their_squares_add_up_to_the_objective(self, seed, tmp_path):
         rng, truth, beam = sensor((30, 44), seed)

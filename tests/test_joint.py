@@ -270,6 +270,7 @@ class TestFluxes:
             assert np.abs(tilt).max() < 4 * one
             assert np.abs(free.flux / flux - 1).max() < 4 * one
 
+    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
     @pytest.mark.parametrize("is_between", [False, True], ids=["whole", "between"])
     def test_without_one_the_tilt_is_left_to_the_gauge(self, is_between):
         rng = np.random.default_rng(4)

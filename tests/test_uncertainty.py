@@ -255,6 +255,7 @@ class TestTilt:
         # 150 pairs: 4 % a standard error of the rms, and three of them.
         assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1, abs=0.13)
 
+    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
     def test_drift_tilts_as_the_formula_says(self):
         shape, shifts = (60, 80), equipix.cross_pattern(5, 7)
         clean = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts)
