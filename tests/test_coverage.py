@@ -49,8 +49,11 @@ def test_the_cause_is_named(shifts, options, cause):
 def test_bad_pixels_are_a_cause():
     """Two thirds of the sensor scatter ten times as much as the noise model that is given."""
     rng = np.random.default_rng(2)
-    scatter = np.where(np.arange(SHAPE[1]) < 17, 5.0, 50.0) * rng.standard_normal((8, *SHAPE))
-    frames = [equipix.average(2000 * each + scatter) for each in exposures(CROSS, 0)]
+    noise = np.where(np.arange(SHAPE[1]) < 17, 5.0, 50.0)
+    frames = [
+        equipix.average(2000 * each + noise * rng.standard_normal((8, *SHAPE)))
+        for each in exposures(CROSS, 0)
+    ]
     with pytest.warns(errors.IdentifiabilityWarning, match=r"count as dead, hot or noisy"):
         found = equipix.calibrate(frames, CROSS, variance=equipix.NoiseModel(5.0, 0.0))
     assert found.is_partial
