@@ -101,11 +101,11 @@ impl Matrix {
         let mean = if is_alone { 1.0 } else { 0.5 };
         for (hat, stencil) in (0_u32..).zip(&self.near) {
             for (place, &[re, im]) in stencil.iter().enumerate() {
-                let (rows, cols) = (place / (2 * REACH + 1), place % (2 * REACH + 1));
-                let other = (hat as usize + rows * self.cols + cols - REACH) as u32;
                 if [re, im] == [0.0; 2] {
                     continue;
                 }
+                let (rows, cols) = (place / (2 * REACH + 1), place % (2 * REACH + 1));
+                let other = (hat as usize + rows * self.cols + cols - REACH) as u32;
                 entries.push((2 * other, 2 * hat, mean * re));
                 entries.push((2 * other + 1, 2 * hat + 1, mean * re));
                 if other > hat && !is_alone {
