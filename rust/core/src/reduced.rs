@@ -20,6 +20,7 @@
 mod blocks;
 mod conjugate_gradients;
 mod dark;
+mod dark_noise;
 mod kernel;
 mod noise;
 mod operator;

@@ -1,5 +1,6 @@
 //! The operator S: products, its diagonal, and the pixels that leave it.
 
+use super::dark::Dark;
 use super::kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
 use crate::control::Control;
 use crate::error::Result;
@@ -91,18 +92,6 @@ impl Scale {
     pub(crate) fn deviation(&self) -> f64 {
         self.slope().sqrt()
     }
-}
-
-/// The noise of the dark, in the units of the linear problem (`dark.rs`).
-pub(crate) struct Dark {
-    /// The standard deviation of e.
-    pub(super) std: Vec<f32>,
-    /// a; 0 in pixels without measurement and in those that have left the system.
-    pub(super) follows: Vec<f32>,
-    /// Σ w c L.
-    pub(super) sums: Vec<f32>,
-    /// 1/c of each exposure.
-    pub(super) factors: Vec<f32>,
 }
 
 impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
@@ -460,7 +449,7 @@ pub(super) struct WeightScratch {
 pub(crate) enum Draw {
     /// Of each measurement by itself.
     Measurements(u64),
-    /// Of the dark, less what M follows of it (`dark.rs`).
+    /// Of the dark, less what M follows of it (`dark_noise.rs`).
     Dark(u64),
 }
 

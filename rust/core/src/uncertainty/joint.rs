@@ -22,10 +22,10 @@
 
 use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
-use super::joint_pulls::{add_change, product, pull_by, pull_of, variance_by_cells};
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
-use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
-use super::smoothed::{Change, Smooth, is_smoothed, smoothed};
+use super::joint_pulls::{add_change, product, pull_of};
+use super::sampling::{ErrorMap, LACK_OF_FUNCTIONAL, LACK_WITH_DARK, NEGLIGIBLE, NOTHING};
+use super::sampling::{Sampled, mean_misfit};
+use super::smoothed::{is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
@@ -33,31 +33,18 @@ use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
 use crate::joint::{
-    self, ConjugateGradients, Fluxes, Follow, Grid, Preconditioner, ShiftPrior, State, System,
+    self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
 };
 use crate::memory;
 use crate::parallel::Workers;
-use crate::random::{self, Streams};
 
+mod draws;
 #[cfg(test)]
 mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
 
-/// Iterations over which a search must find something.
-const PATIENCE: u64 = 50;
-/// The share of what a search may lack that it aims at: the smallest Ritz value is above the eigenvalue.
-const AIM: f64 = 0.5;
-
-/// What is drawn besides the noise of exposures.
-enum Other {
-    Penalty,
-    Priors,
-    Shifts,
-}
-/// How many of them there are.
-const OTHERS: usize = 3;
 /// A linear functional of what was found.
 enum Functional {
     /// Σ g M.
@@ -232,23 +219,6 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         variance.collect()
     }
 
-    /// The change of M in one draw, in the units of the map.
-    fn drawn_change(&mut self, draw: u64, control: &Control) -> Result<Change> {
-        let slope = self.draw(draw, control)?;
-        let mut sign = self.other_signs(draw, Other::Shifts);
-        let variances = self.considered_variances().into_iter();
-        let wrong: Vec<f64> = variances.map(|variance| sign() * variance.sqrt()).collect();
-        let mut sampled = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
-        let mut followed = Vec::new();
-        if let Some(dark) = &self.dark {
-            followed = dark.follow(draw, self.system.pass.exposures.sensor());
-            self.tilts.gauge.apply(&mut followed, self.system.pass.workers);
-        }
-        let unit = self.scale.sqrt();
-        sampled.iter_mut().chain(&mut followed).for_each(|change| *change /= unit);
-        Ok(Change { sampled, followed })
-    }
-
     /// The change of M, in the gauge, with S x = b − S_d δ where considered shifts are wrong by δ, solved
     /// until it lacks at most this share of x · b.
     fn change(
@@ -410,11 +380,11 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
             let goes_on = search.step(system, preconditioner);
-            let left = search.square / search.lowest.expected();
-            if !goes_on || iteration >= FEWEST_ITERATIONS && left <= AIM * lack * search.energy {
+            let left = search.square / search.smallest;
+            if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
                 return Ok(());
             }
-            if iteration % PATIENCE == 0 {
+            if iteration % FEWEST_ITERATIONS == 0 {
                 if search.energy - earlier <= NOTHING * lack * search.energy {
                     break;
                 }
@@ -429,68 +399,6 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// Searches that ended before their answer was as exact as it should be.
     pub(super) const fn incomplete(&self) -> u64 {
         self.incomplete
-    }
-
-    /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
-    fn draw(&mut self, draw: u64, control: &Control) -> Result<Vec<f64>> {
-        let mut slope = self.pulls_of_noise(draw, true, control)?;
-        let mut of_penalty = self.other_signs(draw, Other::Penalty);
-        let mut of_priors = self.other_signs(draw, Other::Priors);
-        let system = &mut self.system;
-        let cells = system.state.beam.len();
-        if let Some(penalty) = &system.penalty {
-            let beam = &system.state.beam;
-            penalty.add_draw(beam, &mut of_penalty, &mut slope[..cells], system.pass.workers);
-        }
-        let params = system.fluxes.columns.len();
-        let mut pulls = system.precisions();
-        pulls.iter_mut().for_each(|precision| *precision = precision.sqrt() * of_priors());
-        let of_shifts = system.centred_pulls(pulls.split_off(params).as_chunks().0.to_vec());
-        let priors = pulls.iter().chain(of_shifts.as_flattened());
-        slope[cells..].iter_mut().zip(priors).for_each(|(slope, pull)| *slope += pull);
-        Ok(slope)
-    }
-
-    /// Jᵀ w Q of noise ε of variance 1/w, if that is drawn, and of the dark's noise.
-    fn pulls_of_noise(&mut self, draw: u64, of_each: bool, control: &Control) -> Result<Vec<f64>> {
-        let streams: Vec<u64> =
-            (0..self.system.pass.exposures.count()).map(|k| self.stream(draw, k, 0)).collect();
-        let Self { system, dark, .. } = self;
-        let sensor = system.pass.exposures.sensor();
-        pull_by(system, control, |pass, row_index, row, workspace| {
-            let cols = pass.exposures.sensor().cols;
-            let errors = dark.iter().flat_map(|dark| dark.errors(draw, row_index, sensor));
-            let errors: Vec<f64> = errors.collect();
-            let (weights, values, sums) = workspace.parts();
-            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
-                let mut sign = random::signs(streams[k] + row_index as u64);
-                let pixels = weights.iter().zip(&*row.sensitivity);
-                let values = values.of_mut(k);
-                for (value, (weight, m)) in values.iter_mut().zip(pixels) {
-                    // As a change of the light, which a pixel without response does not show.
-                    let shown = weight.sqrt() * flux * m;
-                    *value = if shown == 0.0 || !of_each { 0.0 } else { sign() / shown };
-                }
-                for ((value, error), m) in values.iter_mut().zip(&errors).zip(&*row.sensitivity) {
-                    let shown = flux * m;
-                    *value += if shown == 0.0 { 0.0 } else { error / shown };
-                }
-            }
-            let fluxes = &pass.flux[..];
-            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
-        })
-    }
-
-    /// The number of a stream of signs: of a row of an exposure, or behind those of what else is drawn.
-    fn stream(&self, draw: u64, exposure: usize, row: usize) -> u64 {
-        let exposures = self.system.pass.exposures;
-        let streams = Streams::new(exposures.count() + OTHERS, exposures.sensor().rows);
-        streams.number(draw, exposure, row)
-    }
-
-    /// The stream of signs for what else is drawn.
-    fn other_signs(&self, draw: u64, which: Other) -> impl FnMut() -> f64 + use<T> {
-        random::signs(self.stream(draw, self.system.pass.exposures.count() + which as usize, 0))
     }
 
     /// D⁻¹ of each pixel's M.
@@ -547,52 +455,4 @@ fn problem<'m, 'a, T: Real>(
     let mut system = System::new(exposures, grid, fluxes, state, workers, control);
     system.unit = solution.unit;
     Ok(system)
-}
-
-impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
-    fn valid(&self) -> &[f32] {
-        &self.valid
-    }
-
-    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
-        Ok(self.known_part())
-    }
-
-    fn followed(&self) -> &[f32] {
-        self.dark.as_ref().map_or(&[], |dark| &dark.in_gauge)
-    }
-
-    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        let Change { sampled, followed } = self.drawn_change(draw, control)?;
-        for (square, change) in squares.iter_mut().zip(&sampled) {
-            *square += (change * change) as f32;
-        }
-        for ((square, change), followed) in squares.iter_mut().zip(&sampled).zip(&followed) {
-            *square += (2.0 * change * followed) as f32;
-        }
-        Ok(())
-    }
-}
-
-impl<T: Real> Smooth for JointCovariance<'_, '_, T> {
-    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
-        Ok(self.known_part())
-    }
-
-    /// Σ_k (D⁻¹ w e c M)² V with the variance V of the beam's cells by themselves: what they do to M.
-    fn local(&mut self, control: &Control) -> Result<Vec<f64>> {
-        let mut local = variance_by_cells(&mut self.system, control)?;
-        for (local, valid) in local.iter_mut().zip(&self.valid) {
-            *local *= f64::from(*valid) / self.scale;
-        }
-        Ok(local)
-    }
-
-    fn followed(&self) -> &[f32] {
-        Drawn::followed(self)
-    }
-
-    fn change(&mut self, draw: u64, control: &Control) -> Result<Change> {
-        self.drawn_change(draw, control)
-    }
 }

@@ -16,7 +16,7 @@
 //!
 //! A linear functional gᵀM has the variance gᵀ S⁻¹ g: one linear problem, no draws.
 //!
-//! The noise of a dark that was subtracted from all exposures adds a e + r (`reduced/dark.rs`). The
+//! The noise of a dark that was subtracted from all exposures adds a e + r (`reduced/dark_noise.rs`). The
 //! variance of a e is known; r and its product with a e are sampled, in the same draws. To a functional
 //! it adds Σ_p v (Σ_k h_k)², h_k = w c L (x − M h) being the influence of measurement k with S x = g.
 

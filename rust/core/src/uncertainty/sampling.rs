@@ -95,9 +95,10 @@ impl Sampled {
         for (pixel, &valid) in valid.iter().enumerate() {
             let sampled = f64::from(self.squares[pixel]) / draws;
             let variance = self.variance(pixel).max(f64::MIN_POSITIVE);
-            squares += f64::from(valid) * (sampled / variance).powi(2);
+            let share = sampled / variance;
+            squares += f64::from(valid) * share.powi(2);
             let followed = followed.get(pixel).map_or(0.0, |followed| f64::from(*followed));
-            products += f64::from(valid) * sampled * followed / variance.powi(2);
+            products += f64::from(valid) * share * followed / variance;
             count += f64::from(valid);
         }
         let own = (squares - 4.0 * products / draws) / count * draws / (draws + 2.0);
