@@ -75,7 +75,9 @@ def test_an_average_of_an_average_is_that_average(manifest, tmp_path):
         np.testing.assert_array_equal(found.maps[name], values)
     # On the command line too, where --dark names an average.
     assert run("average", mean, "--dark", offset, "-o", tmp_path / "again.tif") == 0
-    np.testing.assert_array_equal(equipix.load(tmp_path / "again.tif").mean, wanted.mean)
+    np.testing.assert_array_equal(
+        equipix.FrameStatistics.load(tmp_path / "again.tif").mean, wanted.mean
+    )
 
 
 def test_another_dark_is_not_subtracted_a_second_time(manifest, tmp_path):

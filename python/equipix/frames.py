@@ -80,7 +80,7 @@ class FrameStatistics(ReadOnly):
         return {name: getattr(self, name) for name in _PAGES}
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.load` reads.
+        """Write to a file that `FrameStatistics.load` reads.
 
         `equipix.average`, experiment.toml and the command line take the file in the place of the
         frames.
@@ -98,6 +98,27 @@ class FrameStatistics(ReadOnly):
             If the file exists and `force` is not set, or it cannot be written.
         """
         save_statistics(path, self, force=force)
+
+    @staticmethod
+    def load(path: str | PathLike[str]) -> FrameStatistics:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : str or path
+            A .tif or .npz file.
+
+        Returns
+        -------
+        FrameStatistics
+            The averaged frames.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, holds something else, or was written in a newer format.
+        """
+        return load_statistics(path)
 
 
 def average(
@@ -187,22 +208,7 @@ def average(
 def save_statistics(
     path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
 ) -> None:
-    """Write averaged frames to a .tif or .npz file.
-
-    Parameters
-    ----------
-    path : path
-        Output; its suffix names the format.
-    statistics : FrameStatistics
-        What `equipix.average` returned.
-    force : bool, optional
-        Replace a file that is there.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `force` is not set, or cannot be written.
-    """
+    """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
     content |= {"saturation": statistics.saturation, "raw": statistics.raw}
@@ -213,23 +219,7 @@ def save_statistics(
 
 
 def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
-    """Read what `save_statistics` wrote.
-
-    Parameters
-    ----------
-    path : path
-        A .tif or .npz file.
-
-    Returns
-    -------
-    FrameStatistics
-        The averaged frames.
-
-    Raises
-    ------
-    FileError
-        If the file is not readable or holds something else.
-    """
+    """Read averaged frames; the parameter and errors are those of `FrameStatistics.load`."""
     return read_statistics(path, *io.load_pages(path))
 
 

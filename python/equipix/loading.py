@@ -24,13 +24,13 @@ the content of ``(path, pages, metadata)``."""
 
 _NO_CORRECTIONS = {
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
-    "themselves: equipix correct subtracts them as --dark",
+    "themselves: FrameStatistics.load reads them, equipix correct subtracts them as --dark",
 }
 """Kinds of files that are no corrections, and what they are."""
 
 
-def load(path: str | PathLike[str]) -> Any:
-    """Read a correction or averaged frames from the file that their `save` wrote.
+def load(path: str | PathLike[str]) -> Correction:
+    """Read a correction from the file that its `save` wrote.
 
     Parameters
     ----------
@@ -39,25 +39,23 @@ def load(path: str | PathLike[str]) -> Any:
 
     Returns
     -------
-    Calibration, another Correction, or FrameStatistics
+    Correction
         As it was saved, bit by bit: from a file that `Calibration.save` wrote a `Calibration`.
 
     Raises
     ------
     FileError
-        If the file cannot be read, holds something else, or was written in a newer format.
-    """
-    return _load(path, READERS)
-
-
-def load_correction(path: str | PathLike[str]) -> Correction:
-    """Read a correction of any kind, and refuse averaged frames.
-
-    The parameters and errors are those of `load`.
+        If the file cannot be read, holds something else, or was written in a newer format. Averaged
+        frames are read by `FrameStatistics.load`.
     """
     readers = {kind: reader for kind, reader in READERS.items() if kind not in _NO_CORRECTIONS}
     correction: Correction = _load(path, readers)
     return correction
+
+
+def load_any(path: str | PathLike[str]) -> Any:
+    """Read a correction or averaged frames; the parameters and errors are those of `load`."""
+    return _load(path, READERS)
 
 
 def load_calibration(path: str | PathLike[str]) -> Calibration:

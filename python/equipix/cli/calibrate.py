@@ -26,7 +26,7 @@ from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError
 from equipix.experiment.run import Experiment
 from equipix.io import SUFFIXES, read_mask, refuse_inputs
-from equipix.loading import load, load_calibration
+from equipix.loading import load_any, load_calibration
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
 
@@ -104,7 +104,7 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Show what a calibration file, or a file of averaged frames, holds."""
-    content = load(file)
+    content = load_any(file)
     result = {"file": str(file), **summary(content)}
     if as_json and hasattr(content, "metadata"):
         result["metadata"] = content.metadata

@@ -15,7 +15,7 @@ from equipix.correction.files import correct_files, is_folder
 from equipix.errors import InputError
 from equipix.frames import average as average_frames
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
-from equipix.loading import load_correction
+from equipix.loading import load
 
 commands = typer.Typer()
 
@@ -78,7 +78,7 @@ def correct(
     refuse_inputs([output], [calibration])
     with progress_bars() as progress:
         done = correct_files(
-            load_correction(calibration),
+            load(calibration),
             frames,
             output,
             dark=dark,
