@@ -28,9 +28,13 @@ _LEADING = 0.4
 """Share of the largest step that others must have in a round: through the beam a grain spreads a
 part 1/n of its own over other pixels, more where several of its pixels meet."""
 
-_STEP = 0.7
-"""Share of the squared residuals of a place that one step in time explains. Of a false value in one
+_STEP = 0.85
+"""Share of the squared residuals of a pixel that one step in time explains. Of a false value in one
 exposure it explains at most 0.38 with five exposures, and less with more."""
+
+_TOGETHER = 4
+"""Pixels of 3×3 that have their step at one moment. A large reflection in one exposure meets itself
+through the beam, in patterns that single pixels may show as a step."""
 
 _MOST_ROUNDS = 10
 """Most rounds of finding and fitting: a large grain hides smaller ones beside it."""
@@ -52,7 +56,7 @@ def without_fallen_dust(
     moment = np.zeros(exposures.shape, np.int64)
     for _ in range(_MOST_ROUNDS):
         step, first = steps(exposures, fit, options)
-        found = (step > _BEYOND) & (step > _LEADING * step.max())
+        found = _together((step > _BEYOND) & (step > _LEADING * step.max()), first)
         edges = not found.any() and moment.any()
         if edges:
             found, first = _beside(moment, step > _NEAR), _around(moment)
@@ -97,6 +101,15 @@ def _scaled(exposures: Exposures, fit: Fit, options: FitOptions) -> Floats:
     scale = ROBUST * nanmedian_abs(signed)
     usual = np.maximum(scale, options.tolerance * np.median(scale) + np.finfo(float).tiny)
     return np.nan_to_num(signed / usual[:, None, None])
+
+
+def _together(found: Bools, first: NDArray[np.int64]) -> Bools:
+    """Those that have others beside them, with the step at the same moment."""
+    together = np.zeros_like(found)
+    for moment in np.unique(first[found]):
+        same = found & (first == moment)
+        together |= same & (box_sums(same) >= _TOGETHER)
+    return together
 
 
 def _beside(moment: NDArray[np.int64], near: Bools) -> Bools:
