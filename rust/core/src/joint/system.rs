@@ -54,6 +54,9 @@ pub(crate) struct System<'m, 'a, T> {
     /// A faster product where it serves, and whether it is of the state last linearised.
     fused: Option<Fused>,
     is_fused_anew: bool,
+    /// Whether products may be made in single precision: where no later step makes good what they leave,
+    /// they may not.
+    pub(crate) allows_single: bool,
     /// Whether the weights and τ are of the state last linearised.
     is_weighed_anew: bool,
 }
@@ -81,6 +84,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             penalty: None,
             fused: None,
             is_fused_anew: false,
+            allows_single: true,
             is_weighed_anew: false,
             state,
         }
@@ -341,7 +345,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// Whether products are made in single precision.
     pub(crate) fn is_single(&self) -> bool {
-        Fused::serves(&self.pass)
+        self.allows_single && Fused::serves(&self.pass)
     }
 
     /// What a step pulls at the cells once M and O have followed it.

@@ -92,6 +92,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let prior = ShiftPrior::of(exposures.positions());
         let (refined, considered) = if solution.refined { (prior, None) } else { (None, prior) };
         system.seek_shifts(refined);
+        system.allows_single = false;
         system.linearise(control)?;
         let preconditioner = Preconditioner::new(&mut system, control)?;
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
