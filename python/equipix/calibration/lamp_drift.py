@@ -12,7 +12,7 @@ from equipix.calibration.significance import chi2_tail
 from equipix.drift import affine_columns, slope_covariance
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Floats
+    from equipix._types import Array, Bools, Floats
     from equipix.calibration.residuals import Residuals
     from equipix.calibration.weights import Weighted
 
@@ -21,6 +21,9 @@ WARNED = 1e-3
 
 _ADDED = 0.01
 """The same below which error bars contain the hidden tilt."""
+
+_BLOCK, _FAR = 16, 5.0
+"""Columns of a block, and how many standard deviations off it is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,8 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     the beam does not take is (1 − 1/j)/(1 − 1/n), with j exposures that see its cell. Errors of
     ln c that are affine in the shifts leave no residual: with P the projector on the other f
     combinations, ε² = |P v|²/f less the variance of v. Without drift the sum of squares of P v over
-    their variances follows χ² of f degrees of freedom.
+    their variances follows χ² of f degrees of freedom. Sums are over blocks of pixels; one whose
+    own flux is far from the median of its exposure is left out, so that dust looks like no drift.
     """
     exposures, fit = weighted.exposures, weighted.fit
     turns = set(exposures.positions.rotation.tolist())
@@ -151,11 +155,28 @@ def _free_fluxes(
     known = np.isfinite(residuals.values)
     signal = np.where(known, residuals.signal, 0)
     share = testable(residuals.rows, shifts, shape)
-    strength = np.sum(signal**2 * share, axis=(1, 2, 3))
-    slope = np.sum(np.where(known, residuals.values, 0) * signal, axis=(1, 2, 3))
+    places = np.arange(0, shape[1], _BLOCK)
+    strengths, slopes = (
+        np.add.reduceat(each.sum(axis=2), places, axis=2)
+        for each in (signal**2 * share, np.where(known, residuals.values, 0) * signal)
+    )
+    agree = _agreeing(strengths, slopes)
+    strength, slope = (np.sum(each, axis=(1, 2), where=agree) for each in (strengths, slopes))
     none = np.full(len(shifts), np.inf)
     variances = np.divide(1.0, strength, where=strength > 0, out=none)
     return np.asarray(np.divide(slope, strength, where=strength > 0, out=0 * slope)), variances
+
+
+def _agreeing(strengths: Floats, slopes: Floats) -> Bools:
+    """Blocks whose flux is near the median of their exposure: dust and reflections are no drift."""
+    known = strengths > 0
+    fluxes = np.divide(slopes, strengths, where=known, out=np.zeros_like(slopes))
+    centres = [
+        np.median(each[use]) if use.any() else 0 for each, use in zip(fluxes, known, strict=True)
+    ]
+    distances = np.abs(fluxes - np.reshape(centres, (-1, 1, 1))) * np.sqrt(np.maximum(strengths, 0))
+    scale = 1.4826 * np.median(distances[known]) if known.any() else 0.0
+    return np.asarray(known & (distances <= _FAR * scale))
 
 
 def _solver_error(error: float, shifts: Floats, shape: tuple[int, int]) -> float:
