@@ -139,24 +139,6 @@ fn refined_shifts() {
     }
 }
 
-#[test]
-fn refined_shifts_that_cross_a_whole_number() {
-    // There a pixel comes to see other cells, on each side of the margin of its turned view.
-    let truth = [[0.0, 0.0], [0.98, 2.27], [-0.02, 1.98], [1.73, 0.98], [3.38, -0.29]];
-    let measured = [[0.0, 0.0], [1.03, 2.24], [0.03, 2.03], [1.7, 1.03], [3.36, -0.27]];
-    for degrees in [[0, 90, 180, 270, 0], [0, 270, 90, 180, 0]] {
-        let simulation = noisy(LONG, &truth).with_noise(1e-4, 3).turned(&degrees);
-        let simulation = Simulation { beam: rolling, ..simulation };
-        let experiment = Experiment {
-            shifts: measured.to_vec(),
-            shift_std: Some(SHIFT_STD.to_vec()),
-            ..simulation.experiment()
-        };
-        check_one(&experiment);
-        check_shifts(&experiment, &truth);
-    }
-}
-
 /// Refined shifts are off the truth by what their standard deviations say, less what all have in common: the
 /// mean by the prior's weights. Ten values seldom hold one beyond four of them.
 fn check_shifts(experiment: &Experiment, truth: &[[f64; 2]]) {

@@ -144,7 +144,11 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
             let wrong: Vec<f64> = random_vector(shifts, 13).iter().map(|z| 0.1 * z).collect();
             // b = S x + S_d δ, which x solves.
             let whole = [&x[..], &wrong].concat();
-            let b = covariance.considering(|system| product(system, &whole, control)).unwrap();
+            let b = if covariance.considered.is_some() {
+                covariance.considering(|system| product(system, &whole, control)).unwrap()
+            } else {
+                product(&mut covariance.system, &whole, control).unwrap()
+            };
             let change = covariance.change(b[..size].to_vec(), &wrong, LACK, control).unwrap();
             let energy = covariance.search.energy;
             let mut in_gauge = gain.clone();
