@@ -3,7 +3,7 @@
 use super::flux::Fluxes;
 use super::layout::Grid;
 use super::preconditioner::Preconditioner;
-use super::rim::{NEAR, Rim};
+use super::rim::{NEAR_OF_TURNED as NEAR, Rim};
 use super::system::System;
 use super::unknowns::State;
 use crate::coarse::DAMPING;
