@@ -381,7 +381,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
             let goes_on = search.step(system, preconditioner);
-            let left = search.square / search.smallest;
+            let left = search.square / search.lowest.found();
             if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
                 return Ok(());
             }
