@@ -114,9 +114,11 @@ def test_a_process_is_refused_or_finishes_whatever_its_limit():
 
 
 def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
-    lines = ['[dark]\nframes = "0.tif"']
+    lines = ['[dark]\nframes = "dark.tif"']
+    write_frames(tmp_path / "dark.tif", np.zeros((2, 800, 800), np.uint16), nbytes=0)
     for k, shift in enumerate(CROSS.tolist()):
-        write_frames(tmp_path / f"{k}.tif", np.ones((2, 800, 800), np.uint16), nbytes=0)
+        frames = np.full((2, 800, 800), k + 1, np.uint16)
+        write_frames(tmp_path / f"{k}.tif", frames, nbytes=0)
         lines.append(f'[[exposure]]\nname = "{k}"\nframes = "{k}.tif"\nshift = {shift}')
     experiment = tmp_path / "experiment.toml"
     experiment.write_text("\n".join(lines))

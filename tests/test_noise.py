@@ -27,7 +27,7 @@ def raw():
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_unit_of_the_frames_plays_no_part(raw, unit):
-    options = {"max_sweeps": 30, "tolerance": 1e-9}
+    options = {"max_sweeps": 15, "tolerance": 1e-9}
     with pytest.warns(errors.ConvergenceWarning):
         plain = equipix.calibrate([equipix.average(each) for each in raw], CROSS, **options)
     with pytest.warns(errors.ConvergenceWarning):

@@ -7,6 +7,7 @@ use crate::coarse::{
 };
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Geometry, Placement, Walk};
 use crate::parallel::Workers;
@@ -33,7 +34,7 @@ pub(super) fn coarse_spaces<T: Real>(
     let coarse = Coarse::of_stars(hats, &[], stars, control)?;
     control.check()?;
     let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
-    let seen = if geometry.views.len() > 1 { Vec::new() } else { seen(reduced, &finer) };
+    let seen = seen(reduced.exposures, &finer);
     let spots: Vec<Vec<Spot>> = match &seen[..] {
         [] => Vec::new(),
         _ => weights
@@ -46,9 +47,18 @@ pub(super) fn coarse_spaces<T: Real>(
     Ok((coarse, waves))
 }
 
+/// How many waves the coarse space of these exposures has.
+pub(super) fn count_waves<T: Real>(exposures: &Exposures<'_, T>) -> usize {
+    let geometry = exposures.geometry();
+    seen(exposures, &Hats::new(geometry.sensor, spacing_of_waves(geometry))).len()
+}
+
 /// The waves that the exposures barely constrain, as a cell sees them: e^{−iq·d} of the pixel that sees it.
-fn seen<T: Real>(reduced: &Reduced<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
-    let exposures = reduced.exposures;
+/// Where exposures are turned against each other no wave is seen as one.
+fn seen<T: Real>(exposures: &Exposures<'_, T>, hats: &Hats) -> Vec<SeenWave> {
+    if exposures.geometry().views.len() > 1 {
+        return Vec::new();
+    }
     let places = Places(&exposures.geometry().placements);
     let weights = exposures.exposure_weights();
     let weighed = weights.iter().zip(exposures.flux()).map(|(weight, c)| weight * c * c);

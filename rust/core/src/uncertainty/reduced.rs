@@ -28,7 +28,7 @@ use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
-use crate::geometry::{Geometry, View};
+use crate::geometry::View;
 use crate::memory;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
@@ -64,7 +64,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
-        memory::check(bytes_needed(exposures.geometry()), || {
+        memory::check(bytes_needed(exposures), || {
             format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
         })?;
         let (sensitivity, beam) = (solution.sensitivity, solution.beam.values);
@@ -360,7 +360,8 @@ fn dot(a: &[f32], b: &[f32], workers: &Workers) -> f64 {
 
 /// What both take beside the measurements, in bytes: a search and three images more, a copy of L in
 /// each view, and the map.
-fn bytes_needed(geometry: &Geometry) -> u64 {
+fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
+    let geometry = exposures.geometry();
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
@@ -368,5 +369,5 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     let turned = if views > 1 { of_views } else { 0 };
     let more = 12 * places(geometry.sensor.rows) + turned;
-    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(geometry)
+    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(exposures)
 }
