@@ -294,6 +294,20 @@ class TestFluxes:
         # What is not affine leaves residuals, not tilts, but for some percent at edges.
         np.testing.assert_allclose(tilt, -affine, atol=0.1 * np.abs(affine).max())
 
+    @pytest.mark.parametrize("level", [0.36, 0.38])
+    def test_pixels_at_a_limit_of_the_range_count_for_both_or_none(self, level):
+        # These columns are near half of the mean, 0.76 and 0.77: the tilt that is removed moves some of
+        # them across that limit.
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        truth[:, :24] *= level
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.02, 1.03, 0.98, 0.99]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit")
+        # Sums of 3072 terms of size 1, in double precision.
+        assert np.abs(cal.tilt).max() < 1e-13
+
     def test_the_tilt_of_the_gauge_is_that_of_the_result(self):
         # A part of weak response and a dead pixel count for neither.
         shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
