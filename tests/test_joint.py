@@ -308,6 +308,22 @@ class TestFluxes:
         # Sums of 3072 terms of size 1, in double precision.
         assert np.abs(cal.tilt).max() < 1e-13
 
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_pixels_that_contradict_themselves_count_for_neither(self):
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.01, 0.99, 1.02, 0.98]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        frames += 1e-3 * np.random.default_rng(4).standard_normal(frames.shape)
+        frames[:, 40, 50] *= [1, 0.5, 1.4, 0.7, 1.9]
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit", robust=True)
+        assert cal.flags[40, 50] & equipix.Flag.UNRELIABLE_FLAT
+        assert np.isfinite(cal.sensitivity[40, 50])
+        assert np.abs(cal.tilt).max() < 1e-13
+        counted = np.isfinite(cal.sensitivity) & (cal.flags & equipix.Flag.UNRELIABLE_FLAT == 0)
+        assert cal.sensitivity[counted].mean() == pytest.approx(1, abs=1e-13)
+
     def test_the_tilt_of_the_gauge_is_that_of_the_result(self):
         # A part of weak response and a dead pixel count for neither.
         shape, shifts = (48, 64), equipix.cross_pattern(5, 7)

@@ -35,7 +35,7 @@ _BLOCK = 16
 
 @dataclass(frozen=True, eq=False)
 class Findings(ReadOnly):
-    """Bad pixels found in the frames before any fit: maps (rows, cols) of bool, or None.
+    """Bad pixels found before the last fit: maps (rows, cols) of bool, or None.
 
     Attributes
     ----------
@@ -48,7 +48,9 @@ class Findings(ReadOnly):
     noisy : ndarray of bool or None
         More scatter between frames than the noise explains: see `noisy_pixels`.
     contradictory : ndarray of bool or None
-        Another response before than after some moment, as under dust that fell.
+        Another response before than after some moment, as under dust that fell; or most of the
+        measurements left out by a robust calibration. The fit flags them, and their sensitivity
+        counts neither for its mean nor for its slope.
     """
 
     saturated: Bools | None = None

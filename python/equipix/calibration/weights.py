@@ -95,9 +95,19 @@ def _robust_fit(
             break
         if middle is not None:
             exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
-        kept = exposures.without(~usable | out)
+        kept = contradictory_found(exposures.without(~usable | out), given)
         fit = kept.fit(options, fit)
     return Weighted(kept, fit, out | (given & ~usable))
+
+
+def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
+    """Exposures with a finding for each pixel most of whose given measurements are left out."""
+    contradictory = given.sum(axis=0) > 2 * kept.usable().sum(axis=0)
+    before = kept.findings.contradictory
+    if before is not None:
+        contradictory |= before
+    findings = dataclasses.replace(kept.findings, contradictory=contradictory)
+    return dataclasses.replace(kept, findings=findings)
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:

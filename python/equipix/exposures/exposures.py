@@ -53,7 +53,7 @@ class Exposures(ReadOnly):
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
     findings : Findings
-        Bad pixels found before any fit.
+        Bad pixels found before the last fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
     dark_variance : ndarray, shape (rows, cols), float64, or None
@@ -213,6 +213,7 @@ class Exposures(ReadOnly):
             offset=self.offset,
             variance=self.variance,
             mask=self.mask,
+            unreliable=self.findings.contradictory,
             workers=options.workers,
             progress=options.progress,
         )
