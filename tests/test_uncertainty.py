@@ -11,7 +11,7 @@ import pytest
 import equipix
 from equipix import Flag, reference, simulate
 from equipix.cli import main
-from equipix.errors import InputError
+from equipix.errors import IdentifiabilityWarning, InputError
 from equipix.uncertainty import tilt_std
 
 CROSS = equipix.cross_pattern(2, 3)
@@ -322,11 +322,13 @@ class TestWhatIsUndetermined:
         wanted = np.sqrt(1e3) / np.sqrt(np.sum(np.square(options["flux"] * seen)))
         assert cal.sensitivity_std[7, 8] == pytest.approx(wanted, rel=1e-5)
 
-    @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_measurements_that_leave_no_freedom_need_a_variance(self):
         frames = np.ones((2, 4, 5))
         message = "'variance' is None and the residuals do not determine the noise"
-        with pytest.raises(InputError, match=message):
+        with (
+            pytest.warns(IdentifiabilityWarning, match="the shifts leave 4 parts"),
+            pytest.raises(InputError, match=message),
+        ):
             equipix.calibrate(frames, [(0, 0), (0, 1)], uncertainty=True)
 
 

@@ -264,21 +264,24 @@ def calibrated(
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)
     drift = lamp_drift(weighted, residuals)
+    found = verdicts.on_fit(weighted, options, test, drift, misfit(weighted, residuals))
+    found += verdicts.on_noise(frames, widths)
+    found = with_coverage(found, weighted, flags)
+    # Before the error bars, which may be refused or interrupted.
+    verdicts.say(found)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
     bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
-    found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
-    found += verdicts.on_noise(frames, widths, bars)
-    found = with_coverage(found, weighted, flags)
-    verdicts.say(found)
+    last = verdicts.on_standard_deviations(weighted, options, bars, dark)
+    verdicts.say(last)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,
         flags=flags,
         orientation=test,
         drift=drift,
-        verdicts=(*advice, *found),
+        verdicts=(*advice, *found, *last),
         bars=bars,
         metadata=metadata | (provenance or {}),
     )
