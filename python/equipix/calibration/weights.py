@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from equipix.calibration.robust import rejected
 from equipix.noise import modelled_variances
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
@@ -73,11 +74,12 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
         at_medians = (c * middle for c in exposures.flux.values)
         start = modelled(exposures, at_medians).fit(rough, start)
         exposures = modelled(exposures, expected(exposures, start, middle, options.fit.workers))
-    # The fit before goes, and with it the variances that it refers to.
-    start = exposures.fit(options.fit, start)
+    fit = exposures.fit(options.fit, start)
+    # With the rough fit go the variances that it refers to.
+    del start
     if options.robust:
-        return _robust_fit(exposures, options.fit, start, middle)
-    return Weighted(exposures, start, None)
+        return _robust_fit(exposures, options.fit, fit, middle)
+    return Weighted(exposures, fit, None)
 
 
 def _robust_fit(
