@@ -332,6 +332,32 @@ class TestWhatIsUndetermined:
             equipix.calibrate(frames, [(0, 0), (0, 1)], uncertainty=True)
 
 
+class TestArraysThatChange:
+    @pytest.mark.parametrize("name", ["frames", "variance", "mask"])
+    def test_are_refused_by_name(self, name):
+        frames, options = case(7, masked=0.1)
+        cal = equipix.calibrate(frames, CROSS, **options)
+        weights = np.where(cal.flags == 0, 1 / cal.flags.size, 0)
+        before = cal.std_of(weights)
+        changed = frames if name == "frames" else options[name]
+        kept = changed.copy()
+        changed[:, 3:5] = False if name == "mask" else np.nan
+        with pytest.raises(InputError, match=f"'{name}' of this calibration changed after"):
+            cal.std_of(weights)
+        changed[:] = kept
+        assert cal.std_of(weights) == before
+
+    def test_copies_may_change(self):
+        frames, options = case(7)
+        options["variance"] = np.asfortranarray(options["variance"])
+        cal = equipix.calibrate(frames, CROSS, **options)
+        weights = np.full(cal.shape, 1 / cal.flags.size)
+        weights[:, :7] *= -1
+        before = cal.std_of(weights)
+        options["variance"] *= 100
+        assert cal.std_of(weights) == before
+
+
 class TestOfAResult:
     @pytest.mark.parametrize("suffix", [".tif", ".npz"])
     def test_is_saved_and_read_but_for_the_measurements(self, tmp_path, suffix):

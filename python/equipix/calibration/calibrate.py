@@ -26,6 +26,7 @@ from equipix.calibration.priors import widened
 from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
 from equipix.calibration.sample_variances import steadied
+from equipix.calibration.unchanged import sampled_arrays
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -182,6 +183,9 @@ def calibrate(
 
     Notes
     -----
+    The arrays given are viewed, not copied, where their dtype and order allow it: they must not
+    change during the call, nor as long as `Calibration.std_of` is asked.
+
     Minimises :math:`F = \sum_k \sum_p w_k(p) [y_k(p) - c_k L(u_k(p)) M(p)]^2` over the sensitivity
     M and the beam L, with weights w = 1/variance, fluxes c and the position u of pixel p in the
     beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
@@ -260,6 +264,7 @@ def calibrated(
     weighted = without_false_pixels(weighted, options)
     weighted, widths = widened(weighted, options)
     weighted = with_dark_misfit(weighted, options.fit)
+    weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)

@@ -31,13 +31,15 @@ _MOST_ROUNDS = 20
 class Weighted(NamedTuple):
     """Exposures with their final weights, their fit, and the measurements left out.
 
-    `dark_misfit` is what the noise of the dark adds to F on average.
+    `dark_misfit` is what the noise of the dark adds to F on average, `sampled` what the arrays held
+    that later questions read again.
     """
 
     exposures: Exposures
     fit: Fit
     rejected: Bools | None
     dark_misfit: float = 0.0
+    sampled: Mapping[str, Array] = MappingProxyType({})
 
     @property
     def reduced_chi2(self) -> float:
