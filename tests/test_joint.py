@@ -296,8 +296,8 @@ class TestFluxes:
 
     @pytest.mark.parametrize("level", [0.36, 0.38])
     def test_pixels_at_a_limit_of_the_range_count_for_both_or_none(self, level):
-        # These columns are near half of the mean, 0.76 and 0.77: the tilt that is removed moves some of
-        # them across that limit.
+        # These columns are near half of the mean, 0.76 and 0.77: the tilt that is removed moves
+        # some of them across that limit.
         shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
         truth = simulate.paper_sensitivity(shape, rng=3)
         truth[:, :24] *= level
