@@ -126,7 +126,10 @@ def _on_searches(bars: ErrorBars | None) -> Verdict | None:
 
 def _on_rounding(exposures: Exposures) -> Verdict | None:
     rounding = exposures.positions.rounding
-    return None if rounding is None else Verdict("rounding", rounding.message)
+    if rounding is None:
+        return None
+    remedy = "use method='multiscale', or move the sensor by whole pixels"
+    return Verdict("rounding", f"{rounding.words}: {remedy}")
 
 
 def _on_order(exposures: Exposures) -> Verdict | None:
