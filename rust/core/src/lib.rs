@@ -202,6 +202,8 @@ mod ritz;
 pub mod solve;
 pub mod statistics;
 pub mod sweep;
+#[cfg(test)]
+mod testing;
 pub mod uncertainty;
 
 pub use beam::Beam;

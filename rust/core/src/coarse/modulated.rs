@@ -200,6 +200,7 @@ fn columns<N: Value>(hats: &Hats, wave: &Wave) -> [Vec<N>; 4] {
 mod tests {
     use super::*;
     use crate::frames::Shape;
+    use crate::testing::random_number;
 
     const SHAPE: Shape = Shape::new(41, 53);
     const VECTORS: [[f64; 2]; 2] = [[2.3, -0.7], [-1.1, 1.9]];
@@ -241,7 +242,7 @@ mod tests {
     }
 
     fn random(index: usize) -> f64 {
-        ((index as f64 * 12.9898).sin() * 43758.5453).rem_euclid(1.0) - 0.5
+        0.5 * random_number(index)
     }
 
     #[test]
