@@ -226,7 +226,7 @@ fn sum(values: &[f64]) -> f64 {
 /// What a change of the light pulls at the beam once M and O have followed it: v → c M w (u − α e − β)
 /// with u = c M v, and the change −α of M; returns the largest size of that less a share of the change
 /// before.
-pub(crate) struct Follow<'s> {
+pub(crate) struct Propagate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
@@ -238,7 +238,7 @@ pub(crate) struct Follow<'s> {
     pub(crate) share: f64,
 }
 
-impl pulp::NullaryFnOnce for Follow<'_> {
+impl pulp::NullaryFnOnce for Propagate<'_> {
     type Output = f64;
 
     #[inline(always)]
