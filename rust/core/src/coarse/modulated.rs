@@ -293,7 +293,7 @@ mod tests {
                 space.spaces[wave].factor.substitute(&mut heights);
                 let energy = |cell: usize| {
                     let [row, col] = [(cell / SHAPE.cols) as f64, (cell % SHAPE.cols) as f64];
-                    let shown = SHIFTS.map(|[down, right]| {
+                    let heights = SHIFTS.map(|[down, right]| {
                         let terms = heights.iter().enumerate();
                         terms
                             .map(|(place, y)| {
@@ -301,8 +301,8 @@ mod tests {
                             })
                             .sum::<f64>()
                     });
-                    let mean = shown.iter().sum::<f64>() / 3.0;
-                    shown.iter().map(|x| (x - mean).powi(2)).sum::<f64>()
+                    let mean = heights.iter().sum::<f64>() / 3.0;
+                    heights.iter().map(|x| (x - mean).powi(2)).sum::<f64>()
                 };
                 // With A y = e_i, yᵀAy = y_i. Of cos² and sin² of the phase the sum over a hat of some
                 // seven periods has half its length, and one period more or less at each end.

@@ -13,7 +13,7 @@
 
 use super::dark::Dark;
 use super::kernel::Common;
-use super::operator::{Reduced, Shown};
+use super::operator::{Input, Reduced};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -67,7 +67,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// The variance that the dark adds to x · b, b being what noise makes of it; 0 without a dark.
     pub(crate) fn variance_by_dark(&mut self, x: &[f32], control: &Control) -> Result<f64> {
         let Some(dark) = self.dark.take() else { return Ok(0.0) };
-        self.hide(Shown::Step(x), control);
+        self.eliminate(Input::Step(x), control);
         let mut sums = self.padding.zeros(self.exposures.sensor().rows, self.workers, control);
         let row = |row: usize| self.padding.row(x, row);
         let done = self.common(&dark.factors, &self.sensitivity, row, &mut sums, control);

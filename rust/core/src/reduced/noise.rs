@@ -11,7 +11,7 @@
 //! standard deviation everywhere and only its signs are drawn: a bit for each measurement.
 
 use super::kernel::{NoiseSlope, Sign, TwoTerms};
-use super::operator::{Draw, ExposureScratch, Reduced, RowWeight, Shown};
+use super::operator::{Draw, ExposureScratch, Input, Reduced, RowWeight};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -24,7 +24,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
     pub(crate) fn draw(&mut self, draw: Draw, slope: &mut [f32], control: &Control) -> Result<f64> {
-        self.hide(Shown::Noise(draw), control);
+        self.eliminate(Input::Noise(draw), control);
         self.for_each_row(slope, control, |row, slope| {
             let [mut scratch, mut of_noise] = [self.scratch(), self.scratch()];
             let lines = self.pixel_lines(row, &mut scratch);
@@ -52,7 +52,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
     pub(crate) fn two_terms(&mut self, variance: &mut [f32], control: &Control) -> Result<()> {
-        self.hide(Shown::Weight, control);
+        self.eliminate(Input::Weight, control);
         self.for_each_row(variance, control, |row, variance| {
             let mut scratch = self.scratch();
             let lines = self.pixel_lines(row, &mut scratch);

@@ -79,12 +79,12 @@ impl<T: Real> JointCovariance<'_, '_, T> {
                 let values = values.of_mut(k);
                 for (value, (weight, m)) in values.iter_mut().zip(pixels) {
                     // As a change of the light, which a pixel without response does not show.
-                    let shown = weight.sqrt() * flux * m;
-                    *value = if shown == 0.0 || !of_each { 0.0 } else { sign() / shown };
+                    let response = weight.sqrt() * flux * m;
+                    *value = if response == 0.0 || !of_each { 0.0 } else { sign() / response };
                 }
                 for ((value, error), m) in values.iter_mut().zip(&errors).zip(&*row.sensitivity) {
-                    let shown = flux * m;
-                    *value += if shown == 0.0 { 0.0 } else { error / shown };
+                    let response = flux * m;
+                    *value += if response == 0.0 { 0.0 } else { error / response };
                 }
             }
             let fluxes = &pass.flux[..];
