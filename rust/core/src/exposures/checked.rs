@@ -271,7 +271,7 @@ impl<'a, T: Real> Exposures<'a, T> {
         Ok(())
     }
 
-    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` has room for them.
+    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` is a buffer for them.
     pub(crate) fn stretch<'s>(
         &self,
         exposure: usize,

@@ -141,7 +141,7 @@ pub(crate) struct Eliminate<'s> {
     pub(crate) weights: &'s [f64],
     /// y, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Σ w e y, Σ w e, Σ w and Σ w y: room for four rows.
+    /// Σ w e y, Σ w e, Σ w and Σ w y: buffers for four rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
     pub(crate) singular: f64,
@@ -232,7 +232,7 @@ pub(crate) struct Propagate<'s> {
     pub(crate) weights: &'s [f64],
     /// v, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Room for rows.
+    /// Buffers for rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// The share of the change before.
     pub(crate) share: f64,

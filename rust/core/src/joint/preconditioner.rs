@@ -211,7 +211,7 @@ impl FilterRows {
         Self { rows, line: vec![0.0; cols + FILTER.len() - 1] }
     }
 
-    /// Room for the row that comes in; the first one goes.
+    /// A buffer for the row that comes in; the first one goes.
     fn next(&mut self) -> &mut [f64] {
         self.rows.rotate_left(1);
         &mut self.rows[FILTER.len() - 1]

@@ -39,7 +39,7 @@ pub(crate) struct Reduced<'m, 'a, T> {
     left_out: Vec<LeftOut>,
     /// (L/scale)² in each view; 0 where unobserved.
     pub(super) light: Vec<Vec<f32>>,
-    /// h in each view: room for the first half of a product.
+    /// h in each view: a buffer for the first half of a product.
     eliminated: Vec<Vec<f32>>,
     /// The noise of a dark that was subtracted from all exposures, where it is known.
     pub(super) dark: Option<Dark>,
@@ -95,7 +95,7 @@ impl Scale {
 }
 
 impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
-    /// Room for the operator of `model`.
+    /// Buffers for the operator of `model`.
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
         workers: &'m Workers,
@@ -431,7 +431,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     }
 }
 
-/// Room for the weights of one row of each exposure.
+/// Buffers for the weights of one row of each exposure.
 pub(crate) struct Scratch {
     pub(super) of_exposures: Vec<ExposureScratch>,
 }

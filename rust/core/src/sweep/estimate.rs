@@ -101,7 +101,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         })
     }
 
-    /// Makes room for L where there is none, by the threads that will use it.
+    /// Allocates L where there is none, by the threads that will use it.
     fn remember_beams(&mut self, control: &Control) {
         let cells = self.exposures.geometry().beam.len();
         for beam in self.beams.iter_mut().filter(|beam| beam.is_empty()) {
