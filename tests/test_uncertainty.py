@@ -11,7 +11,7 @@ import pytest
 import equipix
 from equipix import Flag, reference, simulate
 from equipix.cli import main
-from equipix.errors import InputError
+from equipix.errors import IdentifiabilityWarning, InputError
 from equipix.uncertainty import tilt_std
 
 CROSS = equipix.cross_pattern(2, 3)
@@ -325,12 +325,40 @@ class TestWhatIsUndetermined:
         wanted = np.sqrt(1e3) / np.sqrt(np.sum(np.square(options["flux"] * seen)))
         assert cal.sensitivity_std[7, 8] == pytest.approx(wanted, rel=1e-5)
 
-    @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_measurements_that_leave_no_freedom_need_a_variance(self):
         frames = np.ones((2, 4, 5))
         message = "'variance' is None and the residuals do not determine the noise"
-        with pytest.raises(InputError, match=message):
+        with (
+            pytest.warns(IdentifiabilityWarning, match="the shifts leave 4 parts"),
+            pytest.raises(InputError, match=message),
+        ):
             equipix.calibrate(frames, [(0, 0), (0, 1)], uncertainty=True)
+
+
+class TestArraysThatChange:
+    @pytest.mark.parametrize("name", ["frames", "variance", "mask"])
+    def test_are_refused_by_name(self, name):
+        frames, options = case(7, masked=0.1)
+        cal = equipix.calibrate(frames, CROSS, **options)
+        weights = np.where(cal.flags == 0, 1 / cal.flags.size, 0)
+        before = cal.std_of(weights)
+        changed = frames if name == "frames" else options[name]
+        kept = changed.copy()
+        changed[:, 3:5] = False if name == "mask" else np.nan
+        with pytest.raises(InputError, match=f"'{name}' of this calibration changed after"):
+            cal.std_of(weights)
+        changed[:] = kept
+        assert cal.std_of(weights) == before
+
+    def test_copies_may_change(self):
+        frames, options = case(7)
+        options["variance"] = np.asfortranarray(options["variance"])
+        cal = equipix.calibrate(frames, CROSS, **options)
+        weights = np.full(cal.shape, 1 / cal.flags.size)
+        weights[:, :7] *= -1
+        before = cal.std_of(weights)
+        options["variance"] *= 100
+        assert cal.std_of(weights) == before
 
 
 class TestOfAResult:

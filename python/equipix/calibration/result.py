@@ -14,6 +14,7 @@ from equipix._readonly import ReadOnly
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
 from equipix.calibration.saved import save_fields
+from equipix.calibration.unchanged import check_unchanged
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
@@ -282,7 +283,8 @@ class Calibration(ReadOnly):
         ------
         InputError
             If this calibration was read from a file, which holds no measurements; if the weights
-            do not fit; or if no variance was given and the residuals do not determine it.
+            do not fit; if no variance was given and the residuals do not determine it; or if an
+            array that was calibrated has changed.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 
@@ -290,8 +292,9 @@ class Calibration(ReadOnly):
         -----
         Errors of pixels are correlated: the variance of a mean over many cannot be had from
         `sensitivity_std`. With w the weights and g = w/M it is gᵀ S⁻¹ g, S being the reduced normal
-        matrix: one linear problem, about as much work as the calibration. Changes made since to the
-        arrays that were calibrated go unnoticed.
+        matrix: one linear problem, about as much work as the calibration. It reads the arrays that
+        were calibrated again, which must not have changed: 4096 values of each are compared, so a
+        change of few values is not noticed.
 
         Examples
         --------
@@ -314,6 +317,7 @@ class Calibration(ReadOnly):
                 "measurements: call std_of on the result of calibrate or Experiment.run"
             )
         check_progress(progress)
+        check_unchanged(self.weighted.exposures, self.weighted.sampled)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
         std = functional_std(self.weighted, stack, self.drift, workers=workers, progress=progress)
         return float(std[0]) if np.ndim(weights) == 2 else std

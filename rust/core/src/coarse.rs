@@ -21,7 +21,7 @@ mod spacing;
 mod spectrum;
 
 pub(crate) use hats::Hats;
-pub(crate) use matrix::{Arm, Coarse};
+pub(crate) use matrix::{Coarse, Entry};
 pub(crate) use modulated::Modulated;
 pub(crate) use modulated_kernel::Value;
 pub(crate) use modulated_matrix::{SeenWave, Spot};

@@ -2,7 +2,7 @@
 
 use super::operator::Reduced;
 use crate::coarse::{
-    Arm, Coarse, Complex, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
+    Coarse, Complex, Entry, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
     spacing_of_waves, times,
 };
 use crate::control::Control;
@@ -27,11 +27,11 @@ pub(super) fn coarse_spaces<T: Real>(
 ) -> Result<(Coarse, Modulated<f32>)> {
     let blocks = Blocks::new(hats, geometry);
     let weights = blocks.weights(geometry, reduced, workers, control)?;
-    let stars = weights
+    let entries = weights
         .chunks_exact(geometry.placements.len())
         .enumerate()
-        .map(|(block, weights)| blocks.star(block, weights, hats, geometry));
-    let coarse = Coarse::of_stars(hats, &[], stars, control)?;
+        .map(|(block, weights)| blocks.entries(block, weights, hats, geometry));
+    let coarse = Coarse::of_blocks(hats, &[], entries, control)?;
     control.check()?;
     let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
     let seen = seen(reduced.exposures, &finer);
@@ -154,9 +154,15 @@ impl Blocks {
     }
 
     /// What one block adds.
-    fn star(&self, block: usize, weights: &[f32], hats: &Hats, geometry: &Geometry) -> Vec<Arm> {
+    fn entries(
+        &self,
+        block: usize,
+        weights: &[f32],
+        hats: &Hats,
+        geometry: &Geometry,
+    ) -> Vec<Entry> {
         let spots = self.spots(block, weights, hats, geometry).into_iter();
-        spots.map(|Spot { weight, hats, .. }| Arm { weight, hats, others: Vec::new() }).collect()
+        spots.map(|Spot { weight, hats, .. }| Entry { weight, hats, others: Vec::new() }).collect()
     }
 
     /// The weight of each exposure in a block and the hats at the pixel that sees its centre.

@@ -59,7 +59,7 @@ pub(crate) struct ConjugateGradients<'m, 'a, T> {
 }
 
 impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
-    /// Room for a search.
+    /// Buffers for a search.
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
         workers: &'m Workers,

@@ -44,7 +44,7 @@ pub(super) fn minimise<T: Real>(
             descent::minimise(exposures, options, start, workers, control)?
         }
     };
-    // After the solver, whose vectors then make room for the sets.
+    // After the solver, whose vectors then free memory for the sets.
     let (sensitivity, values) = estimate.into_maps();
     let dead = without_response(exposures, &sensitivity, &values, &history);
     let mut ties = vec![Tie::Firm; sensitivity.len()];
