@@ -43,7 +43,7 @@ def wavy(seed):
 
 
 def sign_of(frames, shifts, **options):
-    """The verdict; reversed shifts and drifts misfit in many ways, of which only the sign matters."""
+    """The verdict; other misfits of reversed shifts and drifts do not matter here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", (DriftWarning, MisfitWarning, IdentifiabilityWarning))
         options = {"tolerance": 1e-2} | options

@@ -43,7 +43,7 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
 
 
 def _usual(weighted: Weighted, options: Options, squares: Floats) -> float:
-    """Mean squared residual of a pixel that has no say in the beam: that of noise, or of the solver.
+    """Mean squared residual of a pixel without influence on the beam: of noise, or of the solver.
 
     Other pixels have less, since the beam follows them: their mean is the share of the degrees of
     freedom among the measurements.

@@ -36,7 +36,9 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
-    24 * places(geometry.sensor.rows) + of_views + coarse::bytes_needed(geometry, count_waves(exposures))
+    24 * places(geometry.sensor.rows)
+        + of_views
+        + coarse::bytes_needed(geometry, count_waves(exposures))
 }
 
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
