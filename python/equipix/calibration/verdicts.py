@@ -53,6 +53,7 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "saturation": SaturationWarning,
     "unit": IdentifiabilityWarning,
     "raw": MissingDarkWarning,
+    "repeated": MisfitWarning,
     "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,
