@@ -51,10 +51,10 @@ def spot(row, col):
 
 @pytest.mark.parametrize(("count", "factor"), [(5, 5 / 3), (4, 2), (3, 3), (2, 2)])
 def test_variances_are_those_of_n_measurements_that_determine_the_beam_too(count, factor):
-    """n/(n − 2) over Σ w c²L² M², the relative variance with a known beam."""
+    """n/(n − 2) over Σ w c²L² M², the relative variance with a known beam; 2 with two."""
     variance = 1e-6 * (1 + np.arange(count))
     weighted = fitted(CROSS[:count], variance=variance)
-    exposures, fit, _ = weighted
+    exposures, fit = weighted.exposures, weighted.fit
     strength = sum(
         (c * light_of(fit, shift)) ** 2 / v
         for c, shift, v in zip(exposures.flux.values, CROSS, variance, strict=False)
@@ -90,8 +90,8 @@ def test_images_are_corrected_but_in_pixels_that_are_not_to_be_used():
 
 
 def test_a_fit_without_a_dark_is_refused():
-    exposures, fit, _ = fitted()
-    weighted = Weighted(dataclasses.replace(exposures, dark=None), fit, None)
+    weighted = fitted()
+    weighted = weighted._replace(exposures=dataclasses.replace(weighted.exposures, dark=None))
     with pytest.raises(InputError, match="holds no dark frame"):
         Equalisation.of(weighted, np.zeros(SHAPE, np.uint32))
 

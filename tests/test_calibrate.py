@@ -368,8 +368,8 @@ class TestFrameStatistics:
         frames, truth = measured((30, 40), noise=0)
         raw = np.rint(frames[:, None] * 200).astype(np.uint8)
         raw[2, :, 5, 6] = 255
-        averages = [equipix.average(each) for each in raw]
-        cal = equipix.calibrate(averages, CROSS, variance=np.ones(5))
+        averages = [equipix.average(each, dark=np.zeros(truth.shape)) for each in raw]
+        cal = equipix.calibrate(averages, CROSS, variance=np.full(5, 1 / 12))
         assert np.argwhere(cal.flags == Flag.SATURATED).tolist() == [[5, 6]]
         # The other four exposures determine the pixel, to the rounding of 200 DN.
         assert cal.sensitivity[5, 6] == pytest.approx(truth[5, 6], abs=5 / 200)

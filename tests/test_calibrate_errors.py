@@ -23,6 +23,22 @@ def frames(shape=(5, 8, 9)):
     return np.random.default_rng(0).uniform(0.5, 1.5, shape)
 
 
+class Lengths:
+    """An array with a unit, which NumPy would drop."""
+
+    def __init__(self, values, unit):
+        self.values, self.unit = values, unit
+
+    def __array__(self, *args, **kwargs):
+        return np.array(self.values, *args, **kwargs)
+
+
+class Length(float):
+    """A number with a unit."""
+
+    units = "um"
+
+
 def changed(**options):
     return {"frames": frames(), "shifts": CROSS} | options
 
@@ -51,7 +67,11 @@ def with_value(array, place, value):
         ({"shifts": with_value(CROSS, (3, 0), np.inf)}, "'shifts' of exposure 3 is .*inf"),
         ({"shifts": with_value(CROSS, (4, 0), 8)}, "'shifts' of exposure 4 is .* row part"),
         ({"shifts": with_value(CROSS, (4, 1), -1e300)}, "'shifts' of exposure 4 .* column part"),
-        ({"frames": np.full((5, 8, 9), np.nan)}, "'mask' leaves no measurement"),
+        ({"shifts": with_value(CROSS, (4, 1), 1e10)}, r"\(.*, 1e\+10\).*micrometres"),
+        ({"shifts": [["9.3 um", "0 um"]] * 5}, "'shifts' holds '9.3 um', expected numbers of"),
+        ({"shifts": Lengths(CROSS, "um")}, "'shifts' has the unit um, expected .* pixel pitch"),
+        ({"shifts": [(Length(9), 0.0)] * 5}, "'shifts' has the unit um"),
+        ({"frames": np.full((5, 8, 9), np.nan)}, "'frames' holds no finite number"),
         ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
         ({"mask": np.zeros((9, 8), bool)}, r"'mask' has shape \(9, 8\), expected \(8, 9\) or"),

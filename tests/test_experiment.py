@@ -13,6 +13,7 @@ from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
 from equipix.defects import dead_pixels, hot_pixels
 from equipix.experiment import run as experiment_run
 from equipix.exposures.averaged import Averaged
+from equipix.io import read_frames
 from equipix.noise import NoiseModel, photon_transfer, scatter_limit
 
 SHAPE = (64, 80)
@@ -121,8 +122,8 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     """Six sensors in a narrow beam; calibrated with the shifts as measured once, and twice."""
     measured = experiment_run.measured_shifts
 
-    def once(path, manifest, *_):
-        return measured(path, manifest)
+    def once(path, manifest, *_, hot):
+        return measured(path, manifest, hot=hot)
 
     errors_of, scores, blocks = ([], []), [], ([], [], [])
     for seed in range(6):
@@ -240,6 +241,8 @@ def test_real_input(data_dir):
             'name = "p1"\ntime = 1',
             r"'time' is missing in exposure 'p0': give all or none",
         ),
+        ('name = "p1"', 'name = "p1"\nshift_um = [1, 2]', r"'shift_um' .* divide micrometres"),
+        ('name = "p0"', 'name = "p0"\nshift = ["9 um", "0 um"]', r"holds '9 um'.* without a unit"),
         ('name = "p2"', "", r"key 'name' is missing in exposure 2"),
         ("bit_depth = 12", "bit_depth = 17", r"holds 17, expected a whole number from 1 to 16"),
         ("bit_depth = 12", "saturation = -1", r"'saturation' in \[sensor\] holds -1"),
@@ -323,7 +326,7 @@ def write_tiff(path, array):
         (np.zeros((2, *SHAPE), np.uint8), r"uint8.*uint16"),
         (
             np.full((2, *SHAPE), 4095, np.uint16),
-            r"experiment\.toml: .* 100\.0% .* exposure 1 \('p1'\) reach .* 4095 DN .* expose less",
+            r"experiment\.toml: 'frames': exposure 1 \('p1'\): 100\.0% .* 4095 DN .* .bit_depth.",
         ),
         (b"", r"empty"),
         (b"II*\0 nothing more", r"bad\.tif"),
@@ -340,6 +343,42 @@ def test_bad_images_are_named(edited, tmp_path, frames, message):
 
 
 @pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("frames/p3.tif", "frames/p1.tif", "'frames' of exposure 'p1' and in 'frames' of .* 'p3'"),
+        ("frames/p3.tif", "dark/dark.tif", r"\[dark\] and in 'frames' of exposure 'p3'"),
+        ("aperture/p3-after.tif", "aperture/p3-before.tif", "'aperture_before' of exposure 'p3'"),
+        ("frames/p3.tif", "aperture/p1-after.tif", "'aperture_after' of exposure 'p1' and in"),
+    ],
+)
+@pytest.mark.parametrize("copy", [False, True], ids=["name", "content"])
+def test_one_file_for_two_measurements_is_refused(
+    edited, manifest, tmp_path, old, new, where, copy
+):
+    name = new
+    if copy:
+        (tmp_path / "copy.tif").write_bytes((manifest.parent / new).read_bytes())
+        name = "copy.tif"
+    path = edited(f'"{old}"', f'"{name}"')
+    with pytest.raises(errors.FileError, match=where) as caught:
+        Experiment.load(path).run()
+    assert new.split("/")[1] in str(caught.value)
+
+
+def test_one_file_listed_twice_is_refused(edited, manifest, tmp_path):
+    (tmp_path / "copy.tif").write_bytes((manifest.parent / "frames/p3.tif").read_bytes())
+    for second in ("frames/p3.tif", "copy.tif"):
+        path = edited('"frames/p3.tif"', f'["frames/p3.tif", "{second}"]')
+        with pytest.raises(errors.FileError, match="twice in 'frames' of exposure 'p3'"):
+            Experiment.load(path).run()
+
+
+def test_an_image_of_the_hole_serves_two_moves(edited):
+    path = edited('"aperture/p2-before.tif"', '"aperture/p1-after.tif"')
+    Experiment.load(path)
+
+
+@pytest.mark.parametrize(
     "option",
     [{"tolerance": -1}, {"tolerance": "x"}, {"max_sweeps": 0}, {"max_sweeps": 2.5}, {"workers": 0}],
 )
@@ -350,14 +389,21 @@ def test_bad_options_are_refused_before_the_work(manifest, option):
     assert stages == []
 
 
-def test_a_missing_spot_names_the_move(edited):
-    path = edited('"aperture/p2-after.tif"', '"dark/dark.tif"')
+def another_dark(manifest, folder):
+    """Dark frames like those of the experiment, but others."""
+    frames = read_frames(manifest.parent / "dark/dark.tif")[::-1]
+    write_tiff(folder / "another.tif", frames)
+    return '"another.tif"'
+
+
+def test_a_missing_spot_names_the_move(edited, manifest, tmp_path):
+    path = edited('"aperture/p2-after.tif"', another_dark(manifest, tmp_path))
     with pytest.raises(errors.SpotError, match=r"move to exposure 'p2'.*after"):
         Experiment.load(path).run()
 
 
-def test_an_exposure_without_light_is_refused(edited):
-    path = edited('"frames/p3.tif"', '"dark/dark.tif"')
+def test_an_exposure_without_light_is_refused(edited, manifest, tmp_path):
+    path = edited('"frames/p3.tif"', another_dark(manifest, tmp_path))
     with pytest.raises(errors.InputError, match="median"):
         Experiment.load(path).run()
 

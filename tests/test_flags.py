@@ -11,7 +11,7 @@ import equipix
 from equipix import simulate
 from equipix.calibration.options import Options
 from equipix.calibration.pixel_flags import pixel_flags
-from equipix.calibration.weights import weighted_fit
+from equipix.calibration.weights import Weighted, contradictory_found, weighted_fit
 from equipix.defects import Findings
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -28,9 +28,9 @@ def weighted():
 
 
 def with_findings(**found):
-    exposures, fit, rejected = weighted()
-    findings = Findings(**found)
-    return type(weighted())(dataclasses.replace(exposures, findings=findings), fit, rejected)
+    fitted = weighted()
+    exposures = dataclasses.replace(fitted.exposures, findings=Findings(**found))
+    return fitted._replace(exposures=exposures)
 
 
 def test_every_finding_has_bits_and_all_bits_have_a_finding():
@@ -54,13 +54,17 @@ def test_findings_add_up():
     found = np.zeros((20, 24), bool)
     found[5, 7] = True
     flags = pixel_flags(with_findings(**dict.fromkeys(FINDINGS, found)), FitOptions())
-    assert flags[5, 7] == Flag.SATURATED | Flag.DEAD | Flag.HOT | Flag.DO_NOT_USE
+    wanted = Flag.SATURATED | Flag.DEAD | Flag.HOT | Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE
+    assert flags[5, 7] == wanted
 
 
 def test_most_measurements_left_out_contradict_each_other():
-    exposures, fit, _ = weighted()
+    given = weighted().exposures
     left_out = np.zeros((5, 20, 24), bool)
     left_out[:3, 4, 4] = left_out[:2, 8, 8] = True
-    flags = pixel_flags(type(weighted())(exposures.without(left_out), fit, left_out), FitOptions())
+    exposures = contradictory_found(given.without(left_out), given.usable())
+    fit = exposures.fit(FitOptions())
+    flags = pixel_flags(Weighted(exposures, fit, left_out), FitOptions())
+    assert fit.flags[4, 4] == BITS["contradictory"]
     assert np.argwhere(flags == BITS["contradictory"]).tolist() == [[4, 4]]
     assert np.count_nonzero(flags) == 1

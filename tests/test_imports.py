@@ -46,7 +46,7 @@ LAYERS = (
     {"correction", "defects", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
-    {"drift", "flags", "maps"},
+    {"drift", "flags", "maps", "mending"},
     {"io"},
     {"_check", "_readonly"},
     {"_types"},

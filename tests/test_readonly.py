@@ -12,6 +12,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.exposures.front import exposures_of
+from equipix.exposures.orientation import Orientation
 from equipix.frames import FrameStatistics, load_statistics, save_statistics
 
 SHAPE, CROSS = (24, 32), equipix.cross_pattern(3, 5)
@@ -115,7 +116,7 @@ def test_exposures_are_read_only_views_of_the_callers_arrays():
     for changed in (
         exposures.chosen(np.array([0, 2])),
         exposures.window(12),
-        exposures.reversed(),
+        exposures.oriented(Orientation(rows=True)),
         exposures.whole(),
         exposures.weighted(np.ones(5)),
         exposures.without(np.zeros((5, *SHAPE), bool)),

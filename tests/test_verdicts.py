@@ -11,8 +11,9 @@ import equipix
 from equipix import simulate
 from equipix.calibration import verdicts
 from equipix.calibration.options import Options
-from equipix.calibration.sign import SignTest, _lower, _Residuals
+from equipix.calibration.orientation import OrientationTest
 from equipix.calibration.weights import Weighted
+from equipix.calibration.window_fit import WindowFit
 from equipix.errors import ConvergenceWarning, MisfitWarning
 from equipix.exposures.options import FitOptions
 
@@ -35,7 +36,7 @@ def verdicts_on(*, variance=True, uncertainty=True, **found):
     exposures = SimpleNamespace(variance=np.ones(5) if variance else None)
     weighted = Weighted(exposures, SimpleNamespace(**GOOD | found), None)
     options = Options(FitOptions(), uncertainty=uncertainty)
-    return verdicts.on_fit(weighted, options, SignTest("undetermined"), None)
+    return verdicts.on_fit(weighted, options, OrientationTest(), None, None)
 
 
 def kinds(**found):
@@ -50,7 +51,6 @@ def test_a_good_fit_has_no_verdict():
     ("kind", "within", "beyond"),
     [
         ("pattern", {"smallest_ritz": 1e-4}, {"smallest_ritz": 0.999e-4}),
-        ("misfit", {"misfit": 4000.0}, {"misfit": 4000.1}),
         (
             "uncertainty",
             {"error_estimate": np.array([3.0, 0.1])},
@@ -66,16 +66,11 @@ def test_a_limit_at_both_sides(kind, within, beyond):
 def test_messages_contain_the_value_and_the_limit():
     for found, value, limit in (
         ({"smallest_ritz": 2e-5}, "2.0e-05", "limit 0.0001"),
-        ({"misfit": 9000.0}, "3.0 times", "limit 2"),
         ({"error_estimate": np.array([0.3])}, "3.0e-01", "limit 0.1"),
     ):
         (verdict,) = verdicts_on(**found)
         assert value in verdict.message
         assert limit in verdict.message
-
-
-def test_no_misfit_is_found_without_known_variances():
-    assert kinds(misfit=9000.0, variance=False) == []
 
 
 def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit():
@@ -106,38 +101,42 @@ def test_a_fit_too_far_from_its_minimum_has_no_standard_deviations():
     assert cal.sensitivity_std is cal.tilt_std is cal.shift_std is None
 
 
-def test_residuals_twice_as_large_as_predicted_are_the_limit():
+def test_five_standard_errors_and_three_per_cent_are_the_limit_of_chi_square():
     frames = experiment()[:, :, :28]
-    shifts = CROSS
-    plain = equipix.calibrate(frames, shifts, variance=np.full(5, 1.0))
+    plain = equipix.calibrate(frames, CROSS, variance=np.full(5, 1e-6))
     # Reduced χ² goes with 1/variance; the fit does not depend on their common factor.
-    at_limit = plain.reduced_chi2 / 4
-    assert equipix.calibrate(frames, shifts, variance=np.full(5, 1.01 * at_limit)).verdicts == ()
-    with pytest.warns(MisfitWarning, match=r"2\.0 times as large"):
-        equipix.calibrate(frames, shifts, variance=np.full(5, 0.99 * at_limit))
+    freedom = plain.weighted.fit.degrees_of_freedom
+    limit = max(0.03, 5 * np.sqrt(2 / freedom))
+    for chi2 in (1 + 0.99 * limit, 1 - 0.99 * limit):
+        variance = np.full(5, plain.reduced_chi2 * 1e-6 / chi2)
+        assert equipix.calibrate(frames, CROSS, variance=variance).verdicts == ()
+    for chi2 in (1 + 1.01 * limit, 1 - 1.01 * limit):
+        variance = np.full(5, plain.reduced_chi2 * 1e-6 / chi2)
+        with pytest.warns(MisfitWarning, match="times as large as the variances predict"):
+            equipix.calibrate(frames, CROSS, variance=variance)
 
 
-@pytest.mark.parametrize("lower", [0, 1])
+def window_fit(left, freedom, *, rng):
+    """A settled fit of a window with residuals of that mean square."""
+    fit = SimpleNamespace(error_estimate=np.array([1e-9]), ended="converged")
+    residuals = np.sqrt(left) * rng.choice([-1.0, 1.0], (3, 8, 8))
+    return WindowFit(fit, left, freedom, 1.0, 1.0, residuals)
+
+
 @pytest.mark.parametrize("freedom", [1000, 7200, 10**6])
-def test_the_sign_needs_six_standard_deviations(lower, freedom):
+def test_an_orientation_needs_six_standard_deviations(freedom):
     """√(2/dof) is the standard deviation of F/dof, relative to it."""
-
-    def fits(ratio):
-        excess = np.full((3, 8, 8), 1.0)
-        low, high = (
-            _Residuals(
-                left=left,
-                freedom=freedom,
-                squares=left * excess,
-                noise=1e-3,
-                error=1e-6,
-                stuck=False,
-            )
-            for left in (0.7, 0.7 * ratio)
-        )
-        return [low, high] if lower == 0 else [high, low]
-
+    rng = np.random.default_rng(1)
     limit = 6 * np.sqrt(2 / freedom)
-    assert _lower(fits(1 + 1.001 * limit)) == lower
-    assert _lower(fits(1 + 0.999 * limit)) is None
-    assert _lower([each._replace(freedom=999) for each in fits(10.0)]) is None
+    low = window_fit(0.7, freedom, rng=rng)
+    assert window_fit(0.7 * (1 + 1.001 * limit), freedom, rng=rng).is_far_above(low)
+    assert not window_fit(0.7 * (1 + 0.999 * limit), freedom, rng=rng).is_far_above(low)
+    few = [window_fit(left, 999, rng=rng) for left in (0.7, 7.0)]
+    assert not few[1].is_far_above(few[0])
+
+
+def test_nothing_is_concluded_from_a_misfit_of_half_a_per_cent():
+    rng = np.random.default_rng(2)
+    low = window_fit(1e-8, 10**4, rng=rng)
+    assert window_fit(1e-8 + 1.01 * 0.005**2, 10**4, rng=rng).is_far_above(low)
+    assert not window_fit(1e-8 + 0.99 * 0.005**2, 10**4, rng=rng).is_far_above(low)

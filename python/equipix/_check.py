@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 _MOST_WORKERS = 1024
 
+_PIXELS = ("", "pix", "pixel", "dimensionless")
+"""Units of a number of pixels, as packages for quantities name them."""
+
 
 @contextmanager
 def naming_memory(what: str) -> Iterator[None]:
@@ -70,6 +73,7 @@ def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> N
 
 def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
     """Shifts as float64 of shape (n, 2), all finite."""
+    _refuse_units(shifts)
     array = as_array("shifts", shifts, ndim=2).astype(np.float64)
     if array.shape[1] != 2:
         raise InputError(f"'shifts' has shape {array.shape}, expected (n, 2): row and column")
@@ -79,6 +83,25 @@ def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
             f"'shifts' of exposure {k} is {array[k].tolist()}, expected finite numbers"
         )
     return array
+
+
+def _refuse_units(shifts: object) -> None:
+    """Refuse lengths with a unit, which NumPy drops, and texts."""
+    first = shifts
+    while isinstance(first, list | tuple) and first:
+        first = first[0]
+    for each in (shifts, first):
+        unit = getattr(each, "unit", getattr(each, "units", None))
+        if unit is not None and str(unit) not in _PIXELS:
+            raise InputError(
+                f"'shifts' has the unit {unit}, expected plain numbers of pixels: divide by the "
+                "pixel pitch, see 'From micrometres to pixels' in README"
+            )
+    if isinstance(first, str):
+        raise InputError(
+            f"'shifts' holds {first!r}, expected numbers of pixels without a unit: divide "
+            "micrometres by the pixel pitch"
+        )
 
 
 def check_shape(shape: tuple[int, int]) -> tuple[int, int]:

@@ -65,6 +65,7 @@ class Exposures:
         offset: bool,
         variance: NDArray[Any] | None,
         mask: NDArray[Any] | None,
+        unreliable: NDArray[Any] | None,
         workers: int | None,
         progress: _Progress | None,
     ) -> Exposures: ...
@@ -163,6 +164,8 @@ class Fit:
         offset: bool,
         workers: int | None,
         progress: _Progress | None,
+        dark_variance: NDArray[Any] | None = None,
+        dark_misfit: bool = False,
     ) -> Uncertainty: ...
 
 @final
@@ -181,6 +184,10 @@ class Uncertainty:
     def shift_variances(self) -> list[list[float]] | None: ...
     @property
     def offset_variances(self) -> tuple[float, float] | None: ...
+    @property
+    def dark_misfit(self) -> float | None: ...
+    @property
+    def incomplete(self) -> int: ...
 
 def locate_spots(
     before: NDArray[Any],

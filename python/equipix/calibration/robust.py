@@ -74,7 +74,7 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions)
         rival = _LEADING * np.maximum(by_pixel, exposures.cells(by_cell, fit, k))
         suspect = (leading[k] > _NEAR) & (leading[k] >= rival)
         result[k] |= suspect & (leading[k] > _BEYOND)
-        result[k] |= suspect & (_box(result[k]) > 0)
+        result[k] |= suspect & (box_sums(result[k]) > 0)
     return result
 
 
@@ -160,7 +160,7 @@ def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
 def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
     """Deviations alone or of the 3×3 means around, of what was used and of what was left out."""
     own = np.abs(residual)
-    quiet = _box(used & (own > _BEYOND)) == 0
+    quiet = box_sums(used & (own > _BEYOND)) == 0
     new = np.fmax(own, np.where(known & quiet, np.abs(_around(residual, used)), np.nan))
     old = np.fmax(own, np.abs(_around(np.clip(residual, -_BEYOND, _BEYOND), known)))
     new[~known] = old[~known] = np.nan
@@ -169,7 +169,7 @@ def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Arr
 
 def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     """Mean of the 3×3 residuals around each pixel, in standard deviations by their own scale."""
-    mean = _box(np.where(where, residual, 0)) / np.sqrt(np.maximum(_box(where), 1))
+    mean = box_sums(np.where(where, residual, 0)) / np.sqrt(np.maximum(box_sums(where), 1))
     scaled: NDArray[Any] = mean / max(1.0, _ROBUST * _median(mean, where))
     return scaled
 
@@ -192,7 +192,7 @@ def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
     return float(np.median(chosen, overwrite_input=True)) if chosen.size else 0.0
 
 
-def _box(image: NDArray[Any]) -> NDArray[Any]:
+def box_sums(image: NDArray[Any]) -> NDArray[Any]:
     """Sum of the 3×3 pixels around each, those beyond the border counting 0."""
     padded = np.pad(image.astype(np.float32), 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]

@@ -94,6 +94,8 @@ def read_fields(
         "verdicts": numbers["verdicts"],
         "reduced_chi2": float("nan") if chi2 is None else chi2,
         "shift_sign": numbers.get("shift_sign", "undetermined"),
+        "orientation": numbers.get("orientation"),
+        "drift": numbers.get("drift"),
         "history": _history(numbers["history"]),
         "rejected": None if rejected is None else rejected.astype(bool),
         "metadata": content["metadata"],
@@ -126,7 +128,9 @@ def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Collect the rest as JSON values, which have neither NaN nor infinity."""
     chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
-    history = fields["history"]
+    history, orientation, drift = (fields[name] for name in ("history", "orientation", "drift"))
+    if orientation is not None:
+        orientation = {**vars(orientation), "best": vars(orientation.best)}
     return {
         "beam_origin": list(fields["beam_origin"]),
         "shifts": fields["shifts"].tolist(),
@@ -137,6 +141,8 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
         "reduced_chi2": chi2 if np.isfinite(chi2) else None,
         "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
         "shift_sign": fields["shift_sign"],
+        "orientation": orientation,
+        "drift": None if drift is None else _lists(vars(drift)),
         "tilt_std": None
         if tilt_std is None
         else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],
@@ -146,6 +152,14 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
             "objective": history.objective.tolist(),
             "error_estimate": history.error_estimate.tolist(),
         },
+    }
+
+
+def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace arrays by lists."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in fields.items()
     }
 
 

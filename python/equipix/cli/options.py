@@ -18,6 +18,10 @@ Uncertainty = Annotated[
 Saturation = Annotated[
     float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
 ]
+Mask = Annotated[
+    Path | None,
+    typer.Option(help="An image or .npy: pixels that are not 0 in it are not used."),
+]
 Picture = Annotated[
     Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
 ]

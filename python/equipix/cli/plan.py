@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from equipix.cli.options import Force, Json, Picture, Seed
@@ -31,7 +32,7 @@ def plan(
     ] = None,
     exposures: Annotated[
         int | None,
-        typer.Option(min=2, help="Exposures of the patterns to find; the fewest unless given."),
+        typer.Option(min=2, help="Exposures of the patterns to find; five unless given."),
     ] = None,
     noise: Annotated[float, typer.Option(help="Noise of an exposure, over its signal.")] = 1e-3,
     drift: Annotated[
@@ -92,12 +93,13 @@ def _pairs(text: str) -> list[list[float]]:
 
 def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
     """Collect the figures of a pattern."""
-    found = identify(budget.shape, budget.shifts)
+    # Rounded: equations and unknowns are the same between pixels, and the budget has the parts.
+    found = identify(budget.shape, np.rint(budget.shifts))
     order = advise_order(budget.shifts)
     return {
         "shifts": budget.shifts.tolist(),
-        "components": found.components,
-        "largest": found.largest,
+        "components": budget.components,
+        "largest": found.largest if budget.components == found.components else found.labels.size,
         "equations": found.equations,
         "unknowns": found.unknowns,
         "rms": budget.rms,

@@ -11,9 +11,12 @@ from equipix._check import as_array, as_floats, as_level, check_count, naming_me
 from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged
+from equipix.exposures.clipping import Clipping, clipping, highest
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
+from equipix.exposures.nothing import refuse_nothing
 from equipix.exposures.positions import Positions
+from equipix.exposures.reach import check_reach
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
 
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array, Bools, FluxModel
+    from equipix._types import Array, Bools, Floats, FluxModel
 
 
 def exposures_of(
@@ -38,15 +41,19 @@ def exposures_of(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     offset: bool = False,
+    dark_variance: ArrayLike | None = None,
 ) -> Exposures:
     """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
         measured = measured_of(frames, variance, saturation)
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
-        return Exposures(
+        positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
+        rows, cols = measured.values.shape[1:]
+        check_reach(shifts, positions, (rows, cols))
+        exposures = Exposures(
             values=measured.values,
-            positions=Positions.of(shifts, rotation=rotation, std=shift_std, count=count),
+            positions=positions,
             flux=Flux.of(flux, flux_std, time, count),
             mask=union(given, measured.mask),
             variance=measured.variance,
@@ -54,7 +61,35 @@ def exposures_of(
             offset=offset,
             findings=measured.findings,
             dark=measured.dark,
+            dark_variance=_of_dark(dark_variance, measured, offset=offset),
+            clipped=measured.clipped,
+            raw=measured.raw and not offset,
         )
+        refuse_nothing(exposures, given)
+        return exposures
+
+
+def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
+    """Variance of the dark that was subtracted from all, given or that of the averages."""
+    if given is not None and offset:
+        raise InputError(
+            "'dark_variance' is that of a dark that was subtracted, but 'dark' is 'fit': give one "
+            "of the two"
+        )
+    if offset:
+        return None
+    if given is None:
+        return measured.dark_variance
+    shape = measured.values.shape[1:]
+    variance = as_array("dark_variance", given, ndim=(0, 2)).astype(np.float64)
+    if variance.shape not in ((1,), shape):  # as_array makes one number an array of one
+        raise InputError(
+            f"'dark_variance' has shape {variance.shape}, expected {shape} or one number"
+        )
+    wrong = variance[~(np.isfinite(variance) & (variance >= 0))]
+    if wrong.size:
+        raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")
+    return np.array(np.broadcast_to(variance, shape))
 
 
 class Measured(NamedTuple):
@@ -66,6 +101,9 @@ class Measured(NamedTuple):
     models: Sequence[NoiseModel]
     findings: Findings
     dark: Array | None = None
+    dark_variance: Floats | None = None
+    clipped: Clipping | None = None
+    raw: bool = False
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -104,7 +142,8 @@ def _of_averaged(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), averaged.values)
-    findings = averaged.findings(noise if isinstance(noise, NoiseModel) else None)
+    model = noise if isinstance(noise, NoiseModel) else None
+    findings = averaged.findings(model)
     dark = averaged.dark
     return Measured(
         averaged.values,
@@ -113,6 +152,9 @@ def _of_averaged(
         models,
         findings,
         None if dark is None else dark.mean.astype(averaged.values.dtype),
+        None if model is None else averaged.dark_variance(model),
+        averaged.clipped,
+        averaged.raw,
     )
 
 
@@ -131,12 +173,24 @@ def _of_arrays(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), values)
-    level = as_level(saturation)
+    level = _largest(frames) if saturation is None else as_level(saturation)
     if level is None:
-        return Measured(values, None, variances, models, Findings())
+        clipped = highest(clipping(each) for each in values)
+        return Measured(values, None, variances, models, Findings(), clipped=clipped)
     saturated = _saturated(values, level)
+    clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
+    if saturation is None and not saturated.any():
+        return Measured(values, None, variances, models, Findings(), clipped=clipped)
     findings = Findings(saturated=np.any(saturated, axis=0))
-    return Measured(values, saturated, variances, models, findings)
+    return Measured(values, saturated, variances, models, findings, clipped=clipped)
+
+
+def _largest(frames: ArrayLike) -> float | None:
+    """Largest value of arrays of whole numbers, which counts as saturated unless given."""
+    arrays = frames if isinstance(frames, list | tuple) else [frames]
+    dtypes = {getattr(each, "dtype", None) for each in arrays}
+    dtype = dtypes.pop() if len(dtypes) == 1 else None
+    return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
 
 
 def _averaged(frames: object) -> Averaged | None:
@@ -167,7 +221,7 @@ def _saturated(values: Array, level: float) -> Bools:
     """Which values reach the saturation level."""
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
-        refuse_saturated(f"exposure {k}", values[k], each, level)
+        refuse_saturated(f"'frames': exposure {k}", values[k], each, level)
     return saturated
 
 

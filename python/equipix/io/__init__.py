@@ -1,8 +1,9 @@
 """Frames, arrays and metadata to and from files."""
 
 from equipix.io.images import frame_format, read_frames, stream_frames
+from equipix.io.masks import read_mask
 from equipix.io.names import as_path, find_files, refuse_inputs
-from equipix.io.pages import SUFFIXES, check_format, check_pages, load_pages, save_pages
+from equipix.io.pages import SUFFIXES, check_format, check_pages, kind_of, load_pages, save_pages
 from equipix.io.tiff import description, write_frames
 from equipix.io.whole import folder_beside, replace_folder, write_whole
 
@@ -15,8 +16,10 @@ __all__ = [
     "find_files",
     "folder_beside",
     "frame_format",
+    "kind_of",
     "load_pages",
     "read_frames",
+    "read_mask",
     "refuse_inputs",
     "replace_folder",
     "save_pages",

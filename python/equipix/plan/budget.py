@@ -15,7 +15,7 @@ from equipix.plan.identifiability import identify, is_connected
 from equipix.plan.noise import factor, local_variance
 from equipix.plan.order import distinct_trend
 from equipix.plan.shift_errors import shift_error_effect
-from equipix.plan.spectrum import Spectrum, spectrum
+from equipix.plan.spectrum import Spectrum, smallest_near, spectrum
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from equipix._types import Floats
+
+_WHOLE = 0.02
+"""Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
+
+_UNDETERMINED = 1e-4
+"""λ of a wave that shifts between pixels do not determine, as in a calibration's verdict."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,6 +128,8 @@ def error_budget(
         Rows and columns of the sensor.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels; at least two.
+        Fractions of a pixel count for drift, errors of shifts and the spectrum; noise is that of
+        the nearest whole shifts, which a calibration between pixels has too.
     noise : float
         Standard deviation of the random noise of an exposure's mean, the same in every pixel, as
         a share of the signal in the middle of the beam at flux 1.
@@ -152,7 +160,8 @@ def error_budget(
     DriftWarning
         If the tilt that drift leaves exceeds the error from noise.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor uncompared.
+        If the shifts leave parts of the sensor uncompared, or, between pixels, do not constrain a
+        wave.
 
     Notes
     -----
@@ -181,7 +190,8 @@ def error_budget(
     if not (np.isfinite(powers).all() and (powers > 0).all()):
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
     positions = np.rint(exact - exact[0]).astype(np.int64) + np.rint(exact[0]).astype(np.int64)
-    components = _components(sizes, positions)
+    waves = spectrum(exact, powers)
+    components = _components(sizes, positions, _between_pixels(exact, waves))
     scale = noise**2 * factor(sizes, positions, powers)
     predicted = _Noise(sizes, positions, powers, beam_width, scale)
     drift_tilt = tilt_std(sizes, exact, drift)
@@ -203,7 +213,7 @@ def error_budget(
             "drift": (float(drift_tilt[0]), float(drift_tilt[1])),
             "shift_error": moved[1],
         },
-        spectrum=spectrum(exact, powers),
+        spectrum=waves,
         distinct_trend=distinct_trend(exact),
         components=components,
         _noise=predicted,
@@ -239,13 +249,33 @@ def _positive(name: str, value: float, *, zero: bool = False) -> None:
         raise InputError(f"'{name}' is {value!r}, expected a number above 0{' or 0' * zero}")
 
 
-def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
+def _between_pixels(shifts: Floats, waves: Spectrum) -> bool:
+    """Whether shifts lie between pixels; warns if a wave is periodic in all of them.
+
+    Such shifts compare each pixel with parts of several cells, so no part of the sensor is
+    unconnected; but a wave of the same phase in all exposures is undetermined.
+    """
+    moves = shifts - shifts[0]
+    if np.abs(moves - np.rint(moves)).max() <= _WHOLE:
+        return False
+    if np.isfinite(waves.worst).all() and smallest_near(waves, shifts) < _UNDETERMINED:
+        row, col = waves.worst
+        warn(
+            f"the shifts do not constrain a wave of ({row:.3f}, {col:.3f}) cycles per pixel, which "
+            "has the same phase in all exposures: choose less regular shifts "
+            "(equipix.plan.suggest)",
+            IdentifiabilityWarning,
+        )
+    return True
+
+
+def _components(shape: tuple[int, int], positions: NDArray[np.int64], between: bool) -> int:
     """Count the components, and warn of more than one."""
     fits = np.all(np.abs(positions) < shape)
-    components = (
-        1 if fits and is_connected(shape, positions) else identify(shape, positions).components
-    )
-    if components > 1:
+    components = 1
+    if not (fits and (between or is_connected(shape, positions))):
+        components = identify(shape, positions).components
+    if components > 1 and not between:
         warn(
             f"the shifts leave {components} parts of the sensor unconnected: the errors are those "
             "within a part: choose other shifts (equipix.plan.suggest)",
@@ -254,11 +284,11 @@ def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
     return components
 
 
-def warn_of_drift(causes: dict[str, float]) -> None:
-    """Warn of a tilt from drift that exceeds the noise."""
+def warn_of_drift(causes: dict[str, float], place: str = "") -> None:
+    """Warn of a tilt from drift that exceeds the noise, of the pattern that `place` names."""
     if causes["drift"] > causes["noise"] > 0:
         warn(
-            f"lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
+            f"{place}lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
             f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
             "residual: measure the flux, turn one exposure, or use larger shifts "
             "(equipix.plan.suggest)",

@@ -17,6 +17,8 @@ mod conjugate_gradients;
 mod first_beam;
 mod flux;
 mod freedom;
+mod fused;
+mod fused_kernel;
 mod kernel;
 mod layout;
 mod memory;
@@ -29,14 +31,16 @@ mod survey;
 mod system;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod unknowns;
+mod waves;
 mod wide;
 mod workspace;
 
 pub(crate) use conjugate_gradients::ConjugateGradients;
 pub(crate) use first_beam::{Source, first_beam};
 pub(crate) use flux::Fluxes;
-pub(crate) use kernel::{Follow, Row};
+pub(crate) use kernel::{Propagate, Row};
 pub(crate) use layout::Grid;
 pub(crate) use memory::{bytes_needed, bytes_needed_by_covariance};
 pub(crate) use outcome::{coefficients, components, freedom, unknowns, values_at_cells};

@@ -25,6 +25,14 @@ pub(crate) fn signs(stream: u64) -> impl FnMut() -> f64 {
     }
 }
 
+/// The first stream of what all exposures have in common; those of single exposures lie below.
+const COMMON: u64 = 1 << 63;
+
+/// The signs of a row of pixels that all exposures of a draw have in common.
+pub(crate) fn signs_in_common(draw: u64, row: usize, rows: usize) -> impl FnMut() -> f64 {
+    signs(COMMON + Streams::new(1, rows).number(draw, 0, row))
+}
+
 /// The numbers of the streams that draws take: of each part of a draw, such as an exposure, by row.
 #[derive(Clone, Copy)]
 pub(crate) struct Streams {

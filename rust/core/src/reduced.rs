@@ -19,6 +19,8 @@
 
 mod blocks;
 mod conjugate_gradients;
+mod dark;
+mod dark_noise;
 mod kernel;
 mod noise;
 mod operator;
@@ -27,6 +29,6 @@ mod two_level;
 mod two_level_kernel;
 
 pub(crate) use conjugate_gradients::{ConjugateGradients, bytes_needed};
-pub(crate) use operator::{Reduced, Scale};
+pub(crate) use operator::{Draw, Reduced, Scale};
 pub(crate) use smallest::Smallest;
 pub(crate) use two_level::TwoLevel;

@@ -5,7 +5,7 @@
 //! | argument | dtype and rank | here | how |
 //! |---|---|---|---|
 //! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
-//! | functionals | float64, 3 | `&[f64]` | view |
+//! | functionals, dark_variance | float64, 3 and 2 | `&[f64]` | view |
 //! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view |
 
 use std::num::NonZeroUsize;
@@ -163,7 +163,8 @@ impl PyFit {
     }
 
     /// Answers what is asked of it, from one linear problem.
-    #[pyo3(signature = (*, error_map, functionals, shifts, offset, workers, progress))]
+    #[pyo3(signature = (*, error_map, functionals, shifts, offset, workers, progress,
+                        dark_variance=None, dark_misfit=false))]
     #[expect(clippy::too_many_arguments, reason = "the questions that there are")]
     fn uncertainty(
         &self,
@@ -174,9 +175,12 @@ impl PyFit {
         offset: bool,
         workers: Option<NonZeroUsize>,
         progress: Option<Bound<'_, PyAny>>,
+        dark_variance: Option<PyReadonlyArray2<'_, f64>>,
+        dark_misfit: bool,
     ) -> PyResult<PyUncertainty> {
         let functionals = functionals.as_ref().map(|stack| stack.as_slice()).transpose()?;
-        let questions = Questions { error_map, functionals, shifts, offset };
+        let dark = dark_variance.as_ref().map(|image| image.as_slice()).transpose()?;
+        let questions = Questions { error_map, functionals, shifts, offset, dark, dark_misfit };
         let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
         let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
         let checked = &self.data.checked;
@@ -276,6 +280,8 @@ pub(crate) struct PyUncertainty {
     variances: Option<Py<PyArray1<f64>>>,
     shift_variances: Option<Vec<[f64; 2]>>,
     offset_variances: Option<(f64, f64)>,
+    dark_misfit: Option<f64>,
+    incomplete: u64,
 }
 
 impl PyUncertainty {
@@ -289,6 +295,8 @@ impl PyUncertainty {
             variances: answers.variances.map(|values| read_only(py, values)).transpose()?,
             shift_variances: answers.shifts,
             offset_variances: answers.offset.map(Into::into),
+            dark_misfit: answers.dark_misfit,
+            incomplete: answers.incomplete,
         })
     }
 }
@@ -300,6 +308,9 @@ struct Questions<'a> {
     functionals: Option<&'a [f64]>,
     shifts: bool,
     offset: bool,
+    /// The variance by pixel of a dark that was subtracted from all exposures.
+    dark: Option<&'a [f64]>,
+    dark_misfit: bool,
 }
 
 struct Answers {
@@ -307,6 +318,8 @@ struct Answers {
     variances: Option<Vec<f64>>,
     shifts: Option<Vec<[f64; 2]>>,
     offset: Option<[f64; 2]>,
+    dark_misfit: Option<f64>,
+    incomplete: u64,
 }
 
 impl Questions<'_> {
@@ -318,12 +331,18 @@ impl Questions<'_> {
         control: &Control,
     ) -> Result<Answers> {
         let mut bars = Uncertainty::new(exposures, solution, workers, control)?;
-        Ok(Answers {
+        if let Some(variance) = self.dark {
+            bars = bars.with_dark(variance)?;
+        }
+        let answers = Answers {
             map: self.error_map.then(|| bars.error_map()).transpose()?,
             variances: self.functionals.map(|stack| bars.variances(stack)).transpose()?,
             shifts: if self.shifts { bars.shift_variances()? } else { None },
             offset: if self.offset { bars.offset_variances()? } else { None },
-        })
+            dark_misfit: self.dark_misfit.then(|| bars.misfit_by_dark()).transpose()?,
+            incomplete: 0,
+        };
+        Ok(Answers { incomplete: bars.incomplete(), ..answers })
     }
 }
 

@@ -57,6 +57,8 @@ pub(crate) struct Experiment {
     pub(crate) mask: Vec<bool>,
     /// Whether an offset of each pixel is sought.
     pub(crate) offset: bool,
+    /// The variance, by pixel, of a dark that was subtracted from all exposures; empty if there is none.
+    pub(crate) dark: Vec<f64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -197,6 +199,15 @@ pub(crate) fn offset_variances(
     Ok(found.unwrap_or_default().map(|variance| variance * unit))
 }
 
+/// What the noise of the dark adds to F on average.
+pub(crate) fn misfit_by_dark(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+) -> Result<f64> {
+    ask(experiment, answer, workers, |bars| bars.misfit_by_dark())
+}
+
 /// The variance of a measurement of weight 1: 1 where variances are given, else reduced χ².
 fn variance_of_weight_1(experiment: &Experiment, answer: &Answer) -> f64 {
     match experiment.noise {
@@ -279,7 +290,13 @@ fn ask<R>(
         unit: variance_of_weight_1(experiment, answer),
     };
     with_exposures(experiment, &workers, |exposures| {
-        question(&mut Uncertainty::new(exposures, &solution, &workers, &control)?)
+        let bars = Uncertainty::new(exposures, &solution, &workers, &control)?;
+        if experiment.dark.is_empty() {
+            return question(&mut { bars });
+        }
+        let unit = variance_of_weight_1(experiment, answer);
+        let relative: Vec<f64> = experiment.dark.iter().map(|variance| variance / unit).collect();
+        question(&mut bars.with_dark(&relative)?)
     })
 }
 

@@ -14,6 +14,7 @@
 use std::f64::consts::TAU;
 
 use super::layout::Window;
+use super::penalty::bent;
 use crate::geometry::Taps;
 
 /// Wave vectors along each axis.
@@ -37,14 +38,13 @@ pub(crate) fn determined_share(windows: &[Window], shares: &[f64], tau: f64) -> 
             along = [along[0] + share * h[0], along[1] + share * h[1]];
         }
         let measured = (seen - along[0] * along[0] - along[1] * along[1]).max(0.0);
-        let bent: f64 = q.iter().map(|q| (2.0 * (q / 2.0).sin()).powi(8)).sum();
-        sum += measured / (measured + tau * bent);
+        sum += measured / (measured + tau * (bent(q[0]) + bent(q[1])));
     }
     sum / (WAVES * WAVES) as f64
 }
 
 /// Σ_j t_j e^{iq(first + j)}, real and imaginary part.
-fn symbol(taps: &Taps, first: usize, q: f64) -> [f64; 2] {
+pub(super) fn symbol(taps: &Taps, first: usize, q: f64) -> [f64; 2] {
     let terms = taps.values.iter().enumerate().map(|(j, t)| {
         let (sin, cos) = (q * (first + j) as f64).sin_cos();
         [t * cos, t * sin]

@@ -100,6 +100,18 @@ impl<'s> Row<'s> {
         (exposures + if with_offset { 6 } else { 3 }) * cols
     }
 
+    /// The same row for a shorter time.
+    pub(crate) fn again(&mut self) -> Row<'_> {
+        let [offset, i12, i22] = &mut self.offset;
+        Row {
+            light: self.light,
+            sensitivity: self.sensitivity,
+            inverse: self.inverse,
+            change: self.change,
+            offset: [offset, i12, i22],
+        }
+    }
+
     pub(crate) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
         let (light, rest) = values.split_at_mut(exposures * cols);
         let mut parts = rest.chunks_exact_mut(cols);
@@ -129,7 +141,7 @@ pub(crate) struct Eliminate<'s> {
     pub(crate) weights: &'s [f64],
     /// y, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Σ w e y, Σ w e, Σ w and Σ w y: room for four rows.
+    /// Σ w e y, Σ w e, Σ w and Σ w y: buffers for four rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
     pub(crate) singular: f64,
@@ -214,19 +226,19 @@ fn sum(values: &[f64]) -> f64 {
 /// What a change of the light pulls at the beam once M and O have followed it: v → c M w (u − α e − β)
 /// with u = c M v, and the change −α of M; returns the largest size of that less a share of the change
 /// before.
-pub(crate) struct Follow<'s> {
+pub(crate) struct Propagate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
     /// v, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Room for rows.
+    /// Buffers for rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// The share of the change before.
     pub(crate) share: f64,
 }
 
-impl pulp::NullaryFnOnce for Follow<'_> {
+impl pulp::NullaryFnOnce for Propagate<'_> {
     type Output = f64;
 
     #[inline(always)]

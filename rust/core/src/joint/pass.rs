@@ -20,6 +20,8 @@ use crate::geometry::{Rotation, TAPS, Taps, View};
 use crate::parallel::dot;
 use crate::parallel::{Add, Workers};
 
+/// Rows of pixels in a band, at least.
+const FEWEST_ROWS: usize = 32;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 16;
 
@@ -39,7 +41,7 @@ pub(crate) struct Pass<'m, 'a, T> {
     /// Whether slopes of the shifts are gathered.
     pub(crate) with_shifts: bool,
     /// [`Row`] by row.
-    rows: Vec<f64>,
+    pub(super) rows: Vec<f64>,
     /// What cells get of the pixels' pulls, by band.
     sums: Vec<f64>,
     /// Passes made.
@@ -80,7 +82,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     pub(crate) fn place(&mut self, shifts: &[[f64; 2]], control: &Control) {
         let Grid { geometry, width, sensor, .. } = &self.grid;
         self.windows = self.grid.windows(shifts);
-        self.bands = Bands::new(&self.windows, &geometry.views, *width);
+        self.bands = Bands::new(&self.windows, &geometry.views, *width, FEWEST_ROWS);
         let size = self.bands.size(sensor.rows);
         if self.sums.len() != size {
             self.sums = Vec::new();

@@ -15,7 +15,8 @@
 use std::ops::Range;
 
 use super::flux::Fluxes;
-use super::kernel::{Eliminate, Follow};
+use super::fused::Fused;
+use super::kernel::{Eliminate, Propagate};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
@@ -50,6 +51,14 @@ pub(crate) struct System<'m, 'a, T> {
     /// D a/(aᵀD a) with these weights D and the coefficients a.
     scale: Vec<f64>,
     pub(crate) penalty: Option<Penalty>,
+    /// A faster product where it serves, and whether it is of the state last linearised.
+    fused: Option<Fused>,
+    is_fused_anew: bool,
+    /// Whether products may be made in single precision: where no later step makes good what they leave,
+    /// they may not.
+    pub(crate) allows_single: bool,
+    /// Whether the weights and τ are of the state last linearised.
+    is_weighed_anew: bool,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -73,6 +82,10 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             weights: Vec::new(),
             scale: Vec::new(),
             penalty: None,
+            fused: None,
+            is_fused_anew: false,
+            allows_single: true,
+            is_weighed_anew: false,
             state,
         }
     }
@@ -130,6 +143,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         self.pass.place(&self.state.shifts, control);
+        // Its bands are those of the shifts.
+        self.fused.take_if(|_| self.shift_prior.is_some());
+        (self.is_fused_anew, self.is_weighed_anew) = (false, false);
         self.pass.flux = self.fluxes.at(&self.state.theta);
         let beam = std::mem::take(&mut self.state.beam);
         let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
@@ -149,8 +165,10 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// What [`linearise`](Self::linearise) gives, at weights D and a weight of the penalty of the state
     /// there.
     pub(crate) fn renew(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.penalty = None;
-        self.weigh(control)?;
+        if !self.is_weighed_anew {
+            self.penalty = None;
+            self.weigh(control)?;
+        }
         self.whole(control)
     }
 
@@ -275,12 +293,26 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
+        if self.is_single() {
+            return self.multiply_single(x, product, share, control);
+        }
+        self.multiply_double(x, product, share, control)
+    }
+
+    /// [`multiply`](Self::multiply) in double precision.
+    pub(super) fn multiply_double(
+        &mut self,
+        x: &[f64],
+        product: &mut Vec<f64>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
         let cells = self.state.beam.len();
         let params = self.fluxes.columns.len();
         let moves = self.centred(&x[cells + params..]);
         let beam = std::mem::take(&mut self.state.beam);
         product.resize(cells, 0.0);
-        let sums = self.follow(&beam, x, &moves, product, share, control);
+        let sums = self.propagate(&beam, x, &moves, product, share, control);
         self.state.beam = beam;
         let sums = sums?;
         self.append(&sums, product);
@@ -293,8 +325,31 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         Ok(sums.largest)
     }
 
+    /// [`multiply`](Self::multiply) in single precision.
+    fn multiply_single(
+        &mut self,
+        x: &[f64],
+        product: &mut Vec<f64>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
+        let Some(penalty) = &self.penalty else { return Ok(f64::INFINITY) };
+        let fused = self.fused.get_or_insert_with(|| Fused::new(&self.pass, control));
+        if !self.is_fused_anew {
+            fused.renew(&self.pass);
+            self.is_fused_anew = true;
+        }
+        product.resize(x.len(), 0.0);
+        fused.multiply(&mut self.pass, penalty, x, share, product, control)
+    }
+
+    /// Whether products are made in single precision.
+    pub(crate) fn is_single(&self) -> bool {
+        self.allows_single && Fused::serves(&self.pass)
+    }
+
     /// What a step pulls at the cells once M and O have followed it.
-    fn follow(
+    fn propagate(
         &mut self,
         beam: &[f64],
         x: &[f64],
@@ -303,10 +358,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<Sums> {
-        let (cells, params) = (beam.len(), self.fluxes.columns.len());
-        let logs = self.fluxes.spread(&x[cells..cells + params]);
-        let shares: Vec<f64> =
-            logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect();
+        let cells = beam.len();
+        let shares = self.shares(&x[cells..]);
         let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(beam));
         self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
             pass.weigh_row(row_index, workspace);
@@ -315,9 +368,53 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see(&views, row_index, workspace);
             let (weights, values, sums) = workspace.parts();
             let fluxes = &pass.flux[..];
-            let follow = Follow { row, fluxes, weights, values, sums, share };
-            found.largest = found.largest.max(pulp::Arch::new().dispatch(follow));
+            let propagate = Propagate { row, fluxes, weights, values, sums, share };
+            found.largest = found.largest.max(pulp::Arch::new().dispatch(propagate));
         })
+    }
+
+    /// Changes of ln c, divided by c, of changes of θ and what stands behind them.
+    fn shares(&self, x: &[f64]) -> Vec<f64> {
+        let logs = self.fluxes.spread(&x[..self.fluxes.columns.len()]);
+        logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect()
+    }
+
+    /// 1ᵀ w Q J x of each pixel: what a change of all its measurements alike does to the slope along x.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn propagate_common(&mut self, x: &[f64], control: &Control) -> Result<Vec<f64>> {
+        let cells = self.state.beam.len();
+        let shares = self.shares(&x[cells..]);
+        let moves = self.centred(&x[cells + self.fluxes.columns.len()..]);
+        let beam = std::mem::take(&mut self.state.beam);
+        let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(&beam));
+        let mut pull = vec![0.0; cells];
+        let done = self.pass.run(&mut pull, control, |pass, row_index, mut row, workspace, _| {
+            pass.weigh_row(row_index, workspace);
+            pass.see_slopes(&beams, row_index, workspace);
+            workspace.begin(row.light, &shares, &moves);
+            pass.see(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
+            let fluxes = &pass.flux[..];
+            let propagate =
+                Propagate { row: row.again(), fluxes, weights, values, sums, share: 0.0 };
+            pulp::Arch::new().dispatch(propagate);
+            row.change.fill(0.0);
+            for (k, flux) in pass.flux.iter().enumerate() {
+                let pulls = values.of(k).iter().zip(&*row.sensitivity);
+                for (sum, (pull, m)) in row.change.iter_mut().zip(pulls) {
+                    // A pixel without response pulls at nothing.
+                    *sum += if *m == 0.0 { 0.0 } else { pull / (flux * m) };
+                }
+            }
+        });
+        drop((views, beams));
+        self.state.beam = beam;
+        done?;
+        let mut common = Vec::new();
+        self.pass.for_rows(|[_, _, sums, ..]| common.extend_from_slice(sums));
+        Ok(common)
     }
 
     /// The priors' weights of the parameters.
@@ -341,6 +438,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         })?;
         self.weights = weights;
+        self.is_weighed_anew = self.penalty.is_none();
         if self.pass.grid.is_spline() {
             let total: f64 = self.weights.iter().sum();
             let typical = self.pass.workers.dot(&self.weights, &self.weights) / total;

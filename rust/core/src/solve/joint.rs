@@ -29,6 +29,8 @@ const STRUCTURED: f64 = 10.0;
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
 const CURVED: [f64; 2] = [1e-8, 0.03];
+/// The most that one step reduces the error by where products are made in single precision.
+const PRECISION: f64 = 1e-5;
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
 /// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
@@ -132,7 +134,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         };
         self.search.begin(&self.system, &preconditioner, slope, control)?;
         let first = self.search.product(&mut self.system, control)?;
-        let error = first / self.search.smallest;
+        let error = first / self.search.lowest.expected();
         self.looks.push(Look { sweep: self.products(), objective, error });
         if self.begins_to_refine(error) {
             return Ok(None);
@@ -203,7 +205,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
-        let reachable = first * first.clamp(CURVED[0], CURVED[1]);
+        let least = if self.system.is_single() { PRECISION } else { CURVED[0] };
+        let reachable = first * first.clamp(least, CURVED[1]);
         while self.products() + A_LOOK < self.limit {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
@@ -213,7 +216,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             control.check()?;
             let size = self.search.product(&mut self.system, control)?;
             let aim = AIM * self.options.tolerance;
-            let near = size <= reachable || size / self.search.smallest <= aim;
+            let near = size <= reachable || size / self.search.lowest.expected() <= aim;
             if near && self.search.iterations >= FEWEST_ITERATIONS {
                 break;
             }
@@ -255,7 +258,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let exposures = system.pass.exposures;
         let without_offset = system.without_offset();
         let history = History { looks: self.looks, ended };
-        let smallest = self.search.smallest;
+        let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));

@@ -15,10 +15,17 @@
 //! (`joint/flux.rs`): its covariance is added. Shifts that have a prior but were not refined are wrong by
 //! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
 //! out the mean of M, and the tilt where free fluxes leave it undetermined.
+//!
+//! On larger sensors the squares of C x are smoothed (`smoothed.rs`).
+//!
+//! The noise of a dark that was subtracted from all exposures is a fourth (`joint_dark.rs`).
 
+use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
-use super::joint_pulls::{add_change, product, pull_by, pull_of};
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
+use super::joint_pulls::{add_change, product, pull_of};
+use super::sampling::{ErrorMap, LACK_OF_FUNCTIONAL, LACK_WITH_DARK, NEGLIGIBLE, NOTHING};
+use super::sampling::{Sampled, mean_misfit};
+use super::smoothed::{is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
@@ -26,26 +33,18 @@ use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
 use crate::joint::{
-    self, ConjugateGradients, Fluxes, Follow, Grid, Preconditioner, ShiftPrior, State, System,
+    self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
 };
 use crate::memory;
 use crate::parallel::Workers;
-use crate::random::{self, Streams};
 
+mod draws;
 #[cfg(test)]
 mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
 
-/// What is drawn besides the noise of exposures.
-enum Other {
-    Penalty,
-    Priors,
-    Shifts,
-}
-/// How many of them there are.
-const OTHERS: usize = 3;
 /// A linear functional of what was found.
 enum Functional {
     /// Σ g M.
@@ -71,6 +70,9 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     valid: Vec<f32>,
     /// The mean of D⁻¹: in these units squares have no extreme values.
     scale: f64,
+    /// The noise of a dark that was subtracted from all exposures.
+    dark: Option<Dark>,
+    incomplete: u64,
 }
 
 impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
@@ -90,6 +92,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let prior = ShiftPrior::of(exposures.positions());
         let (refined, considered) = if solution.refined { (prior, None) } else { (None, prior) };
         system.seek_shifts(refined);
+        system.allows_single = false;
         system.linearise(control)?;
         let preconditioner = Preconditioner::new(&mut system, control)?;
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
@@ -103,13 +106,49 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             determined,
             valid,
             scale,
+            dark: None,
+            incomplete: 0,
         })
+    }
+
+    /// Takes the noise of the dark into account, of these variances. A sought offset takes all of it.
+    pub(super) fn set_dark(&mut self, variance: &[f64], control: &Control) -> Result<()> {
+        if self.system.pass.with_offset {
+            return Ok(());
+        }
+        let mut dark = Dark::of(&mut self.system, variance, control)?;
+        let propagated: Vec<f64> = dark.propagated().collect();
+        let in_gauge = self.tilts.gauge.diagonal(&propagated);
+        dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
+        self.dark = Some(dark);
+        Ok(())
+    }
+
+    /// What the noise of the dark adds to F, on average; 0 without a dark.
+    pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
+        let Some(left) = self.dark.as_ref().map(|dark| dark.left) else { return Ok(0.0) };
+        let pixels = count(&self.valid);
+        if left <= NEGLIGIBLE * pixels {
+            return Ok(left);
+        }
+        self.search = ConjugateGradients::default();
+        let propagated = mean_misfit(pixels, |draw| {
+            let slope = self.pulls_of_noise(draw, false, control)?;
+            self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
+            Ok(self.search.energy)
+        })?;
+        Ok(left - propagated)
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
         self.search = ConjugateGradients::default();
-        let sampled = Sampled::of(self, control)?;
+        let sensor = self.system.pass.exposures.sensor();
+        let sampled = if is_smoothed(sensor) {
+            smoothed(self, sensor, control)?
+        } else {
+            Sampled::of(self, control)?
+        };
         let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
             true => (self.scale * sampled.variance(pixel)).sqrt(),
             false => f64::NAN,
@@ -157,50 +196,28 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     ) -> Result<Vec<f64>> {
         self.search = ConjugateGradients::default();
         let total = functionals.len() as u64;
+        let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
             control.report("uncertainty", index, total);
-            self.variance_of(functional, LACK_OF_FUNCTIONAL, control)
+            self.variance_of(functional, lack, control)
         });
         found.collect()
     }
 
     /// The part of the variance that is known: the diagonal of P D⁻¹ Pᵀ, and what S does not see.
     fn known_part(&self) -> Vec<f32> {
-        let own = self.own();
-        let parts = &self.tilts.gauge.parts;
-        let dot = |a: &[f64], b: &[f64]| -> f64 {
-            a.iter().zip(b).zip(&own).map(|((a, b), own)| a * b * own).sum()
-        };
-        // (1 − U Wᵀ) V (1 − W Uᵀ) = V − U Wᵀ V − V W Uᵀ + U (Wᵀ V W) Uᵀ.
-        let mixed: Vec<Vec<f64>> =
-            parts.iter().map(|[_, w]| parts.iter().map(|[_, v]| dot(w, v)).collect()).collect();
-        let variance = |pixel: usize| {
-            let mut variance = own[pixel];
-            for ([u, w], mixed) in parts.iter().zip(&mixed) {
-                variance -= 2.0 * u[pixel] * own[pixel] * w[pixel];
-                for ([v, _], mixed) in parts.iter().zip(mixed) {
-                    variance += u[pixel] * mixed * v[pixel];
-                }
-            }
+        let mut own = self.own();
+        if let Some(dark) = &self.dark {
+            own.iter_mut().zip(dark.propagated()).for_each(|(own, propagated)| *own += propagated);
+        }
+        let in_gauge = self.tilts.gauge.diagonal(&own).enumerate();
+        let variance = in_gauge.map(|(pixel, mut variance)| {
             if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
                 variance += form(covariance, [tilts[0][pixel], tilts[1][pixel]]);
             }
             (variance / self.scale) as f32
-        };
-        (0..own.len()).map(variance).collect()
-    }
-
-    /// Adds the square of the change of M in one draw.
-    fn add_square(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        let slope = self.draw(draw, control)?;
-        let mut sign = self.other_signs(draw, Other::Shifts);
-        let variances = self.considered_variances().into_iter();
-        let wrong: Vec<f64> = variances.map(|variance| sign() * variance.sqrt()).collect();
-        let change = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
-        for (square, change) in squares.iter_mut().zip(&change) {
-            *square += (change * change / self.scale) as f32;
-        }
-        Ok(())
+        });
+        variance.collect()
     }
 
     /// The change of M, in the gauge, with S x = b − S_d δ where considered shifts are wrong by δ, solved
@@ -235,6 +252,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         Ok(change)
     }
 
+    /// What the noise of the dark adds to the variance of a functional, Σ g M or with g = 0 another one,
+    /// once S x = its pull is solved.
+    fn variance_by_dark(&mut self, gain: &[f64], control: &Control) -> Result<f64> {
+        let Some(dark) = &self.dark else { return Ok(0.0) };
+        let influence = self.system.propagate_common(&self.search.x, control)?;
+        Ok(dark.variance_of(gain, &influence))
+    }
+
     /// The variance of a functional, in the gauge of the result, solved until it lacks at most this
     /// share of what S has in it. A g must be 0 where M is undetermined.
     fn variance_of(&mut self, functional: Functional, lack: f64, control: &Control) -> Result<f64> {
@@ -246,7 +271,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let others = pull.len() - own.as_flattened().len();
                 pull[others..].copy_from_slice(own.as_flattened());
                 self.apply_inverse(pull, lack, control)?;
-                Ok(self.search.energy)
+                let no_gain = vec![0.0; self.valid.len()];
+                Ok(self.search.energy + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -269,7 +295,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (pull, seen) = self.pull_of_gain(&gain, control)?;
         let others = pull.len();
         self.apply_inverse(pull, lack, control)?;
-        variance += self.search.energy;
+        variance += self.search.energy + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
             x.resize(others + seen.len(), 0.0);
@@ -351,14 +377,13 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
         search.begin(system, preconditioner, b, control)?;
-        let mut earlier = 0.0;
+        let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
-            if !search.step(system, preconditioner)
-                || iteration >= FEWEST_ITERATIONS
-                    && search.square / search.smallest <= lack * search.energy
-            {
-                break;
+            let goes_on = search.step(system, preconditioner);
+            let left = search.square / search.lowest.found();
+            if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
+                return Ok(());
             }
             if iteration % FEWEST_ITERATIONS == 0 {
                 if search.energy - earlier <= NOTHING * lack * search.energy {
@@ -367,55 +392,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 earlier = search.energy;
             }
         }
+        // Rounding may leave a Ritz value next to 0, but then the residual is rounding too.
+        self.incomplete += u64::from(search.square > NOTHING * lack * first);
         Ok(())
     }
 
-    /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
-    fn draw(&mut self, draw: u64, control: &Control) -> Result<Vec<f64>> {
-        let streams: Vec<u64> =
-            (0..self.system.pass.exposures.count()).map(|k| self.stream(draw, k, 0)).collect();
-        let mut of_penalty = self.other_signs(draw, Other::Penalty);
-        let mut of_priors = self.other_signs(draw, Other::Priors);
-        let system = &mut self.system;
-        let mut slope = pull_by(system, control, |pass, row_index, row, workspace| {
-            let cols = pass.exposures.sensor().cols;
-            let (weights, values, sums) = workspace.parts();
-            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
-                let mut sign = random::signs(streams[k] + row_index as u64);
-                let pixels = weights.iter().zip(&*row.sensitivity);
-                for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
-                    // As a change of the light, which a pixel without response does not show.
-                    let shown = weight.sqrt() * flux * m;
-                    *value = if shown == 0.0 { 0.0 } else { sign() / shown };
-                }
-            }
-            let fluxes = &pass.flux[..];
-            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
-        })?;
-        let cells = system.state.beam.len();
-        if let Some(penalty) = &system.penalty {
-            let beam = &system.state.beam;
-            penalty.add_draw(beam, &mut of_penalty, &mut slope[..cells], system.pass.workers);
-        }
-        let params = system.fluxes.columns.len();
-        let mut pulls = system.precisions();
-        pulls.iter_mut().for_each(|precision| *precision = precision.sqrt() * of_priors());
-        let of_shifts = system.centred_pulls(pulls.split_off(params).as_chunks().0.to_vec());
-        let priors = pulls.iter().chain(of_shifts.as_flattened());
-        slope[cells..].iter_mut().zip(priors).for_each(|(slope, pull)| *slope += pull);
-        Ok(slope)
-    }
-
-    /// The number of a stream of signs: of a row of an exposure, or behind those of what else is drawn.
-    fn stream(&self, draw: u64, exposure: usize, row: usize) -> u64 {
-        let exposures = self.system.pass.exposures;
-        let streams = Streams::new(exposures.count() + OTHERS, exposures.sensor().rows);
-        streams.number(draw, exposure, row)
-    }
-
-    /// The stream of signs for what else is drawn.
-    fn other_signs(&self, draw: u64, which: Other) -> impl FnMut() -> f64 + use<T> {
-        random::signs(self.stream(draw, self.system.pass.exposures.count() + which as usize, 0))
+    /// Searches that ended before their answer was as exact as it should be.
+    pub(super) const fn incomplete(&self) -> u64 {
+        self.incomplete
     }
 
     /// D⁻¹ of each pixel's M.
@@ -472,18 +456,4 @@ fn problem<'m, 'a, T: Real>(
     let mut system = System::new(exposures, grid, fluxes, state, workers, control);
     system.unit = solution.unit;
     Ok(system)
-}
-
-impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
-    fn valid(&self) -> &[f32] {
-        &self.valid
-    }
-
-    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
-        Ok(self.known_part())
-    }
-
-    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        self.add_square(draw, squares, control)
-    }
 }

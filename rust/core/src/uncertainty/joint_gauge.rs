@@ -29,6 +29,27 @@ impl Gauge {
         }
     }
 
+    /// The diagonal of P V Pᵀ for a diagonal V.
+    pub(super) fn diagonal<'v>(&'v self, own: &'v [f64]) -> impl Iterator<Item = f64> + 'v {
+        let parts = &self.parts;
+        let dot = |a: &[f64], b: &[f64]| -> f64 {
+            a.iter().zip(b).zip(own).map(|((a, b), own)| a * b * own).sum()
+        };
+        // (1 − U Wᵀ) V (1 − W Uᵀ) = V − U Wᵀ V − V W Uᵀ + U (Wᵀ V W) Uᵀ.
+        let mixed: Vec<Vec<f64>> =
+            parts.iter().map(|[_, w]| parts.iter().map(|[_, v]| dot(w, v)).collect()).collect();
+        (0..own.len()).map(move |pixel| {
+            let mut variance = own[pixel];
+            for ([u, w], mixed) in parts.iter().zip(&mixed) {
+                variance -= 2.0 * u[pixel] * own[pixel] * w[pixel];
+                for ([v, _], mixed) in parts.iter().zip(mixed) {
+                    variance += u[pixel] * mixed * v[pixel];
+                }
+            }
+            variance
+        })
+    }
+
     /// Pᵀ g.
     pub(super) fn transpose(&self, functional: &mut [f64], workers: &Workers) {
         let heights: Vec<f64> =

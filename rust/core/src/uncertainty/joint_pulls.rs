@@ -72,3 +72,37 @@ pub(super) fn add_change<T: Real>(system: &System<'_, '_, T>, change: &mut [f64]
         sums.by_ref().zip(change).for_each(|(sum, change)| *sum += change);
     });
 }
+
+/// What the noise of each cell of the beam, at the M that there is, does by itself to the variance of M:
+/// Σ_k (i₁₁ w e c M)² V with 1/V = Σ w c² M² over the pixels that see a cell.
+pub(super) fn variance_by_cells<T: Real>(
+    system: &mut System<'_, '_, T>,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let of_cells = std::mem::take(&mut system.weights);
+    let views = system.pass.views_of(&of_cells);
+    let mut no_pull = vec![0.0; of_cells.len()];
+    let done = system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, _| {
+        pass.weigh_row(row_index, workspace);
+        workspace.values().clear();
+        pass.see(&views, row_index, workspace);
+        let cols = row.change.len();
+        let (weights, values, _) = workspace.parts();
+        row.change.fill(0.0);
+        for (k, flux) in pass.flux.iter().enumerate() {
+            let (weights, light) = (&weights[k * cols..][..cols], &row.light[k * cols..][..cols]);
+            for (col, weight) in values.of_mut(k).iter_mut().enumerate() {
+                let share =
+                    row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
+                row.change[col] += if *weight > 0.0 { share * share / *weight } else { 0.0 };
+                *weight = 0.0;
+            }
+        }
+    });
+    drop(views);
+    system.weights = of_cells;
+    done?;
+    let mut variance = vec![0.0; system.pass.exposures.sensor().len()];
+    add_change(system, &mut variance);
+    Ok(variance)
+}
