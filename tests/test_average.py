@@ -208,6 +208,7 @@ FRAMES = np.zeros((3, 4, 5), np.uint8)
         ([None], {}, r"'source\[0\]' has dtype object"),
         (FRAMES, {"dark": np.zeros((5, 4))}, r"'dark' has shape \(5, 4\), expected \(4, 5\)"),
         (FRAMES, {"dark": np.zeros(4)}, "'dark' has shape"),
+        (FRAMES, {"dark": np.full((4, 5), np.nan)}, "'dark' holds no finite number"),
         (FRAMES, {"saturation": np.nan}, "'saturation' is nan"),
         (FRAMES, {"saturation": "full"}, "'saturation' is 'full'"),
         (FRAMES, {"workers": 0}, "'workers' is 0"),

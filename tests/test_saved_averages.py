@@ -88,6 +88,29 @@ def test_another_dark_is_not_subtracted_a_second_time(manifest, tmp_path):
             equipix.average(tmp_path / "mean.npz", dark=other)
 
 
+SUBTRACTED = "its dark was already subtracted; 'dark' needs frames or an average without a dark"
+
+
+def test_a_dark_is_no_average_from_which_one_was_subtracted(manifest, direct, tmp_path, capsys):
+    frames, dark = manifest.parent / "frames/p0.tif", manifest.parent / "dark/dark.tif"
+    wrong, cal = tmp_path / "wrong.tif", tmp_path / "cal.tif"
+    subtracted = equipix.average(dark, dark=equipix.average(dark), saturation=4095)
+    subtracted.save(wrong)
+    direct.save(cal)
+    with pytest.raises(errors.InputError, match=f"^'dark': {SUBTRACTED}"):
+        equipix.average(frames, dark=subtracted)
+    with pytest.raises(errors.InputError, match=f"^'dark': {SUBTRACTED}"):
+        direct.correct(np.ones(SHAPE), dark=subtracted)
+    toml = manifest.with_name("wrong-dark.toml")
+    toml.write_text(manifest.read_text().replace("dark/dark.tif", str(wrong)))
+    for command in (("average", frames), ("correct", cal, frames)):
+        assert run(*command, "--dark", wrong, "-o", tmp_path / "out.tif") == 1
+        assert f"error: {wrong}: {SUBTRACTED}" in capsys.readouterr().err
+    assert run("calibrate", toml, "-o", tmp_path / "out.tif") == 1
+    assert f"[dark] {wrong}: {SUBTRACTED}" in capsys.readouterr().err
+    assert not (tmp_path / "out.tif").exists()
+
+
 def test_another_saturation_level_is_refused(manifest, tmp_path):
     path = averaged(manifest, tmp_path, suffix=".npz", subtract=False, saturation=4000)
     with pytest.raises(errors.FileError, match=r"saturation level 4000, expected 4095: average"):

@@ -458,11 +458,15 @@ def _subtract(
             "'source' is an average from which another dark than 'dark' is subtracted already: "
             "give the frames, or the dark that was subtracted"
         )
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
     mean = dark.mean if isinstance(dark, FrameStatistics) else dark
     if mean.shape != statistics.mean.shape:
         raise InputError(
             f"'dark' has shape {mean.shape}, expected {statistics.mean.shape} like the frames"
         )
+    if not np.isfinite(mean).any():
+        raise InputError("'dark' holds no finite number: give the mean of dark frames")
     variance = dark.variance_of_mean if isinstance(dark, FrameStatistics) else 0.0
     return FrameStatistics(
         statistics.mean - mean,
@@ -473,6 +477,21 @@ def _subtract(
         dark if isinstance(dark, FrameStatistics) else None,
         statistics.saturation,
     )
+
+
+def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:
+    """Refuse an average as a dark if a dark was subtracted from it; `place` is for the message.
+
+    Raises
+    ------
+    InputError
+        If one was: the average holds no dark level any more.
+    """
+    if dark.dark is not None:
+        raise InputError(
+            f"{place}: its dark was already subtracted; 'dark' needs frames or an average without "
+            "a dark"
+        )
 
 
 def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:

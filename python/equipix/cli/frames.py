@@ -14,6 +14,7 @@ from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import correct_files, is_folder
 from equipix.errors import InputError
 from equipix.frames import average as average_frames
+from equipix.frames import refuse_subtracted
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
@@ -45,6 +46,7 @@ def average(
         offset = None
         if dark:
             offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+            refuse_subtracted(offset, " ".join(dark))
         frames = average_frames(
             source,
             dark=offset,

@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix._types import Flagged, Progress
 from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
-from equipix.frames import average, load_statistics
+from equipix.frames import average, refuse_subtracted
 from equipix.io import (
     description,
     find_files,
@@ -170,8 +170,6 @@ def _takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
 
 def _dark_frame(source: str) -> NDArray[Any]:
     """Read the mean of dark frames, averaged already or not."""
-    try:
-        mean = load_statistics(source).mean
-    except (FileError, InputError):  # not averaged yet
-        mean = average(source).mean
-    return mean.astype(np.float32)
+    dark = average(source)
+    refuse_subtracted(dark, source)
+    return dark.mean.astype(np.float32)

@@ -22,7 +22,7 @@ from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
-from equipix.frames import average, saved_shape
+from equipix.frames import average, refuse_subtracted, saved_shape
 from equipix.io import as_path, frame_format
 
 if TYPE_CHECKING:
@@ -185,7 +185,11 @@ class Experiment:
         return hot_pixels(self._dark(options), None)
 
     def _dark(self, options: FitOptions) -> FrameStatistics:
-        return self._statistics("dark", self.manifest.dark.frames, None, options)
+        frames = self.manifest.dark.frames
+        dark = self._statistics("dark", frames, None, options)
+        files = ", ".join(map(str, find_files(self.path, frames)))
+        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
+        return dark
 
     def run(
         self,
