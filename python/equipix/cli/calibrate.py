@@ -70,7 +70,7 @@ def calibrate(
     refuse_inputs([output], [experiment, *loaded.files(), *([mask] if mask else [])])
     if not partial:
         # `_refuse_partial` says the same as an error.
-        warnings.filterwarnings("ignore", "the exposures determine only")
+        warnings.filterwarnings("ignore", "the exposures determine only|the fit ended far from")
     with progress_bars() as progress:
         calibration = loaded.run(
             flux=flux,
@@ -90,7 +90,7 @@ def calibrate(
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
-    """Refuse a result that determines less than half of the unmasked pixels."""
+    """Refuse a result that determines less than half of the unmasked pixels, or none."""
     for verdict in calibration.verdicts:
         if verdict.kind == "partial":
             raise EquipixError(
