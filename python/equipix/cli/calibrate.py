@@ -86,7 +86,10 @@ def calibrate(
     if not partial:
         _refuse_partial(calibration, output)
     calibration.save(output, force=force)
-    show_result({"output": str(output), **of_calibration(calibration)}, as_json=as_json)
+    result = {"output": str(output), **of_calibration(calibration)}
+    if not as_json:  # their messages are on stderr, as warnings
+        result["verdicts"] = ", ".join(each.kind for each in calibration.verdicts) or "none"
+    show_result(result, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
