@@ -15,7 +15,7 @@ from equipix.defects import (
     refuse_saturated,
 )
 from equipix.errors import InputError
-from equipix.exposures.clipping import Clipping, clipping_of, highest
+from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
 from equipix.frames import same_statistics
 from equipix.noise import NoiseModel, photon_transfer
 
@@ -110,7 +110,8 @@ class Averaged:
         saturates = frames.saturated > 0
         named = f" ({name!r})" if name else ""
         self._refuse_saturated(f"'frames': exposure {exposure}{named}", frames)
-        self._clipped.append(clipping_of(frames))
+        clipped = clipping_of(frames)
+        self._clipped.append(clipped)
         self.raw &= frames.raw
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
@@ -119,7 +120,9 @@ class Averaged:
         self._frames.append(count)
         if self.dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
-        self._points.append(photon_transfer(frames.mean, frames.variance, ~saturates, count))
+        # Clipped samples scatter less: their bins would have most of the weight in the noise model.
+        free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
+        self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
     @cached_property
     def noise(self) -> NoiseModel | None:
