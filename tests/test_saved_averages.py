@@ -139,3 +139,26 @@ def test_arrays_that_are_no_averages_are_named(tmp_path, capsys):
     equipix.average(np.ones((2, 3, 3))).save(tmp_path / "one.npz")
     assert run("inspect", tmp_path / "one.npz", "--json") == 0
     assert json.loads(capsys.readouterr().out)["saturation"] is None
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_what_equipix_saved_is_no_raw_frame(manifest, direct, tmp_path, capsys, suffix):
+    frames = manifest.parent / "frames/p0.tif"
+    cal, mean = tmp_path / f"cal{suffix}", tmp_path / f"mean{suffix}"
+    direct.save(cal)
+    equipix.average(frames).save(mean)
+    toml = manifest.with_name("saved.toml")
+    toml.write_text(manifest.read_text().replace("frames/p1.tif", str(cal)))
+    hole = manifest.with_name("hole.toml")
+    hole.write_text(manifest.read_text().replace("aperture/p1-after.tif", str(mean)))
+    for command, file, kind in [
+        (("average", cal), cal, "a calibration"),
+        (("average", frames, cal), cal, "a calibration"),
+        (("correct", cal, mean), mean, "frame statistics"),
+        (("correct", cal, cal), cal, "a calibration"),
+        (("correct", cal, frames, "--dark", cal), cal, "a calibration"),
+        (("calibrate", toml), cal, "a calibration"),
+        (("calibrate", hole), mean, "frame statistics"),
+    ]:
+        assert run(*command, "-o", tmp_path / "out.tif") == 1, command
+        assert f"error: {file}: holds {kind}, expected raw frames" in capsys.readouterr().err

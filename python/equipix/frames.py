@@ -246,16 +246,18 @@ def _of_pages(
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:
-    """Rows and columns of the averages that a file holds; None if it holds something else.
+    """Rows and columns of the averages that a file holds; None if equipix has not saved it.
 
-    Files of whole numbers, which cameras write, are not searched for averages.
+    Raises
+    ------
+    FileError
+        If equipix has saved something else in it, such as a calibration.
     """
-    if path.suffix.lower() not in io.SUFFIXES:
+    kind = io.saved_kind(path)
+    if kind is None:
         return None
-    if path.suffix.lower() != ".npz" and io.frame_format(path)[1] != np.float64:
-        return None
-    if io.kind_of(path) != _KIND:
-        return None
+    if kind != _KIND:
+        io.refuse_saved(path)
     rows, cols = load_statistics(path).mean.shape
     return rows, cols
 

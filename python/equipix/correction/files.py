@@ -16,6 +16,7 @@ from equipix.io import (
     folder_beside,
     frame_format,
     refuse_inputs,
+    refuse_saved,
     stream_frames,
     write_frames,
     write_whole,
@@ -143,7 +144,8 @@ def _warn_of_corrected(files: list[Path]) -> None:
 
 
 def _count(file: Path, correction: Correction) -> int:
-    """Count the frames of a file; they must be of the sensor's shape."""
+    """Count the frames of a file; they must be raw, and of the sensor's shape."""
+    refuse_saved(file)
     (count, *shape), _ = frame_format(file)
     if tuple(shape) != correction.shape:
         raise InputError(
