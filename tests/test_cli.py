@@ -175,6 +175,22 @@ def test_inspect_shows_an_average(run, experiment, tmp_path):
     assert re.search(r"\nsaturation +65535\n", run("inspect", mean)[1])
 
 
+def test_a_file_is_not_averaged_twice(run, experiment, tmp_path):
+    frames, copy, out = (
+        experiment.parent / "frames/p0.tif",
+        tmp_path / "copy.tif",
+        tmp_path / "m.tif",
+    )
+    copy.write_bytes(frames.read_bytes())
+    refused(run("average", frames, frames, "-o", out), "'p0.tif' stands twice in the frames")
+    refused(run("average", frames, copy, "-o", out), "'p0.tif' and 'copy.tif' are the same images")
+    refused(
+        run("average", frames, "--dark", frames, "-o", out), "'p0.tif' stands in the frames and"
+    )
+    refused(run("average", frames, "--dark", copy, "-o", out), "are the same images, and stand in")
+    assert not out.exists()
+
+
 def test_average_writes_statistics(run, experiment, tmp_path):
     frames, dark = experiment.parent / "frames", experiment.parent / "dark/dark.tif"
     output = tmp_path / "mean.tif"
