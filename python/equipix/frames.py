@@ -435,8 +435,8 @@ def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatist
     shape = statistics.mean.shape
     if array.dtype != np.bool_ or array.shape != shape:
         raise InputError(
-            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}: True "
-            "= do not use"
+            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}, True "
+            f"= do not use{': give mask != 0' if array.shape == shape else ''}"
         )
     if array.all():
         raise InputError("'mask' is True in every pixel, expected some pixels to use")

@@ -19,6 +19,7 @@ from equipix.cli.options import (
     Tolerance,
     Uncertainty,
     Workers,
+    naming_mask,
 )
 from equipix.cli.summary import of_calibration, summary
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
@@ -71,7 +72,7 @@ def calibrate(
     if not partial:
         # `_refuse_partial` says the same as an error.
         warnings.filterwarnings("ignore", "the exposures determine only|the fit ended far from")
-    with progress_bars() as progress:
+    with progress_bars() as progress, naming_mask(mask):
         calibration = loaded.run(
             flux=flux,
             mask=None if mask is None else read_mask(mask),

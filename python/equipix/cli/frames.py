@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from equipix._types import Flagged
-from equipix.cli.options import Force, Json, Mask, Saturation, Workers
+from equipix.cli.options import Force, Json, Mask, Saturation, Workers, naming_mask
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import correct_files, is_folder
@@ -44,7 +44,7 @@ def average(
     refuse_inputs([output], [*images, *offsets, *([mask] if mask else [])])
     refuse_repeated_files(images, offsets)
     excluded = None if mask is None else read_mask(mask)
-    with progress_bars() as progress:
+    with progress_bars() as progress, naming_mask(mask):
         offset = None
         if dark:
             offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)

@@ -247,7 +247,9 @@ def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
     """Mask of one exposure or of all, of frames of that shape."""
     array = as_array("mask", mask, ndim=(2, 3))
     if array.dtype != np.bool_:
-        raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
+        raise InputError(
+            f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+        )
     if array.shape not in (shape[1:], shape):
         raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
     return array
