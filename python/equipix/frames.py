@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native, io
-from equipix._check import as_array, as_floats, as_level, naming_memory, positive_workers
+from equipix._check import (
+    as_array,
+    as_floats,
+    as_level,
+    check_maps,
+    naming_memory,
+    positive_workers,
+)
 from equipix._readonly import ReadOnly
 from equipix.errors import FileError, InputError, UnsupportedFileError
 
@@ -73,6 +80,12 @@ class FrameStatistics(ReadOnly):
     dark: FrameStatistics | None = None
     saturation: float | None = None
     raw: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse maps of different shapes."""
+        ReadOnly.__post_init__(self)
+        dark = {} if self.dark is None else {"dark": self.dark.mean}
+        check_maps("FrameStatistics", self.maps | dark)
 
     @property
     def maps(self) -> dict[str, NDArray[Any]]:
@@ -443,9 +456,7 @@ def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatist
     maps = {name: values.copy() for name, values in statistics.maps.items()}
     for name, values in maps.items():
         values[array] = 0 if name in _COUNTS else np.nan
-    return FrameStatistics(
-        **maps, dark=statistics.dark, saturation=statistics.saturation, raw=statistics.raw
-    )
+    return dataclasses.replace(statistics, **maps)
 
 
 def _subtract(
@@ -470,25 +481,17 @@ def _subtract(
     if not np.isfinite(mean).any():
         raise InputError("'dark' holds no finite number: give the mean of dark frames")
     variance = dark.variance_of_mean if isinstance(dark, FrameStatistics) else 0.0
-    return FrameStatistics(
-        statistics.mean - mean,
-        statistics.variance,
-        statistics.variance_of_mean + variance,
-        statistics.count,
-        statistics.saturated,
-        dark if isinstance(dark, FrameStatistics) else None,
-        statistics.saturation,
+    return dataclasses.replace(
+        statistics,
+        mean=statistics.mean - mean,
+        variance_of_mean=statistics.variance_of_mean + variance,
+        dark=dark if isinstance(dark, FrameStatistics) else None,
+        raw=False,
     )
 
 
 def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:
-    """Refuse an average as a dark if a dark was subtracted from it; `place` is for the message.
-
-    Raises
-    ------
-    InputError
-        If one was: the average holds no dark level any more.
-    """
+    """Refuse as a dark an average that holds no dark level; `place` is for the message."""
     if dark.dark is not None:
         raise InputError(
             f"{place}: its dark was already subtracted; 'dark' needs frames or an average without "

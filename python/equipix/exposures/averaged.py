@@ -109,6 +109,7 @@ class Averaged:
             )
         saturates = frames.saturated > 0
         named = f" ({name!r})" if name else ""
+        _refuse_no_variance(f"'frames': exposure {exposure}{named}", frames)
         self._refuse_saturated(f"'frames': exposure {exposure}{named}", frames)
         clipped = clipping_of(frames)
         self._clipped.append(clipped)
@@ -182,6 +183,17 @@ class Averaged:
         of_dark = self.dark_variance(noise)
         variance = 0.0 if of_dark is None else float(np.median(of_dark))
         return [noise.of_mean(frames, dark_variance=variance) for frames in self._frames]
+
+
+def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:
+    """Refuse averages of several samples without a finite variance that is not negative."""
+    several = (frames.count > 1) & np.isfinite(frames.mean)
+    wrong = several & ~(np.isfinite(frames.variance) & (frames.variance >= 0))
+    if wrong.any():
+        raise InputError(
+            f"{which}: 'variance' holds {frames.variance[wrong][0]:g}, expected finite numbers not "
+            "below 0 where 'count' is above 1"
+        )
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

@@ -227,12 +227,15 @@ def _saturated(values: Array, level: float) -> Bools:
 
 def as_variances(variance: ArrayLike, values: Array) -> Array:
     """Variances in the shape and dtype that the solver takes."""
-    variances = as_array("variance", variance, ndim=(1, 3))
-    if variances.ndim == 1:
+    variances = as_array("variance", variance, ndim=(0, 1, 2, 3))
+    shape = np.shape(variance)  # as_array makes one number an array of one
+    if len(shape) == 1:
         check_count("variance", len(variances), len(values))
         return variances.astype(np.float64)
-    if variances.shape != values.shape:
-        raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
+    if shape != values.shape:
+        raise InputError(
+            f"'variance' has shape {shape}, expected {(len(values),)} or {values.shape}"
+        )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return variances.astype(values.dtype, copy=False)
 
