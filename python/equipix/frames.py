@@ -259,15 +259,8 @@ def _of_pages(
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:
-    """Rows and columns of the averages that a file holds; None if equipix has not saved it.
-
-    Raises
-    ------
-    FileError
-        If equipix has saved something else in it, such as a calibration.
-    """
-    kind = io.saved_kind(path)
-    if kind is None:
+    """Rows and columns of the averages in a file; None of frames. A calibration is an error."""
+    if (kind := io.saved_kind(path)) is None:
         return None
     if kind != _KIND:
         io.refuse_saved(path)
@@ -329,7 +322,7 @@ def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
-            f"{level:g}: average the frames again with this level"
+            f"{level:g}: average the frames again with saturation={level:g} (--saturation {level:g})"
         )
     return statistics
 
