@@ -394,6 +394,11 @@ def test_bad_options_are_refused_before_the_work(manifest, option):
     assert stages == []
 
 
+def test_linear_fluxes_without_times_name_the_file(manifest):
+    with pytest.raises(errors.InputError, match=r"experiment\.toml: .*--flux linear.* 'time'"):
+        Experiment.load(manifest).run(flux="linear")
+
+
 def another_dark(manifest, folder):
     """Dark frames like those of the experiment, but others."""
     frames = read_frames(manifest.parent / "dark/dark.tif")[::-1]

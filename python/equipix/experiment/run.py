@@ -258,6 +258,11 @@ class Experiment:
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
         self._warn_of_unused(flux)
+        if flux == "linear" and self._column("time") is None:
+            raise InputError(
+                f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
+                "[[exposure]]"
+            )
         self.check_formats()
         excluded = self._excluded(mask)
         hashes = sha256_of([self.path, *self.files()])
