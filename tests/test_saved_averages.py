@@ -113,7 +113,7 @@ def test_a_dark_is_no_average_from_which_one_was_subtracted(manifest, direct, tm
 
 def test_another_saturation_level_is_refused(manifest, tmp_path):
     path = averaged(manifest, tmp_path, suffix=".npz", subtract=False, saturation=4000)
-    with pytest.raises(errors.FileError, match=r"expected 4095: .* \(--saturation 4095\)"):
+    with pytest.raises(errors.FileError, match=r"level 4000, expected 4095: .*--saturation 4095\)"):
         Experiment.load(path).run()
 
 

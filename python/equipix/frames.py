@@ -322,7 +322,7 @@ def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
-            f"{level:g}: average the frames again with saturation={level:g} (--saturation {level:g})"
+            f"{level:g}: average the frames again with it (saturation=, --saturation {level:g})"
         )
     return statistics
 
@@ -446,7 +446,7 @@ def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatist
         )
     if array.all():
         raise InputError("'mask' is True in every pixel, expected some pixels to use")
-    maps = {name: values.copy() for name, values in statistics.maps.items()}
+    maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
     for name, values in maps.items():
         values[array] = 0 if name in _COUNTS else np.nan
     return dataclasses.replace(statistics, **maps)

@@ -134,7 +134,7 @@ def _json_value(value: Any) -> Any:
     return value
 
 
-def _words(value: object) -> str:
+def _words(value: Any) -> str:
     match value:
         case bool():
             return "yes" if value else "no"
