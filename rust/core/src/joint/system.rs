@@ -250,14 +250,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             objective += self.unit * precision * theta * theta;
         }
         if let Some(prior) = &self.shift_prior {
-            let known = prior.measured.as_flattened().iter().zip(prior.precisions.as_flattened());
-            let found = self.state.shifts.as_flattened();
-            let of_shifts = slope[cells + params..].iter_mut().zip(found).zip(known);
-            for ((slope, found), (measured, precision)) in of_shifts {
-                let deviation = found - measured;
-                *slope -= self.unit * precision * deviation;
+            let found = self.state.shifts.iter().zip(&prior.measured);
+            let deviations: Vec<[f64; 2]> =
+                found.map(|(d, measured)| [d[0] - measured[0], d[1] - measured[1]]).collect();
+            let known = deviations.as_flattened().iter().zip(prior.precisions.as_flattened());
+            for (deviation, precision) in known {
                 objective += self.unit * precision * deviation * deviation;
             }
+            let pulls = prior.pull(&deviations);
+            let of_shifts = slope[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(slope, pull)| *slope -= self.unit * pull);
         }
         objective
     }
@@ -319,9 +321,15 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         if let Some(penalty) = &self.penalty {
             penalty.add_product(&x[..cells], &mut product[..cells], self.pass.workers);
         }
-        let found = x[cells..cells + params].iter().chain(moves.as_flattened());
-        let priors = product[cells..].iter_mut().zip(found).zip(self.precisions());
-        priors.for_each(|((product, x), precision)| *product += precision * x);
+        let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
+        for ((product, x), precision) in of_flux.zip(&self.fluxes.precisions) {
+            *product += self.unit * precision * x;
+        }
+        if let Some(prior) = &self.shift_prior {
+            let pulls = prior.pull(&moves);
+            let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(product, pull)| *product += self.unit * pull);
+        }
         Ok(sums.largest)
     }
 

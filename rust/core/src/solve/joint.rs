@@ -14,7 +14,7 @@ use crate::exposures::{Exposures, FluxKind};
 use crate::fit::{Fit, Refinement, Solution};
 use crate::frames::Real;
 use crate::gauge::FluxGauge;
-use crate::joint::{self, ConjugateGradients, Preconditioner, ShiftPrior, System};
+use crate::joint::{self, ConjugateGradients, Directions, Preconditioner, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
 
@@ -22,9 +22,6 @@ use crate::parallel::Workers;
 const MOST_PRODUCTS: u64 = 5000;
 /// The estimated error of M at which shifts begin to be refined.
 const BEFORE_SHIFTS: f64 = 1e-3;
-/// A beam whose structure is so much larger than noise determines shifts; by the slopes of noise steps
-/// would lead nowhere.
-const STRUCTURED: f64 = 10.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
@@ -185,12 +182,14 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn begins_to_refine(&mut self, error: f64) -> bool {
         let near = error <= BEFORE_SHIFTS.max(self.options.tolerance)
             && self.search.iterations >= FEWEST_ITERATIONS;
-        let Some(prior) = self.shift_prior.take_if(|_| near) else { return false };
-        // Of a grid too small for second differences the structure is NaN, which determines nothing.
-        let determined = self.system.structure() >= STRUCTURED;
-        if !determined {
-            self.refinement = Refinement::Undetermined;
-            return false;
+        let Some(mut prior) = self.shift_prior.take_if(|_| near) else { return false };
+        match self.system.determined_directions(&prior) {
+            Directions::None => {
+                self.refinement = Refinement::Undetermined;
+                return false;
+            }
+            Directions::One(along) => prior.along = Some(along),
+            Directions::Both => {}
         }
         self.refinement = Refinement::Done;
         self.system.seek_shifts(Some(prior));
