@@ -85,7 +85,9 @@ impl<T: Real> System<'_, '_, T> {
         let mut largest = [0.0; 3];
         for distance in DISTANCES {
             let mut found = [0.0; 3];
-            for step in [distance * cols, distance] {
+            // Along a row that is shorter nothing lies so far apart.
+            let along_row = (distance < cols).then_some(distance);
+            for step in along_row.into_iter().chain([distance * cols]) {
                 let [sums, cells] = self.second_differences(&slopes, step, [rows, cols]);
                 if cells[0] == 0.0 {
                     continue;
