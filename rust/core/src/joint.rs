@@ -22,6 +22,7 @@ mod fused_kernel;
 mod kernel;
 mod layout;
 mod memory;
+mod noise_curvature;
 mod outcome;
 mod pass;
 mod penalty;

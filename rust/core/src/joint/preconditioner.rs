@@ -98,6 +98,9 @@ impl Preconditioner {
                 }
             }
         }
+        for (own, noise) in own[params..].iter_mut().zip(system.noise_diagonal()) {
+            *own = (*own - noise).max(f64::MIN_POSITIVE);
+        }
         let coarse = Coarse::of_stars(&hats, &own, stars, control)?;
         control.check()?;
         let waves = Waves::new(system, &blocks, seen);

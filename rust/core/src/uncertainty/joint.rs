@@ -31,10 +31,10 @@ use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::Solution;
+use crate::fit::{Refinement, Solution};
 use crate::frames::Real;
 use crate::joint::{
-    self, ConjugateGradients, Directions, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
+    self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
 };
 use crate::memory;
 use crate::parallel::Workers;
@@ -91,12 +91,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         })?;
         let mut system = problem(exposures, solution, workers, control)?;
         let prior = ShiftPrior::of(exposures.positions());
-        let (refined, considered) = if solution.refined {
-            system.linearise(control)?;
-            parted(&system, prior)
-        } else {
-            (None, prior)
-        };
+        let (refined, considered) = parted(solution.refinement, prior);
+        if refined.is_some() {
+            system.correct_for_noise();
+        }
         system.seek_shifts(refined);
         system.allows_single = false;
         system.linearise(control)?;
@@ -284,7 +282,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let kept = kept.flatten().zip(self.considered_variances());
                 let kept: f64 = kept.map(|(q, v)| q * q * v).sum();
                 let no_gain = vec![0.0; self.valid.len()];
-                Ok(self.search.energy + kept + self.variance_by_dark(&no_gain, control)?)
+                Ok(self.energy() + kept + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -307,7 +305,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (pull, seen) = self.pull_of_gain(&gain, control)?;
         let others = self.others();
         self.apply_inverse(pull, lack, control)?;
-        variance += self.search.energy + self.variance_by_dark(&gain, control)?;
+        variance += self.energy() + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
             x.truncate(others);
@@ -371,7 +369,13 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             workers.add_multiple(&mut pull, -height / size, &pulled);
         }
         self.apply_inverse(pull, lack, control)?;
-        Ok(variance + found + self.search.energy)
+        Ok(variance + found + self.energy())
+    }
+
+    /// The variance of b · x for x = S⁻¹ b as the search has left it: S lacks what noise adds to it along
+    /// shifts, but the slope of F has that noise (`joint/noise_curvature.rs`).
+    fn energy(&self) -> f64 {
+        self.search.energy + self.system.noise_energy(&self.search.x)
     }
 
     /// How many unknowns come before the shifts.
@@ -455,17 +459,18 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 }
 
 /// The part of the prior on shifts that were refined, and the part along which they were not.
-fn parted<T: Real>(
-    system: &System<'_, '_, T>,
+fn parted(
+    refinement: Refinement,
     prior: Option<ShiftPrior>,
 ) -> (Option<ShiftPrior>, Option<ShiftPrior>) {
-    let Some(mut prior) = prior else { return (None, None) };
-    let Directions::One([row, col]) = system.determined_directions(&prior) else {
-        return (Some(prior), None);
+    let along = |[row, col]: [f64; 2]| {
+        prior.clone().map(|prior| ShiftPrior { along: Some([row, col]), ..prior })
     };
-    let rest = ShiftPrior { along: Some([-col, row]), ..prior.clone() };
-    prior.along = Some([row, col]);
-    (Some(prior), Some(rest))
+    match refinement {
+        Refinement::Done => (prior, None),
+        Refinement::Along([row, col]) => (along([row, col]), along([-col, row])),
+        _ => (None, prior),
+    }
 }
 
 /// The problem at a solution.

@@ -63,7 +63,8 @@ impl Case {
             Exposures::new(measurements, positions, flux, self.offset, &workers, &control).unwrap();
         let options = crate::Options::default();
         let fit = crate::calibrate(&exposures, &options, None, &workers, &control).unwrap();
-        let solution = Solution { refined: self.refined, unit: UNIT, ..fit.solution() };
+        let refinement = if self.refined { Refinement::Done } else { Refinement::Undetermined };
+        let solution = Solution { refinement, unit: UNIT, ..fit.solution() };
         let covariance = JointCovariance::new(&exposures, &solution, &workers, &control);
         visit(&mut covariance.unwrap(), &control);
     }
@@ -121,7 +122,8 @@ fn draws_have_the_covariance_of_the_problem_and_are_independent() {
             let draws: Vec<Vec<f64>> =
                 (0..DRAWS).map(|draw| covariance.draw(draw, control).unwrap()).collect();
             for x in directions {
-                let energy = dot(&x, &product(&mut covariance.system, &x, control).unwrap());
+                let energy = dot(&x, &product(&mut covariance.system, &x, control).unwrap())
+                    + covariance.system.noise_energy(&x);
                 let heights: Vec<f64> = draws.iter().map(|b| dot(&x, b) / energy.sqrt()).collect();
                 // Five standard errors: a square of a normal value scatters by √2, a product of two by 1.
                 let draws = DRAWS as f64;
