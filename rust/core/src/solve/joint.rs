@@ -30,6 +30,8 @@ const CURVED: [f64; 2] = [1e-8, 0.03];
 /// What a step leaves of the error where shifts are sought, whose second derivatives the linear problem does
 /// not know.
 const BY_SHIFTS: f64 = 0.1;
+/// Passes without progress after which a fit has stalled where shifts are sought: the steps are short.
+const PATIENCE_BY_SHIFTS: u64 = 150;
 /// The most that one step reduces the error by where products are made in single precision.
 const PRECISION: f64 = 1e-5;
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
@@ -271,7 +273,10 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let last = self.looks.last()?;
         let settled = last.error == 0.0;
         let certain = self.search.iterations >= FEWEST_ITERATIONS || settled;
-        let stalled = stalled_since(&self.looks).is_some_and(|earlier| earlier >= SETTLING);
+        let patience = if self.system.seeks_shifts() { PATIENCE_BY_SHIFTS } else { 0 };
+        let stalled = stalled_since(&self.looks).is_some_and(|earlier| {
+            earlier >= SETTLING && self.looks[earlier].sweep + patience <= last.sweep
+        });
         if certain && last.error <= self.options.tolerance {
             Some(Ended::Converged)
         } else if last.sweep + A_LOOK >= self.limit {
