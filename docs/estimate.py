@@ -56,7 +56,7 @@ def compare(rng: Generator) -> dict[str, float]:
         found = {m: stopped(frames, shifts, m, int(rng.integers(*LIMITS[m]))) for m in LIMITS}
     if best.components > 1 or not best.converged:
         return {}
-    errors = {m: np.abs(f.sensitivity / best.sensitivity - 1).max() for m, f in found.items()}
+    errors = {m: np.nanmax(np.abs(f.sensitivity / best.sensitivity - 1)) for m, f in found.items()}
     return {m: e / found[m].error_estimate for m, e in errors.items() if e > 100 * SHARP}
 
 
@@ -69,7 +69,7 @@ def early(rng: Generator) -> list[float]:
         if best.components > 1 or not best.converged:
             return []
         found = [equipix.calibrate(frames, shifts, tolerance=tolerance) for tolerance in EARLY]
-    errors = [np.abs(each.sensitivity / best.sensitivity - 1).max() for each in found]
+    errors = [np.nanmax(np.abs(each.sensitivity / best.sensitivity - 1)) for each in found]
     return [error / each.error_estimate for error, each in zip(errors, found, strict=True)]
 
 

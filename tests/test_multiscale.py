@@ -295,6 +295,8 @@ class TestSingularCoarseMatrices:
         assert abs(others / others.mean() - 1).max() < 10 * 1e-6
 
 
+# The frames have no noise, their variances do.
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestAlmostNoWeight:
     """Pixels whose weight is below a millionth of the mean."""
 

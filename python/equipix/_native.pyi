@@ -65,6 +65,7 @@ class Exposures:
         offset: bool,
         variance: NDArray[Any] | None,
         mask: NDArray[Any] | None,
+        unreliable: NDArray[Any] | None,
         workers: int | None,
         progress: _Progress | None,
     ) -> Exposures: ...

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix._readonly import ReadOnly
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
 from equipix.calibration.significance import chi2_tail
 from equipix.drift import affine_columns, slope_covariance
@@ -27,7 +28,7 @@ _BLOCK, _FAR = 16, 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class Drift:
+class Drift(ReadOnly):
     """Drift of the lamp against the fluxes that were given.
 
     Attributes
