@@ -22,7 +22,6 @@ mod fused_kernel;
 mod kernel;
 mod layout;
 mod memory;
-mod noise_curvature;
 mod outcome;
 mod pass;
 mod penalty;

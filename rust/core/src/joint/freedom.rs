@@ -34,70 +34,30 @@ pub(crate) fn wave_means<const N: usize>(
     quantities: impl Fn([f64; 2], f64, f64) -> [f64; N],
 ) -> [f64; N] {
     let mut sums = [0.0; N];
-    for_waves(windows, shares, tau, |seen| {
-        let found = quantities(seen.q, seen.determined, seen.penalty);
-        sums.iter_mut().zip(found).for_each(|(sum, value)| *sum += value);
-    });
-    sums.map(|sum| sum * means())
-}
-
-/// Real and imaginary part.
-pub(super) type Complex = [f64; 2];
-
-/// A wave as the exposures see it.
-pub(super) struct Seen<'w> {
-    pub(super) q: [f64; 2],
-    /// h_k, and Σ_k ω_k h_k.
-    pub(super) factors: &'w [Complex],
-    pub(super) mean: Complex,
-    /// s and τ g.
-    pub(super) determined: f64,
-    pub(super) penalty: f64,
-}
-
-/// Calls `visit` for each of some wave vectors; [`means`] times a sum over them is the mean.
-pub(super) fn for_waves(
-    windows: &[Window],
-    shares: &[f64],
-    tau: f64,
-    mut visit: impl FnMut(&Seen<'_>),
-) {
-    let mut factors = vec![[0.0; 2]; windows.len()];
     for wave in 0..WAVES * WAVES {
         // Not at q = 0 itself, where both symbols are 0.
         let q = [wave / WAVES, wave % WAVES].map(|i| TAU * (i as f64 + 0.5) / WAVES as f64);
-        let (mut seen, mut mean) = (0.0, [0.0; 2]);
-        for ((h, window), share) in factors.iter_mut().zip(windows).zip(shares) {
-            *h = product(
+        let mut seen = 0.0;
+        let mut along = [0.0; 2];
+        for (window, share) in windows.iter().zip(shares) {
+            let ([a, b], [c, d]) = (
                 symbol(&window.along_rows, window.row, q[0]),
                 symbol(&window.along_cols, window.col, q[1]),
             );
+            let h = [a * c - b * d, a * d + b * c];
             seen += share * (h[0] * h[0] + h[1] * h[1]);
-            mean = [mean[0] + share * h[0], mean[1] + share * h[1]];
+            along = [along[0] + share * h[0], along[1] + share * h[1]];
         }
-        let determined = (seen - mean[0] * mean[0] - mean[1] * mean[1]).max(0.0);
-        let penalty = tau * (bent(q[0]) + bent(q[1]));
-        visit(&Seen { q, factors: &factors, mean, determined, penalty });
+        let measured = (seen - along[0] * along[0] - along[1] * along[1]).max(0.0);
+        let found = quantities(q, measured, tau * (bent(q[0]) + bent(q[1])));
+        sums.iter_mut().zip(found).for_each(|(sum, value)| *sum += value);
     }
-}
-
-/// One by how many waves there are.
-pub(super) const fn means() -> f64 {
-    1.0 / (WAVES * WAVES) as f64
-}
-
-pub(super) fn product([a, b]: Complex, [c, d]: Complex) -> Complex {
-    [a * c - b * d, a * d + b * c]
+    sums.map(|sum| sum / (WAVES * WAVES) as f64)
 }
 
 /// Σ_j t_j e^{iq(first + j)}, real and imaginary part.
-pub(super) fn symbol(taps: &Taps, first: usize, q: f64) -> Complex {
-    symbol_of(&taps.values, first, q)
-}
-
-/// The symbol of factors that need not be values of a spline.
-pub(super) fn symbol_of(factors: &[f64], first: usize, q: f64) -> Complex {
-    let terms = factors.iter().enumerate().map(|(j, t)| {
+pub(super) fn symbol(taps: &Taps, first: usize, q: f64) -> [f64; 2] {
+    let terms = taps.values.iter().enumerate().map(|(j, t)| {
         let (sin, cos) = (q * (first + j) as f64).sin_cos();
         [t * cos, t * sin]
     });

@@ -98,9 +98,6 @@ impl Preconditioner {
                 }
             }
         }
-        for (own, noise) in own[params..].iter_mut().zip(system.noise_diagonal()) {
-            *own = (*own - noise).max(f64::MIN_POSITIVE);
-        }
         let coarse = Coarse::of_blocks(&hats, &own, entries, control)?;
         control.check()?;
         let waves = Waves::new(system, &blocks, seen);

@@ -48,8 +48,9 @@ impl<T: Real> System<'_, '_, T> {
         let [noise, smoothed] = self.slope_noise();
         let information = self.information_of_shifts(smoothed);
         let known = [0, 1].map(|axis| {
-            let mean = prior.precisions.iter().map(|p| p[axis]).sum::<f64>() / count;
-            (self.unit * count * mean).max(OVER_NOISE * self.unit * noise[axis])
+            // Of the shift known least: that of a reference is often exact.
+            let least = prior.precisions.iter().map(|p| p[axis]).fold(f64::INFINITY, f64::min);
+            (self.unit * count * least).max(OVER_NOISE * self.unit * noise[axis])
         });
         // In units of what is to be exceeded.
         let scale = known.map(f64::sqrt);

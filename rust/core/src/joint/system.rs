@@ -18,7 +18,6 @@ use super::flux::Fluxes;
 use super::fused::Fused;
 use super::kernel::{Eliminate, Propagate};
 use super::layout::Grid;
-use super::noise_curvature::NoiseCurvature;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
 use super::unknowns::{ShiftPrior, State};
@@ -38,8 +37,6 @@ pub(crate) struct System<'m, 'a, T> {
     pub(crate) pass: Pass<'m, 'a, T>,
     pub(crate) fluxes: Fluxes,
     shift_prior: Option<ShiftPrior>,
-    /// What is taken from S along shifts.
-    noise: Option<NoiseCurvature>,
     /// F of the measurements alone, at the state last linearised.
     pub(crate) misfit: f64,
     /// The variance of a measurement of weight 1.
@@ -62,6 +59,8 @@ pub(crate) struct System<'m, 'a, T> {
     pub(crate) allows_single: bool,
     /// Whether the weights and τ are of the state last linearised.
     is_weighed_anew: bool,
+    /// Whether the penalty counts more cells than at the state linearised before.
+    pub(crate) sees_more: bool,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -78,7 +77,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass: Pass::new(exposures, grid, with_flux, workers, control),
             fluxes,
             shift_prior: None,
-            noise: None,
             misfit: 0.0,
             unit: 1.0,
             pull: Vec::new(),
@@ -90,6 +88,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             is_fused_anew: false,
             allows_single: true,
             is_weighed_anew: false,
+            sees_more: false,
             state,
         }
     }
@@ -100,34 +99,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         std::mem::replace(&mut self.shift_prior, prior)
     }
 
-    /// Takes from S the curvature that noise adds to it along shifts.
-    pub(crate) fn correct_for_noise(&mut self) {
-        let windows = self.pass.grid.windows(&self.state.shifts);
-        let (shares, count) = (self.shares_of_exposures(), windows.len());
-        let pixels = self.pass.exposures.used() as f64 / count as f64;
-        self.noise = Some(NoiseCurvature::new(&windows, &shares, SMOOTHING, pixels));
-    }
-
     /// The share of each exposure in all weights.
     pub(super) fn shares_of_exposures(&self) -> Vec<f64> {
         let weights = self.pass.exposures.exposure_weights();
         let total: f64 = weights.iter().sum();
         weights.iter().map(|weight| weight / total).collect()
-    }
-
-    /// What S lacks of a change of the unknowns by their shifts, xᵀN x.
-    pub(crate) fn noise_energy(&self, x: &[f64]) -> f64 {
-        let Some(noise) = self.noise.as_ref().filter(|_| self.seeks_shifts()) else { return 0.0 };
-        let moves = self.centred(&x[self.state.beam.len() + self.fluxes.columns.len()..]);
-        let pulls = noise.product(&moves);
-        let terms = pulls.as_flattened().iter().zip(moves.as_flattened());
-        self.unit * terms.map(|(pull, d)| pull * d).sum::<f64>()
-    }
-
-    /// The diagonal of N by unknown shifts; empty where they are not refined.
-    pub(super) fn noise_diagonal(&self) -> Vec<f64> {
-        let noise = self.noise.iter().filter(|_| self.seeks_shifts());
-        noise.flat_map(NoiseCurvature::diagonal).map(|n| self.unit * n).collect()
     }
 
     /// Whether shifts are sought.
@@ -363,11 +339,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let pulls = prior.pull(&moves);
             let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
             of_shifts.for_each(|(product, pull)| *product += self.unit * pull);
-            if let Some(noise) = &self.noise {
-                let pulls = prior.centred_pulls(&noise.product(&moves));
-                let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
-                of_shifts.for_each(|(product, pull)| *product -= self.unit * pull);
-            }
         }
         Ok(sums.largest)
     }
@@ -492,8 +463,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(SMOOTHING * typical, |penalty| penalty.tau);
             let shape = self.pass.grid.geometry.beam;
-            self.penalty =
-                Some(Penalty::new(shape, &self.weights, tau, self.pass.workers, control));
+            let mut penalty = Penalty::new(shape, &self.weights, tau, self.pass.workers, control);
+            // Nor would it be one if cells left it that come out of sight.
+            let last = self.penalty.take();
+            self.sees_more = last.is_some_and(|last| penalty.count_where(&last));
+            self.penalty = Some(penalty);
         }
         control.check()
     }

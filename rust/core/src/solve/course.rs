@@ -2,8 +2,8 @@
 //!
 //! The linear problem leaves out the second derivatives of the model. Those by one shift and one cell of the
 //! beam, times residuals, vanish on average, but not their squares: a wrong shift makes cells follow noise
-//! that they should not, and those make the next shift wrong. With noise N in the curvature I + N along a shift
-//! (`joint/noise_curvature.rs`) a step leaves ±√(N/(I + N)) of such errors, 0.45 for fringes of 18 % and
+//! that they should not, and those make the next shift wrong. Where slopes of noise add N to the curvature I
+//! along a shift, a step leaves ±√(N/(I + N)) of such errors, 0.45 for fringes of 18 % and
 //! 100 pixels. So steps are those of nonlinear conjugate gradients (Polak and Ribière 1969) with the
 //! linear problem as the preconditioner, which end such errors after a few.
 

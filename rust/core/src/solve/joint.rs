@@ -132,9 +132,13 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn next(&mut self, control: &Control) -> Result<Option<Ended>> {
         let linear = self.system.linearise(control)?;
         // Where shifts still move, cells come into the penalty, and F is not one function.
-        let moving = self.system.seeks_shifts() && self.looks.len() <= SETTLING;
+        let moving =
+            self.system.seeks_shifts() && (self.looks.len() <= SETTLING || self.system.sees_more);
         if self.takes_back(linear.0, moving) {
             return Ok(None);
+        }
+        if self.system.sees_more {
+            self.course = None;
         }
         if self.corrects_length(&linear.1) {
             return Ok(None);

@@ -92,9 +92,6 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let mut system = problem(exposures, solution, workers, control)?;
         let prior = ShiftPrior::of(exposures.positions());
         let (refined, considered) = parted(solution.refinement, prior);
-        if refined.is_some() {
-            system.correct_for_noise();
-        }
         system.seek_shifts(refined);
         system.allows_single = false;
         system.linearise(control)?;
@@ -282,7 +279,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let kept = kept.flatten().zip(self.considered_variances());
                 let kept: f64 = kept.map(|(q, v)| q * q * v).sum();
                 let no_gain = vec![0.0; self.valid.len()];
-                Ok(self.energy() + kept + self.variance_by_dark(&no_gain, control)?)
+                Ok(self.search.energy + kept + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -305,7 +302,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (pull, seen) = self.pull_of_gain(&gain, control)?;
         let others = self.others();
         self.apply_inverse(pull, lack, control)?;
-        variance += self.energy() + self.variance_by_dark(&gain, control)?;
+        variance += self.search.energy + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
             x.truncate(others);
@@ -369,13 +366,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             workers.add_multiple(&mut pull, -height / size, &pulled);
         }
         self.apply_inverse(pull, lack, control)?;
-        Ok(variance + found + self.energy())
-    }
-
-    /// The variance of b · x for x = S⁻¹ b as the search has left it: S lacks what noise adds to it along
-    /// shifts, but the slope of F has that noise (`joint/noise_curvature.rs`).
-    fn energy(&self) -> f64 {
-        self.search.energy + self.system.noise_energy(&self.search.x)
+        Ok(variance + found + self.search.energy)
     }
 
     /// How many unknowns come before the shifts.
