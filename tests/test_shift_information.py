@@ -16,7 +16,7 @@ STD = 0.03
 
 
 def fringes(period, contrast=0.18, *, angle=0.0, crossed=False):
-    """An even beam with fringes across the columns, turned by an angle, or with two sets of them."""
+    """An even beam with fringes across columns, turned by an angle, or with two sets of them."""
 
     def beam(rows, cols):
         along = np.cos(angle) * cols + np.sin(angle) * rows
@@ -118,8 +118,8 @@ class TestErrorBars:
     def test_z_scores_of_sensitivity_and_shifts(self, contrast, crossed):
         """Whether or not the shifts are refined, M and shifts are as far off as stated."""
         z_of_m, z_of_shifts = [], []
-        # The measured shifts of seed 3 are 1.84 times as far off as stated (8 degrees of freedom, p = 0.001):
-        # the fit rightly says so and widens `shift_std`.
+        # The measured shifts of seed 3 are 1.84 times as far off as stated (8 degrees of freedom,
+        # p = 0.001): the fit rightly says so and widens `shift_std`.
         for seed in (0, 1, 2, 4, 5, 6):
             shape = (96, 128)
             beam = fringes(30, contrast, crossed=crossed)
