@@ -25,6 +25,7 @@ mod memory;
 mod outcome;
 mod pass;
 mod penalty;
+mod pixels;
 mod preconditioner;
 mod rim;
 mod shift_information;

@@ -25,9 +25,9 @@ const DISTANCES: [usize; 5] = [8, 16, 32, 64, 128];
 const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
 /// Cells beside one that its smoothed slope takes.
 const REACH: usize = 3;
-/// The structure is at least so many times what noise adds to the curvature of F along shifts: then
-/// steps leave less than a fifth of an error.
-const OVER_NOISE: f64 = 4.0;
+/// The structure is at least so many times what noise adds to the curvature N of F along shifts: standard
+/// deviations of shifts, which take both for structure, are too small by 1 + N/I, so by 5 % at most.
+const OVER_NOISE: f64 = 20.0;
 
 /// The directions in the beam along which shifts are refined.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -181,7 +181,8 @@ fn directions([rr, rc, cc]: [f64; 3], scale: [f64; 2]) -> Directions {
         return Directions::Both;
     }
     // A number that is none determines nothing.
-    if !(middle + spread > 1.0) {
+    let is_one = middle + spread > 1.0;
+    if !is_one {
         return Directions::None;
     }
     let angle = 0.5 * rc.atan2(half);

@@ -490,28 +490,4 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         }
         weights
     }
-
-    /// M and O at the state, row by row.
-    pub(crate) fn pixels(&self) -> [Vec<f64>; 2] {
-        let mut found = [Vec::new(), Vec::new()];
-        self.pass.for_rows(|[sensitivity, _, _, offset, ..]| {
-            found[0].extend_from_slice(sensitivity);
-            found[1].extend_from_slice(offset);
-        });
-        found
-    }
-
-    /// The mean M of the pixels with measurements.
-    fn mean_sensitivity(&self) -> f64 {
-        let (mut sum, mut count) = (0.0, 0);
-        self.pass.for_rows(|[sensitivity, inverse, ..]| {
-            for (m, inverse) in sensitivity.iter().zip(inverse) {
-                if *inverse > 0.0 {
-                    sum += m;
-                    count += 1;
-                }
-            }
-        });
-        sum / f64::from(count.max(1))
-    }
 }
