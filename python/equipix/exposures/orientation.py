@@ -64,3 +64,16 @@ class Orientation:
             (self.turned, "give 270 for 90 degrees of rotation, and 90 for 270"),
         ]
         return "; then ".join(text for wanted, text in parts if wanted) or "change nothing"
+
+    @property
+    def changes(self) -> str:
+        """The same, as what has been changed."""
+        both = self.rows and self.cols
+        parts = [
+            (both, "the sign of all shifts reversed"),
+            (self.rows and not both, "the sign of the shifts along rows reversed"),
+            (self.cols and not both, "the sign of the shifts along columns reversed"),
+            (self.exchanged, "the two values of each shift exchanged"),
+            (self.turned, "rotations of 90 and 270 degrees exchanged"),
+        ]
+        return " and ".join(text for wanted, text in parts if wanted) or "nothing changed"

@@ -135,14 +135,19 @@ pub(crate) struct PyFit {
     smallest_ritz: Option<f64>,
     #[pyo3(get)]
     leaves_tilt: bool,
-    #[pyo3(get)]
-    refinement: &'static str,
+    refinement: Refinement,
     #[pyo3(get)]
     is_joint: bool,
 }
 
 #[pymethods]
 impl PyFit {
+    /// What became of shifts that were to be refined.
+    #[getter]
+    const fn refinement(&self) -> &'static str {
+        refinement_code(self.refinement)
+    }
+
     /// D = Σ w c² L² of each pixel.
     #[pyo3(signature = (*, workers))]
     fn information(
@@ -221,7 +226,7 @@ impl PyFit {
             unit,
             smallest_ritz: fit.smallest_ritz,
             leaves_tilt: fit.leaves_tilt,
-            refinement: refinement_code(fit.refinement),
+            refinement: fit.refinement,
             is_joint,
         })
     }
@@ -254,7 +259,7 @@ impl BorrowedFit<'_> {
             beam: self.beam.view()?,
             flux: &self.fit.flux,
             shifts: &self.fit.shifts,
-            refined: self.fit.refinement == refinement_code(Refinement::Done),
+            refinement: self.fit.refinement,
             joint: self.fit.is_joint,
             unit: self.fit.unit,
         })
@@ -359,6 +364,6 @@ const fn refinement_code(refinement: Refinement) -> &'static str {
         Refinement::None => "none",
         Refinement::NotTried => "not tried",
         Refinement::Undetermined => "undetermined",
-        Refinement::Done => "refined",
+        Refinement::Along(_) | Refinement::Done => "refined",
     }
 }
