@@ -108,9 +108,9 @@ class Averaged:
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        named = f" ({name!r})" if name else ""
-        _refuse_no_variance(f"'frames': exposure {exposure}{named}", frames)
-        self._refuse_saturated(f"'frames': exposure {exposure}{named}", frames)
+        which = f"'frames': exposure {exposure}{f' ({name!r})' if name else ''}"
+        _refuse_no_variance(which, frames)
+        self._refuse_saturated(which, frames)
         clipped = clipping_of(frames)
         self._clipped.append(clipped)
         self.raw &= frames.raw
