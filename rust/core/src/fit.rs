@@ -160,7 +160,7 @@ pub struct Solution<'s> {
     pub flux: &'s [f64],
     /// The shifts as found.
     pub shifts: &'s [[f64; 2]],
-    /// Whether they were refined.
+    /// What became of those that were to be refined.
     pub refinement: Refinement,
     /// Whether it is that of a joint fit.
     pub joint: bool,
