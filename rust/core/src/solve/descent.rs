@@ -9,7 +9,7 @@ use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
 use crate::reduced::{ConjugateGradients, Scale, Smallest};
-use crate::sweep::Estimate;
+use crate::sweep::{Estimate, Plain};
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
@@ -77,7 +77,7 @@ fn look<T: Real>(
     search: &mut ConjugateGradients<'_, '_, T>,
     control: &Control,
 ) -> Result<(f64, f64)> {
-    let misfit = estimate.slopes(scale.slope(), &mut search.residual, control)?;
+    let misfit = estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
     search.start(&estimate.sensitivity, estimate.beams(), control)?;
     let mut smallest = Smallest::default();
     while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}

@@ -5,8 +5,9 @@
 //! with L at its closed form. The number of products does not depend
 //! on the size of the sensor, where coordinate descent takes (size/shift)² sweeps.
 //!
-//! The steps are linear in M. With M → M·eᵍ a dead pixel whose best M is below 0 would never get
-//! there.
+//! The first step from equal pixels is that of the problem of ln L and ln M, which is linear but for noise:
+//! it comes to M at once where others take steps that are short at first. All others are linear in M. With
+//! M → M·eᵍ a dead pixel whose best M is below 0 would never get there.
 
 use super::options::Options;
 use super::start;
@@ -20,7 +21,7 @@ use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
 use crate::reduced::{ConjugateGradients, Scale, Smallest};
-use crate::sweep::Estimate;
+use crate::sweep::{Estimate, Logarithmic, Plain};
 
 /// Upper limit on products: an experiment that needs more cannot be solved by this method.
 const MOST_PRODUCTS: u64 = 100_000;
@@ -28,6 +29,8 @@ const MOST_PRODUCTS: u64 = 100_000;
 const AIM: f64 = 0.8;
 /// The most that one step reduces the error by: single precision holds no more.
 const PRECISION: f64 = 1e-5;
+/// The most that the first step reduces the error by: what noise makes of a logarithm is left.
+const BY_LOGARITHMS: f64 = 1e-4;
 /// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
 const RESCUE_SWEEPS: u64 = 32;
 const MOST_RESCUES: u32 = 8;
@@ -58,8 +61,14 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     let mut looks: Vec<Look> = Vec::new();
     let (mut halvings, mut rescues) = (0, 0);
     let mut products = 0;
+    let mut by_logarithms = start.is_none();
     loop {
-        let objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
+        let (scale, slopes) = (scale.slope(), &mut search.residual);
+        let objective = if by_logarithms && looks.is_empty() {
+            estimate.slopes::<Logarithmic>(scale, slopes, control)?
+        } else {
+            estimate.slopes::<Plain>(scale, slopes, control)?
+        };
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
@@ -67,11 +76,18 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         let highest = looks.last().map_or(f64::INFINITY, |last| last.objective + noise);
         // A number that is none is no fall either.
         let fell = objective <= highest;
+        if !fell && by_logarithms && looks.len() == 1 {
+            // Of noise alone logarithms say nothing.
+            by_logarithms = false;
+            looks.clear();
+            estimate.start(control)?;
+            continue;
+        }
         if !fell && halvings <= MOST_HALVINGS {
             halvings += 1;
             // The last time, what is left of the step is taken back.
             let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS));
-            estimate.advance(&search.x, -share);
+            estimate.advance::<Plain>(&search.x, -share);
             continue;
         }
         let stuck = halvings > MOST_HALVINGS;
@@ -100,7 +116,8 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         estimate.forget_beams();
         let total = forecast(&looks, options.tolerance).min(limit);
         let aim = AIM * options.tolerance;
-        let reachable = reachable(&search);
+        let first = by_logarithms && looks.len() == 1;
+        let reachable = if first { search.largest() * BY_LOGARITHMS } else { reachable(&search) };
         while products + 1 < limit {
             control.report("calibrate", products, total.max(products));
             let near = search.largest() <= reachable || smallest.left(&search) <= aim;
@@ -110,7 +127,11 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             }
             products += 1;
         }
-        estimate.advance(&search.x, 1.0);
+        if first {
+            estimate.advance::<Logarithmic>(&search.x, 1.0);
+        } else {
+            estimate.advance::<Plain>(&search.x, 1.0);
+        }
     }
 }
 

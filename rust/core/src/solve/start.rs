@@ -22,7 +22,7 @@ pub(super) fn estimate<'m, 'a, T: Real>(
     let mut estimate = Estimate::new(exposures, workers, control);
     match start {
         Some(start) => estimate = estimate.at(start.sensitivity),
-        None => estimate.start_bright(control)?,
+        None => estimate.start(control)?,
     }
     Ok(estimate)
 }
