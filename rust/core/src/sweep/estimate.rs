@@ -73,7 +73,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                             && ratio.is_finite()
                             && !(1.0 / UNLIKE..UNLIKE).contains(&ratio)
                         {
-                            *m = ratio.max(0.0);
+                            *m = ratio;
                         }
                     }
                 }
