@@ -139,10 +139,19 @@ pub(crate) struct PyFit {
     refinement: &'static str,
     #[pyo3(get)]
     is_joint: bool,
+    /// The weights of the prior of M on pixels in weak light.
+    prior: Option<Arc<[f64]>>,
 }
 
 #[pymethods]
 impl PyFit {
+    /// The weights λ of the prior of M on pixels in weak light, if there are such.
+    #[getter]
+    fn prior(&self, py: Python<'_>) -> PyResult<Option<Py<PyArray2<f64>>>> {
+        let weights = self.prior.as_ref().map(|weights| weights.to_vec());
+        weights.map(|weights| image(py, weights, self.data.checked.sensor())).transpose()
+    }
+
     /// D = Σ w c² L² of each pixel.
     #[pyo3(signature = (*, workers))]
     fn information(
@@ -223,6 +232,7 @@ impl PyFit {
             leaves_tilt: fit.leaves_tilt,
             refinement: refinement_code(fit.refinement),
             is_joint,
+            prior: fit.prior,
         })
     }
 
@@ -257,6 +267,7 @@ impl BorrowedFit<'_> {
             refined: self.fit.refinement == refinement_code(Refinement::Done),
             joint: self.fit.is_joint,
             unit: self.fit.unit,
+            prior: self.fit.prior.clone(),
         })
     }
 }

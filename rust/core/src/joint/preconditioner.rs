@@ -98,7 +98,7 @@ impl Preconditioner {
                 }
             }
         }
-        let coarse = Coarse::of_stars(&hats, &own, stars, control)?;
+        let coarse = Coarse::of_stars(&hats, &[], &own, stars, control)?;
         control.check()?;
         let waves = Waves::new(system, &blocks, seen);
         let rim = Rim::new(system, control)?;

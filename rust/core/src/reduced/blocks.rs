@@ -30,10 +30,12 @@ pub(super) fn coarse_spaces<T: Real>(
         .chunks_exact(geometry.placements.len())
         .enumerate()
         .map(|(block, weights)| blocks.star(block, weights, hats, geometry));
-    let coarse = Coarse::of_stars(hats, &[], stars, control)?;
+    let coarse = Coarse::of_stars(hats, &reduced.prior_of_hats(hats), &[], stars, control)?;
     control.check()?;
     let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
-    let seen = if geometry.views.len() > 1 { Vec::new() } else { seen(reduced, &finer) };
+    // What a prior holds is no wave.
+    let without = geometry.views.len() > 1 || reduced.weak.is_some();
+    let seen = if without { Vec::new() } else { seen(reduced, &finer) };
     let spots: Vec<Vec<Spot>> = match &seen[..] {
         [] => Vec::new(),
         _ => weights

@@ -14,6 +14,7 @@ use crate::frames::Real;
 use crate::geometry::Geometry;
 use crate::padded::Padding;
 use crate::parallel::Workers;
+use crate::prior::Prior;
 use crate::ritz::Ritz;
 
 /// Values that a thread takes at a time.
@@ -91,9 +92,10 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         &mut self,
         sensitivity: &[f64],
         beams: &[Vec<f64>],
+        prior: Option<&Prior>,
         control: &Control,
     ) -> Result<()> {
-        self.linearise(sensitivity, beams, control)?;
+        self.linearise(sensitivity, beams, prior, control)?;
         self.begin(control)
     }
 
@@ -105,10 +107,23 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         &mut self,
         sensitivity: &[f64],
         beams: &[Vec<f64>],
+        prior: Option<&Prior>,
         control: &Control,
     ) -> Result<()> {
-        self.reduced.linearise(sensitivity, beams, control)?;
+        self.reduced.linearise(sensitivity, beams, prior, control)?;
         self.two_level.prepare(&self.reduced, control)
+    }
+
+    /// Forgets the preconditioner, since the prior is another.
+    pub(crate) fn renew(&mut self) {
+        self.two_level.forget();
+    }
+
+    /// x ← D⁻¹ b, what a sweep of coordinate descent adds to M.
+    pub(crate) fn sweep_step(&mut self) {
+        let inverse = &self.reduced.inverse_diagonal;
+        let terms = self.x.iter_mut().zip(&self.residual).zip(inverse);
+        terms.for_each(|((x, b), inverse)| *x = b * inverse);
     }
 
     /// Starts from x = 0, where the residual is b, with the S that there is.
@@ -118,7 +133,6 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
     pub(crate) fn begin(&mut self, control: &Control) -> Result<()> {
         self.workers.fill(&mut self.x, 0.0, control);
         self.workers.fill(&mut self.direction, 0.0, control);
-        self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
         self.energy = 0.0;
         self.square = self.descend(0.0);
@@ -184,11 +198,6 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         let size = |largest: f32, value: &f32| largest.max(value.abs());
         let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
         self.relative(f64::from(tops.into_iter().fold(0.0, f32::max)))
-    }
-
-    /// The pixels that have left the system, with the step to the closed form of their M.
-    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
-        self.reduced.left_out()
     }
 
     /// The root mean square of the relative size of P⁻¹ r, weighted by D.

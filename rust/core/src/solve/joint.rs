@@ -269,8 +269,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             rotation: exposures.positions().rotations[0],
             sensor: exposures.sensor(),
         });
-        let left_out = without_offset.clone();
-        Ok(Found { fit, left_out, dead: Vec::new(), without_offset, fluxes })
+        let held = without_offset.clone();
+        Ok(Found { fit, held, dead: Vec::new(), without_offset, fluxes })
     }
 }
 
@@ -305,6 +305,7 @@ fn fit<T: Real>(
         degrees_of_freedom: 0,
         variance_is_known: exposures.variance_is_known(),
         history,
+        prior: None,
     })
 }
 

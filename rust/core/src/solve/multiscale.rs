@@ -10,6 +10,7 @@
 
 use super::options::Options;
 use super::start;
+use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::convergence::{
     Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, rounding, stalled_since,
@@ -37,8 +38,8 @@ const MOST_CURVED: f64 = 0.1;
 const TYPICAL: u64 = 60;
 
 /// Minimises F until the estimated error of M is at most the tolerance, the products are used up,
-/// or the estimate no longer falls. Returns the pixels too that their measurements leave almost no
-/// weight.
+/// or the estimate no longer falls. Returns the pixels too that the prior holds more than their
+/// measurements.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
@@ -55,11 +56,12 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     let mut estimate = start::estimate(exposures, start, workers, control)?;
     let mut search = ConjugateGradients::new(exposures, workers, control);
     let mut smallest = Smallest::default();
+    let mut weak = WeakLight::new();
     let mut looks: Vec<Look> = Vec::new();
     let (mut halvings, mut rescues) = (0, 0);
     let mut products = 0;
     loop {
-        let objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
+        let mut objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
@@ -76,7 +78,11 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         }
         let stuck = halvings > MOST_HALVINGS;
         halvings = 0;
-        search.start(&estimate.sensitivity, estimate.beams(), control)?;
+        if weak.update(&mut estimate, &mut search, control)? {
+            objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
+            products += 1;
+        }
+        search.start(&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref(), control)?;
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
         let ended = ended(&looks, &smallest, options, limit, noise);
@@ -84,18 +90,14 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             rescues += 1;
             smallest.stuck = false;
             for _ in 0..RESCUE_SWEEPS.min(limit.saturating_sub(products)) {
-                estimate.sweep(control)?;
+                weak::sweep(&mut estimate, &mut search, control)?;
                 products += 1;
             }
             search.forget(control);
             continue;
         }
         if let Some(ended) = ended {
-            for (pixel, step) in search.left_out() {
-                estimate.sensitivity[pixel] += step;
-            }
-            let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
-            return Ok((estimate, History { looks, ended }, left_out));
+            return Ok((estimate, History { looks, ended }, weak.held));
         }
         estimate.forget_beams();
         let total = forecast(&looks, options.tolerance).min(limit);

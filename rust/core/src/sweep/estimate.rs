@@ -6,12 +6,13 @@ use super::kernel::{STRETCH, Scratch, improve, measure, quotient};
 use super::lines::{BeamRow, darkest, pixel_lines};
 use crate::control::Control;
 use crate::error::Result;
-use crate::exposures::Exposures;
+use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
 use crate::geometry::View;
 use crate::median::median;
 use crate::padded::Padding;
 use crate::parallel::Workers;
+use crate::prior::Prior;
 
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
@@ -23,6 +24,11 @@ const BRIGHT: f64 = 4.0;
 /// So many pixels on either side of it.
 const AROUND: usize = 4;
 
+/// Rows and columns whose residuals are sampled.
+const SAMPLED: usize = 64;
+/// The median square of a standard normal value.
+const MEDIAN_OF_SQUARES: f64 = 0.4549;
+
 /// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
 pub struct Estimate<'m, 'a, T> {
     exposures: &'m Exposures<'a, T>,
@@ -31,6 +37,8 @@ pub struct Estimate<'m, 'a, T> {
     pub sensitivity: Vec<f64>,
     /// L in each of the geometry's views; 0 without a measurement.
     beams: Vec<Vec<f64>>,
+    /// The prior of M, where light is weak.
+    pub(crate) prior: Option<Prior>,
 }
 
 impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
@@ -42,6 +50,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
             workers,
             sensitivity: workers.filled(exposures.sensor().len(), 1.0, control),
             beams: vec![Vec::new(); exposures.geometry().views.len()],
+            prior: None,
         }
     }
 
@@ -82,8 +91,8 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         self.with_best_beam(control, |estimate, rows| estimate.update_sensitivity(rows, control))
     }
 
-    /// Updates all L; writes half the slope of −F along each pixel's M, times `scale`, to `slopes`
-    /// and returns F.
+    /// Updates all L; writes half the slope of −F − R along each pixel's M, times `scale`, to `slopes`
+    /// and returns F + R, R being that of the prior.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
@@ -95,10 +104,13 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     ) -> Result<f64> {
         let padding = Padding::of(self.exposures.geometry());
         let body = padding.body_mut(slopes);
-        self.with_best_beam(control, |estimate, rows| {
+        let sensitivity = &self.sensitivity;
+        let of_prior = self.prior.as_mut().map_or(0.0, |prior| prior.at(sensitivity));
+        let misfit = self.with_best_beam(control, |estimate, rows| {
             let body = &mut body[rows.start * padding.width..rows.end * padding.width];
             estimate.measure_slopes(rows, scale, &padding, body, control)
-        })
+        })?;
+        Ok(misfit + of_prior)
     }
 
     /// Makes room for L where there is none, by the threads that will use it.
@@ -149,6 +161,40 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         let Shape { cols, .. } = self.exposures.sensor();
         let row = cols * self.exposures.count() * size_of::<T>();
         (IN_CACHE / row).max(4 * BAND * self.workers.count()).next_multiple_of(BAND)
+    }
+
+    /// The variance of a measurement of weight 1: the median of a sample of squared residuals, of which a
+    /// few false ones do not move it, for as many degrees of freedom as `held` pixels without own M leave.
+    pub(crate) fn variance(&self, held: usize) -> f64 {
+        let Shape { rows, cols } = self.exposures.sensor();
+        let geometry = self.exposures.geometry();
+        let mut squares = Vec::new();
+        let mut weights = vec![0.0; cols];
+        for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
+            for (k, place) in geometry.placements.iter().enumerate() {
+                let width = geometry.views[place.view].shape.cols;
+                let light =
+                    &self.beams[place.view][(row + place.row) * width + place.col..][..cols];
+                let measured = self.exposures.stretch(k, row, 0..cols, &mut weights);
+                for col in (0..cols).step_by(cols.div_ceil(SAMPLED)) {
+                    let (value, weight) = match &measured {
+                        Stretch::Uniform(values, weight) => (values[col], *weight),
+                        Stretch::Weighted(values, weights) => (values[col], weights[col]),
+                    };
+                    if weight > 0.0 {
+                        let model = self.exposures.flux()[k] * light[col];
+                        let left = value.to_f64() - model * self.sensitivity[row * cols + col];
+                        squares.push(weight * left * left);
+                    }
+                }
+            }
+        }
+        let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
+        let unknowns = (rows * cols).saturating_sub(held) + cells;
+        let used = self.exposures.used();
+        let freedom = used.saturating_sub(unknowns).max(1);
+        let median = median(&mut squares, f64::total_cmp).unwrap_or(0.0);
+        median / MEDIAN_OF_SQUARES * used as f64 / freedom as f64
     }
 
     /// Takes M as given; what is not a number becomes 1.
@@ -306,6 +352,12 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                         &mut scratch,
                     );
                     objective += measure(&lines, sought, &mut found, &mut weights);
+                    if let Some(prior) = &self.prior {
+                        let pixels = stretch.clone().map(|col| row * cols + col).zip(sought);
+                        for (found, (pixel, &m)) in found.iter_mut().zip(pixels) {
+                            *found += prior.slope(pixel, m);
+                        }
+                    }
                     for (slope, found) in slopes[stretch].iter_mut().zip(&found) {
                         *slope = (found * scale) as f32;
                     }

@@ -1,0 +1,165 @@
+//! The prior of pixels in weak light (`prior.rs`) in the linear problem.
+//!
+//! With t = Σ x / Σ M over a piece of connected pixels it adds Vᵀ Λ V, V x = x − M t, to S: a change of M by a
+//! factor in a whole piece still weighs nothing.
+
+use std::sync::Arc;
+
+use super::operator::Reduced;
+use crate::coarse::Hats;
+use crate::connectivity::NONE;
+use crate::frames::Real;
+use crate::parallel::Workers;
+use crate::prior::Prior;
+use crate::random;
+
+/// The prior's part of S at one M.
+pub(crate) struct Weak {
+    /// λ/μ², in the units of S, padded.
+    pub(super) weights: Vec<f32>,
+    pieces: Arc<[i32]>,
+    /// Σ M of each piece.
+    totals: Vec<f64>,
+}
+
+/// Sums over the pixels of each piece; in bands of rows where there is one piece.
+fn sums(
+    pieces: &[i32],
+    count: usize,
+    cols: usize,
+    workers: &Workers,
+    value: impl Fn(usize, usize) -> f64 + Sync + Send,
+) -> Vec<f64> {
+    let of_row = |row: usize, sums: &mut [f64]| {
+        for (col, &piece) in pieces[row * cols..][..cols].iter().enumerate() {
+            if piece != NONE {
+                sums[piece as usize] += value(row, col);
+            }
+        }
+    };
+    let rows = pieces.len() / cols;
+    let mut total = vec![0.0; count];
+    if count == 1 {
+        let by_row = workers.map(rows, |row| {
+            let mut sum = [0.0];
+            of_row(row, &mut sum);
+            sum[0]
+        });
+        total[0] = by_row.into_iter().sum();
+    } else {
+        (0..rows).for_each(|row| of_row(row, &mut total));
+    }
+    total
+}
+
+impl<T: Real> Reduced<'_, '_, T> {
+    /// Takes the prior into S, at the M of the last linearisation.
+    pub(super) fn weigh_prior(&self, prior: &Prior, sensitivity: &[f64]) -> Weak {
+        let (padding, cols) = (self.padding, self.exposures.sensor().cols);
+        let mut weights = vec![0.0; self.sensitivity.len()];
+        let scale = self.scale.slope();
+        for (row, line) in
+            padding.body_mut(&mut weights).chunks_exact_mut(padding.width).enumerate()
+        {
+            for (col, weight) in line[..cols].iter_mut().enumerate() {
+                *weight = (prior.curvature(row * cols + col) * scale) as f32;
+            }
+        }
+        let pieces = Arc::clone(&prior.pieces);
+        let count = pieces.iter().max().map_or(0, |&last| (last + 1) as usize);
+        let value = |row: usize, col: usize| sensitivity[row * cols + col];
+        let totals = sums(&pieces, count, cols, self.workers, value);
+        Weak { weights, pieces, totals }
+    }
+
+    /// Adds Vᵀ Λ V x to a product; returns x · Vᵀ Λ V x.
+    pub(super) fn add_prior(&self, x: &[f32], product: &mut [f32]) -> f64 {
+        let Some(weak) = &self.weak else { return 0.0 };
+        let (padding, cols) = (self.padding, self.exposures.sensor().cols);
+        let at = |image: &[f32], row: usize, col: usize| f64::from(padding.row(image, row)[col]);
+        let count = weak.totals.len();
+        let shares = sums(&weak.pieces, count, cols, self.workers, |row, col| at(x, row, col));
+        let shares: Vec<f64> =
+            shares.iter().zip(&weak.totals).map(|(sum, total)| sum / total).collect();
+        let varied = |row: usize, col: usize| {
+            let share = shares[weak.pieces[row * cols + col] as usize];
+            at(x, row, col) - share * at(&self.sensitivity, row, col)
+        };
+        let pull = |row: usize, col: usize| at(&weak.weights, row, col) * varied(row, col);
+        let energy = |row: usize, col: usize| pull(row, col) * varied(row, col);
+        let total: f64 = sums(&weak.pieces, count, cols, self.workers, energy).iter().sum();
+        self.add_balanced(weak, product, pull);
+        total
+    }
+
+    /// Adds Vᵀ of what is pulled at pixels.
+    fn add_balanced(
+        &self,
+        weak: &Weak,
+        product: &mut [f32],
+        pull: impl Fn(usize, usize) -> f64 + Sync + Send,
+    ) {
+        let (padding, cols) = (self.padding, self.exposures.sensor().cols);
+        let moment = |row: usize, col: usize| {
+            pull(row, col) * f64::from(padding.row(&self.sensitivity, row)[col])
+        };
+        let count = weak.totals.len();
+        let common = sums(&weak.pieces, count, cols, self.workers, moment);
+        let common: Vec<f64> =
+            common.iter().zip(&weak.totals).map(|(sum, total)| sum / total).collect();
+        self.workers.map_blocks(padding.body_mut(product), padding.width, |row, line| {
+            for (col, value) in line[..cols].iter_mut().enumerate() {
+                if let Ok(piece) = usize::try_from(weak.pieces[row * cols + col]) {
+                    *value += (pull(row, col) - common[piece]) as f32;
+                }
+            }
+        });
+    }
+
+    /// What the prior adds to the hats' own elements of the coarse matrix; empty without one.
+    pub(super) fn prior_of_hats(&self, hats: &Hats) -> Vec<f64> {
+        let Some(weak) = &self.weak else { return Vec::new() };
+        let mut own = vec![0.0; hats.count()];
+        for row in 0..self.exposures.sensor().rows {
+            let line = self.padding.row(&weak.weights, row).iter();
+            let pixels = line.zip(self.padding.row(&self.sensitivity, row)).enumerate();
+            for (col, (&weight, &m)) in pixels.filter(|(_, (weight, _))| **weight > 0.0) {
+                for (hat, height) in hats.over(row as f64, col as f64) {
+                    own[hat] += height * f64::from(weight * m * m);
+                }
+            }
+        }
+        own
+    }
+
+    /// Adds a draw of the prior's noise, of the covariance of its part of S, to a right-hand side.
+    pub(crate) fn draw_prior(&self, draw: u64, slope: &mut [f32]) {
+        let Some(weak) = &self.weak else { return };
+        let (sensor, padding) = (self.exposures.sensor(), self.padding);
+        let signs = self.workers.map(sensor.rows, |row| {
+            let mut sign = random::signs_of_prior(draw, row, sensor.rows);
+            (0..sensor.cols).map(|_| sign()).collect::<Vec<f64>>()
+        });
+        self.add_balanced(weak, slope, |row, col| {
+            f64::from(padding.row(&weak.weights, row)[col]).sqrt() * signs[row][col]
+        });
+    }
+
+    /// D of each pixel, without the prior, in the units of F.
+    pub(crate) fn information(&self) -> Vec<f64> {
+        let (padding, cols) = (self.padding, self.exposures.sensor().cols);
+        let mut found = Vec::with_capacity(self.exposures.sensor().len());
+        for row in 0..self.exposures.sensor().rows {
+            for col in 0..cols {
+                let inverse = f64::from(padding.row(&self.inverse_diagonal, row)[col]);
+                let own = self
+                    .weak
+                    .as_ref()
+                    .map_or(0.0, |w| f64::from(padding.row(&w.weights, row)[col]));
+                let whole = if inverse > 0.0 { 1.0 / inverse } else { 0.0 };
+                found.push((whole - own).max(0.0) / self.scale.slope());
+            }
+        }
+        found
+    }
+}
