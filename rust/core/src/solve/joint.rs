@@ -3,6 +3,7 @@
 use super::found::Found;
 use super::options::Options;
 use super::start;
+use super::weak::WeakLight;
 use crate::beam::Beam;
 use crate::connectivity::NONE;
 use crate::control::Control;
@@ -80,6 +81,8 @@ struct Steps<'m, 'a, T> {
     /// Whether a step raised F at any length.
     stuck: bool,
     preconditioner: Option<Preconditioner>,
+    /// The prior of M in weak light.
+    weak: WeakLight,
     /// What is known of shifts that are refined later.
     shift_prior: Option<ShiftPrior>,
     refinement: Refinement,
@@ -95,6 +98,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     ) -> Result<Self> {
         let limit = options.limit(MOST_PRODUCTS)?;
         let (mut system, swept) = start::system(exposures, start, workers, control)?;
+        let weak = WeakLight::new();
         let mut shift_prior = ShiftPrior::of(exposures.positions());
         let mut refinement =
             shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
@@ -114,6 +118,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             halvings: 0,
             stuck: false,
             preconditioner: None,
+            weak,
             shift_prior,
             refinement,
         })
@@ -121,11 +126,15 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
 
     /// One step, or a shorter last one; says why the search has ended, if it has.
     fn next(&mut self, control: &Control) -> Result<Option<Ended>> {
-        let linear = self.system.linearise(control)?;
+        let mut linear = self.system.linearise(control)?;
         // Where shifts still move, cells come into the penalty, and F is not one function.
         let moving = self.system.seeks_shifts() && self.looks.len() <= SETTLING;
         if self.takes_back(linear.0, moving) {
             return Ok(None);
+        }
+        if self.weak.update_joint(&mut self.system)? {
+            linear = self.system.linearise(control)?;
+            self.preconditioner = None;
         }
         let (objective, slope) = self.settled(linear, control)?;
         let preconditioner = match self.preconditioner.take() {
@@ -176,7 +185,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             return Ok(linear);
         }
         if !self.system.pass.exposures.variance_is_known() {
-            self.system.unit = self.system.misfit / joint::freedom(&self.system);
+            let freedom = joint::freedom(&self.system) + self.weak.held.len() as f64;
+            self.system.unit = self.system.misfit / freedom;
         }
         self.system.renew(control)
     }
@@ -260,7 +270,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let history = History { looks: self.looks, ended };
         let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
-        fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
+        let held = self.weak.held;
+        fit.degrees_of_freedom =
+            degrees_of_freedom(system, &fit, without_offset.len()) + held.len() as i64;
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
         let theta = system.state.theta.first().copied().unwrap_or_default();
         let fluxes = fitted.then(|| FluxGauge {
@@ -269,7 +281,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             rotation: exposures.positions().rotations[0],
             sensor: exposures.sensor(),
         });
-        let held = without_offset.clone();
+        let mut held = [held, without_offset.clone()].concat();
+        held.sort_unstable();
+        held.dedup();
         Ok(Found { fit, held, dead: Vec::new(), without_offset, fluxes })
     }
 }
@@ -305,7 +319,9 @@ fn fit<T: Real>(
         degrees_of_freedom: 0,
         variance_is_known: exposures.variance_is_known(),
         history,
-        prior: None,
+        prior: system.prior.as_ref().map(|prior| {
+            prior.weights.iter().map(|weight| weight * prior.mean * prior.mean).collect()
+        }),
     })
 }
 

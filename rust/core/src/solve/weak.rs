@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use crate::connectivity::{Components, Tie};
+use crate::connectivity::{Components, NONE, Tie};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
+use crate::joint::{self, System};
 use crate::prior::{self, LIT, Prior};
 use crate::reduced::ConjugateGradients;
 use crate::sweep::Estimate;
@@ -45,7 +46,7 @@ impl WeakLight {
         range: [f64; 2],
         noise: f64,
         information: impl FnOnce() -> Vec<f64>,
-        control: &Control,
+        connected: impl FnOnce(&[f64]) -> Result<Arc<[i32]>>,
     ) -> Result<Option<Option<Prior>>> {
         if self.settled {
             return Ok(None);
@@ -64,14 +65,8 @@ impl WeakLight {
         if !is_weak && !had {
             return Ok(None);
         }
-        let pieces = match self.pieces.take() {
-            Some(pieces) => pieces,
-            None => {
-                let ties = vec![Tie::Firm; exposures.sensor().len()];
-                Components::of(exposures, &ties, control)?.pixels.into()
-            }
-        };
         let information = information();
+        let pieces = self.pieces.take().map_or_else(|| connected(&information), Ok)?;
         let weights: Arc<[f64]> = information
             .iter()
             .zip(&*pieces)
@@ -102,12 +97,39 @@ impl WeakLight {
         search.reduced.linearise(&estimate.sensitivity, estimate.beams(), former, control)?;
         let (exposures, reduced) = (search.reduced.exposures, &search.reduced);
         let information = || reduced.information();
-        let Some(prior) = self.decide(exposures, reduced.range, noise, information, control)?
-        else {
-            return Ok(false);
+        let connected = |_: &[f64]| {
+            let ties = vec![Tie::Firm; exposures.sensor().len()];
+            Ok(Components::of(exposures, &ties, control)?.pixels.into())
         };
+        let found = self.decide(exposures, reduced.range, noise, information, connected)?;
+        let Some(prior) = found else { return Ok(false) };
         estimate.prior = prior;
         search.renew();
+        Ok(true)
+    }
+}
+
+impl WeakLight {
+    /// Gives a joint problem the prior that follows from its state; whether it has changed.
+    pub(super) fn update_joint<T: Real>(&mut self, system: &mut System<'_, '_, T>) -> Result<bool> {
+        if self.settled {
+            return Ok(false);
+        }
+        let information = system.information();
+        let freedom = joint::freedom(system) + self.held.len() as f64;
+        let range = joint::range(&information);
+        let connected = |information: &[f64]| {
+            let piece = |d: &f64| if *d > 0.0 { 0 } else { NONE };
+            Ok(information.iter().map(piece).collect())
+        };
+        let (exposures, noise) = (system.pass.exposures, system.variance(freedom));
+        let found = self.decide(exposures, range, noise, || information, connected)?;
+        let Some(prior) = found else { return Ok(false) };
+        let mean = system.mean;
+        system.prior = prior.map(|prior| joint::Prior {
+            weights: prior.weights.iter().map(|weight| weight / (mean * mean)).collect(),
+            mean,
+        });
         Ok(true)
     }
 }

@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
 use crate::geometry::View;
-use crate::median::median;
+use crate::median::{MEDIAN_OF_SQUARES, median};
 use crate::padded::Padding;
 use crate::parallel::Workers;
 use crate::prior::Prior;
@@ -26,8 +26,6 @@ const AROUND: usize = 4;
 
 /// Rows and columns whose residuals are sampled.
 const SAMPLED: usize = 64;
-/// The median square of a standard normal value.
-const MEDIAN_OF_SQUARES: f64 = 0.4549;
 
 /// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
 pub struct Estimate<'m, 'a, T> {
