@@ -51,7 +51,7 @@ def spot(row, col):
 
 @pytest.mark.parametrize(("count", "factor"), [(5, 5 / 3), (4, 2), (3, 3), (2, 2)])
 def test_variances_are_those_of_n_measurements_that_determine_the_beam_too(count, factor):
-    """n/(n − 2) over Σ w c²L² M², the relative variance with a known beam."""
+    """n/(n − 2) over Σ w c²L² M², the relative variance with a known beam; 2 with two."""
     variance = 1e-6 * (1 + np.arange(count))
     weighted = fitted(CROSS[:count], variance=variance)
     exposures, fit = weighted.exposures, weighted.fit

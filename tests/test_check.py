@@ -302,7 +302,7 @@ class TestOddPixels:
 
     def test_a_saturation_that_leaves_nothing_is_named(self):
         frames = np.ones((5, 20, 30))
-        with pytest.raises(errors.InputError, match=r"100\.0% of the pixels of exposure 0"):
+        with pytest.raises(errors.InputError, match=r"exposure 0: 100\.0% of the pixels"):
             equipix.calibrate(frames, CROSS, saturation=0.5)
         with pytest.raises(errors.InputError, match="'saturation' is -1"):
             equipix.calibrate(frames, CROSS, saturation=-1)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import average, cli, load, simulate
+from equipix import FrameStatistics, average, cli, simulate
 from equipix.frames import load_statistics
 from equipix.io import read_frames
 
@@ -82,7 +82,7 @@ def test_calibrate_reports_what_it_saved(run, experiment, tmp_path):
     )
     assert (status, err) == (0, "")
     result = json.loads(out)
-    saved = load(output)
+    saved = equipix.load(output)
     assert result["sweeps"] == saved.sweeps
     assert result["converged"] is True
     assert result["shape"] == list(SHAPE)
@@ -147,8 +147,8 @@ def test_inspect_shows_an_average(run, experiment, tmp_path):
     told = json.loads(out)
     assert status == 0
     assert (told["shape"], told["frames"], told["saturation"]) == (list(SHAPE), 6, 4095)
-    assert told["dark_frames"] == load(mean).dark.count.max()
-    assert told["mean"] == pytest.approx(load(mean).mean.mean())
+    assert told["dark_frames"] == FrameStatistics.load(mean).dark.count.max()
+    assert told["mean"] == pytest.approx(FrameStatistics.load(mean).mean.mean())
     assert "saturated pixels" in run("inspect", mean)[1]
 
 
@@ -169,7 +169,7 @@ def test_average_writes_statistics(run, experiment, tmp_path):
 
 def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_path):
     inputs = [experiment.parent / f"frames/p{k}.tif" for k in range(2)]
-    expected = load(calibration).correct(read_frames(inputs), flagged="replace")
+    expected = equipix.load(calibration).correct(read_frames(inputs), flagged="replace")
     one, folder = tmp_path / "all.tif", tmp_path / "corrected"
     for output in (one, folder):
         status, out, _ = run(

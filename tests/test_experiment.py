@@ -326,7 +326,7 @@ def write_tiff(path, array):
         (np.zeros((2, *SHAPE), np.uint8), r"uint8.*uint16"),
         (
             np.full((2, *SHAPE), 4095, np.uint16),
-            r"experiment\.toml: .* 100\.0% .* exposure 1 \('p1'\) reach .* 4095 DN .* expose less",
+            r"experiment\.toml: 'frames': exposure 1 \('p1'\): 100\.0% .* 4095 DN .* .bit_depth.",
         ),
         (b"", r"empty"),
         (b"II*\0 nothing more", r"bad\.tif"),

@@ -11,7 +11,7 @@ import equipix
 from equipix import simulate
 from equipix.calibration.options import Options
 from equipix.calibration.pixel_flags import pixel_flags
-from equipix.calibration.weights import weighted_fit
+from equipix.calibration.weights import Weighted, contradictory_found, weighted_fit
 from equipix.defects import Findings
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -59,10 +59,12 @@ def test_findings_add_up():
 
 
 def test_most_measurements_left_out_contradict_each_other():
-    fitted = weighted()
+    given = weighted().exposures
     left_out = np.zeros((5, 20, 24), bool)
     left_out[:3, 4, 4] = left_out[:2, 8, 8] = True
-    exposures = fitted.exposures.without(left_out)
-    flags = pixel_flags(fitted._replace(exposures=exposures, rejected=left_out), FitOptions())
+    exposures = contradictory_found(given.without(left_out), given.usable())
+    fit = exposures.fit(FitOptions())
+    flags = pixel_flags(Weighted(exposures, fit, left_out), FitOptions())
+    assert fit.flags[4, 4] == BITS["contradictory"]
     assert np.argwhere(flags == BITS["contradictory"]).tolist() == [[4, 4]]
     assert np.count_nonzero(flags) == 1

@@ -294,6 +294,36 @@ class TestFluxes:
         # What is not affine leaves residuals, not tilts, but for some percent at edges.
         np.testing.assert_allclose(tilt, -affine, atol=0.1 * np.abs(affine).max())
 
+    @pytest.mark.parametrize("level", [0.36, 0.38])
+    def test_pixels_at_a_limit_of_the_range_count_for_both_or_none(self, level):
+        # These columns are near half of the mean, 0.76 and 0.77: the tilt that is removed moves
+        # some of them across that limit.
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        truth[:, :24] *= level
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.02, 1.03, 0.98, 0.99]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit")
+        # Sums of 3072 terms of size 1, in double precision.
+        assert np.abs(cal.tilt).max() < 1e-13
+
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_pixels_that_contradict_themselves_count_for_neither(self):
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.01, 0.99, 1.02, 0.98]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        frames += 1e-3 * np.random.default_rng(4).standard_normal(frames.shape)
+        frames[:, 40, 50] *= [1, 0.5, 1.4, 0.7, 1.9]
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit", robust=True)
+        assert cal.flags[40, 50] & equipix.Flag.UNRELIABLE_FLAT
+        assert np.isfinite(cal.sensitivity[40, 50])
+        assert np.abs(cal.tilt).max() < 1e-13
+        counted = np.isfinite(cal.sensitivity) & (cal.flags & equipix.Flag.UNRELIABLE_FLAT == 0)
+        assert cal.sensitivity[counted].mean() == pytest.approx(1, abs=1e-13)
+
     def test_the_tilt_of_the_gauge_is_that_of_the_result(self):
         # A part of weak response and a dead pixel count for neither.
         shape, shifts = (48, 64), equipix.cross_pattern(5, 7)

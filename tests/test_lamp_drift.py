@@ -137,3 +137,17 @@ def test_the_covariance_of_slopes_has_their_standard_deviations():
 def test_the_tail_of_chi_square(value, freedom, tail):
     """Quantiles from tables, given to six digits."""
     assert chi2_tail(value, freedom) == pytest.approx(tail, rel=1e-5)
+
+
+def test_the_tilt_of_a_linear_drift_is_named():
+    shape, shifts, rate = (64, 80), equipix.cross_pattern(5, 7), 2e-3
+    flux = np.exp(rate * np.arange(5))
+    clean = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts, flux=flux)
+    frames = clean + 1e-4 * np.random.default_rng(3).standard_normal(clean.shape)
+    with pytest.warns(DriftWarning, match="if it is linear in the order of the exposures"):
+        cal = equipix.calibrate(frames, shifts)
+    # The rate is known to the standard error of what the trend leaves: 3.5 % of its variance.
+    visible = rate * np.sqrt(10 * equipix.plan.distinct_trend(shifts))
+    error = 5 * cal.drift.flux_std / visible
+    np.testing.assert_allclose(cal.drift.trend_tilt, np.abs(cal.tilt), rtol=error)
+    assert (cal.drift.trend_tilt > 2 * cal.drift.tilt_std).all()

@@ -36,7 +36,7 @@ def verdicts_on(*, variance=True, uncertainty=True, **found):
     exposures = SimpleNamespace(variance=np.ones(5) if variance else None)
     weighted = Weighted(exposures, SimpleNamespace(**GOOD | found), None)
     options = Options(FitOptions(), uncertainty=uncertainty)
-    return verdicts.on_fit(weighted, options, OrientationTest(), None, None, None)
+    return verdicts.on_fit(weighted, options, OrientationTest(), None, None)
 
 
 def kinds(**found):

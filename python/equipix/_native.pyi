@@ -65,6 +65,7 @@ class Exposures:
         offset: bool,
         variance: NDArray[Any] | None,
         mask: NDArray[Any] | None,
+        unreliable: NDArray[Any] | None,
         workers: int | None,
         progress: _Progress | None,
     ) -> Exposures: ...
@@ -147,6 +148,8 @@ class Fit:
     def unit(self) -> float: ...
     @property
     def smallest_ritz(self) -> float | None: ...
+    @property
+    def prior(self) -> NDArray[Any] | None: ...
     @property
     def leaves_tilt(self) -> bool: ...
     @property

@@ -35,7 +35,7 @@ _BLOCK = 16
 
 @dataclass(frozen=True, eq=False)
 class Findings(ReadOnly):
-    """Bad pixels found in the frames before any fit: maps (rows, cols) of bool, or None.
+    """Bad pixels found before the last fit: maps (rows, cols) of bool, or None.
 
     Attributes
     ----------
@@ -48,7 +48,9 @@ class Findings(ReadOnly):
     noisy : ndarray of bool or None
         More scatter between frames than the noise explains: see `noisy_pixels`.
     contradictory : ndarray of bool or None
-        Another response before than after some moment, as under dust that fell.
+        Another response before than after some moment, as under dust that fell; or most of the
+        measurements left out by a robust calibration. The fit flags them, and their sensitivity
+        counts neither for its mean nor for its slope.
     """
 
     saturated: Bools | None = None
@@ -58,19 +60,23 @@ class Findings(ReadOnly):
     contradictory: Bools | None = None
 
 
-def refuse_saturated(which: str, values: Array, saturates: Bools, level: float | None) -> None:
-    """Refuse an exposure whose saturated values leave none to measure with.
+def refuse_saturated(
+    which: str, values: Array, saturates: Bools, level: float | None, key: str = "saturation"
+) -> None:
+    """Refuse a frame whose saturated values leave none to measure with.
 
     Parameters
     ----------
     which : str
-        The exposure, in words.
+        The argument, and which of its frames.
     values : ndarray, shape (rows, cols)
         Its values.
     saturates : ndarray of bool, shape (rows, cols)
         Which of them saturate.
     level : float or None
         The saturation level in DN, where it is known.
+    key : str
+        The argument or key of a file that gives the level.
 
     Raises
     ------
@@ -79,9 +85,9 @@ def refuse_saturated(which: str, values: Array, saturates: Bools, level: float |
     """
     if saturates.any() and not (np.isfinite(values) & ~saturates).any():
         raise InputError(
-            f"'frames': {np.mean(saturates):.1%} of the pixels of {which} reach the saturation "
+            f"{which}: {np.mean(saturates):.1%} of the pixels reach the saturation "
             f"level{'' if level is None else f' of {level:g} DN'} and none is left to measure "
-            "with: expose less, or correct 'saturation' or 'bit_depth'"
+            f"with: expose less, or correct '{key}'"
         )
 
 

@@ -190,12 +190,11 @@ class Rounding(NamedTuple):
     shift: list[float]
 
     @property
-    def message(self) -> str:
-        """What was rounded, the limit and the remedy."""
+    def words(self) -> str:
+        """What was rounded, and the limit."""
         return (
             f"shifts are rounded to whole pixels: that of exposure {self.exposure} (from 0) is "
-            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole): use "
-            "method='multiscale', or move the sensor by whole pixels"
+            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole)"
         )
 
 

@@ -26,6 +26,7 @@ from equipix.calibration.priors import widened
 from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
 from equipix.calibration.sample_variances import steadied
+from equipix.calibration.unchanged import sampled_arrays
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -182,6 +183,9 @@ def calibrate(
 
     Notes
     -----
+    The arrays given are viewed, not copied, where their dtype and order allow it: they must not
+    change during the call, nor as long as `Calibration.std_of` is asked.
+
     Minimises :math:`F = \sum_k \sum_p w_k(p) [y_k(p) - c_k L(u_k(p)) M(p)]^2` over the sensitivity
     M and the beam L, with weights w = 1/variance, fluxes c and the position u of pixel p in the
     beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
@@ -260,25 +264,29 @@ def calibrated(
     weighted = without_false_pixels(weighted, options)
     weighted, widths = widened(weighted, options)
     weighted = with_dark_misfit(weighted, options.fit)
+    weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))
     test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)
     drift = lamp_drift(weighted, residuals)
+    found = verdicts.on_fit(weighted, options, test, drift, misfit(weighted, residuals))
+    found += verdicts.on_noise(frames, widths)
+    found = with_coverage(found, weighted, flags)
+    # Before the error bars, which may be refused or interrupted.
+    verdicts.say(found)
     wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
     bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
-    found = verdicts.on_fit(weighted, options, test, dark, drift, misfit(weighted, residuals))
-    found += verdicts.on_noise(frames, widths, bars)
-    found = with_coverage(found, weighted, flags)
-    verdicts.say(found)
+    last = verdicts.on_standard_deviations(weighted, options, bars, dark)
+    verdicts.say(last)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,
         flags=flags,
         orientation=test,
         drift=drift,
-        verdicts=(*advice, *found),
+        verdicts=(*advice, *found, *last),
         bars=bars,
         metadata=metadata | (provenance or {}),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,26 +82,36 @@ def steps(exposures: Exposures, fit: Fit, options: FitOptions) -> tuple[Floats, 
     residuals = _scaled(exposures, fit, options)
     count, shape = len(residuals), exposures.shape
     largest, moment = np.zeros(shape), np.zeros(shape, np.int64)
-    means = np.stack([box_sums(each) / 3 for each in residuals])
-    squares = [np.sum(each**2, axis=0) for each in (residuals, means)]
+    square = np.einsum("krc,krc->rc", residuals, residuals)
     for first in range(2, count - 1):
         contrast = np.where(np.arange(count) < first, -1 / first, 1 / (count - first))
         contrast /= np.linalg.norm(contrast)
-        both = [np.abs(np.tensordot(contrast, each, axes=1)) for each in (residuals, means)]
-        explains = both[0] ** 2 > _STEP * squares[0]
-        step = np.where(explains & (both[1] > _NEAR), both[0], 0)
+        own = np.tensordot(contrast.astype(np.float32), residuals, axes=1)
+        # Box sums are linear: those of the step are the step of those of the residuals.
+        mean = np.abs(box_sums(own)) / 3
+        explains = own**2 > _STEP * square
+        step = np.where(explains & (mean > _NEAR), np.abs(own), 0)
         later = step > largest
         moment[later], largest[later] = first, step[later]
     return largest, moment
 
 
-def _scaled(exposures: Exposures, fit: Fit, options: FitOptions) -> Floats:
-    """Residuals in standard deviations, by their own scale in each exposure; 0 where unknown."""
-    residuals = exposures.residuals(fit, options.workers)
-    signed = np.copysign(np.sqrt(exposures.weighted_squares(residuals**2)), residuals)
-    scale = ROBUST * nanmedian_abs(signed)
-    usual = np.maximum(scale, options.tolerance * np.median(scale) + np.finfo(float).tiny)
-    return np.nan_to_num(signed / usual[:, None, None])
+def _scaled(exposures: Exposures, fit: Fit, options: FitOptions) -> NDArray[np.float32]:
+    """Residuals in standard deviations, by their own scale in each exposure; 0 where unknown.
+
+    One exposure after the other, in single precision: they are as many as the data.
+    """
+    scaled, scale = np.empty(exposures.values.shape, np.float32), np.empty(len(exposures))
+    for k, each in enumerate(scaled):
+        residual = exposures.residual(fit, k, options.workers)
+        usable = exposures.usable(k)
+        np.divide(residual, exposures.deviation(k), out=residual, where=usable)
+        residual[~usable] = np.nan
+        scale[k] = ROBUST * nanmedian_abs(residual[None])[0]
+        each[:] = residual
+    usual = np.maximum(scale, options.tolerance * np.median(scale) + np.finfo(np.float32).tiny)
+    scaled /= usual[:, None, None].astype(np.float32)
+    return np.nan_to_num(scaled, copy=False)
 
 
 def _together(found: Bools, first: NDArray[np.int64]) -> Bools:
@@ -121,5 +132,5 @@ def _around(moment: NDArray[np.int64]) -> NDArray[np.int64]:
     """Largest moment among the 3×3 pixels around each."""
     padded = np.pad(moment, 1)
     rows, cols = moment.shape
-    parts = [padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3)]
-    return np.asarray(np.max(parts, axis=0))
+    parts = (padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
+    return functools.reduce(np.maximum, parts)

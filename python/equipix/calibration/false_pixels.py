@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _CONTRADICTORY = 9.0
 """Mean squared residual of a pixel over the usual one from which its values contradict the fit. Of
-five values noise has it in one of a million pixels."""
+five values noise has it in less than one of a million pixels."""
 
 
 def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
@@ -29,10 +29,7 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
     if not (dead | hot).any():
         return weighted
     squares = _mean_squares(weighted, options.fit.workers)
-    # Without noise, only what the tolerance leaves would be compared.
-    power = np.square(weighted.exposures.values, dtype=np.float64)
-    solver = options.fit.tolerance**2 * np.nanmean(weighted.exposures.weighted_squares(power))
-    false = (dead | hot) & (squares > _CONTRADICTORY * max(np.nanmedian(squares), solver))
+    false = (dead | hot) & (squares > _CONTRADICTORY * _usual(weighted, options, squares))
     if not false.any():
         return weighted
     exposures = weighted.exposures
@@ -43,6 +40,22 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
     )
     exposures = dataclasses.replace(exposures.without(false), findings=findings)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
+
+
+def _usual(weighted: Weighted, options: Options, squares: Floats) -> float:
+    """Mean squared residual of a pixel without influence on the beam: of noise, or of the solver.
+
+    Other pixels have less, since the beam follows them: their mean is the share of the degrees of
+    freedom among the measurements.
+    """
+    exposures, fit = weighted.exposures, weighted.fit
+    if fit.degrees_of_freedom < 1:
+        return np.inf
+    noise = np.nanmedian(squares) * exposures.usable().sum() / fit.degrees_of_freedom
+    # Without noise, only what the solver leaves would be compared.
+    error = max(options.fit.tolerance, float(fit.error_estimate[-1]))
+    power = np.square(exposures.values, dtype=np.float64)
+    return float(max(noise, error**2 * np.nanmean(exposures.weighted_squares(power))))
 
 
 def _either(before: Bools | None, found: Bools) -> Bools:

@@ -21,7 +21,8 @@ class History(ReadOnly):
         How many sweeps had been made.
     objective : ndarray, shape (looks,), float64
         Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
-        and while such a fit still finds their weights.
+        and while such a fit still finds their weights. In coordinate descent it is F after a sweep;
+        `Calibration.objective` is smaller by the one update of the beam that follows the last.
     error_estimate : ndarray, shape (looks,), float64
         The estimated largest relative error of the sensitivity.
     """

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from equipix.calibration.verdicts import Verdict
 from equipix.exposures.clipping import clipping_advice
 from equipix.exposures.reach import micrometre_step
+from equipix.exposures.repeated import repeated
 
 if TYPE_CHECKING:
     from equipix.exposures.exposures import Exposures
@@ -14,7 +15,12 @@ if TYPE_CHECKING:
 
 def on_input(exposures: Exposures) -> list[Verdict]:
     """Verdicts on exposures that the values given contradict."""
-    found = [_on_clipping(exposures), _on_raw(exposures), _on_units(exposures)]
+    found = [
+        _on_clipping(exposures),
+        _on_raw(exposures),
+        _on_units(exposures),
+        _on_repeats(exposures),
+    ]
     return [verdict for verdict in found if verdict is not None]
 
 
@@ -47,4 +53,17 @@ def _on_units(exposures: Exposures) -> Verdict | None:
         f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
         f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
         "pitch, see 'From micrometres to pixels' in README",
+    )
+
+
+def _on_repeats(exposures: Exposures) -> Verdict | None:
+    """Verdict on one exposure that is given twice."""
+    pair = repeated(exposures.values)
+    if pair is None:
+        return None
+    first, second = pair
+    return Verdict(
+        "repeated",
+        f"exposures {first} and {second} are equal, value for value, which noise prevents: give "
+        "each position its own frames, and see whether the sensor moved",
     )

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix._readonly import ReadOnly
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
 from equipix.calibration.significance import chi2_tail
-from equipix.drift import affine_columns, slope_covariance
+from equipix.drift import affine_columns, slope_covariance, unit_times
 
 if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
@@ -22,12 +23,15 @@ WARNED = 1e-3
 _ADDED = 0.01
 """The same below which error bars contain the hidden tilt."""
 
+_VISIBLE = 1e-6
+"""Share of the variance of a trend below which what it leaves is rounding."""
+
 _BLOCK, _FAR = 16, 5.0
 """Columns of a block, and how many standard deviations off it is left out."""
 
 
 @dataclass(frozen=True, eq=False)
-class Drift:
+class Drift(ReadOnly):
     """Drift of the lamp against the fluxes that were given.
 
     Attributes
@@ -45,7 +49,10 @@ class Drift:
     slope_covariance : ndarray, shape (2, 2)
         Covariance of the slope of ln M, per pixel, that such a drift hides.
     tilt_std : ndarray, shape (2,)
-        Standard deviation of the hidden tilt, edge to edge (row, col).
+        Standard deviation of the hidden tilt, edge to edge (row, col), of independent errors.
+    trend_tilt : ndarray, shape (2,)
+        Size of the hidden tilt, edge to edge, if the lamp drifted linearly in the order of the
+        exposures and left this residual; 0 where the trend was fitted or leaves none.
     """
 
     size: float
@@ -54,6 +61,7 @@ class Drift:
     probability: float
     slope_covariance: Floats
     tilt_std: Floats
+    trend_tilt: Floats
 
     @property
     def is_added(self) -> bool:
@@ -69,8 +77,19 @@ class Drift:
             f"(standard error {self.flux_std:.1e}, {self.degrees_of_freedom} degrees of freedom). "
             "Such a drift of the lamp probably hides a tilt of the sensitivity, edge to edge, of "
             f"{rows:.1e} along rows and {cols:.1e} along columns (one standard deviation), which "
-            "leaves no residual: give 'flux' from a monitor of the lamp, turn one exposure by 90 "
-            "or 180 degrees and use flux='fit', or use larger shifts and more exposures"
+            f"leaves no residual{self._words_of_trend}. Give 'flux' from a monitor of the lamp, "
+            "turn one exposure by 90 or 180 degrees and use flux='fit', or use larger shifts and "
+            "more exposures. In a smooth beam shifts that are wrong look the same"
+        )
+
+    @property
+    def _words_of_trend(self) -> str:
+        rows, cols = self.trend_tilt
+        if not np.any(self.trend_tilt > self.tilt_std):
+            return ""
+        return (
+            f"; if it is linear in the order of the exposures, of {rows:.1e} and {cols:.1e}: then "
+            "give 'time' and flux='linear'"
         )
 
     def variance_of(self, weights: Floats, response: Floats) -> Floats:
@@ -145,7 +164,8 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     covariance = slope_covariance(shifts, size, exposures.flux.time)
     tilt = np.sqrt(np.diag(covariance)) * exposures.shape
     probability = chi2_tail(float(scatter @ scatter), freedom)
-    return Drift(size, flux_std, freedom, probability, covariance, tilt)
+    trend = np.abs(_slope_of_trend(columns, rest, exposures.flux.time)) * exposures.shape
+    return Drift(size, flux_std, freedom, probability, covariance, tilt, trend)
 
 
 def _free_fluxes(
@@ -177,6 +197,16 @@ def _agreeing(strengths: Floats, slopes: Floats) -> Bools:
     distances = np.abs(fluxes - np.reshape(centres, (-1, 1, 1))) * np.sqrt(np.maximum(strengths, 0))
     scale = 1.4826 * np.median(distances[known]) if known.any() else 0.0
     return np.asarray(known & (distances <= _FAR * scale))
+
+
+def _slope_of_trend(columns: Floats, rest: Floats, time: Array | None) -> Floats:
+    """Slope of ln M (row, col) that a trend in the order of exposures hides if it leaves `rest`."""
+    order = unit_times(np.arange(len(columns)))
+    visible = _rest(columns, order)
+    if time is not None or not visible @ visible > _VISIBLE:
+        return np.zeros(2)
+    hidden = np.linalg.lstsq(columns, order, rcond=None)[0][1:3]
+    return np.asarray(hidden * (visible @ rest) / (visible @ visible))
 
 
 def _solver_error(error: float, shifts: Floats, shape: tuple[int, int]) -> float:

@@ -21,16 +21,13 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
     Flagged are pixels that the solver left undetermined, those found before the fit, outliers of
     the response, and pixels whose measurements contradict each other.
     """
-    exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
+    exposures, fit = weighted.exposures, weighted.fit
     flags: Array = fit.flags.copy()
     dead, hot = odd_pixels(weighted, options)
     set_bits(flags, "dead", dead)
     set_bits(flags, "hot", hot)
     for finding, pixels in vars(exposures.findings).items():
         set_bits(flags, finding, pixels)
-    if rejected is not None:
-        kept = exposures.usable().sum(axis=0)
-        set_bits(flags, "contradictory", rejected.sum(axis=0) > kept)
     return flags
 
 

@@ -45,5 +45,6 @@ def _read_orientation(content: dict[str, Any] | None) -> OrientationTest | None:
 def _read_drift(content: dict[str, Any] | None) -> Drift | None:
     if content is None:
         return None
-    arrays = {name: np.array(content[name]) for name in ("slope_covariance", "tilt_std")}
+    names = ("slope_covariance", "tilt_std", "trend_tilt")
+    arrays = {name: np.array(content[name]) for name in names}
     return Drift(**{**content, **arrays})

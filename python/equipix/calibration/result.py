@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix._check import check_count, check_progress, per_exposure
+from equipix._check import check_count, check_progress
 from equipix._native import Beam
 from equipix._readonly import ReadOnly
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
+from equipix.calibration.prediction import places_of, signal_at, subtract_signals
 from equipix.calibration.saved import save_fields
+from equipix.calibration.unchanged import check_unchanged
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
-from equipix.exposures.positions import Positions
 from equipix.flags import determined
 from equipix.maps import slope_pixels, tilt
 
@@ -177,8 +178,7 @@ class Calibration(ReadOnly):
         metadata: dict[str, Any],
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
-        exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
-        dtype = exposures.values.dtype
+        exposures, fit, dtype = weighted.exposures, weighted.fit, weighted.exposures.values.dtype
         return cls(
             sensitivity=fit.sensitivity.astype(dtype, copy=False),
             beam=fit.beam.values,
@@ -204,7 +204,7 @@ class Calibration(ReadOnly):
             tilt_std=None if bars is None else bars.tilt,
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
-            rejected=rejected,
+            rejected=weighted.rejected,
             shift_sign=orientation.sign,
             orientation=orientation,
             drift=drift,
@@ -221,8 +221,7 @@ class Calibration(ReadOnly):
     def is_partial(self) -> bool:
         """Whether less than half of the pixels that are not masked are determined.
 
-        The verdict of kind ``"partial"`` contains the cause. `equipix calibrate` writes such a
-        result only with ``--partial``.
+        The verdict of kind ``"partial"`` contains the cause.
         """
         return any(verdict.kind == "partial" for verdict in self.verdicts)
 
@@ -282,7 +281,8 @@ class Calibration(ReadOnly):
         ------
         InputError
             If this calibration was read from a file, which holds no measurements; if the weights
-            do not fit; or if no variance was given and the residuals do not determine it.
+            do not fit; if no variance was given and the residuals do not determine it; or if an
+            array that was calibrated has changed.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 
@@ -290,8 +290,9 @@ class Calibration(ReadOnly):
         -----
         Errors of pixels are correlated: the variance of a mean over many cannot be had from
         `sensitivity_std`. With w the weights and g = w/M it is gᵀ S⁻¹ g, S being the reduced normal
-        matrix: one linear problem, about as much work as the calibration. Changes made since to the
-        arrays that were calibrated go unnoticed.
+        matrix: one linear problem, about as much work as the calibration. It reads the arrays that
+        were calibrated again, which must not have changed: 4096 values of each are compared, so a
+        change of few values is not noticed.
 
         Examples
         --------
@@ -314,6 +315,7 @@ class Calibration(ReadOnly):
                 "measurements: call std_of on the result of calibrate or Experiment.run"
             )
         check_progress(progress)
+        check_unchanged(self.weighted.exposures, self.weighted.sampled)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
         std = functional_std(self.weighted, stack, self.drift, workers=workers, progress=progress)
         return float(std[0]) if np.ndim(weights) == 2 else std
@@ -414,8 +416,8 @@ class Calibration(ReadOnly):
         """
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
-        (place,) = self._places(np.reshape(shift, (1, 2)), [rotation], [flux])
-        return self._signal(*place)
+        (place,) = places_of(np.reshape(shift, (1, 2)), [rotation], [flux])
+        return signal_at(place, self._beam, self.sensitivity)
 
     def residuals(
         self,
@@ -436,8 +438,7 @@ class Calibration(ReadOnly):
         variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
             Variance of the values given, as for `calibrate`.
         shifts, rotation, flux : array_like, optional
-            Where and how bright the exposures were taken, as for `calibrate`; by default those
-            of the calibration.
+            Of the exposures, as for `calibrate`; by default those of the calibration.
 
         Returns
         -------
@@ -463,39 +464,21 @@ class Calibration(ReadOnly):
             raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
         if shifts is None:
             check_count("frames", len(values), len(self.shifts))
-        places = self._places(
+        places = places_of(
             self.shifts if shifts is None else shifts,
             self.rotation if shifts is None and rotation is None else rotation,
             self.flux if shifts is None and flux is None else flux,
         )
         check_count("shifts", len(places), len(values))
         residuals = np.full(values.shape, np.nan, np.result_type(values, self.sensitivity))
-        for k, place in enumerate(places):
-            signal = self._signal(*place)
-            np.subtract(values[k], signal, out=residuals[k], where=np.isfinite(values[k]))
-            if self.dark_is_fitted:
-                residuals[k] -= self.dark
-            variance = measured.variance_of(k, signal)
-            if variance is not None:
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    residuals[k] /= np.sqrt(variance)
+        signals = (signal_at(place, self._beam, self.sensitivity) for place in places)
+        subtract_signals(measured, signals, self.dark if self.dark_is_fitted else None, residuals)
         return residuals
 
-    def _places(
-        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
-    ) -> list[tuple[list[float], int, float]]:
-        """Shift, rotation and flux of each exposure, checked."""
-        positions = Positions.of(shifts, rotation=rotation)
-        fluxes = per_exposure("flux", flux, len(positions), default=1)
-        rows = zip(positions.shifts, positions.rotation, fluxes, strict=True)
-        return [(shift.tolist(), int(turn), float(c)) for shift, turn, c in rows]
-
-    def _signal(self, shift: list[float], rotation: int, flux: float) -> NDArray[Any]:
-        """Frame c · L(u) · M(p) from a position, in the dtype of the sensitivity."""
-        slope = self.beam_tilt.tolist()
-        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=slope)
-        light = beam.light(self.shape, (shift[0], shift[1]), rotation, workers=None)
-        return np.asarray(flux * light * self.sensitivity, self.sensitivity.dtype)
+    @property
+    def _beam(self) -> Beam:
+        tilt = self.beam_tilt.tolist()
+        return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.

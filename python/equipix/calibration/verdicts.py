@@ -53,6 +53,7 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "saturation": SaturationWarning,
     "unit": IdentifiabilityWarning,
     "raw": MissingDarkWarning,
+    "repeated": MisfitWarning,
     "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,
@@ -102,22 +103,34 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
     return [verdict for verdict in found if verdict is not None]
 
 
-def on_noise(
-    frames: float | None, contradictions: Iterable[Contradiction], bars: ErrorBars | None
-) -> list[Verdict]:
-    """Verdicts on variances and priors that the data contradict, and on the error bars.
+def on_noise(frames: float | None, contradictions: Iterable[Contradiction]) -> list[Verdict]:
+    """Verdicts on variances and priors that the data contradict.
 
     `frames` is the number of frames whose sample variances were given.
     """
     found = [] if frames is None else [Verdict("variance", sample_variances.words(frames))]
-    found += [Verdict("prior", each.words) for each in contradictions]
+    return [*found, *(Verdict("prior", each.words) for each in contradictions)]
+
+
+def on_standard_deviations(
+    weighted: Weighted, options: Options, bars: ErrorBars | None, dark: DarkStd | None
+) -> list[Verdict]:
+    """Verdicts that need standard deviations: on a fitted dark, and on the error bars."""
+    found = [_on_dark(weighted.fit, options, dark), _on_searches(bars)]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def _on_searches(bars: ErrorBars | None) -> Verdict | None:
     count = 0 if bars is None else bars.exactness["incomplete_searches"]
-    return [*found, Verdict("uncertainty", incomplete_searches(count))] if count else found
+    return Verdict("uncertainty", incomplete_searches(count)) if count else None
 
 
 def _on_rounding(exposures: Exposures) -> Verdict | None:
     rounding = exposures.positions.rounding
-    return None if rounding is None else Verdict("rounding", rounding.message)
+    if rounding is None:
+        return None
+    remedy = "use method='multiscale', or move the sensor by whole pixels"
+    return Verdict("rounding", f"{rounding.words}: {remedy}")
 
 
 def _on_order(exposures: Exposures) -> Verdict | None:
@@ -140,7 +153,6 @@ def on_fit(
     weighted: Weighted,
     options: Options,
     test: OrientationTest,
-    dark: DarkStd | None,
     drift: Drift | None,
     misfit: Misfit | None,
 ) -> list[Verdict]:
@@ -150,7 +162,6 @@ def on_fit(
         _on_components(weighted.fit),
         _on_patterns(weighted.fit),
         _on_tilt(weighted.fit),
-        _on_dark(weighted.fit, options, dark),
         *_on_residuals(drift, misfit),
         _on_convergence(weighted.fit, options),
         _on_uncertainty(weighted.fit, options),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from equipix.calibration.robust import rejected
 from equipix.noise import modelled_variances
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
@@ -30,13 +31,15 @@ _MOST_ROUNDS = 20
 class Weighted(NamedTuple):
     """Exposures with their final weights, their fit, and the measurements left out.
 
-    `dark_misfit` is what the noise of the dark adds to F on average.
+    `dark_misfit` is what the noise of the dark adds to F on average, `sampled` what the arrays held
+    that later questions read again.
     """
 
     exposures: Exposures
     fit: Fit
     rejected: Bools | None
     dark_misfit: float = 0.0
+    sampled: Mapping[str, Array] = MappingProxyType({})
 
     @property
     def reduced_chi2(self) -> float:
@@ -73,11 +76,12 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
         at_medians = (c * middle for c in exposures.flux.values)
         start = modelled(exposures, at_medians).fit(rough, start)
         exposures = modelled(exposures, expected(exposures, start, middle, options.fit.workers))
-    # The fit before goes, and with it the variances that it refers to.
-    start = exposures.fit(options.fit, start)
+    fit = exposures.fit(options.fit, start)
+    # With the rough fit go the variances that it refers to.
+    del start
     if options.robust:
-        return _robust_fit(exposures, options.fit, start, middle)
-    return Weighted(exposures, start, None)
+        return _robust_fit(exposures, options.fit, fit, middle)
+    return Weighted(exposures, fit, None)
 
 
 def _robust_fit(
@@ -95,9 +99,19 @@ def _robust_fit(
             break
         if middle is not None:
             exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
-        kept = exposures.without(~usable | out)
+        kept = contradictory_found(exposures.without(~usable | out), given)
         fit = kept.fit(options, fit)
     return Weighted(kept, fit, out | (given & ~usable))
+
+
+def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
+    """Exposures with a finding for each pixel most of whose given measurements are left out."""
+    contradictory = given.sum(axis=0) > 2 * kept.usable().sum(axis=0)
+    before = kept.findings.contradictory
+    if before is not None:
+        contradictory |= before
+    findings = dataclasses.replace(kept.findings, contradictory=contradictory)
+    return dataclasses.replace(kept, findings=findings)
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:

@@ -44,7 +44,8 @@ class Equalisation:
         The dark frame, in DN.
     variance : ndarray, shape (rows, cols)
         Relative variance of the sensitivity by noise, the beam being known: 1/(M² Σ w c²L²), times
-        n/(n − 2) since a pixel's n measurements determine the beam too. NaN where unknown.
+        n/(n − 2) since a pixel's n measurements determine the beam too; with two, which determine
+        no noise, times 2. NaN where unknown.
     """
 
     gain: Array

@@ -92,6 +92,11 @@ class Sensor(_Table):
             return float(2**self.bit_depth - 1)
         return self.saturation
 
+    @property
+    def saturation_key(self) -> str:
+        """The key that gives `saturation_level`."""
+        return "bit_depth" if self.saturation is None and self.bit_depth else "saturation"
+
 
 class Dark(_Table):
     """Table ``[dark]``: frames without light."""

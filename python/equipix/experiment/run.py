@@ -323,9 +323,14 @@ class Experiment:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""
         exposures = self.manifest.exposure
         with naming_memory("averaging"):
-            gain = self.manifest.sensor.gain_dn_per_e
-            level = self.manifest.sensor.saturation_level
-            averaged = Averaged(len(exposures), dtype=np.float32, gain=gain, saturation=level)
+            sensor = self.manifest.sensor
+            averaged = Averaged(
+                len(exposures),
+                dtype=np.float32,
+                gain=sensor.gain_dn_per_e,
+                saturation=sensor.saturation_level,
+                saturation_key=sensor.saturation_key,
+            )
             for each in exposures:
                 statistics = self._statistics(each.name, each.frames, dark, options)
                 try:

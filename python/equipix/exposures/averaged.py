@@ -61,8 +61,10 @@ class Averaged:
         dtype: DTypeLike = np.float64,
         gain: float | None = None,
         saturation: float | None = None,
+        saturation_key: str = "saturation",
     ) -> None:
         self.count, self.gain, self.saturation = count, gain, saturation
+        self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
@@ -85,12 +87,13 @@ class Averaged:
         Raises
         ------
         InputError
-            If it has another shape than the first, another dark, or saturates in every pixel.
+            If it has another shape than the first, another dark, or no finite value that does not
+            saturate; with the first exposure, if its dark has none.
         """
         exposure, shape = len(self._frames), frames.mean.shape
         if exposure == 0:
             if frames.dark is not None:
-                self._refuse_saturated("the dark", frames.dark)
+                self._refuse_saturated("'dark'", frames.dark)
             self.values = np.empty((self.count, *shape), self._dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
@@ -105,7 +108,8 @@ class Averaged:
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        self._refuse_saturated(f"exposure {exposure}{f' ({name!r})' if name else ''}", frames)
+        named = f" ({name!r})" if name else ""
+        self._refuse_saturated(f"'frames': exposure {exposure}{named}", frames)
         self._clipped.append(clipping_of(frames))
         self.raw &= frames.raw
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
@@ -160,7 +164,8 @@ class Averaged:
         return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
     def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
-        refuse_saturated(which, frames.mean, frames.saturated > 0, self.saturation)
+        saturates = frames.saturated > 0
+        refuse_saturated(which, frames.mean, saturates, self.saturation, self._saturation_key)
 
     def _dead(self, noise: NoiseModel | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""

@@ -53,7 +53,7 @@ class Exposures(ReadOnly):
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
     findings : Findings
-        Bad pixels found before any fit.
+        Bad pixels found before the last fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
     dark_variance : ndarray, shape (rows, cols), float64, or None
@@ -176,11 +176,23 @@ class Exposures(ReadOnly):
     def residuals(self, fit: Fit, workers: int | None) -> Floats:
         """Return y − c · L(u) · M(p) − O(p), (n, rows, cols); NaN where nothing is predicted."""
         residuals = np.empty(self.values.shape)
-        for k, residual in enumerate(residuals):
-            np.subtract(self.values[k], self.light(fit, k, workers) * fit.sensitivity, out=residual)
-            if fit.offset is not None:
-                residual -= fit.offset
+        for k in range(len(self)):
+            residuals[k] = self.residual(fit, k, workers)
         return residuals
+
+    def residual(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
+        """Return y − c · L(u) · M(p) − O(p) of one exposure; NaN where nothing is predicted."""
+        residual = self.light(fit, exposure, workers)
+        residual *= fit.sensitivity
+        np.subtract(self.values[exposure], residual, out=residual)
+        if fit.offset is not None:
+            residual -= fit.offset
+        return residual
+
+    def deviation(self, exposure: int) -> Floats:
+        """Return the standard deviation of the values of an exposure; 1 where weights are equal."""
+        variance = 1.0 if self.variance is None else self.variance[exposure]
+        return np.asarray(np.sqrt(variance, dtype=np.float64))
 
     def weighted_squares(self, squares: Array) -> Floats:
         """Return squares over variances; NaN where nothing is measured."""
@@ -213,6 +225,7 @@ class Exposures(ReadOnly):
             offset=self.offset,
             variance=self.variance,
             mask=self.mask,
+            unreliable=self.findings.contradictory,
             workers=options.workers,
             progress=options.progress,
         )

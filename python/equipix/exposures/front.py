@@ -221,7 +221,7 @@ def _saturated(values: Array, level: float) -> Bools:
     """Which values reach the saturation level."""
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
-        refuse_saturated(f"exposure {k}", values[k], each, level)
+        refuse_saturated(f"'frames': exposure {k}", values[k], each, level)
     return saturated
 
 

@@ -15,6 +15,11 @@ use crate::geometry::Rotation;
 use crate::linalg::inverse;
 use crate::parallel::Workers;
 
+/// Upper limit on rounds of selecting the pixels of the slope and removing it. Few pixels are close to a
+/// limit of the range, so two or three rounds are usual. Pixels that a tilt moves to and fro across a limit
+/// may leave no set that is its own result: then a slope of their size remains.
+const MOST_ROUNDS: usize = 20;
+
 /// Brings M to mean 1, each component for itself, and M to NaN outside the largest, L to NaN outside
 /// all. The pixels `left_out` are not in the means unless nothing else is there.
 pub(crate) fn fix_means(fit: &mut Fit, left_out: &[usize], workers: &Workers) {
@@ -57,20 +62,39 @@ pub(crate) fn fix_fluxes(fit: &mut Fit, gauge: &FluxGauge) {
     let FluxGauge { drift, open, rotation, sensor } = gauge;
     untilt(fit, rotation.in_sensor(*drift), *rotation, *sensor);
     if !open.is_empty() {
-        let counted = slope_pixels(&fit.sensitivity, &fit.flags);
-        let slope = slopes(&counted, *sensor).map(|weights| {
-            let pixels = weights.iter().zip(&fit.sensitivity).filter(|(w, _)| **w != 0.0);
-            pixels.map(|(weight, m)| weight * m.ln()).sum::<f64>()
-        });
-        for direction in open.iter().map(|direction| rotation.in_sensor(*direction)) {
-            let along = direction[0] * slope[0] + direction[1] * slope[1];
-            untilt(fit, direction.map(|part| along * part), *rotation, *sensor);
-        }
+        level(fit, gauge);
     }
     let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
     fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
     let coefficients = fit.beam.coefficients.iter_mut().flatten();
     fit.beam.values.iter_mut().chain(coefficients).for_each(|value| *value *= mean.exp());
+}
+
+/// Brings the slope of ln M to 0 along the open directions. Removing it changes which pixels are within the
+/// range of [`slope_pixels`], so both are repeated until the pixels are those of the result.
+fn level(fit: &mut Fit, gauge: &FluxGauge) {
+    let FluxGauge { open, rotation, sensor, .. } = gauge;
+    let mut before = Vec::new();
+    for _ in 0..MOST_ROUNDS {
+        let counted = slope_pixels(&fit.sensitivity, &fit.flags);
+        if counted == before {
+            return;
+        }
+        let slope = slope(&fit.sensitivity, &counted, *sensor);
+        for direction in open.iter().map(|direction| rotation.in_sensor(*direction)) {
+            let along = direction[0] * slope[0] + direction[1] * slope[1];
+            untilt(fit, direction.map(|part| along * part), *rotation, *sensor);
+        }
+        before = counted;
+    }
+}
+
+/// The least-squares slope of ln M along rows and columns, a pixel, over the pixels that are `counted`.
+fn slope(sensitivity: &[f64], counted: &[bool], sensor: Shape) -> [f64; 2] {
+    slopes(counted, sensor).map(|weights| {
+        let pixels = weights.iter().zip(sensitivity).filter(|(w, _)| **w != 0.0);
+        pixels.map(|(weight, m)| weight * m.ln()).sum()
+    })
 }
 
 /// M → M·exp(−slope·p) and all that goes with it.

@@ -1,4 +1,4 @@
-//! D = Σ w c² L² of a pixel: what its measurements say of its M, by itself.
+//! The information D = Σ w c² L² of each pixel on M: the inverse variance of M with a known beam.
 
 use crate::control::Control;
 use crate::error::Result;

@@ -40,7 +40,7 @@ mod workspace;
 pub(crate) use conjugate_gradients::ConjugateGradients;
 pub(crate) use first_beam::{Source, first_beam};
 pub(crate) use flux::Fluxes;
-pub(crate) use kernel::{Follow, Row};
+pub(crate) use kernel::{Propagate, Row};
 pub(crate) use layout::Grid;
 pub(crate) use memory::{bytes_needed, bytes_needed_by_covariance};
 pub(crate) use outcome::{coefficients, components, freedom, range, unknowns, values_at_cells};

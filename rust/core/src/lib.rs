@@ -126,7 +126,7 @@
 //! ritz            the smallest Ritz value, from conjugate gradients
 //! beam            the light that a sensor sees of the beam from any position
 //! connectivity    what the measurements can compare; connected pixels
-//! information     what the measurements of a pixel say of its M
+//! information     the information D = Σ w c² L² of each pixel on M: its inverse variance with a known beam
 //! exposures       measurements, weights, positions, fluxes; the one check of their values
 //! padded          images as rows of one width, with zeros around
 //! geometry        shifts, rotations, the padded grid of the beam, the taps of its spline
@@ -203,6 +203,8 @@ mod ritz;
 pub mod solve;
 pub mod statistics;
 pub mod sweep;
+#[cfg(test)]
+mod testing;
 pub mod uncertainty;
 
 pub use beam::Beam;

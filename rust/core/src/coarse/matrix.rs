@@ -38,19 +38,19 @@ pub(crate) struct Coarse {
 impl Coarse {
     /// The matrix of the hats, with `own` on their diagonal unless it is empty, and other unknowns, whose own
     /// diagonal elements are `others`, summed over blocks: what each exposure sees of them there.
-    pub(crate) fn of_stars(
+    pub(crate) fn of_blocks(
         hats: &Hats,
         own: &[f64],
         others: &[f64],
-        stars: impl Iterator<Item = Vec<Arm>>,
+        blocks: impl Iterator<Item = Vec<Entry>>,
         control: &Control,
     ) -> Result<Self> {
         let mut matrix = Matrix::new(hats, others.len());
-        for (block, star) in stars.enumerate() {
-            if block % CHECK_EVERY == 0 {
+        for (index, entries) in blocks.enumerate() {
+            if index % CHECK_EVERY == 0 {
                 control.check()?;
             }
-            matrix.add_star(&star);
+            matrix.add_block(&entries);
         }
         let of_hats = own.iter().enumerate();
         let of_others =
@@ -138,14 +138,14 @@ impl Coarse {
 }
 
 /// One exposure's part in a block: its weight there, and what it sees of the unknowns.
-pub(crate) struct Arm {
+pub(crate) struct Entry {
     pub(crate) weight: f64,
     pub(crate) hats: [(usize, f64); 4],
     /// Behind the hats.
     pub(crate) others: Vec<(usize, f64)>,
 }
 
-impl Arm {
+impl Entry {
     fn heights(&self) -> impl Iterator<Item = (usize, f64)> {
         self.hats.iter().chain(&self.others).copied()
     }
@@ -173,29 +173,29 @@ impl Matrix {
     }
 
     /// Adds Σ_k Ω_k (φ_k − φ̄)(φ_k − φ̄)ᵀ, φ̄ the weighted mean.
-    fn add_star(&mut self, star: &[Arm]) {
-        let total: f64 = star.iter().map(|arm| arm.weight).sum();
+    fn add_block(&mut self, entries: &[Entry]) {
+        let total: f64 = entries.iter().map(|entry| entry.weight).sum();
         let mut nodes: Vec<usize> =
-            star.iter().flat_map(|arm| arm.heights().map(|hat| hat.0)).collect();
+            entries.iter().flat_map(|entry| entry.heights().map(|hat| hat.0)).collect();
         nodes.sort_unstable();
         nodes.dedup();
         let mut mean = vec![0.0; nodes.len()];
-        let mut heights = vec![0.0; star.len() * nodes.len()];
-        for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
-            for (hat, height) in arm.heights() {
-                self.masses[hat] += arm.weight * height * height;
+        let mut heights = vec![0.0; entries.len() * nodes.len()];
+        for (entry, heights) in entries.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
+            for (hat, height) in entry.heights() {
+                self.masses[hat] += entry.weight * height * height;
                 let at = nodes.partition_point(|&node| node < hat);
                 heights[at] += height;
-                mean[at] += arm.weight / total * height;
+                mean[at] += entry.weight / total * height;
             }
         }
-        for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
+        for (entry, heights) in entries.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
             for (height, mean) in heights.iter_mut().zip(&mean) {
                 *height -= mean;
             }
             for (a, &upper) in nodes.iter().enumerate() {
                 for (b, &lower) in nodes.iter().enumerate().skip(a) {
-                    self.add(upper, lower, arm.weight * heights[a] * heights[b]);
+                    self.add(upper, lower, entry.weight * heights[a] * heights[b]);
                 }
             }
         }

@@ -200,6 +200,7 @@ fn columns<N: Value>(hats: &Hats, wave: &Wave) -> [Vec<N>; 4] {
 mod tests {
     use super::*;
     use crate::frames::Shape;
+    use crate::testing::random_number;
 
     const SHAPE: Shape = Shape::new(41, 53);
     const VECTORS: [[f64; 2]; 2] = [[2.3, -0.7], [-1.1, 1.9]];
@@ -241,7 +242,7 @@ mod tests {
     }
 
     fn random(index: usize) -> f64 {
-        ((index as f64 * 12.9898).sin() * 43758.5453).rem_euclid(1.0) - 0.5
+        0.5 * random_number(index)
     }
 
     #[test]
@@ -292,7 +293,7 @@ mod tests {
                 space.spaces[wave].factor.substitute(&mut heights);
                 let energy = |cell: usize| {
                     let [row, col] = [(cell / SHAPE.cols) as f64, (cell % SHAPE.cols) as f64];
-                    let shown = SHIFTS.map(|[down, right]| {
+                    let heights = SHIFTS.map(|[down, right]| {
                         let terms = heights.iter().enumerate();
                         terms
                             .map(|(place, y)| {
@@ -300,8 +301,8 @@ mod tests {
                             })
                             .sum::<f64>()
                     });
-                    let mean = shown.iter().sum::<f64>() / 3.0;
-                    shown.iter().map(|x| (x - mean).powi(2)).sum::<f64>()
+                    let mean = heights.iter().sum::<f64>() / 3.0;
+                    heights.iter().map(|x| (x - mean).powi(2)).sum::<f64>()
                 };
                 // With A y = e_i, yᵀAy = y_i. Of cos² and sin² of the phase the sum over a hat of some
                 // seven periods has half its length, and one period more or less at each end.

@@ -58,10 +58,10 @@ impl Matrix {
             let factor = seen.factors[spot.exposure];
             spread(spot, &nodes, &mut heights);
             for ((height, mean), &node) in heights.iter().zip(&mut mean).zip(&nodes) {
-                let shown = factor.map(|part| height * part);
+                let column = factor.map(|part| height * part);
                 let share = spot.weight / total;
-                *mean = [mean[0] + share * shown[0], mean[1] + share * shown[1]];
-                self.masses[node] += spot.weight * (shown[0] * shown[0] + shown[1] * shown[1]);
+                *mean = [mean[0] + share * column[0], mean[1] + share * column[1]];
+                self.masses[node] += spot.weight * (column[0] * column[0] + column[1] * column[1]);
             }
         }
         for spot in block {

@@ -25,13 +25,13 @@ const MOST_HEIGHTS: usize = 30_000;
 /// What the matrix of the hats and its factor take in bytes: as measured for 28 000 and 51 000 hats,
 /// or those of a full triangle, twice, where exposures are turned against each other. Those of a wave have
 /// two heights for each hat.
-pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
+pub(crate) fn bytes_needed(geometry: &Geometry, waves: usize) -> u64 {
     let hats = Hats::new(geometry.sensor, spacing(geometry)).count() as u64;
     if geometry.views.len() > 1 {
         return 8 * hats * hats;
     }
     let of_wave = Hats::new(geometry.sensor, spacing_of_waves(geometry));
-    2700 * hats + 8000 * (MOST_WAVES * of_wave.count()) as u64
+    2700 * hats + 8000 * (waves * of_wave.count()) as u64
 }
 
 /// How far apart the hats of a wave stand: as all others, unless they would be too many.

@@ -22,7 +22,7 @@ const DETERMINED: f64 = 1e-5;
 /// Minima of the scan that are followed further down.
 const MOST_CANDIDATES: usize = 12;
 /// Upper limit on waves: more save few iterations (docs/method.md, section 5).
-pub(super) const MOST_WAVES: usize = 4;
+pub(crate) const MOST_WAVES: usize = 4;
 /// Steps over the wave vectors along an axis, for each pixel that shifts reach, and at least and at most.
 const STEPS_A_PIXEL: usize = 8;
 const STEPS: [usize; 2] = [16, 512];

@@ -34,6 +34,7 @@ pub struct Checked {
     offset: bool,
     geometry: Geometry,
     tallies: Vec<Tally>,
+    unreliable: Vec<usize>,
 }
 
 impl Checked {
@@ -71,8 +72,24 @@ impl<'a, T: Real> Exposures<'a, T> {
         let tallies = (0..count).map(|exposure| tally(&measurements, exposure, workers, control));
         let tallies = tallies.collect::<Result<Vec<_>>>()?;
         check_light(&tallies)?;
-        let checked = Checked { positions, flux, offset, geometry, tallies };
+        let unreliable = Vec::new();
+        let checked = Checked { positions, flux, offset, geometry, tallies, unreliable };
         Ok(Self { measurements, checked })
+    }
+
+    /// The same exposures, with pixels whose measurements contradict each other: M is fitted there, flagged,
+    /// and counts neither for the mean of M nor for its slope.
+    ///
+    /// # Errors
+    /// [`Error::Shape`](crate::Error::Shape) if `unreliable` has not a value for each pixel.
+    pub fn with_unreliable(mut self, unreliable: &[bool]) -> Result<Self> {
+        let pixels = self.sensor().len();
+        if unreliable.len() != pixels {
+            let (got, wanted) = (unreliable.len().to_string(), pixels.to_string());
+            return Err(Error::Shape { argument: "unreliable", got, wanted });
+        }
+        self.checked.unreliable = (0..pixels).filter(|&pixel| unreliable[pixel]).collect();
+        Ok(self)
     }
 
     /// Views exposures again that were checked before: the same values, unchanged.
@@ -144,6 +161,11 @@ impl<'a, T: Real> Exposures<'a, T> {
     #[must_use]
     pub const fn offset(&self) -> bool {
         self.checked.offset
+    }
+
+    /// The pixels whose measurements contradict each other, by rising index.
+    pub(crate) fn unreliable(&self) -> &[usize] {
+        &self.checked.unreliable
     }
 
     /// Whether all shifts are whole and exact, and nothing is sought besides M and L.
@@ -249,7 +271,7 @@ impl<'a, T: Real> Exposures<'a, T> {
         Ok(())
     }
 
-    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` has room for them.
+    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` is a buffer for them.
     pub(crate) fn stretch<'s>(
         &self,
         exposure: usize,

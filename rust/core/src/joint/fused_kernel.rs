@@ -71,7 +71,7 @@ pub(super) struct Eliminate<'s> {
     pub(super) pixels: Pixels<'s>,
     pub(super) last: &'s mut [f64],
     pub(super) share: f64,
-    /// Room for v of each exposure.
+    /// Buffers for v of each exposure.
     pub(super) values: &'s mut [[f32; LANES]],
     /// The pulls of the row, of the same number.
     pub(super) pulls: &'s mut Ring,
@@ -141,7 +141,7 @@ pub(super) struct Back<'s> {
     pub(super) rows: [&'s [f32]; TAPS],
     pub(super) along_rows: [f32; TAPS],
     pub(super) along_cols: [f32; TAPS],
-    /// Room for a row.
+    /// A buffer for a row.
     pub(super) line: &'s mut [f32],
     pub(super) sums: &'s mut [f32],
 }

@@ -141,7 +141,7 @@ pub(crate) struct Eliminate<'s> {
     pub(crate) weights: &'s [f64],
     /// y, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Σ w e y, Σ w e, Σ w and Σ w y: room for four rows.
+    /// Σ w e y, Σ w e, Σ w and Σ w y: buffers for four rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
     pub(crate) singular: f64,
@@ -233,19 +233,19 @@ fn sum(values: &[f64]) -> f64 {
 /// What a change of the light pulls at the beam once M and O have followed it: v → c M w (u − α e − β)
 /// with u = c M v, and the change −α of M; returns the largest size of that less a share of the change
 /// before.
-pub(crate) struct Follow<'s> {
+pub(crate) struct Propagate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
     /// v, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Room for rows.
+    /// Buffers for rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// The share of the change before.
     pub(crate) share: f64,
 }
 
-impl pulp::NullaryFnOnce for Follow<'_> {
+impl pulp::NullaryFnOnce for Propagate<'_> {
     type Output = f64;
 
     #[inline(always)]

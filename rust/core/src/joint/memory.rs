@@ -1,7 +1,7 @@
 //! What the joint fit and its covariance hold in memory.
 
 use super::rim::WIDEST;
-use crate::coarse;
+use crate::coarse::{self, MOST_WAVES};
 use crate::exposures::Exposures;
 use crate::frames::Real;
 
@@ -23,7 +23,10 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let of_pixel = if exposures.offset() { 8 * count + 48 } else { 16 * count + 32 } + 30;
     let turned = if views > 1 { 24 * views } else { 0 };
     let rim = 2000 * WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
-    of_pixel * pixels + (27 * views + turned + 153) * cells + rim + coarse::bytes_needed(geometry)
+    of_pixel * pixels
+        + (27 * views + turned + 153) * cells
+        + rim
+        + coarse::bytes_needed(geometry, MOST_WAVES)
 }
 
 /// What the covariance of a joint fit holds beside the measurements, in bytes: the fit's, and for each

@@ -16,7 +16,7 @@ use super::survey::Block;
 use super::system::System;
 use super::waves::Waves;
 use super::wide::Wide;
-use crate::coarse::{Arm, Coarse, DAMPING, Hats, spacing};
+use crate::coarse::{Coarse, DAMPING, Entry, Hats, spacing};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -67,7 +67,7 @@ impl Preconditioner {
             let place = system.pass.grid.place(k, [centre(0, sensor.rows), centre(1, sensor.cols)]);
             [0, 1].map(|axis| place[axis] + system.state.shifts[k][axis] + origin[axis] as f64)
         };
-        let arm = |index: usize, k: usize, block: &Block| {
+        let entry = |index: usize, k: usize, block: &Block| {
             let [row, col] = seen(index, k);
             let columns = system.fluxes.columns.iter().enumerate();
             let mut others: Vec<_> =
@@ -76,11 +76,11 @@ impl Preconditioner {
                 let first = hats.count() + params + 2 * k;
                 others.extend([0, 1].map(|axis| (first + axis, block.slope[axis] / block.weight)));
             }
-            Arm { weight: block.weight, hats: hats.over(row, col), others }
+            Entry { weight: block.weight, hats: hats.over(row, col), others }
         };
-        let stars = blocks.chunks_exact(count).enumerate().map(|(index, blocks)| {
+        let entries = blocks.chunks_exact(count).enumerate().map(|(index, blocks)| {
             let lit = blocks.iter().enumerate().filter(|(_, block)| block.weight > 0.0);
-            lit.map(|(k, block)| arm(index, k, block)).collect()
+            lit.map(|(k, block)| entry(index, k, block)).collect()
         });
         // What a block's mean slope leaves of its mean square is the parameter's own.
         let mut own = system.precisions();
@@ -98,7 +98,8 @@ impl Preconditioner {
                 }
             }
         }
-        let coarse = Coarse::of_stars(&hats, &prior_of_hats(system, &hats), &own, stars, control)?;
+        let of_prior = prior_of_hats(system, &hats);
+        let coarse = Coarse::of_blocks(&hats, &of_prior, &own, entries, control)?;
         control.check()?;
         let waves = Waves::new(system, &blocks, seen);
         let rim = Rim::new(system, control)?;
@@ -233,7 +234,7 @@ impl FilterRows {
         Self { rows, line: vec![0.0; cols + FILTER.len() - 1] }
     }
 
-    /// Room for the row that comes in; the first one goes.
+    /// A buffer for the row that comes in; the first one goes.
     fn next(&mut self) -> &mut [f64] {
         self.rows.rotate_left(1);
         &mut self.rows[FILTER.len() - 1]

@@ -16,7 +16,7 @@ use std::ops::Range;
 
 use super::flux::Fluxes;
 use super::fused::Fused;
-use super::kernel::{Eliminate, Follow};
+use super::kernel::{Eliminate, Propagate};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
@@ -401,7 +401,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let moves = self.centred(&x[cells + params..]);
         let beam = std::mem::take(&mut self.state.beam);
         product.resize(cells, 0.0);
-        let sums = self.follow(&beam, x, &moves, product, share, control);
+        let sums = self.propagate(&beam, x, &moves, product, share, control);
         self.state.beam = beam;
         let sums = sums?;
         self.append(&sums, product);
@@ -438,7 +438,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// What a step pulls at the cells once M and O have followed it.
-    fn follow(
+    fn propagate(
         &mut self,
         beam: &[f64],
         x: &[f64],
@@ -457,8 +457,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see(&views, row_index, workspace);
             let (weights, values, sums) = workspace.parts();
             let fluxes = &pass.flux[..];
-            let follow = Follow { row, fluxes, weights, values, sums, share };
-            found.largest = found.largest.max(pulp::Arch::new().dispatch(follow));
+            let propagate = Propagate { row, fluxes, weights, values, sums, share };
+            found.largest = found.largest.max(pulp::Arch::new().dispatch(propagate));
         })
     }
 
@@ -472,7 +472,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn follow_common(&mut self, x: &[f64], control: &Control) -> Result<Vec<f64>> {
+    pub(crate) fn propagate_common(&mut self, x: &[f64], control: &Control) -> Result<Vec<f64>> {
         let cells = self.state.beam.len();
         let shares = self.shares(&x[cells..]);
         let moves = self.centred(&x[cells + self.fluxes.columns.len()..]);
@@ -486,8 +486,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see(&views, row_index, workspace);
             let (weights, values, sums) = workspace.parts();
             let fluxes = &pass.flux[..];
-            let follow = Follow { row: row.again(), fluxes, weights, values, sums, share: 0.0 };
-            pulp::Arch::new().dispatch(follow);
+            let propagate =
+                Propagate { row: row.again(), fluxes, weights, values, sums, share: 0.0 };
+            pulp::Arch::new().dispatch(propagate);
             row.change.fill(0.0);
             for (k, flux) in pass.flux.iter().enumerate() {
                 let pulls = values.of(k).iter().zip(&*row.sensitivity);

@@ -12,16 +12,16 @@ use crate::exposures::{Exposures, Flux, FluxKind, Mask, Measurements, Positions,
 use crate::frames::{Shape, Stack};
 use crate::geometry::Rotation;
 use crate::parallel::Workers;
+use crate::testing::{self, SENSOR, random_number};
 
-const SENSOR: Shape = Shape::new(9, 11);
 const ROTATIONS: [Rotation; 4] =
     [Rotation::None, Rotation::Quarter, Rotation::Half, Rotation::ThreeQuarters];
 const FLUX: [f64; 4] = [1.0, 1.1, 0.9, 1.2];
-const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [0.3, 2.2], [-1.6, 0.7], [2.4, 1.5]];
+const SHIFTS: &[[f64; 2]] = testing::SHIFTS.split_at(4).0;
 
 /// A number from 0 to 1 that looks random.
 fn random(index: usize) -> f64 {
-    ((index as f64 * 12.9898).sin() * 43758.5453).rem_euclid(1.0)
+    0.5 + 0.5 * random_number(index)
 }
 
 /// Variances, and what is masked.
@@ -61,8 +61,8 @@ fn with_system(
     let lamp = Flux { values: FLUX.to_vec(), kind: FluxKind::Known };
     let exposures =
         Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
-    let grid = Grid::new(SENSOR, &SHIFTS, rotations, false).unwrap();
-    let fluxes = Fluxes::new(&FLUX, &FluxKind::Known, &SHIFTS, rotations);
+    let grid = Grid::new(SENSOR, SHIFTS, rotations, false).unwrap();
+    let fluxes = Fluxes::new(&FLUX, &FluxKind::Known, SHIFTS, rotations);
     let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
     let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
     let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control);

@@ -2,11 +2,12 @@
 
 use super::operator::Reduced;
 use crate::coarse::{
-    Arm, Coarse, Complex, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
+    Coarse, Complex, Entry, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
     spacing_of_waves, times,
 };
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Geometry, Placement, Walk};
 use crate::parallel::Workers;
@@ -26,16 +27,16 @@ pub(super) fn coarse_spaces<T: Real>(
 ) -> Result<(Coarse, Modulated<f32>)> {
     let blocks = Blocks::new(hats, geometry);
     let weights = blocks.weights(geometry, reduced, workers, control)?;
-    let stars = weights
+    let entries = weights
         .chunks_exact(geometry.placements.len())
         .enumerate()
-        .map(|(block, weights)| blocks.star(block, weights, hats, geometry));
-    let coarse = Coarse::of_stars(hats, &reduced.prior_of_hats(hats), &[], stars, control)?;
+        .map(|(block, weights)| blocks.entries(block, weights, hats, geometry));
+    let coarse = Coarse::of_blocks(hats, &reduced.prior_of_hats(hats), &[], entries, control)?;
     control.check()?;
     let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
     // What a prior holds is no wave.
-    let without = geometry.views.len() > 1 || reduced.weak.is_some();
-    let seen = if without { Vec::new() } else { seen(reduced, &finer) };
+    let without = reduced.weak.is_some();
+    let seen = if without { Vec::new() } else { seen(reduced.exposures, &finer) };
     let spots: Vec<Vec<Spot>> = match &seen[..] {
         [] => Vec::new(),
         _ => weights
@@ -48,9 +49,18 @@ pub(super) fn coarse_spaces<T: Real>(
     Ok((coarse, waves))
 }
 
+/// How many waves the coarse space of these exposures has.
+pub(super) fn count_waves<T: Real>(exposures: &Exposures<'_, T>) -> usize {
+    let geometry = exposures.geometry();
+    seen(exposures, &Hats::new(geometry.sensor, spacing_of_waves(geometry))).len()
+}
+
 /// The waves that the exposures barely constrain, as a cell sees them: e^{−iq·d} of the pixel that sees it.
-fn seen<T: Real>(reduced: &Reduced<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
-    let exposures = reduced.exposures;
+/// Where exposures are turned against each other no wave is seen as one.
+fn seen<T: Real>(exposures: &Exposures<'_, T>, hats: &Hats) -> Vec<SeenWave> {
+    if exposures.geometry().views.len() > 1 {
+        return Vec::new();
+    }
     let places = Places(&exposures.geometry().placements);
     let weights = exposures.exposure_weights();
     let weighed = weights.iter().zip(exposures.flux()).map(|(weight, c)| weight * c * c);
@@ -146,9 +156,15 @@ impl Blocks {
     }
 
     /// What one block adds.
-    fn star(&self, block: usize, weights: &[f32], hats: &Hats, geometry: &Geometry) -> Vec<Arm> {
+    fn entries(
+        &self,
+        block: usize,
+        weights: &[f32],
+        hats: &Hats,
+        geometry: &Geometry,
+    ) -> Vec<Entry> {
         let spots = self.spots(block, weights, hats, geometry).into_iter();
-        spots.map(|Spot { weight, hats, .. }| Arm { weight, hats, others: Vec::new() }).collect()
+        spots.map(|Spot { weight, hats, .. }| Entry { weight, hats, others: Vec::new() }).collect()
     }
 
     /// The weight of each exposure in a block and the hats at the pixel that sees its centre.

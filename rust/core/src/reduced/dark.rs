@@ -5,7 +5,7 @@ pub(crate) struct Dark {
     /// The standard deviation of e.
     pub(super) std: Vec<f32>,
     /// a; 0 in pixels without measurement.
-    pub(super) follows: Vec<f32>,
+    pub(super) propagation: Vec<f32>,
     /// 1/c of each exposure.
     pub(super) factors: Vec<f32>,
 }

@@ -13,7 +13,7 @@
 
 use super::dark::Dark;
 use super::kernel::Common;
-use super::operator::{Reduced, Shown};
+use super::operator::{Input, Reduced};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -36,8 +36,8 @@ impl<T: Real> Reduced<'_, '_, T> {
         let one = vec![1.0; padding.width];
         self.common(&factors, &no_response, |_| &one, &mut sums, control)?;
         let pairs = sums.iter().zip(&self.inverse_diagonal);
-        let follows = pairs.map(|(sum, inverse)| sum * inverse).collect();
-        self.dark = Some(Dark { std, follows, factors });
+        let propagation = pairs.map(|(sum, inverse)| sum * inverse).collect();
+        self.dark = Some(Dark { std, propagation, factors });
         Ok(())
     }
 
@@ -67,7 +67,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// The variance that the dark adds to x · b, b being what noise makes of it; 0 without a dark.
     pub(crate) fn variance_by_dark(&mut self, x: &[f32], control: &Control) -> Result<f64> {
         let Some(dark) = self.dark.take() else { return Ok(0.0) };
-        self.hide(Shown::Step(x), control);
+        self.eliminate(Input::Step(x), control);
         let mut sums = self.padding.zeros(self.exposures.sensor().rows, self.workers, control);
         let row = |row: usize| self.padding.row(x, row);
         let done = self.common(&dark.factors, &self.sensitivity, row, &mut sums, control);
@@ -78,21 +78,21 @@ impl<T: Real> Reduced<'_, '_, T> {
     }
 
     /// The variance of what M follows at once, a² v; empty without a dark.
-    pub(crate) fn followed(&self) -> Vec<f32> {
+    pub(crate) fn propagated(&self) -> Vec<f32> {
         let of = |dark: &Dark| {
-            let pairs = dark.follows.iter().zip(&dark.std);
+            let pairs = dark.propagation.iter().zip(&dark.std);
             pairs.map(|(a, std)| (a * std).powi(2)).collect()
         };
         self.dark.as_ref().map(of).unwrap_or_default()
     }
 
     /// What M follows at once in one draw, a e.
-    pub(crate) fn follow(&self, draw: u64, image: &mut [f32], control: &Control) -> Result<()> {
+    pub(crate) fn propagate(&self, draw: u64, image: &mut [f32], control: &Control) -> Result<()> {
         let Some(dark) = &self.dark else { return Ok(()) };
         self.for_each_row(image, control, |row, values| {
             self.errors(dark, draw, row, values);
-            let follows = self.padding.row(&dark.follows, row);
-            values.iter_mut().zip(follows).for_each(|(value, a)| *value *= a);
+            let propagation = self.padding.row(&dark.propagation, row);
+            values.iter_mut().zip(propagation).for_each(|(value, a)| *value *= a);
             0.0
         })?;
         Ok(())
@@ -105,9 +105,9 @@ impl<T: Real> Reduced<'_, '_, T> {
         let place = &self.exposures.geometry().placements[exposure];
         let light = &self.light[place.view];
         let light = self.padding.row_from(light, row + place.row, place.col);
-        let follows = self.padding.row(&dark.follows, row);
+        let propagation = self.padding.row(&dark.propagation, row);
         self.errors(dark, draw, row, &mut noise[..self.padding.width]);
-        for ((noise, square), a) in noise.iter_mut().zip(light).zip(follows) {
+        for ((noise, square), a) in noise.iter_mut().zip(light).zip(propagation) {
             *noise *= dark.factors[exposure] - square.sqrt() * a;
         }
     }

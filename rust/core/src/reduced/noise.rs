@@ -11,7 +11,7 @@
 //! standard deviation everywhere and only its signs are drawn: a bit for each measurement.
 
 use super::kernel::{NoiseSlope, Sign, TwoTerms};
-use super::operator::{Draw, ExposureScratch, Reduced, RowWeight, Shown};
+use super::operator::{Draw, ExposureScratch, Input, Reduced, RowWeight};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -24,7 +24,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
     pub(crate) fn draw(&mut self, draw: Draw, slope: &mut [f32], control: &Control) -> Result<f64> {
-        self.hide(Shown::Noise(draw), control);
+        self.eliminate(Input::Noise(draw), control);
         self.for_each_row(slope, control, |row, slope| {
             let [mut scratch, mut of_noise] = [self.scratch(), self.scratch()];
             let lines = self.pixel_lines(row, &mut scratch);
@@ -52,7 +52,7 @@ impl<T: Real> Reduced<'_, '_, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
     pub(crate) fn two_terms(&mut self, variance: &mut [f32], control: &Control) -> Result<()> {
-        self.hide(Shown::Weight, control);
+        self.eliminate(Input::Weight, control);
         self.for_each_row(variance, control, |row, variance| {
             let mut scratch = self.scratch();
             let lines = self.pixel_lines(row, &mut scratch);
@@ -135,12 +135,12 @@ impl<T: Real> Reduced<'_, '_, T> {
 mod tests {
     use super::*;
     use crate::exposures::{Exposures, Flux, Mask, Measurements, Positions, Variance};
-    use crate::frames::{Shape, Stack};
+    use crate::frames::Stack;
     use crate::geometry::{Rotation, View};
     use crate::parallel::Workers;
     use crate::reduced::ConjugateGradients;
+    use crate::testing::{SENSOR, assert_unit_and_independent};
 
-    const SENSOR: Shape = Shape::new(9, 11);
     const SHIFTS: [[f64; 2]; 3] = [[0.0, 0.0], [2.0, 3.0], [-1.0, 1.0]];
     /// So that no weight, and no root of one, is 1.
     const VARIANCES: [f64; 3] = [4e-6, 9e-5, 5e-7];
@@ -189,12 +189,7 @@ mod tests {
                         dot(&x, &b) / energy.sqrt()
                     })
                     .collect();
-                // Five standard errors: a square of a normal value scatters by √2, a product of two by 1.
-                let draws = DRAWS as f64;
-                let square = heights.iter().map(|h| h * h).sum::<f64>() / draws;
-                assert!((square - 1.0).abs() < 5.0 * (2.0 / draws).sqrt(), "{square}");
-                let next = heights.windows(2).map(|pair| pair[0] * pair[1]).sum::<f64>() / draws;
-                assert!(next.abs() < 5.0 / draws.sqrt(), "{next}");
+                assert_unit_and_independent(&heights);
             }
         }
     }

@@ -9,6 +9,7 @@ use super::operator::Reduced;
 use crate::coarse::Hats;
 use crate::connectivity::NONE;
 use crate::frames::Real;
+use crate::padded::BAND;
 use crate::parallel::Workers;
 use crate::prior::Prior;
 use crate::random;
@@ -40,12 +41,12 @@ fn sums(
     let rows = pieces.len() / cols;
     let mut total = vec![0.0; count];
     if count == 1 {
-        let by_row = workers.map(rows, |row| {
+        let by_band = workers.map(rows.div_ceil(BAND), |band| {
             let mut sum = [0.0];
-            of_row(row, &mut sum);
+            (band * BAND..rows.min((band + 1) * BAND)).for_each(|row| of_row(row, &mut sum));
             sum[0]
         });
-        total[0] = by_row.into_iter().sum();
+        total[0] = by_band.into_iter().sum();
     } else {
         (0..rows).for_each(|row| of_row(row, &mut total));
     }
@@ -76,20 +77,29 @@ impl<T: Real> Reduced<'_, '_, T> {
     pub(super) fn add_prior(&self, x: &[f32], product: &mut [f32]) -> f64 {
         let Some(weak) = &self.weak else { return 0.0 };
         let (padding, cols) = (self.padding, self.exposures.sensor().cols);
-        let at = |image: &[f32], row: usize, col: usize| f64::from(padding.row(image, row)[col]);
-        let count = weak.totals.len();
-        let shares = sums(&weak.pieces, count, cols, self.workers, |row, col| at(x, row, col));
-        let shares: Vec<f64> =
-            shares.iter().zip(&weak.totals).map(|(sum, total)| sum / total).collect();
-        let varied = |row: usize, col: usize| {
-            let share = shares[weak.pieces[row * cols + col] as usize];
-            at(x, row, col) - share * at(&self.sensitivity, row, col)
+        let by_piece = |value: &(dyn Fn(usize, usize) -> f64 + Sync + Send)| {
+            sums(&weak.pieces, weak.totals.len(), cols, self.workers, value)
         };
-        let pull = |row: usize, col: usize| at(&weak.weights, row, col) * varied(row, col);
-        let energy = |row: usize, col: usize| pull(row, col) * varied(row, col);
-        let total: f64 = sums(&weak.pieces, count, cols, self.workers, energy).iter().sum();
+        let lead = padding.lead;
+        let place = |row: usize, col: usize| lead + row * padding.width + col;
+        let moved = by_piece(&|row, col| f64::from(x[place(row, col)]));
+        let shares: Vec<f64> =
+            moved.iter().zip(&weak.totals).map(|(sum, total)| sum / total).collect();
+        let varied = |row: usize, col: usize| {
+            let (at, piece) = (place(row, col), weak.pieces[row * cols + col] as usize);
+            f64::from(x[at]) - shares[piece] * f64::from(self.sensitivity[at])
+        };
+        let weight = |row: usize, col: usize| f64::from(weak.weights[place(row, col)]);
+        let pull = |row: usize, col: usize| match weight(row, col) {
+            0.0 => 0.0,
+            weight => weight * varied(row, col),
+        };
+        let energy = by_piece(&|row, col| match weight(row, col) {
+            0.0 => 0.0,
+            weight => weight * varied(row, col).powi(2),
+        });
         self.add_balanced(weak, product, pull);
-        total
+        energy.iter().sum()
     }
 
     /// Adds Vᵀ of what is pulled at pixels.
@@ -100,17 +110,22 @@ impl<T: Real> Reduced<'_, '_, T> {
         pull: impl Fn(usize, usize) -> f64 + Sync + Send,
     ) {
         let (padding, cols) = (self.padding, self.exposures.sensor().cols);
-        let moment = |row: usize, col: usize| {
-            pull(row, col) * f64::from(padding.row(&self.sensitivity, row)[col])
-        };
         let count = weak.totals.len();
+        let moment = |row: usize, col: usize| {
+            pull(row, col) * f64::from(self.sensitivity[padding.lead + row * padding.width + col])
+        };
         let common = sums(&weak.pieces, count, cols, self.workers, moment);
         let common: Vec<f64> =
             common.iter().zip(&weak.totals).map(|(sum, total)| sum / total).collect();
-        self.workers.map_blocks(padding.body_mut(product), padding.width, |row, line| {
-            for (col, value) in line[..cols].iter_mut().enumerate() {
-                if let Ok(piece) = usize::try_from(weak.pieces[row * cols + col]) {
-                    *value += (pull(row, col) - common[piece]) as f32;
+        let body = padding.body_mut(product);
+        self.workers.map_blocks(body, BAND * padding.width, |band, rows| {
+            for (index, line) in rows.chunks_exact_mut(padding.width).enumerate() {
+                let row = band * BAND + index;
+                let pieces = &weak.pieces[row * cols..][..cols];
+                for (col, (value, &piece)) in line.iter_mut().zip(pieces).enumerate() {
+                    if let Ok(piece) = usize::try_from(piece) {
+                        *value += (pull(row, col) - common[piece]) as f32;
+                    }
                 }
             }
         });

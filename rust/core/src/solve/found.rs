@@ -20,9 +20,13 @@ pub(super) struct Found {
 }
 
 impl Found {
-    /// The result: the pixels' flags, then M in its gauge, of mean 1 in each component.
-    pub(super) fn into_fit(self, workers: &Workers) -> Fit {
-        let Self { mut fit, held, dead, without_offset, fluxes } = self;
+    /// The result: the pixels' flags, then M in its gauge, of mean 1 in each component; the `unreliable`
+    /// pixels are flagged and not in the mean, like those that the prior holds.
+    pub(super) fn into_fit(self, unreliable: &[usize], workers: &Workers) -> Fit {
+        let Self { mut fit, mut held, dead, without_offset, fluxes } = self;
+        held.extend(unreliable);
+        held.sort_unstable();
+        held.dedup();
         fit.flags = flags(&fit.components);
         let mark = |flags: &mut [u32], pixels: &[usize], flag: u32| {
             pixels.iter().for_each(|&pixel| flags[pixel] |= flag | flag::DO_NOT_USE);

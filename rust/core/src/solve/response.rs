@@ -31,8 +31,8 @@ pub(super) fn without_response<T: Real>(
     let weak = |&pixel: &usize| sensitivity[pixel].abs() <= WEAK_RESPONSE * typical;
     // M²D is what a pixel shows of light: unlike M, the same in any gauge.
     let nil = |&pixel: &usize| {
-        let shown = sensitivity[pixel].powi(2) * information_at(exposures, beam, pixel);
-        shown <= noise.max(NIL_RESPONSE * ordinary)
+        let strength = sensitivity[pixel].powi(2) * information_at(exposures, beam, pixel);
+        strength <= noise.max(NIL_RESPONSE * ordinary)
     };
     (0..sensitivity.len()).filter(weak).filter(nil).collect()
 }

@@ -125,8 +125,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             return Ok(());
         }
         let mut dark = Dark::of(&mut self.system, variance, control)?;
-        let followed: Vec<f64> = dark.followed().collect();
-        let in_gauge = self.tilts.gauge.diagonal(&followed);
+        let propagated: Vec<f64> = dark.propagated().collect();
+        let in_gauge = self.tilts.gauge.diagonal(&propagated);
         dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
         self.dark = Some(dark);
         Ok(())
@@ -140,12 +140,12 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             return Ok(left);
         }
         self.search = ConjugateGradients::default();
-        let followed = mean_misfit(pixels, |draw| {
+        let propagated = mean_misfit(pixels, |draw| {
             let slope = self.pulls_of_noise(draw, false, control)?;
             self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
             Ok(self.search.energy)
         })?;
-        Ok(left - followed)
+        Ok(left - propagated)
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
@@ -216,7 +216,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     fn known_part(&self) -> Vec<f32> {
         let mut own = self.own();
         if let Some(dark) = &self.dark {
-            own.iter_mut().zip(dark.followed()).for_each(|(own, followed)| *own += followed);
+            own.iter_mut().zip(dark.propagated()).for_each(|(own, propagated)| *own += propagated);
         }
         let in_gauge = self.tilts.gauge.diagonal(&own).enumerate();
         let variance = in_gauge.map(|(pixel, mut variance)| {
@@ -264,7 +264,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// once S x = its pull is solved.
     fn variance_by_dark(&mut self, gain: &[f64], control: &Control) -> Result<f64> {
         let Some(dark) = &self.dark else { return Ok(0.0) };
-        let influence = self.system.follow_common(&self.search.x, control)?;
+        let influence = self.system.propagate_common(&self.search.x, control)?;
         Ok(dark.variance_of(gain, &influence))
     }
 

@@ -23,7 +23,7 @@ pub(super) struct Dark {
     /// The standard deviation of e, by pixel.
     std: Vec<f64>,
     /// a.
-    follows: Vec<f64>,
+    propagation: Vec<f64>,
     /// The mean of eᵀ 1ᵀ w Q 1 e.
     pub(super) left: f64,
     /// The variance of a e in the gauge, in the units of the map.
@@ -59,15 +59,15 @@ impl Dark {
                     found.objective += variance[col] * (sum - row.change[col] * along);
                 }
             })?;
-        let mut follows = vec![0.0; variance.len()];
-        add_change(system, &mut follows);
+        let mut propagation = vec![0.0; variance.len()];
+        add_change(system, &mut propagation);
         let std = variance.iter().map(|v| v.sqrt()).collect();
-        Ok(Self { std, follows, left: found.objective, in_gauge: Vec::new() })
+        Ok(Self { std, propagation, left: found.objective, in_gauge: Vec::new() })
     }
 
     /// The variance of a e.
-    pub(super) fn followed(&self) -> impl Iterator<Item = f64> {
-        self.follows.iter().zip(&self.std).map(|(a, std)| (a * std).powi(2))
+    pub(super) fn propagated(&self) -> impl Iterator<Item = f64> {
+        self.propagation.iter().zip(&self.std).map(|(a, std)| (a * std).powi(2))
     }
 
     /// e of a row of pixels in one draw.
@@ -77,14 +77,14 @@ impl Dark {
     }
 
     /// a e in one draw.
-    pub(super) fn follow(&self, draw: u64, sensor: Shape) -> Vec<f64> {
+    pub(super) fn propagate(&self, draw: u64, sensor: Shape) -> Vec<f64> {
         let errors = (0..sensor.rows).flat_map(|row| self.errors(draw, row, sensor));
-        errors.zip(&self.follows).map(|(error, a)| a * error).collect()
+        errors.zip(&self.propagation).map(|(error, a)| a * error).collect()
     }
 
     /// What it adds to the variance of Σ g M where 1ᵀ w Q J x is `influence`.
     pub(super) fn variance_of(&self, gain: &[f64], influence: &[f64]) -> f64 {
-        let pixels = self.follows.iter().zip(&self.std).zip(gain.iter().zip(influence));
+        let pixels = self.propagation.iter().zip(&self.std).zip(gain.iter().zip(influence));
         pixels.map(|((a, std), (g, h))| ((a * g + h) * std).powi(2)).sum()
     }
 }

@@ -31,7 +31,7 @@ use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::{Real, flag};
-use crate::geometry::{Geometry, View};
+use crate::geometry::View;
 use crate::memory;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
@@ -50,7 +50,7 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     /// b.
     slope: Vec<f32>,
     /// The variance of what M follows of the dark at once, in the gauge; empty without a dark.
-    followed: Vec<f32>,
+    propagated: Vec<f32>,
     undetermined: Vec<bool>,
     incomplete: u64,
 }
@@ -68,7 +68,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
-        memory::check(bytes_needed(exposures.geometry()), || {
+        memory::check(bytes_needed(exposures), || {
             format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
         })?;
         let (sensitivity, beam) = (solution.sensitivity, solution.beam.values);
@@ -115,7 +115,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         }
         let slope = padding.zeros(exposures.sensor().rows, workers, control);
         let smallest = Smallest::default();
-        let followed = Vec::new();
+        let propagated = Vec::new();
         Ok(Self {
             exposures,
             workers,
@@ -124,7 +124,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             valid,
             count,
             slope,
-            followed,
+            propagated,
             undetermined,
             incomplete: 0,
         })
@@ -133,7 +133,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
     /// Takes the noise of the dark into account, of these variances.
     pub(super) fn set_dark(&mut self, variance: &[f64], control: &Control) -> Result<()> {
         self.search.reduced.set_dark(variance, control)?;
-        self.followed = self.in_gauge(self.search.reduced.followed());
+        self.propagated = self.in_gauge(self.search.reduced.propagated());
         Ok(())
     }
 
@@ -297,12 +297,12 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
             let m = f64::from(m);
             *variance += (m * (m * mean - 2.0 * f64::from(*u) / *count)) as f32;
         }
-        variance.iter_mut().zip(&self.followed).for_each(|(variance, dark)| *variance += dark);
+        variance.iter_mut().zip(&self.propagated).for_each(|(variance, dark)| *variance += dark);
         Ok(variance)
     }
 
-    fn followed(&self) -> &[f32] {
-        &self.followed
+    fn propagated(&self) -> &[f32] {
+        &self.propagated
     }
 
     /// Adds the square of T x, in the gauge, of one draw x.
@@ -317,7 +317,7 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
             search.residual.copy_from_slice(slope);
         }
         self.apply_inverse(LACK_OF_DRAW, control)?;
-        let followed = self.follow_dark(draw, control)?;
+        let propagated = self.propagate_dark(draw, control)?;
         let Self { search, slope, workers, valid, count, .. } = self;
         // T x = x − D⁻¹ S x of the noise, and x of the dark: x − D⁻¹ (b − r), b being that of the noise.
         let inverse = &search.reduced.inverse_diagonal;
@@ -336,8 +336,8 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
             for (index, square) in squares.iter_mut().enumerate() {
                 let rest = slope[from + index] - mean * m[from + index];
                 *square += rest * rest;
-                if let Some(followed) = followed.get(from + index) {
-                    *square += 2.0 * rest * followed;
+                if let Some(propagated) = propagated.get(from + index) {
+                    *square += 2.0 * rest * propagated;
                 }
             }
         });
@@ -347,16 +347,16 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
 
 impl<T: Real> ReducedCovariance<'_, '_, T> {
     /// What M follows at once of the dark in one draw, in the gauge; empty without a dark.
-    fn follow_dark(&self, draw: u64, control: &Control) -> Result<Vec<f32>> {
+    fn propagate_dark(&self, draw: u64, control: &Control) -> Result<Vec<f32>> {
         if !self.search.reduced.has_dark() {
             return Ok(Vec::new());
         }
-        let mut followed = self.image(control);
-        self.search.reduced.follow(draw, &mut followed, control)?;
-        let mean = (dot(&followed, &self.valid, self.workers) / self.count) as f32;
+        let mut propagated = self.image(control);
+        self.search.reduced.propagate(draw, &mut propagated, control)?;
+        let mean = (dot(&propagated, &self.valid, self.workers) / self.count) as f32;
         let m = &self.search.reduced.sensitivity;
-        followed.iter_mut().zip(m).for_each(|(value, m)| *value -= mean * m);
-        Ok(followed)
+        propagated.iter_mut().zip(m).for_each(|(value, m)| *value -= mean * m);
+        Ok(propagated)
     }
 }
 
@@ -374,7 +374,8 @@ fn dot(a: &[f32], b: &[f32], workers: &Workers) -> f64 {
 
 /// What both take beside the measurements, in bytes: a search and three images more, a copy of L in
 /// each view, and the map.
-fn bytes_needed(geometry: &Geometry) -> u64 {
+fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
+    let geometry = exposures.geometry();
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
@@ -382,5 +383,5 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     let turned = if views > 1 { of_views } else { 0 };
     let more = 12 * places(geometry.sensor.rows) + turned;
-    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(geometry)
+    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(exposures)
 }

@@ -45,7 +45,7 @@ pub(super) trait Drawn {
     /// The part of the variance of M that is known.
     fn known(&mut self, control: &Control) -> Result<Vec<f32>>;
     /// The part of the known variance whose draws multiply the rest; empty without a dark.
-    fn followed(&self) -> &[f32];
+    fn propagated(&self) -> &[f32];
     /// Adds the square of the rest of one draw, and twice its product with what M follows at once.
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()>;
 }
@@ -70,7 +70,7 @@ impl Sampled {
             problem.add_draw(sampled.draws, &mut sampled.squares, control)?;
             sampled.draws += 1;
             if sampled.draws == wanted {
-                let share = sampled.share(problem.valid(), problem.followed());
+                let share = sampled.share(problem.valid(), problem.propagated());
                 let needed = (exactness(share, 1) / EXACTNESS).powi(2).ceil() as u64;
                 wanted = needed.min(MOST_DRAWS);
                 sampled.exactness = exactness(share, sampled.draws);
@@ -87,9 +87,9 @@ impl Sampled {
     /// The root mean square, over the valid pixels, of the share of the variance that is sampled,
     /// without what the scatter of so many draws adds to it.
     ///
-    /// With x sampled and f `followed`, x² + 2 x f scatters by 2 s² + 4 f² s, s being the variance of x:
+    /// With x sampled and f `propagated`, x² + 2 x f scatters by 2 s² + 4 f² s, s being the variance of x:
     /// as the square of a share with s² + 2 f² s would.
-    fn share(&self, valid: &[f32], followed: &[f32]) -> f64 {
+    fn share(&self, valid: &[f32], propagated: &[f32]) -> f64 {
         let draws = self.draws as f64;
         let [mut count, mut squares, mut products] = [0.0; 3];
         for (pixel, &valid) in valid.iter().enumerate() {
@@ -97,8 +97,8 @@ impl Sampled {
             let variance = self.variance(pixel).max(f64::MIN_POSITIVE);
             let share = sampled / variance;
             squares += f64::from(valid) * share.powi(2);
-            let followed = followed.get(pixel).map_or(0.0, |followed| f64::from(*followed));
-            products += f64::from(valid) * share * followed / variance;
+            let propagated = propagated.get(pixel).map_or(0.0, |propagated| f64::from(*propagated));
+            products += f64::from(valid) * share * propagated / variance;
             count += f64::from(valid);
         }
         let own = (squares - 4.0 * products / draws) / count * draws / (draws + 2.0);

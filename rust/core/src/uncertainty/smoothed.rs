@@ -22,7 +22,7 @@ pub(super) struct Change {
     /// What the beam and the other unknowns make of M.
     pub(super) sampled: Vec<f64>,
     /// What M follows of the dark at once; empty without a dark.
-    pub(super) followed: Vec<f64>,
+    pub(super) propagated: Vec<f64>,
 }
 
 /// A linear problem that draws can be made of and smoothed.
@@ -32,7 +32,7 @@ pub(super) trait Smooth {
     /// What the sampled part is nearly proportional to; 0 in pixels that do not count.
     fn local(&mut self, control: &Control) -> Result<Vec<f64>>;
     /// The part of the known variance whose draws multiply the rest; empty without a dark.
-    fn followed(&self) -> &[f32];
+    fn propagated(&self) -> &[f32];
     /// One draw.
     fn change(&mut self, draw: u64, control: &Control) -> Result<Change>;
 }
@@ -54,7 +54,7 @@ pub(super) fn smoothed(
     while sums.draws < wanted {
         control.report("uncertainty", sums.draws, wanted);
         let change = problem.change(sums.draws, control)?;
-        sums.add(&change, problem.followed());
+        sums.add(&change, problem.propagated());
         if sums.draws == wanted {
             let exactness = sums.exactness();
             let needed = wanted as f64 * (exactness / EXACTNESS).powi(2);
@@ -89,7 +89,7 @@ impl Sums {
     }
 
     /// Adds the smoothed variance of one draw.
-    fn add(&mut self, change: &Change, followed: &[f32]) {
+    fn add(&mut self, change: &Change, propagated: &[f32]) {
         let counts = |pixel: usize| self.local[pixel] > 0.0;
         let squares = change.sampled.iter().enumerate();
         let mut own: Vec<f64> =
@@ -99,7 +99,7 @@ impl Sums {
             *own *= if *around > 0.0 { local / around } else { 0.0 };
         }
         for ((own, product), variance) in
-            own.iter_mut().zip(self.products(change, followed)).zip(followed)
+            own.iter_mut().zip(self.products(change, propagated)).zip(propagated)
         {
             *own += 2.0 * product * f64::from(*variance);
         }
@@ -111,15 +111,15 @@ impl Sums {
     }
 
     /// The products of a draw with what M follows at once, over the squares of the latter, in each window.
-    fn products(&self, change: &Change, followed: &[f32]) -> Vec<f64> {
-        if followed.is_empty() {
+    fn products(&self, change: &Change, propagated: &[f32]) -> Vec<f64> {
+        if propagated.is_empty() {
             return Vec::new();
         }
         let counts = |pixel: usize| self.local[pixel] > 0.0;
-        let pairs = change.sampled.iter().zip(&change.followed).enumerate();
+        let pairs = change.sampled.iter().zip(&change.propagated).enumerate();
         let mut products: Vec<f64> =
             pairs.map(|(pixel, (a, b))| if counts(pixel) { a * b } else { 0.0 }).collect();
-        let squares = followed.iter().enumerate();
+        let squares = propagated.iter().enumerate();
         let mut around: Vec<f64> =
             squares.map(|(pixel, v)| if counts(pixel) { f64::from(*v) } else { 0.0 }).collect();
         over_windows(&mut products, self.sensor);

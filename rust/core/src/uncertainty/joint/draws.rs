@@ -4,7 +4,7 @@ use super::JointCovariance;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
-use crate::joint::Follow;
+use crate::joint::Propagate;
 use crate::random::{self, Streams};
 use crate::uncertainty::joint_pulls::{pull_by, pull_of, variance_by_cells};
 use crate::uncertainty::sampling::{Drawn, LACK_OF_DRAW};
@@ -27,14 +27,14 @@ impl<T: Real> JointCovariance<'_, '_, T> {
         let variances = self.considered_variances().into_iter();
         let wrong: Vec<f64> = variances.map(|variance| sign() * variance.sqrt()).collect();
         let mut sampled = self.change(slope, &wrong, LACK_OF_DRAW, control)?;
-        let mut followed = Vec::new();
+        let mut propagated = Vec::new();
         if let Some(dark) = &self.dark {
-            followed = dark.follow(draw, self.system.pass.exposures.sensor());
-            self.tilts.gauge.apply(&mut followed, self.system.pass.workers);
+            propagated = dark.propagate(draw, self.system.pass.exposures.sensor());
+            self.tilts.gauge.apply(&mut propagated, self.system.pass.workers);
         }
         let unit = self.scale.sqrt();
-        sampled.iter_mut().chain(&mut followed).for_each(|change| *change /= unit);
-        Ok(Change { sampled, followed })
+        sampled.iter_mut().chain(&mut propagated).for_each(|change| *change /= unit);
+        Ok(Change { sampled, propagated })
     }
 
     /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
@@ -96,16 +96,17 @@ impl<T: Real> JointCovariance<'_, '_, T> {
                 let values = values.of_mut(k);
                 for (value, (weight, m)) in values.iter_mut().zip(pixels) {
                     // As a change of the light, which a pixel without response does not show.
-                    let shown = weight.sqrt() * flux * m;
-                    *value = if shown == 0.0 || !of_each { 0.0 } else { sign() / shown };
+                    let response = weight.sqrt() * flux * m;
+                    *value = if response == 0.0 || !of_each { 0.0 } else { sign() / response };
                 }
                 for ((value, error), m) in values.iter_mut().zip(&errors).zip(&*row.sensitivity) {
-                    let shown = flux * m;
-                    *value += if shown == 0.0 { 0.0 } else { error / shown };
+                    let response = flux * m;
+                    *value += if response == 0.0 { 0.0 } else { error / response };
                 }
             }
             let fluxes = &pass.flux[..];
-            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
+            let propagate = Propagate { row, fluxes, weights, values, sums, share: 0.0 };
+            pulp::Arch::new().dispatch(propagate);
         })
     }
 
@@ -131,17 +132,17 @@ impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
         Ok(self.known_part())
     }
 
-    fn followed(&self) -> &[f32] {
+    fn propagated(&self) -> &[f32] {
         self.dark.as_ref().map_or(&[], |dark| &dark.in_gauge)
     }
 
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        let Change { sampled, followed } = self.drawn_change(draw, control)?;
+        let Change { sampled, propagated } = self.drawn_change(draw, control)?;
         for (square, change) in squares.iter_mut().zip(&sampled) {
             *square += (change * change) as f32;
         }
-        for ((square, change), followed) in squares.iter_mut().zip(&sampled).zip(&followed) {
-            *square += (2.0 * change * followed) as f32;
+        for ((square, change), propagated) in squares.iter_mut().zip(&sampled).zip(&propagated) {
+            *square += (2.0 * change * propagated) as f32;
         }
         Ok(())
     }
@@ -161,8 +162,8 @@ impl<T: Real> Smooth for JointCovariance<'_, '_, T> {
         Ok(local)
     }
 
-    fn followed(&self) -> &[f32] {
-        Drawn::followed(self)
+    fn propagated(&self) -> &[f32] {
+        Drawn::propagated(self)
     }
 
     fn change(&mut self, draw: u64, control: &Control) -> Result<Change> {

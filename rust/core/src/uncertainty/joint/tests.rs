@@ -2,11 +2,11 @@
 
 use super::*;
 use crate::exposures::{Flux, FluxKind, Mask, Measurements, Positions, Variance};
-use crate::frames::{Shape, Stack};
+use crate::frames::Stack;
 use crate::geometry::Rotation;
+use crate::parallel::dot;
+use crate::testing::{SENSOR, SHIFTS, assert_unit_and_independent, random_number, random_vector};
 
-const SENSOR: Shape = Shape::new(9, 11);
-const SHIFTS: [[f64; 2]; 5] = [[0.0, 0.0], [0.3, 2.2], [-1.6, 0.7], [2.4, 1.5], [0.8, -2.1]];
 const ROTATIONS: [Rotation; 5] =
     [Rotation::None, Rotation::None, Rotation::Half, Rotation::Quarter, Rotation::None];
 const FLUX: [f64; 5] = [1.0, 0.5, 0.9, 1.2, 0.7];
@@ -84,21 +84,8 @@ impl Case {
     }
 }
 
-/// A number from −1 to 1 that looks random.
-fn random_number(index: usize) -> f64 {
-    2.0 * ((index as f64 * 12.9898).sin() * 43758.5453).rem_euclid(1.0) - 1.0
-}
-
-fn random_vector(length: usize, seed: usize) -> Vec<f64> {
-    (0..length).map(|i| random_number(1000 * seed + i)).collect()
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
-/// Steps of the cells, of each flux and of each shift, for themselves.
-fn directions(system: &System<'_, '_, f64>) -> Vec<Vec<f64>> {
+/// Steps of the cells, of each flux and of each shift alone, and of each of these together with cells.
+fn directions(system: &mut System<'_, '_, f64>, control: &Control) -> Vec<Vec<f64>> {
     let (cells, size) = (system.state.beam.len(), system.size());
     let of_cells = (1..4).map(|seed| {
         let mut step = random_vector(size, seed);
@@ -110,25 +97,35 @@ fn directions(system: &System<'_, '_, f64>) -> Vec<Vec<f64>> {
         step[unknown] = 1.0;
         step
     });
-    of_cells.chain(alone).collect()
+    let mut steps: Vec<Vec<f64>> = alone.collect();
+    let with_cells: Vec<_> = steps.iter().map(|step| coupled(system, step, control)).collect();
+    steps.extend(with_cells);
+    of_cells.chain(steps).collect()
+}
+
+/// A step of one parameter, and that of the cells that it pulls, of equal energies: S couples both, so a
+/// draw whose parts have the covariances of their blocks alone has another variance along it.
+fn coupled(system: &mut System<'_, '_, f64>, step: &[f64], control: &Control) -> Vec<f64> {
+    let cells = system.state.beam.len();
+    let mut pulled = product(system, step, control).unwrap();
+    let own = dot(step, &pulled);
+    pulled[cells..].fill(0.0);
+    let of_cells = dot(&pulled, &product(system, &pulled, control).unwrap());
+    let unit = |(own_part, pulled): (&f64, &f64)| own_part / own.sqrt() + pulled / of_cells.sqrt();
+    step.iter().zip(&pulled).map(unit).collect()
 }
 
 #[test]
 fn draws_have_the_covariance_of_the_problem_and_are_independent() {
     for case in Case::all() {
         case.visit(|covariance, control| {
-            let directions = directions(&covariance.system);
+            let directions = directions(&mut covariance.system, control);
             let draws: Vec<Vec<f64>> =
                 (0..DRAWS).map(|draw| covariance.draw(draw, control).unwrap()).collect();
             for x in directions {
                 let energy = dot(&x, &product(&mut covariance.system, &x, control).unwrap());
                 let heights: Vec<f64> = draws.iter().map(|b| dot(&x, b) / energy.sqrt()).collect();
-                // Five standard errors: a square of a normal value scatters by √2, a product of two by 1.
-                let draws = DRAWS as f64;
-                let square = dot(&heights, &heights) / draws;
-                assert!((square - 1.0).abs() < 5.0 * (2.0 / draws).sqrt(), "{square}");
-                let next = dot(&heights, &heights[1..]) / draws;
-                assert!(next.abs() < 5.0 / draws.sqrt(), "{next}");
+                assert_unit_and_independent(&heights);
             }
         });
     }
