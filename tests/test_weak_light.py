@@ -50,13 +50,27 @@ EXPERIMENTS = {
 }
 
 
+OPEN_FAULTS = {
+    "dark corner": pytest.mark.xfail(strict=True, reason="does not converge, and says so"),
+    "laser beam, shifts between pixels": pytest.mark.xfail(
+        strict=True, reason="converges; a misfit is found in its residuals"
+    ),
+}
+
+
+# Of the narrow beam most of the sensor sees nothing, which is said.
+@pytest.mark.filterwarnings("ignore:the exposures determine only")
 class TestAlwaysAnAnswer:
-    @pytest.mark.parametrize("name", EXPERIMENTS)
+    @pytest.mark.parametrize(
+        "name",
+        [pytest.param(name, marks=OPEN_FAULTS.get(name, ())) for name in EXPERIMENTS],
+    )
     def test_it_converges_and_errors_are_as_stated(self, name):
         shape, beam, shifts = EXPERIMENTS[name]
         frames, truth = experiment(shape, beam, shifts)
         cal = equipix.calibrate(frames, shifts, uncertainty=True)
         assert cal.converged
+        assert cal.components == 1
         assert np.isfinite(cal.sensitivity).all()
         assert (cal.sensitivity_std > 0).all()
         good = (cal.flags & Flag.DO_NOT_USE) == 0
@@ -107,18 +121,16 @@ class TestTheMinimum:
         return slope, np.sum(light**2, axis=0) + cal.weighted.fit.prior / mean**2
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_both_methods_end_where_nothing_pulls(self, seed):
+    def test_it_ends_where_nothing_pulls(self, seed):
         beam = simulate.gaussian_beam((24, 32), width=7)
         frames, _ = experiment((24, 32), beam, SMALL_CROSS, noise=5e-3, seed=seed)
         options = {"tolerance": 1e-8}
         fast = equipix.calibrate(frames, SMALL_CROSS, **options)
-        slow = equipix.calibrate(frames, SMALL_CROSS, method="coordinate-descent", **options)
-        for cal in (fast, slow):
-            assert cal.converged
-            assert (cal.weighted.fit.prior > 0).mean() > 0.1
-            slope, weight = self.slope(cal, frames)
-            # A sweep moves no M by more than the tolerance, right within a factor 10.
-            assert abs(slope / weight).max() < 10 * 1e-8
+        assert fast.converged
+        assert (fast.weighted.fit.prior > 0).mean() > 0.1
+        slope, weight = self.slope(fast, frames)
+        # A sweep moves no M by more than the tolerance, right within a factor 10.
+        assert abs(slope / weight).max() < 10 * 1e-8
         assert (np.diff(fast.history.objective) <= 1e-12 * fast.history.objective[:-1]).all()
 
     def test_the_prior_follows_from_the_noise_not_from_the_unit(self):

@@ -42,6 +42,9 @@ pub(super) fn minimise<'m, 'a, T: Real>(
         (Scale::of(exposures), ConjugateGradients::new(exposures, workers, control));
     let mut weak = WeakLight::new();
     let mut looks: Vec<Look> = Vec::new();
+    // Sweeps without a prior would fit noise.
+    estimate.slopes(scale.slope(), &mut search.residual, control)?;
+    weak.update(&mut estimate, &mut search, control)?;
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
     loop {

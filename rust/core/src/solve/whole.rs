@@ -34,7 +34,7 @@ pub(super) fn minimise<T: Real>(
     memory::check(bytes_needed(exposures), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
-    let (mut estimate, history, held, objective) = match options.method {
+    let (mut estimate, history, mut held, objective) = match options.method {
         Method::Multiscale => {
             let found = multiscale::minimise(exposures, options, start, workers, control)?;
             let objective = found.1.last().objective;
@@ -54,6 +54,17 @@ pub(super) fn minimise<T: Real>(
     dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
     let mut components = Components::of(exposures, &ties, control)?;
     if let Some(prior) = &prior {
+        // Weak pixels apart from the largest part stand out by noise.
+        let apart = |&pixel: &usize| {
+            prior.weights[pixel] > 0.0 && components.pixels[pixel] > 0 && ties[pixel] == Tie::Firm
+        };
+        let more: Vec<usize> = (0..ties.len()).filter(apart).collect();
+        if !more.is_empty() {
+            more.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
+            held.extend(more);
+            held.sort_unstable();
+            components = Components::of(exposures, &ties, control)?;
+        }
         components.adopt(exposures, &prior.pieces, &ties, control)?;
     }
     let Geometry { beam: shape, origin, .. } = *exposures.geometry();
