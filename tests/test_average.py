@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import textwrap
@@ -208,6 +209,7 @@ FRAMES = np.zeros((3, 4, 5), np.uint8)
         ([None], {}, r"'source\[0\]' has dtype object"),
         (FRAMES, {"dark": np.zeros((5, 4))}, r"'dark' has shape \(5, 4\), expected \(4, 5\)"),
         (FRAMES, {"dark": np.zeros(4)}, "'dark' has shape"),
+        (FRAMES, {"dark": np.full((4, 5), np.nan)}, "'dark' holds no finite number"),
         (FRAMES, {"saturation": np.nan}, "'saturation' is nan"),
         (FRAMES, {"saturation": "full"}, "'saturation' is 'full'"),
         (FRAMES, {"workers": 0}, "'workers' is 0"),
@@ -369,3 +371,23 @@ def test_a_mask_that_is_none_is_refused(mask: object) -> None:
 def test_a_saturation_level_is_above_0(level: float) -> None:
     with pytest.raises(InputError, match=r"'saturation' is .*above 0"):
         equipix.average(np.ones((2, 3, 4)), saturation=level)
+
+
+@pytest.mark.parametrize("name", ["variance", "variance_of_mean", "count", "saturated", "dark"])
+def test_statistics_of_different_shapes_are_refused_by_name(name: str) -> None:
+    good, other = equipix.average(np.ones((3, 4, 5))), equipix.average(np.ones((3, 4, 6)))
+    wrong = other if name == "dark" else getattr(other, name)
+    with pytest.raises(InputError, match=rf"'{name}' of FrameStatistics has shape \(4, 6\)"):
+        dataclasses.replace(good, **{name: wrong})
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_a_variance_that_is_none_is_refused(value: float) -> None:
+    rng = np.random.default_rng(1)
+    shifts = [(0, 0), (0, 3), (3, 0)]
+    frames = [equipix.average(rng.normal(1000, 5, (4, 20, 30))) for _ in shifts]
+    variance = frames[1].variance.copy()
+    variance[2, 3] = value
+    frames[1] = dataclasses.replace(frames[1], variance=variance)
+    with pytest.raises(InputError, match=f"exposure 1: 'variance' holds {value:g}, expected"):
+        equipix.calibrate(frames, shifts)

@@ -82,6 +82,7 @@ def with_value(array, place, value):
         ({"frames": with_value(frames(), 4, 0)}, "'frames' of exposure 4 have a median"),
         ({"variance": np.ones(4)}, "'variance' has 4 entries"),
         ({"variance": np.ones((5, 8, 8))}, "'variance' has shape"),
+        ({"variance": 9.0}, r"'variance' has shape \(\), expected \(5,\) or \(5, "),
         ({"variance": with_value(np.ones(5), 2, 0)}, "'variance' of exposure 2 is 0"),
         ({"variance": with_value(np.ones(5), 2, -1)}, "'variance' of exposure 2 is -1"),
         ({"variance": with_value(np.ones(5), 2, np.nan)}, "'variance' of exposure 2 is NaN"),
@@ -130,7 +131,7 @@ def test_one_position_is_refused_where_the_solver_would_search_in_vain(shift, op
 
 def test_an_unmet_tolerance_says_what_would_meet_it():
     with pytest.warns(ConvergenceWarning, match="allow more sweeps"):
-        equipix.calibrate(frames(), CROSS, max_sweeps=2)
+        equipix.calibrate(frames(), CROSS, max_sweeps=8)
     with pytest.warns(ConvergenceWarning, match="no longer decreasing: use a larger"):
         equipix.calibrate(frames(), CROSS, tolerance=1e-300)
 

@@ -100,6 +100,27 @@ def test_warnings_are_one_line_each(run, experiment, tmp_path):
     assert re.fullmatch(r"equipix: warning: not converged after \d sweeps[^\n]*\n", err)
 
 
+def test_verdicts_and_rejected_values_are_reported(run, experiment, tmp_path):
+    output = tmp_path / "cal.tif"
+    command = ("calibrate", experiment, "-o", output, "--max-sweeps", "2", "--robust")
+    status, out, err = run(*command)
+    assert status == 0
+    assert re.search(r"\nverdicts +convergence\n", out)
+    saved = equipix.load(output)
+    (verdict,) = saved.verdicts
+    assert verdict.message in err
+    inspected = json.loads(run("inspect", output, "--json")[1])
+    calibrated = json.loads(run(*command, "--force", "--json")[1])
+    for told in (inspected, calibrated):
+        assert told["verdicts"] == [{"kind": "convergence", "message": verdict.message}]
+        assert told["is_partial"] is False
+        assert list(told["rejected_values"]) == ["p0", "p1", "p2", "p3", "p4"]
+        assert list(told["rejected_values"].values()) == saved.metadata["rejected"]
+    out = run("inspect", output)[1]
+    assert re.search(rf"\nverdicts +convergence: {re.escape(verdict.message)}\n", out)
+    assert re.search(r"\nrejected values +p0 \d+, p1 ", out)
+
+
 def test_inspect_shows_the_calibration(run, calibration):
     status, out, _ = run("inspect", calibration)
     assert status == 0
@@ -150,6 +171,24 @@ def test_inspect_shows_an_average(run, experiment, tmp_path):
     assert told["dark_frames"] == FrameStatistics.load(mean).dark.count.max()
     assert told["mean"] == pytest.approx(FrameStatistics.load(mean).mean.mean())
     assert "saturated pixels" in run("inspect", mean)[1]
+    run("average", frames, "-o", mean, "--force")
+    assert re.search(r"\nsaturation +65535\n", run("inspect", mean)[1])
+
+
+def test_a_file_is_not_averaged_twice(run, experiment, tmp_path):
+    frames, copy, out = (
+        experiment.parent / "frames/p0.tif",
+        tmp_path / "copy.tif",
+        tmp_path / "m.tif",
+    )
+    copy.write_bytes(frames.read_bytes())
+    refused(run("average", frames, frames, "-o", out), "'p0.tif' stands twice in the frames")
+    refused(run("average", frames, copy, "-o", out), "'p0.tif' and 'copy.tif' are the same images")
+    refused(
+        run("average", frames, "--dark", frames, "-o", out), "'p0.tif' stands in the frames and"
+    )
+    refused(run("average", frames, "--dark", copy, "-o", out), "are the same images, and stand in")
+    assert not out.exists()
 
 
 def test_average_writes_statistics(run, experiment, tmp_path):

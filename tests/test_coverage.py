@@ -109,3 +109,24 @@ def test_the_command_writes_it_only_if_asked(manifest, tmp_path, capsys):
     assert not done.value.code
     assert "equipix: warning: the exposures determine only" in capsys.readouterr().err
     assert equipix.load(output).is_partial
+
+
+def test_a_fit_far_from_its_minimum_is_written_only_if_asked(manifest, tmp_path, capsys):
+    """A hundredth of a pixel is no shift: 50 sweeps end at an estimated error of about 100."""
+    small, output = manifest.with_name("small.toml"), tmp_path / "cal.npz"
+    small.write_text(manifest.read_text().replace("shift = [7, 0]", "shift = [0.01, 0]"))
+    command = ["calibrate", str(small), "-o", str(output), "--max-sweeps", "50"]
+    with pytest.raises(SystemExit) as done:
+        cli.main(command)
+    captured = capsys.readouterr()
+    assert (done.value.code, captured.out) == (1, "")
+    last = captured.err.splitlines()[-1]
+    assert "is not written (--partial writes it): the fit ended far from its minimum" in last
+    assert captured.err.count("the fit ended far") == 1
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SystemExit) as done:
+        cli.main([*command, "--partial"])
+    assert not done.value.code
+    found = equipix.load(output)
+    assert found.is_partial
+    assert found.error_estimate > 1

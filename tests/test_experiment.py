@@ -182,7 +182,11 @@ def test_given_shifts_and_fluxes_are_used(edited, manifest):
         )
     text = re.sub(r"aperture_\w+ = .*\n", "", text)
     path = edited(manifest.read_text(), text)
-    with pytest.warns(errors.ConvergenceWarning):
+    # The fluxes are not those of the frames, so two products leave M undetermined.
+    with (
+        pytest.warns(errors.IdentifiabilityWarning, match="far from its minimum"),
+        pytest.warns(errors.ConvergenceWarning),
+    ):
         calibration = Experiment.load(path).run(max_sweeps=2)
     np.testing.assert_array_equal(calibration.shifts, SHIFTS)
     np.testing.assert_allclose(calibration.flux, [1, 1.1, 1.2, 1.3, 1.4])
@@ -245,6 +249,11 @@ def test_real_input(data_dir):
         ('name = "p0"', 'name = "p0"\nshift = ["9 um", "0 um"]', r"holds '9 um'.* without a unit"),
         ('name = "p2"', "", r"key 'name' is missing in exposure 2"),
         ("bit_depth = 12", "bit_depth = 17", r"holds 17, expected a whole number from 1 to 16"),
+        (
+            "bit_depth = 12",
+            "bit_depth = 12\nsaturation = 4096",
+            r"is 4096, above 4095, the largest",
+        ),
         ("bit_depth = 12", "saturation = -1", r"'saturation' in \[sensor\] holds -1"),
         ("bit_depth = 12", "gain_dn_per_e = 'x'", r"'gain_dn_per_e' in \[sensor\] holds 'x'"),
         ('name = "p1"', 'name = "p1"\nrotation = 45', r"holds 45, expected 0, 90, 180 or 270"),
@@ -387,6 +396,11 @@ def test_bad_options_are_refused_before_the_work(manifest, option):
     with pytest.raises(errors.InputError, match=f"'{next(iter(option))}' is"):
         Experiment.load(manifest).run(**option, progress=lambda *stage: stages.append(stage))
     assert stages == []
+
+
+def test_linear_fluxes_without_times_name_the_file(manifest):
+    with pytest.raises(errors.InputError, match=r"experiment\.toml: .*--flux linear.* 'time'"):
+        Experiment.load(manifest).run(flux="linear")
 
 
 def another_dark(manifest, folder):

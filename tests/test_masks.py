@@ -135,6 +135,21 @@ def test_the_command_line_takes_a_mask(manifest, tmp_path, mask, capsys):
     assert "one of the inputs" in capsys.readouterr().err
 
 
+def test_a_mask_of_another_shape_is_named_by_its_file(manifest, tmp_path, capsys):
+    file, frames = write_mask(tmp_path / "wrong.npy", np.zeros((3, 4), bool)), "frames/p0.tif"
+    for command in (("calibrate", manifest), ("average", manifest.parent / frames)):
+        assert run(*command, "-o", tmp_path / "out.tif", "--mask", file) == 1
+        assert f"error: {file}: 'mask' " in capsys.readouterr().err
+
+
+def test_a_mask_of_whole_numbers_is_refused_with_the_remedy():
+    frames, mask = np.ones((3, 4, 5)), np.zeros((4, 5), int)
+    with pytest.raises(errors.InputError, match="'mask' .* give mask != 0"):
+        equipix.calibrate(frames, SHIFTS[:3], mask=mask)
+    with pytest.raises(errors.InputError, match="'mask' .* give mask != 0"):
+        equipix.average(frames, mask=mask)
+
+
 def test_averages_with_a_mask_calibrate(mask):
     """The masked pixels are those of no use; the others have the M of a calibration with mask."""
     rng = np.random.default_rng(5)
@@ -163,13 +178,17 @@ def test_averages_with_a_mask_calibrate(mask):
         ('mask = "cube.npy"', r"cube\.npy: holds float64 of shape \(2, 48, 64\), expected one"),
         ("mask = 3", r"'mask' in \[sensor\] holds 3, expected an image file"),
         ("region = 3", r"'region' in \[sensor\] holds 3, expected tables"),
-        ("[[sensor.region]]\nrows = [5]", r"'rows' in \[\[sensor.region\]\] 0 holds \[5\]"),
+        ("[[sensor.region]]\nrows = [5]", r"'rows' in \[\[sensor.region\]\] 1 holds \[5\]"),
         ("[[sensor.region]]\nrows = [5, 5]", r"\[5, 5\] holds no pixel.* in \[\[sensor.region\]\]"),
-        ("[[sensor.region]]\nrows = [0, 49]", r"region\]\] 0: 'rows' ends at 49, expected at most"),
+        ("[[sensor.region]]\nrows = [0, 49]", r"region\]\] 1: 'rows' ends at 49, expected at most"),
         ("[[sensor.region]]\ncentre = [5, 5]", r"give both 'centre' and 'radius'"),
         ("[[sensor.region]]\noutside = true", r"give 'rows', 'cols' or both, or 'centre'"),
-        ("[[sensor.region]]\nrow = [1, 2]", r"unknown key 'row' in \[\[sensor.region\]\] 0"),
+        ("[[sensor.region]]\nrow = [1, 2]", r"unknown key 'row' in \[\[sensor.region\]\] 1"),
         ("[[sensor.region]]\nrows = [0, 48]", r"leave no pixel to use"),
+        (
+            "[[sensor.region]]\nrows = [0, 1]\n[[sensor.region]]\ncentre = [24, 99]\nradius = 9",
+            r"region\]\] 2: 'centre' \[24\.0, 99\.0\] and 'radius' 9 name no pixel .* 48 rows and",
+        ),
     ],
 )
 def test_a_wrong_mask_is_refused_by_name(edited, tmp_path, lines, message):

@@ -7,6 +7,7 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
+from equipix.exposures.positions import Positions
 from equipix.exposures.repeated import repeated
 
 CROSS = equipix.cross_pattern(3, 5)
@@ -21,16 +22,18 @@ def exposures(noise=1e-3):
 
 def test_the_first_pair_is_named():
     frames = exposures()
-    assert repeated(frames) is None
+    positions = Positions.of(CROSS)
+    assert repeated(frames, positions) is None
     frames[3] = frames[1]
     frames[1:4:2, 5, 6] = np.nan
-    assert repeated(frames) == (1, 3)
+    assert repeated(frames, positions) == (1, 3)
+    assert repeated(frames, Positions.of(CROSS[[0, 1, 2, 1, 4]])) is None
     frames[3, -1, -1] += 1e-9
-    assert repeated(frames) is None
+    assert repeated(frames, positions) is None
 
 
 def test_constants_may_repeat():
-    assert repeated(np.ones((5, 4, 6))) is None
+    assert repeated(np.ones((5, 4, 6)), Positions.of(CROSS)) is None
 
 
 def test_a_calibration_says_so():

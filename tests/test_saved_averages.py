@@ -88,9 +88,32 @@ def test_another_dark_is_not_subtracted_a_second_time(manifest, tmp_path):
             equipix.average(tmp_path / "mean.npz", dark=other)
 
 
+SUBTRACTED = "its dark was already subtracted; 'dark' needs frames or an average without a dark"
+
+
+def test_a_dark_is_no_average_from_which_one_was_subtracted(manifest, direct, tmp_path, capsys):
+    frames, dark = manifest.parent / "frames/p0.tif", manifest.parent / "dark/dark.tif"
+    wrong, cal = tmp_path / "wrong.tif", tmp_path / "cal.tif"
+    subtracted = equipix.average(dark, dark=equipix.average(dark), saturation=4095)
+    subtracted.save(wrong)
+    direct.save(cal)
+    with pytest.raises(errors.InputError, match=f"^'dark': {SUBTRACTED}"):
+        equipix.average(frames, dark=subtracted)
+    with pytest.raises(errors.InputError, match=f"^'dark': {SUBTRACTED}"):
+        direct.correct(np.ones(SHAPE), dark=subtracted)
+    toml = manifest.with_name("wrong-dark.toml")
+    toml.write_text(manifest.read_text().replace("dark/dark.tif", str(wrong)))
+    for command in (("average", frames), ("correct", cal, frames)):
+        assert run(*command, "--dark", wrong, "-o", tmp_path / "out.tif") == 1
+        assert f"error: {wrong}: {SUBTRACTED}" in capsys.readouterr().err
+    assert run("calibrate", toml, "-o", tmp_path / "out.tif") == 1
+    assert f"[dark] {wrong}: {SUBTRACTED}" in capsys.readouterr().err
+    assert not (tmp_path / "out.tif").exists()
+
+
 def test_another_saturation_level_is_refused(manifest, tmp_path):
     path = averaged(manifest, tmp_path, suffix=".npz", subtract=False, saturation=4000)
-    with pytest.raises(errors.FileError, match=r"saturation level 4000, expected 4095: average"):
+    with pytest.raises(errors.FileError, match=r"level 4000, expected 4095: .*--saturation 4095\)"):
         Experiment.load(path).run()
 
 
@@ -116,3 +139,26 @@ def test_arrays_that_are_no_averages_are_named(tmp_path, capsys):
     equipix.average(np.ones((2, 3, 3))).save(tmp_path / "one.npz")
     assert run("inspect", tmp_path / "one.npz", "--json") == 0
     assert json.loads(capsys.readouterr().out)["saturation"] is None
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_what_equipix_saved_is_no_raw_frame(manifest, direct, tmp_path, capsys, suffix):
+    frames = manifest.parent / "frames/p0.tif"
+    cal, mean = tmp_path / f"cal{suffix}", tmp_path / f"mean{suffix}"
+    direct.save(cal)
+    equipix.average(frames).save(mean)
+    toml = manifest.with_name("saved.toml")
+    toml.write_text(manifest.read_text().replace("frames/p1.tif", str(cal)))
+    hole = manifest.with_name("hole.toml")
+    hole.write_text(manifest.read_text().replace("aperture/p1-after.tif", str(mean)))
+    for command, file, kind in [
+        (("average", cal), cal, "a calibration"),
+        (("average", frames, cal), cal, "a calibration"),
+        (("correct", cal, mean), mean, "frame statistics"),
+        (("correct", cal, cal), cal, "a calibration"),
+        (("correct", cal, frames, "--dark", cal), cal, "a calibration"),
+        (("calibrate", toml), cal, "a calibration"),
+        (("calibrate", hole), mean, "frame statistics"),
+    ]:
+        assert run(*command, "-o", tmp_path / "out.tif") == 1, command
+        assert f"error: {file}: holds {kind}, expected raw frames" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import numpy as np
 from equipix.errors import InputError, InsufficientMemoryError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -102,6 +102,19 @@ def _refuse_units(shifts: object) -> None:
             f"'shifts' holds {first!r}, expected numbers of pixels without a unit: divide "
             "micrometres by the pixel pitch"
         )
+
+
+def check_maps(owner: str, maps: Mapping[str, ArrayLike]) -> None:
+    """Refuse maps of one sensor that are not of one shape (rows, cols), that of the first."""
+    shapes = {name: np.shape(values) for name, values in maps.items()}
+    first = next(iter(shapes))
+    for name, shape in shapes.items():
+        if len(shape) != 2:
+            raise InputError(f"'{name}' of {owner} has shape {shape}, expected (rows, cols)")
+        if shape != shapes[first]:
+            raise InputError(
+                f"'{name}' of {owner} has shape {shape}, expected {shapes[first]} like '{first}'"
+            )
 
 
 def check_shape(shape: tuple[int, int]) -> tuple[int, int]:

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native, io
-from equipix._check import as_array, as_floats, as_level, naming_memory, positive_workers
+from equipix._check import (
+    as_array,
+    as_floats,
+    as_level,
+    check_maps,
+    naming_memory,
+    positive_workers,
+)
 from equipix._readonly import ReadOnly
 from equipix.errors import FileError, InputError, UnsupportedFileError
 
@@ -73,6 +80,12 @@ class FrameStatistics(ReadOnly):
     dark: FrameStatistics | None = None
     saturation: float | None = None
     raw: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse maps of different shapes."""
+        ReadOnly.__post_init__(self)
+        dark = {} if self.dark is None else {"dark": self.dark.mean}
+        check_maps("FrameStatistics", self.maps | dark)
 
     @property
     def maps(self) -> dict[str, NDArray[Any]]:
@@ -246,16 +259,11 @@ def _of_pages(
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:
-    """Rows and columns of the averages that a file holds; None if it holds something else.
-
-    Files of whole numbers, which cameras write, are not searched for averages.
-    """
-    if path.suffix.lower() not in io.SUFFIXES:
+    """Rows and columns of the averages in a file; None of frames. A calibration is an error."""
+    if (kind := io.saved_kind(path)) is None:
         return None
-    if path.suffix.lower() != ".npz" and io.frame_format(path)[1] != np.float64:
-        return None
-    if io.kind_of(path) != _KIND:
-        return None
+    if kind != _KIND:
+        io.refuse_saved(path)
     rows, cols = load_statistics(path).mean.shape
     return rows, cols
 
@@ -314,7 +322,7 @@ def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
-            f"{level:g}: average the frames again with this level"
+            f"{level:g}: average the frames again with it (saturation=, --saturation {level:g})"
         )
     return statistics
 
@@ -433,17 +441,15 @@ def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatist
     shape = statistics.mean.shape
     if array.dtype != np.bool_ or array.shape != shape:
         raise InputError(
-            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}: True "
-            "= do not use"
+            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}, True "
+            f"= do not use{': give mask != 0' if array.shape == shape else ''}"
         )
     if array.all():
         raise InputError("'mask' is True in every pixel, expected some pixels to use")
-    maps = {name: values.copy() for name, values in statistics.maps.items()}
+    maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
     for name, values in maps.items():
         values[array] = 0 if name in _COUNTS else np.nan
-    return FrameStatistics(
-        **maps, dark=statistics.dark, saturation=statistics.saturation, raw=statistics.raw
-    )
+    return dataclasses.replace(statistics, **maps)
 
 
 def _subtract(
@@ -458,21 +464,32 @@ def _subtract(
             "'source' is an average from which another dark than 'dark' is subtracted already: "
             "give the frames, or the dark that was subtracted"
         )
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
     mean = dark.mean if isinstance(dark, FrameStatistics) else dark
     if mean.shape != statistics.mean.shape:
         raise InputError(
             f"'dark' has shape {mean.shape}, expected {statistics.mean.shape} like the frames"
         )
+    if not np.isfinite(mean).any():
+        raise InputError("'dark' holds no finite number: give the mean of dark frames")
     variance = dark.variance_of_mean if isinstance(dark, FrameStatistics) else 0.0
-    return FrameStatistics(
-        statistics.mean - mean,
-        statistics.variance,
-        statistics.variance_of_mean + variance,
-        statistics.count,
-        statistics.saturated,
-        dark if isinstance(dark, FrameStatistics) else None,
-        statistics.saturation,
+    return dataclasses.replace(
+        statistics,
+        mean=statistics.mean - mean,
+        variance_of_mean=statistics.variance_of_mean + variance,
+        dark=dark if isinstance(dark, FrameStatistics) else None,
+        raw=False,
     )
+
+
+def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:
+    """Refuse as a dark an average that holds no dark level; `place` is for the message."""
+    if dark.dark is not None:
+        raise InputError(
+            f"{place}: its dark was already subtracted; 'dark' needs frames or an average without "
+            "a dark"
+        )
 
 
 def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:

@@ -11,12 +11,16 @@ from equipix.calibration.verdicts import Verdict
 from equipix.flags import Flag, usable
 
 if TYPE_CHECKING:
+    from equipix._native import Fit
     from equipix._types import Array, Bools
     from equipix.calibration.weights import Weighted
     from equipix.exposures.exposures import Exposures
 
 _LEAST = 0.5
 """Least share of the pixels not masked by the caller that a calibration must determine."""
+
+_LARGEST_ERROR = 1.0
+"""Largest estimated relative error of M: above it, M is not determined to its first digit."""
 
 _FEWEST = 3
 """Fewest exposures that compare pixels along both axes."""
@@ -25,8 +29,11 @@ _FEWEST = 3
 def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> list[Verdict]:
     """Add the verdict on a fit that determines less than half of the pixels that are not masked.
 
-    It stands in the place of that on components, which it contains.
+    It stands in the place of that on components, which it contains. A fit that ended far from its
+    minimum determines none.
     """
+    if not float(weighted.fit.error_estimate[-1]) <= _LARGEST_ERROR:
+        return [Verdict("partial", _far(weighted.fit)), *found]
     wanted = _wanted(weighted.exposures)
     determined = usable(flags) & wanted
     count, total = int(determined.sum()), int(wanted.sum())
@@ -37,6 +44,15 @@ def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> lis
         f"{_cause(weighted, wanted & ~determined, flags)}"
     )
     return [Verdict("partial", text), *(each for each in found if each.kind != "components")]
+
+
+def _far(fit: Fit) -> str:
+    """Return the words on a fit that ended far from its minimum."""
+    return (
+        "the fit ended far from its minimum, and determines no pixel (estimated relative error "
+        f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): allow more sweeps, or "
+        "use larger shifts in a beam with more structure"
+    )
 
 
 def _wanted(exposures: Exposures) -> Bools:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration.pixel_flags import odd_pixels
+from equipix.exposures.front import union
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Bools, Floats
+    from equipix._types import Array, Floats
     from equipix.calibration.options import Options
     from equipix.calibration.weights import Weighted
 
@@ -35,8 +36,8 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
     exposures = weighted.exposures
     findings = dataclasses.replace(
         exposures.findings,
-        dead=_either(exposures.findings.dead, dead & false),
-        hot=_either(exposures.findings.hot, hot & false),
+        dead=union(exposures.findings.dead, dead & false),
+        hot=union(exposures.findings.hot, hot & false),
     )
     exposures = dataclasses.replace(exposures.without(false), findings=findings)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
@@ -58,19 +59,13 @@ def _usual(weighted: Weighted, options: Options, squares: Floats) -> float:
     return float(max(noise, error**2 * np.nanmean(exposures.weighted_squares(power))))
 
 
-def _either(before: Bools | None, found: Bools) -> Bools:
-    return found if before is None else before | found
-
-
 def _mean_squares(weighted: Weighted, workers: int | None) -> Floats:
     """Mean squared residual of each pixel times weights; NaN without any."""
     exposures, fit = weighted.exposures, weighted.fit
     usable = exposures.usable()
     total, count = np.zeros(exposures.shape), np.zeros(exposures.shape)
-    for k, values in enumerate(exposures.values):
-        residual = values - exposures.light(fit, k, workers) * fit.sensitivity
-        if fit.offset is not None:
-            residual -= fit.offset
+    for k in range(len(exposures)):
+        residual = exposures.residual(fit, k, workers)
         known = usable[k] & np.isfinite(residual)
         variance: Array | float = 1.0 if exposures.variance is None else exposures.variance[k]
         total += np.divide(residual**2, variance, where=known, out=np.zeros(exposures.shape))

@@ -57,8 +57,8 @@ def _on_units(exposures: Exposures) -> Verdict | None:
 
 
 def _on_repeats(exposures: Exposures) -> Verdict | None:
-    """Verdict on one exposure that is given twice."""
-    pair = repeated(exposures.values)
+    """Verdict on one exposure that is given for two positions."""
+    pair = repeated(exposures.values, exposures.positions)
     if pair is None:
         return None
     first, second = pair

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix._readonly import ReadOnly
+from equipix.calibration.residual_tests import ROBUST
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
 from equipix.calibration.significance import chi2_tail
 from equipix.drift import affine_columns, slope_covariance, unit_times
@@ -195,7 +196,7 @@ def _agreeing(strengths: Floats, slopes: Floats) -> Bools:
         np.median(each[use]) if use.any() else 0 for each, use in zip(fluxes, known, strict=True)
     ]
     distances = np.abs(fluxes - np.reshape(centres, (-1, 1, 1))) * np.sqrt(np.maximum(strengths, 0))
-    scale = 1.4826 * np.median(distances[known]) if known.any() else 0.0
+    scale = ROBUST * np.median(distances[known]) if known.any() else 0.0
     return np.asarray(known & (distances <= _FAR * scale))
 
 

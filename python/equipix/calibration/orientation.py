@@ -259,8 +259,8 @@ def _answer(left: set[Orientation], name: str) -> ShiftSign:
 
 def _reason(low: WindowFit, left: set[Orientation], best: Orientation) -> str:
     if low.is_white:
-        also = [way.words for way in left if way != AS_GIVEN]
-        return f"so it fits as well after '{also[0]}', since the beam is too smooth; {_REMEDY}"
+        also = next(way.changes for way in left if way != AS_GIVEN)
+        return f"the data fit equally well with {also}, since the beam is too smooth; {_REMEDY}"
     return (
         f"in the best orientation ('{best.words}') residuals of neighbours are still correlated by "
         f"{max(abs(each.size) for each in low.neighbours):.0%}: look for another cause, such as "

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.calibration.residual_tests import ROBUST
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -26,9 +28,6 @@ m spreads 1/(m − 1) of its own deviation over each of the others: at most a ha
 
 _TESTABLE = 1e-6
 """Least share of its variance that a residual must keep: less is rounding."""
-
-_ROBUST = 1.4826
-"""Standard deviation over median absolute deviation, for normal noise."""
 
 
 def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions) -> Bools:
@@ -136,7 +135,7 @@ def deviations(
         residual[known] = scaled
         used = known & ~left_out[k]
         least = options.tolerance * _median(root * light, known)
-        residual /= max(_ROBUST * _median(residual, used), least, np.finfo(float).tiny)
+        residual /= max(ROBUST * _median(residual, used), least, np.finfo(float).tiny)
         del light, weight, root, spread, scaled
         new[k], old[k] = _conspicuous(residual, used, known)
     return new, old
@@ -170,7 +169,7 @@ def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Arr
 def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     """Mean of the 3×3 residuals around each pixel, in standard deviations by their own scale."""
     mean = box_sums(np.where(where, residual, 0)) / np.sqrt(np.maximum(box_sums(where), 1))
-    scaled: NDArray[Any] = mean / max(1.0, _ROBUST * _median(mean, where))
+    scaled: NDArray[Any] = mean / max(1.0, ROBUST * _median(mean, where))
     return scaled
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix.calibration.fallen_dust import without_fallen_dust
 from equipix.calibration.robust import rejected
+from equipix.exposures.front import union
 from equipix.noise import modelled_variances
 
 if TYPE_CHECKING:
@@ -107,10 +108,8 @@ def _robust_fit(
 def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
     """Exposures with a finding for each pixel most of whose given measurements are left out."""
     contradictory = given.sum(axis=0) > 2 * kept.usable().sum(axis=0)
-    before = kept.findings.contradictory
-    if before is not None:
-        contradictory |= before
-    findings = dataclasses.replace(kept.findings, contradictory=contradictory)
+    found = union(kept.findings.contradictory, contradictory)
+    findings = dataclasses.replace(kept.findings, contradictory=found)
     return dataclasses.replace(kept, findings=findings)
 
 

@@ -19,6 +19,7 @@ from equipix.cli.options import (
     Tolerance,
     Uncertainty,
     Workers,
+    naming_mask,
 )
 from equipix.cli.summary import of_calibration, summary
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
@@ -70,8 +71,8 @@ def calibrate(
     refuse_inputs([output], [experiment, *loaded.files(), *([mask] if mask else [])])
     if not partial:
         # `_refuse_partial` says the same as an error.
-        warnings.filterwarnings("ignore", "the exposures determine only")
-    with progress_bars() as progress:
+        warnings.filterwarnings("ignore", "the exposures determine only|the fit ended far from")
+    with progress_bars() as progress, naming_mask(mask):
         calibration = loaded.run(
             flux=flux,
             mask=None if mask is None else read_mask(mask),
@@ -86,11 +87,14 @@ def calibrate(
     if not partial:
         _refuse_partial(calibration, output)
     calibration.save(output, force=force)
-    show_result({"output": str(output), **of_calibration(calibration)}, as_json=as_json)
+    result = {"output": str(output), **of_calibration(calibration)}
+    if not as_json:  # their messages are on stderr, as warnings
+        result["verdicts"] = ", ".join(each.kind for each in calibration.verdicts) or "none"
+    show_result(result, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
-    """Refuse a result that determines less than half of the unmasked pixels."""
+    """Refuse a result that determines less than half of the unmasked pixels, or none."""
     for verdict in calibration.verdicts:
         if verdict.kind == "partial":
             raise EquipixError(

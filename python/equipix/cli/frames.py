@@ -8,12 +8,14 @@ from typing import Annotated
 import typer
 
 from equipix._types import Flagged
-from equipix.cli.options import Force, Json, Mask, Saturation, Workers
+from equipix.cli.options import Force, Json, Mask, Saturation, Workers, naming_mask
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import correct_files, is_folder
 from equipix.errors import InputError
+from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
+from equipix.frames import refuse_subtracted
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
@@ -38,13 +40,15 @@ def average(
 ) -> None:
     """Mean and variance of every pixel over many frames."""
     check_output(output, force=force, suffixes=SUFFIXES)
-    inputs = find_files([*source, *(dark or []), *([mask] if mask else [])])
-    refuse_inputs([output], inputs)
+    images, offsets = find_files(source), find_files(dark) if dark else []
+    refuse_inputs([output], [*images, *offsets, *([mask] if mask else [])])
+    refuse_repeated_files(images, offsets)
     excluded = None if mask is None else read_mask(mask)
-    with progress_bars() as progress:
+    with progress_bars() as progress, naming_mask(mask):
         offset = None
         if dark:
             offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+            refuse_subtracted(offset, " ".join(dark))
         frames = average_frames(
             source,
             dark=offset,

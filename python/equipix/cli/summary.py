@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,7 +71,19 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         **({"orientation": orientation.words} if orientation else {}),
         "fluxes": options.get("flux", "known"),
         "flagged_pixels": flagged(calibration),
+        **_rejected(calibration),
+        "is_partial": calibration.is_partial,
+        "verdicts": [asdict(verdict) for verdict in calibration.verdicts],
     }
+
+
+def _rejected(calibration: Calibration) -> dict[str, Any]:
+    """Count the values of each exposure that a robust calibration left out, by its name."""
+    counts = calibration.metadata.get("rejected")
+    if counts is None:
+        return {}
+    names = calibration.metadata.get("exposures", range(len(counts)))
+    return {"rejected_values": dict(zip(map(str, names), counts, strict=True))}
 
 
 def _misfit_name(options: dict[str, Any]) -> str:

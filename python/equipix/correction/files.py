@@ -9,13 +9,14 @@ import numpy as np
 
 from equipix._types import Flagged, Progress
 from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
-from equipix.frames import average, load_statistics
+from equipix.frames import average, refuse_subtracted
 from equipix.io import (
     description,
     find_files,
     folder_beside,
     frame_format,
     refuse_inputs,
+    refuse_saved,
     stream_frames,
     write_frames,
     write_whole,
@@ -143,7 +144,8 @@ def _warn_of_corrected(files: list[Path]) -> None:
 
 
 def _count(file: Path, correction: Correction) -> int:
-    """Count the frames of a file; they must be of the sensor's shape."""
+    """Count the frames of a file; they must be raw, and of the sensor's shape."""
+    refuse_saved(file)
     (count, *shape), _ = frame_format(file)
     if tuple(shape) != correction.shape:
         raise InputError(
@@ -170,8 +172,6 @@ def _takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
 
 def _dark_frame(source: str) -> NDArray[Any]:
     """Read the mean of dark frames, averaged already or not."""
-    try:
-        mean = load_statistics(source).mean
-    except (FileError, InputError):  # not averaged yet
-        mean = average(source).mean
-    return mean.astype(np.float32)
+    dark = average(source)
+    refuse_subtracted(dark, source)
+    return dark.mean.astype(np.float32)

@@ -11,7 +11,7 @@ from equipix.errors import InputError
 from equipix.experiment.manifest import find_files
 from equipix.exposures.positions import in_beam, variance_in_beam
 from equipix.flags import usable
-from equipix.io import read_frames
+from equipix.io import read_frames, refuse_saved
 from equipix.mending import hot_places, mended
 from equipix.shifts import measure_shift, saturation_level
 
@@ -132,7 +132,7 @@ def _spots(
 ) -> tuple[ShiftMeasurement, tuple[int, int]]:
     """Find the spots of the move to `exposure`, and the shape of the sensor."""
     before, after = (
-        read_frames(find_files(path, entry))
+        _images(find_files(path, entry))
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )
@@ -148,6 +148,13 @@ def _spots(
         return measure_shift(before, after, saturation=level, hot=hot), before.shape[-2:]
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
+
+
+def _images(files: list[Path]) -> Array:
+    """Images of the aperture, as the camera gave them."""
+    for file in files:
+        refuse_saved(file)
+    return read_frames(files)
 
 
 def _equalised(

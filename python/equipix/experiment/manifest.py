@@ -85,6 +85,18 @@ class Sensor(_Table):
     mask: Text | None = None
     region: Annotated[list[Region], Field(min_length=1)] | None = None
 
+    @model_validator(mode="after")
+    def _level_within_depth(self) -> Self:
+        if self.saturation is None or self.bit_depth is None:
+            return self
+        largest = 2**self.bit_depth - 1
+        if self.saturation > largest:
+            raise _problem(
+                f"'saturation' in [sensor] is {self.saturation:g}, above {largest}, the largest "
+                f"value that 'bit_depth' = {self.bit_depth} holds: no value would reach it"
+            )
+        return self
+
     @property
     def saturation_level(self) -> float | None:
         """Level that counts as saturated: the given one, else the largest of `bit_depth`."""
@@ -218,7 +230,7 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
         case ["exposure", int(index), *_]:
             place = f" in exposure {index}{_name(content['exposure'][index])}"
         case ["sensor", "region", int(index), *_]:
-            place = f" in [[sensor.region]] {index}"
+            place = f" in [[sensor.region]] {index + 1}"
         case [table, _, *_]:
             place = f" in [{table}]"
         case _:

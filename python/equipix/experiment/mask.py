@@ -46,7 +46,7 @@ def excluded_pixels(path: Path, manifest: Manifest, shape: tuple[int, int]) -> B
     excluded = np.zeros(shape, bool)
     if sensor.mask is not None:
         excluded |= _of_file(path, sensor.mask, shape)
-    for index, region in enumerate(sensor.region or []):
+    for index, region in enumerate(sensor.region or [], start=1):
         excluded |= _of_region(f"{path}: [[sensor.region]] {index}", region, shape)
     if excluded.all():
         raise FileError(f"{path}: 'mask' and 'region' in [sensor] leave no pixel to use")
@@ -64,7 +64,8 @@ def _of_file(path: Path, entry: str, shape: tuple[int, int]) -> Bools:
 
 
 def _of_region(place: str, region: Region, shape: tuple[int, int]) -> Bools:
-    inside = _rectangle(place, region, shape) if region.centre is None else _disc(region, shape)
+    shaped = _rectangle if region.centre is None else _disc
+    inside = shaped(place, region, shape)
     return ~inside if region.outside else inside
 
 
@@ -80,8 +81,13 @@ def _rectangle(place: str, region: Region, shape: tuple[int, int]) -> Bools:
     return inside
 
 
-def _disc(region: Region, shape: tuple[int, int]) -> Bools:
+def _disc(place: str, region: Region, shape: tuple[int, int]) -> Bools:
     row, col = region.centre or (0.0, 0.0)
     rows, cols = np.ogrid[: shape[0], : shape[1]]
     inside: Bools = np.hypot(rows - row, cols - col) <= (region.radius or 0.0)
+    if not inside.any():
+        raise FileError(
+            f"{place}: 'centre' {[row, col]} and 'radius' {region.radius:g} name no pixel of the "
+            f"sensor, which has {shape[0]} rows and {shape[1]} columns"
+        )
     return inside

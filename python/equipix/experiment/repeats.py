@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from equipix.errors import FileError
 from equipix.experiment.manifest import find_files
+from equipix.experiment.provenance import sha256_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -52,6 +53,23 @@ def refuse_repeats(
         for one, other in _alike(first.files, second.files, hashes):
             raise FileError(
                 f"{path}: {_words(one, other)} in {first} and in {second}: give each its own frames"
+            )
+
+
+def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
+    """Refuse a file that is averaged twice, by its name or its content, or as its own dark.
+
+    Raises
+    ------
+    FileError
+        With the file and where it stands.
+    """
+    for hashes in (None, sha256_of(dict.fromkeys([*frames, *dark]))):
+        for one, other in _alike(frames, frames, hashes, within=True):
+            raise FileError(f"{_words(one, other)} twice in the frames: give each once")
+        for one, other in _alike(frames, dark, hashes):
+            raise FileError(
+                f"{_words(one, other)} in the frames and in 'dark': give each its own frames"
             )
 
 

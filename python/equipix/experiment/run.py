@@ -22,7 +22,7 @@ from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
-from equipix.frames import average, saved_shape
+from equipix.frames import average, refuse_subtracted, saved_shape
 from equipix.io import as_path, frame_format
 
 if TYPE_CHECKING:
@@ -185,7 +185,11 @@ class Experiment:
         return hot_pixels(self._dark(options), None)
 
     def _dark(self, options: FitOptions) -> FrameStatistics:
-        return self._statistics("dark", self.manifest.dark.frames, None, options)
+        frames = self.manifest.dark.frames
+        dark = self._statistics("dark", frames, None, options)
+        files = ", ".join(map(str, find_files(self.path, frames)))
+        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
+        return dark
 
     def run(
         self,
@@ -254,6 +258,11 @@ class Experiment:
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
         self._warn_of_unused(flux)
+        if flux == "linear" and self._column("time") is None:
+            raise InputError(
+                f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
+                "[[exposure]]"
+            )
         self.check_formats()
         excluded = self._excluded(mask)
         hashes = sha256_of([self.path, *self.files()])

@@ -15,7 +15,7 @@ from equipix.defects import (
     refuse_saturated,
 )
 from equipix.errors import InputError
-from equipix.exposures.clipping import Clipping, clipping_of, highest
+from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
 from equipix.frames import same_statistics
 from equipix.noise import NoiseModel, photon_transfer
 
@@ -108,9 +108,11 @@ class Averaged:
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        named = f" ({name!r})" if name else ""
-        self._refuse_saturated(f"'frames': exposure {exposure}{named}", frames)
-        self._clipped.append(clipping_of(frames))
+        which = f"'frames': exposure {exposure}{f' ({name!r})' if name else ''}"
+        _refuse_no_variance(which, frames)
+        self._refuse_saturated(which, frames)
+        clipped = clipping_of(frames)
+        self._clipped.append(clipped)
         self.raw &= frames.raw
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
@@ -119,7 +121,9 @@ class Averaged:
         self._frames.append(count)
         if self.dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
-        self._points.append(photon_transfer(frames.mean, frames.variance, ~saturates, count))
+        # Clipped samples scatter less: their bins would have most of the weight in the noise model.
+        free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
+        self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
     @cached_property
     def noise(self) -> NoiseModel | None:
@@ -179,6 +183,17 @@ class Averaged:
         of_dark = self.dark_variance(noise)
         variance = 0.0 if of_dark is None else float(np.median(of_dark))
         return [noise.of_mean(frames, dark_variance=variance) for frames in self._frames]
+
+
+def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:
+    """Refuse averages of several samples without a finite variance that is not negative."""
+    several = (frames.count > 1) & np.isfinite(frames.mean)
+    wrong = several & ~(np.isfinite(frames.variance) & (frames.variance >= 0))
+    if wrong.any():
+        raise InputError(
+            f"{which}: 'variance' holds {frames.variance[wrong][0]:g}, expected finite numbers not "
+            "below 0 where 'count' is above 1"
+        )
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

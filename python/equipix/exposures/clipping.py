@@ -9,7 +9,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from equipix._types import Array
+    from equipix._types import Array, Bools
     from equipix.frames import FrameStatistics
 
 _MANY = 16
@@ -26,6 +26,9 @@ _RARE = 0.05
 
 _ROUNDING = 1e-9
 """Relative rounding of means from which a dark was subtracted, and added again."""
+
+_SIGMAS = 6
+"""Distance from a level, in standard deviations, at which no sample reaches it."""
 
 _FEWEST_BITS = 8
 """Fewest bits of a camera."""
@@ -72,8 +75,7 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     missing from few other pixels, those at the level need not be compared with those just below,
     which contain the pixels that saturate in some frames only.
     """
-    raw = frames.mean if frames.dark is None else frames.mean + frames.dark.mean
-    raw = np.where(frames.saturated > 0, np.nan, raw)
+    raw = np.where(frames.saturated > 0, np.nan, _raw(frames))
     found = clipping(raw, crowded=0.0)
     if found is None:
         return None
@@ -82,6 +84,25 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:
         return found
     return clipping(raw)
+
+
+def unclipped(frames: FrameStatistics, clipped: Clipping) -> Bools:
+    """Find pixels whose samples all lie below a level: only their scatter is that of the camera.
+
+    The limit is six standard deviations of a sample below the level, those of pixels at 50 to 90 %
+    of it: near the level they have up to √2 times that.
+    """
+    raw = _raw(frames)
+    bright = (raw > 0.5 * clipped.level) & (raw < 0.9 * clipped.level)
+    variances = frames.variance[bright & np.isfinite(frames.variance)]
+    scatter = float(np.sqrt(np.median(variances))) if variances.size else 0.0
+    below: Bools = raw < clipped.level - _SIGMAS * scatter
+    return below
+
+
+def _raw(frames: FrameStatistics) -> Array:
+    """Mean before the dark was subtracted."""
+    return frames.mean if frames.dark is None else frames.mean + frames.dark.mean
 
 
 def clipping_advice(clipped: Clipping) -> str:

@@ -227,12 +227,15 @@ def _saturated(values: Array, level: float) -> Bools:
 
 def as_variances(variance: ArrayLike, values: Array) -> Array:
     """Variances in the shape and dtype that the solver takes."""
-    variances = as_array("variance", variance, ndim=(1, 3))
-    if variances.ndim == 1:
+    variances = as_array("variance", variance, ndim=(0, 1, 2, 3))
+    shape = np.shape(variance)  # as_array makes one number an array of one
+    if len(shape) == 1:
         check_count("variance", len(variances), len(values))
         return variances.astype(np.float64)
-    if variances.shape != values.shape:
-        raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
+    if shape != values.shape:
+        raise InputError(
+            f"'variance' has shape {shape}, expected {(len(values),)} or {values.shape}"
+        )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return variances.astype(values.dtype, copy=False)
 
@@ -247,7 +250,9 @@ def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
     """Mask of one exposure or of all, of frames of that shape."""
     array = as_array("mask", mask, ndim=(2, 3))
     if array.dtype != np.bool_:
-        raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
+        raise InputError(
+            f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+        )
     if array.shape not in (shape[1:], shape):
         raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
     return array

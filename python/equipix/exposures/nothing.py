@@ -39,7 +39,7 @@ def refuse_nothing(exposures: Exposures, given: Bools | None) -> None:
         )
     left = np.any([*_parts(exposures, given)], axis=0)
     if exposures.clipped is not None and left.any():
-        raise InputError(f"'frames' leave no usable pixel: {clipping_advice(exposures.clipped)}")
+        raise InputError(f"'frames': {clipping_advice(exposures.clipped)}")
     for name, reason in _REASONS.items():
         found = getattr(exposures.findings, name)
         if found is not None and 2 * np.count_nonzero(left & found) > np.count_nonzero(left):

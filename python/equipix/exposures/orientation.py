@@ -55,12 +55,27 @@ class Orientation:
     @property
     def words(self) -> str:
         """What is to be changed, as a request."""
-        both = self.rows and self.cols
-        parts = [
-            (both, "reverse the sign of all shifts"),
-            (self.rows and not both, "reverse the sign of the shifts along rows"),
-            (self.cols and not both, "reverse the sign of the shifts along columns"),
-            (self.exchanged, "exchange the two values of each shift: (row, col), not (x, y)"),
-            (self.turned, "give 270 for 90 degrees of rotation, and 90 for 270"),
-        ]
-        return "; then ".join(text for wanted, text in parts if wanted) or "change nothing"
+        return "; then ".join(request for request, _ in self._changes()) or "change nothing"
+
+    @property
+    def changes(self) -> str:
+        """The same, as what has been changed."""
+        return " and ".join(change for _, change in self._changes()) or "nothing changed"
+
+    def _changes(self) -> list[tuple[str, str]]:
+        """Each change, as a request and as done."""
+        signs = {
+            (True, True): "of all shifts",
+            (True, False): "of the shifts along rows",
+            (False, True): "of the shifts along columns",
+        }
+        found = []
+        if which := signs.get((self.rows, self.cols)):
+            found.append((f"reverse the sign {which}", f"the sign {which} reversed"))
+        if self.exchanged:
+            request = "exchange the two values of each shift: (row, col), not (x, y)"
+            found.append((request, "the two values of each shift exchanged"))
+        if self.turned:
+            request = "give 270 for 90 degrees of rotation, and 90 for 270"
+            found.append((request, "rotations of 90 and 270 degrees exchanged"))
+        return found

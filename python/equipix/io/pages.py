@@ -11,6 +11,7 @@ import numpy as np
 
 from equipix.errors import FileError, InputError
 from equipix.io import tiff
+from equipix.io.images import frame_format
 from equipix.io.names import as_path
 from equipix.io.reading import reading
 from equipix.io.whole import write_whole
@@ -123,6 +124,31 @@ def kind_of(path: Path) -> str | None:
         return None
     kind = content.get("kind") if isinstance(content, dict) else None
     return kind if isinstance(kind, str) else None
+
+
+def saved_kind(path: Path) -> str | None:
+    """Kind of content in a file that stands in the place of frames; None of other files.
+
+    Files of whole numbers, which cameras write, are not searched.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES or (suffix != ".npz" and frame_format(path)[1].kind != "f"):
+        return None
+    return kind_of(path)
+
+
+def refuse_saved(path: Path) -> None:
+    """Refuse a file that `save_pages` wrote where images are expected.
+
+    Raises
+    ------
+    FileError
+        With what the file holds.
+    """
+    kind = saved_kind(path)
+    if kind is not None:
+        article = "" if kind.endswith("s") else "a "
+        raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
 
 
 def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:

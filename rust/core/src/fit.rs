@@ -14,7 +14,7 @@ use crate::information;
 use crate::parallel::Workers;
 
 /// What became of shifts that were to be refined.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Refinement {
     /// They were not to be.
     None,
@@ -22,8 +22,27 @@ pub enum Refinement {
     NotTried,
     /// The beam has too little structure to determine them: they are as given.
     Undetermined,
+    /// They are refined along this direction (row, column) of length 1 alone.
+    Along([f64; 2]),
     /// They are refined.
     Done,
+}
+
+impl Refinement {
+    /// Whether they are refined, if along one direction alone.
+    #[must_use]
+    pub const fn is_done(self) -> bool {
+        matches!(self, Self::Along(_) | Self::Done)
+    }
+
+    /// The direction along which alone they are refined.
+    #[must_use]
+    pub const fn along(self) -> Option<[f64; 2]> {
+        match self {
+            Self::Along(direction) => Some(direction),
+            _ => None,
+        }
+    }
 }
 
 /// A calibrated sensor.
@@ -72,7 +91,7 @@ impl Fit {
             beam: self.beam.view(),
             flux: &self.flux,
             shifts: &self.shifts,
-            refined: self.refinement == Refinement::Done,
+            refinement: self.refinement,
             joint: self.is_joint(),
             unit: self.unit(),
             prior: self.prior.clone(),
@@ -146,8 +165,8 @@ pub struct Solution<'s> {
     pub flux: &'s [f64],
     /// The shifts as found.
     pub shifts: &'s [[f64; 2]],
-    /// Whether they were refined.
-    pub refined: bool,
+    /// What became of those that were to be refined.
+    pub refinement: Refinement,
     /// Whether it is that of a joint fit.
     pub joint: bool,
     /// The variance of a measurement of weight 1.

@@ -25,8 +25,10 @@ mod memory;
 mod outcome;
 mod pass;
 mod penalty;
+mod pixels;
 mod preconditioner;
 mod rim;
+mod shift_information;
 mod survey;
 mod system;
 #[cfg(test)]
@@ -47,6 +49,7 @@ pub(crate) use outcome::{coefficients, components, freedom, range, unknowns, val
 pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
+pub(crate) use shift_information::Directions;
 pub(crate) use system::{Prior, System};
 pub(crate) use unknowns::{ShiftPrior, State};
 pub(crate) use workspace::Workspace;

@@ -12,6 +12,7 @@
 //! ```
 
 mod calibrate;
+mod course;
 mod descent;
 mod found;
 mod joint;

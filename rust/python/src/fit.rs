@@ -135,8 +135,7 @@ pub(crate) struct PyFit {
     smallest_ritz: Option<f64>,
     #[pyo3(get)]
     leaves_tilt: bool,
-    #[pyo3(get)]
-    refinement: &'static str,
+    refinement: Refinement,
     #[pyo3(get)]
     is_joint: bool,
     /// The weights of the prior of M on pixels in weak light.
@@ -150,6 +149,12 @@ impl PyFit {
     fn prior(&self, py: Python<'_>) -> PyResult<Option<Py<PyArray2<f64>>>> {
         let weights = self.prior.as_ref().map(|weights| weights.to_vec());
         weights.map(|weights| image(py, weights, self.data.checked.sensor())).transpose()
+    }
+
+    /// What became of shifts that were to be refined.
+    #[getter]
+    const fn refinement(&self) -> &'static str {
+        refinement_code(self.refinement)
     }
 
     /// D = Σ w c² L² of each pixel.
@@ -230,7 +235,7 @@ impl PyFit {
             unit,
             smallest_ritz: fit.smallest_ritz,
             leaves_tilt: fit.leaves_tilt,
-            refinement: refinement_code(fit.refinement),
+            refinement: fit.refinement,
             is_joint,
             prior: fit.prior,
         })
@@ -264,7 +269,7 @@ impl BorrowedFit<'_> {
             beam: self.beam.view()?,
             flux: &self.fit.flux,
             shifts: &self.fit.shifts,
-            refined: self.fit.refinement == refinement_code(Refinement::Done),
+            refinement: self.fit.refinement,
             joint: self.fit.is_joint,
             unit: self.fit.unit,
             prior: self.fit.prior.clone(),
@@ -370,6 +375,6 @@ const fn refinement_code(refinement: Refinement) -> &'static str {
         Refinement::None => "none",
         Refinement::NotTried => "not tried",
         Refinement::Undetermined => "undetermined",
-        Refinement::Done => "refined",
+        Refinement::Along(_) | Refinement::Done => "refined",
     }
 }

@@ -110,6 +110,7 @@ pub(crate) struct Answer {
     pub(crate) shifts: Vec<[f64; 2]>,
     /// Whether shifts were refined.
     pub(crate) refined: bool,
+    pub(crate) refinement: Refinement,
     pub(crate) leaves_tilt: bool,
     /// The component of each pixel and of each cell, the largest one being 0; −1 for none.
     pub(crate) labels: [Vec<i32>; 2],
@@ -285,7 +286,7 @@ fn ask<R>(
         },
         flux: &answer.flux,
         shifts: &answer.shifts,
-        refined: answer.refined,
+        refinement: answer.refinement,
         joint: answer.is_joint(),
         unit: variance_of_weight_1(experiment, answer),
     };
@@ -316,7 +317,8 @@ fn answer(fit: Fit) -> Answer {
         beam_shape: [fit.beam.shape.rows, fit.beam.shape.cols],
         origin: fit.beam.origin,
         beam: fit.beam.values,
-        refined: fit.refinement == Refinement::Done,
+        refined: fit.refinement.is_done(),
+        refinement: fit.refinement,
         leaves_tilt: fit.leaves_tilt,
         labels: [fit.components.pixels, fit.components.cells],
         misfit: fit.misfit,

@@ -22,7 +22,18 @@ const WAVES: usize = 64;
 
 /// The mean of s/(s + τ g) over wave vectors, for exposures that weigh `shares` of all.
 pub(crate) fn determined_share(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
-    let mut sum = 0.0;
+    let share = |_, measured: f64, penalty: f64| [measured / (measured + penalty)];
+    wave_means(windows, shares, tau, share)[0]
+}
+
+/// The means of quantities (q, s, τ g) over wave vectors q.
+pub(crate) fn wave_means<const N: usize>(
+    windows: &[Window],
+    shares: &[f64],
+    tau: f64,
+    quantities: impl Fn([f64; 2], f64, f64) -> [f64; N],
+) -> [f64; N] {
+    let mut sums = [0.0; N];
     for wave in 0..WAVES * WAVES {
         // Not at q = 0 itself, where both symbols are 0.
         let q = [wave / WAVES, wave % WAVES].map(|i| TAU * (i as f64 + 0.5) / WAVES as f64);
@@ -38,9 +49,10 @@ pub(crate) fn determined_share(windows: &[Window], shares: &[f64], tau: f64) -> 
             along = [along[0] + share * h[0], along[1] + share * h[1]];
         }
         let measured = (seen - along[0] * along[0] - along[1] * along[1]).max(0.0);
-        sum += measured / (measured + tau * (bent(q[0]) + bent(q[1])));
+        let found = quantities(q, measured, tau * (bent(q[0]) + bent(q[1])));
+        sums.iter_mut().zip(found).for_each(|(sum, value)| *sum += value);
     }
-    sum / (WAVES * WAVES) as f64
+    sums.map(|sum| sum / (WAVES * WAVES) as f64)
 }
 
 /// Σ_j t_j e^{iq(first + j)}, real and imaginary part.

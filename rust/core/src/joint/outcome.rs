@@ -31,9 +31,7 @@ pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     if !system.pass.grid.is_spline() {
         return seen + params;
     }
-    let weights = system.pass.exposures.exposure_weights();
-    let total: f64 = weights.iter().sum();
-    let shares: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
+    let shares = system.shares_of_exposures();
     let windows = system.pass.grid.windows(&system.state.shifts);
     (determined_share(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
 }

@@ -62,6 +62,25 @@ impl Penalty {
         Self { shape, tau, counted, pull, norm: 0.0, bent, energy: 0.0 }
     }
 
+    /// Counts also where another penalty does; returns whether it now counts where the other one does not.
+    pub(crate) fn count_where(&mut self, other: &Self) -> bool {
+        let mut grows = false;
+        for (own, other) in self.counted.iter_mut().zip(&other.counted) {
+            for (own, other) in own.iter_mut().zip(other) {
+                grows |= *own > *other;
+                *own = own.max(*other);
+            }
+        }
+        grows
+    }
+
+    /// Whether it has a part in a cell.
+    pub(super) fn concerns(&self, cell: usize) -> bool {
+        let mut found = false;
+        self.for_row(cell, |_, _| found = true);
+        found
+    }
+
     /// Takes the beam a of weights D that its multiples are free of.
     pub(crate) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
         let cols = self.shape.cols;
@@ -242,6 +261,20 @@ impl<N: Value> pulp::NullaryFnOnce for Bend<'_, N> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn cells_out_of_sight_stay_in_it() {
+        let (shape, workers) = (Shape::new(9, 11), Workers::new(None).unwrap());
+        let seen = |rows: usize| -> Vec<f64> {
+            (0..99).map(|cell| f64::from(u8::from(cell / 11 < rows))).collect()
+        };
+        let of = |rows| Penalty::new(shape, &seen(rows), 1.0, &workers, &Control::default());
+        let (eight, nine) = (of(8), of(9));
+        let (first_of_row_9, mut less, mut more) = (8 * 11, of(8), of(9));
+        assert!(!eight.concerns(first_of_row_9) && nine.concerns(first_of_row_9));
+        assert!(!less.count_where(&nine) && less.counted == nine.counted);
+        assert!(more.count_where(&eight) && more.counted == nine.counted);
+    }
 
     #[test]
     fn a_multiple_of_the_beam_and_a_cubic_cost_nothing() {

@@ -111,6 +111,7 @@ fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
     let is_turned = system.pass.grid.geometry.views.len() > 1;
     let near = if is_turned { NEAR_OF_TURNED } else { NEAR };
     let (weights, shape) = (&system.weights, system.pass.grid.geometry.beam);
+    let penalty = system.penalty.as_ref();
     let rows = system.pass.workers.map(shape.rows, |row| {
         let mut found = Vec::new();
         for col in 0..shape.cols {
@@ -124,7 +125,7 @@ fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
                     let around = &weights[row * shape.cols + col - near..][..=2 * near];
                     around.iter().all(|&weight| weight >= least)
                 });
-            if weights[cell] > 0.0 && !inside {
+            if !inside && (weights[cell] > 0.0 || penalty.is_some_and(|p| p.concerns(cell))) {
                 found.push(cell as u32);
             }
         }

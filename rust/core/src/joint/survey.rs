@@ -1,14 +1,9 @@
-//! What the exposures show of the beam, in sums: over blocks of pixels, and of its structure.
+//! What the exposures show of the beam, in sums over blocks of pixels.
 
 use super::system::System;
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::{Real, Shape};
-
-/// Cells between slopes that are compared.
-const APART: usize = 8;
-/// Binomial factors of standard deviation 1.
-const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
+use crate::frames::Real;
 
 /// What one exposure shows in a block of pixels, with the light e = c L: Σ w (M e)², and with its
 /// slopes along the shift Σ w M² e ∂e and Σ w M² (∂e)².
@@ -55,39 +50,5 @@ impl<T: Real> System<'_, '_, T> {
         });
         let found: Result<Vec<Vec<Block>>> = found.into_iter().collect();
         Ok(found?.concat())
-    }
-
-    /// How much the beam's slopes change from place to place, over those of noise: the mean square of
-    /// the smoothed slopes' second differences over [`APART`] cells, by that of what smoothing took
-    /// away. A beam without structure, such as a Gaussian, has slopes of its own too, but by those
-    /// shifts are nearly degenerate with a bend of M.
-    pub(crate) fn structure(&self) -> f64 {
-        let Shape { rows, cols } = self.pass.grid.geometry.beam;
-        let beam = &self.state.beam;
-        let seen = |cell: usize| self.weights.get(cell).is_some_and(|&weight| weight > 0.0);
-        let [mut kept, mut lost] = [0.0, 0.0];
-        for (step, length) in [(1, cols), (cols, rows)] {
-            let slope = |cell: usize| beam[cell + step] - beam[cell - step];
-            let smooth = |cell: usize| {
-                let terms = SMOOTH.iter().enumerate();
-                terms.map(|(i, t)| t * slope(cell + i * step - 2 * step)).sum::<f64>()
-            };
-            for cell in 0..beam.len() {
-                let place = cell / step % length;
-                let ends = 3..length.saturating_sub(3 + 2 * APART);
-                if !ends.contains(&place) {
-                    continue;
-                }
-                let places = [cell, cell + APART * step, cell + 2 * APART * step];
-                let known =
-                    |cell: usize| seen(cell - 3 * step) && seen(cell) && seen(cell + 3 * step);
-                if places.into_iter().all(known) {
-                    let [first, middle, last] = places.map(smooth);
-                    kept += (first - 2.0 * middle + last).powi(2) / 6.0;
-                    lost += (slope(cell) - first).powi(2);
-                }
-            }
-        }
-        kept / lost
     }
 }

@@ -63,6 +63,8 @@ pub(crate) struct System<'m, 'a, T> {
     pub(crate) allows_single: bool,
     /// Whether the weights and τ are of the state last linearised.
     is_weighed_anew: bool,
+    /// Whether the penalty counts more cells than at the state linearised before.
+    pub(crate) sees_more: bool,
     /// The prior of M in weak light, and R there.
     pub(crate) prior: Option<Prior>,
     of_prior: f64,
@@ -100,6 +102,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             is_fused_anew: false,
             allows_single: true,
             is_weighed_anew: false,
+            sees_more: false,
             prior: None,
             of_prior: 0.0,
             state,
@@ -110,6 +113,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     pub(crate) fn seek_shifts(&mut self, prior: Option<ShiftPrior>) -> Option<ShiftPrior> {
         self.pass.with_shifts = prior.is_some();
         std::mem::replace(&mut self.shift_prior, prior)
+    }
+
+    /// The share of each exposure in all weights.
+    pub(super) fn shares_of_exposures(&self) -> Vec<f64> {
+        let weights = self.pass.exposures.exposure_weights();
+        let total: f64 = weights.iter().sum();
+        weights.iter().map(|weight| weight / total).collect()
     }
 
     /// Whether shifts are sought.
@@ -336,14 +346,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             objective += self.unit * precision * theta * theta;
         }
         if let Some(prior) = &self.shift_prior {
-            let known = prior.measured.as_flattened().iter().zip(prior.precisions.as_flattened());
-            let found = self.state.shifts.as_flattened();
-            let of_shifts = slope[cells + params..].iter_mut().zip(found).zip(known);
-            for ((slope, found), (measured, precision)) in of_shifts {
-                let deviation = found - measured;
-                *slope -= self.unit * precision * deviation;
+            let found = self.state.shifts.iter().zip(&prior.measured);
+            let deviations: Vec<[f64; 2]> =
+                found.map(|(d, measured)| [d[0] - measured[0], d[1] - measured[1]]).collect();
+            let known = deviations.as_flattened().iter().zip(prior.precisions.as_flattened());
+            for (deviation, precision) in known {
                 objective += self.unit * precision * deviation * deviation;
             }
+            let pulls = prior.pull(&deviations);
+            let of_shifts = slope[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(slope, pull)| *slope -= self.unit * pull);
         }
         objective
     }
@@ -408,9 +420,15 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         if let Some(penalty) = &self.penalty {
             penalty.add_product(&x[..cells], &mut product[..cells], self.pass.workers);
         }
-        let found = x[cells..cells + params].iter().chain(moves.as_flattened());
-        let priors = product[cells..].iter_mut().zip(found).zip(self.precisions());
-        priors.for_each(|((product, x), precision)| *product += precision * x);
+        let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
+        for ((product, x), precision) in of_flux.zip(&self.fluxes.precisions) {
+            *product += self.unit * precision * x;
+        }
+        if let Some(prior) = &self.shift_prior {
+            let pulls = prior.pull(&moves);
+            let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(product, pull)| *product += self.unit * pull);
+        }
         Ok(sums.largest)
     }
 
@@ -534,8 +552,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(SMOOTHING * typical, |penalty| penalty.tau);
             let shape = self.pass.grid.geometry.beam;
-            self.penalty =
-                Some(Penalty::new(shape, &self.weights, tau, self.pass.workers, control));
+            let mut penalty = Penalty::new(shape, &self.weights, tau, self.pass.workers, control);
+            // Nor would it be one if cells left it that come out of sight.
+            let last = self.penalty.take();
+            self.sees_more = last.is_some_and(|last| penalty.count_where(&last));
+            self.penalty = Some(penalty);
         }
         control.check()
     }
@@ -557,29 +578,5 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             *weight *= (self.pass.flux[exposure] * m).powi(2);
         }
         weights
-    }
-
-    /// M and O at the state, row by row.
-    pub(crate) fn pixels(&self) -> [Vec<f64>; 2] {
-        let mut found = [Vec::new(), Vec::new()];
-        self.pass.for_rows(|[sensitivity, _, _, offset, ..]| {
-            found[0].extend_from_slice(sensitivity);
-            found[1].extend_from_slice(offset);
-        });
-        found
-    }
-
-    /// The mean M of the pixels with measurements.
-    fn mean_sensitivity(&self) -> f64 {
-        let (mut sum, mut count) = (0.0, 0);
-        self.pass.for_rows(|[sensitivity, inverse, ..]| {
-            for (m, inverse) in sensitivity.iter().zip(inverse) {
-                if *inverse > 0.0 {
-                    sum += m;
-                    count += 1;
-                }
-            }
-        });
-        sum / f64::from(count.max(1))
     }
 }

@@ -13,8 +13,8 @@ use crate::parallel::Workers;
 ///
 /// Whole shifts and known fluxes leave M and L alone to be found, by the method asked for; everything
 /// else is fitted jointly. Pixels that their measurements leave almost no weight, or whose measurements
-/// contradict each other, are flagged and not in the mean. A `start` saves passes over the data; it must be of the same sensor, with as many
-/// exposures.
+/// contradict each other, are flagged and not in the mean. A `start` saves passes over the data; it must be of
+/// the same sensor, with as many exposures.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for options that make no sense, and for what does not go

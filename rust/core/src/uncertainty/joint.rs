@@ -13,7 +13,8 @@
 //!
 //! Three things stand beside S. A prior on fluxes leaves a tilt of M open that S does not see
 //! (`joint/flux.rs`): its covariance is added. Shifts that have a prior but were not refined are wrong by
-//! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
+//! its full width: what that does to M is drawn too, and likewise along the direction in which they were
+//! not refined; the two directions are taken as independent. And of all this the gauge of the result takes
 //! out the mean of M, and the tilt where free fluxes leave it undetermined.
 //!
 //! On larger sensors the squares of C x are smoothed (`smoothed.rs`).
@@ -30,7 +31,7 @@ use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::Solution;
+use crate::fit::{Refinement, Solution};
 use crate::frames::{Real, flag};
 use crate::joint::{
     self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
@@ -90,7 +91,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         })?;
         let mut system = problem(exposures, solution, workers, control)?;
         let prior = ShiftPrior::of(exposures.positions());
-        let (refined, considered) = if solution.refined { (prior, None) } else { (None, prior) };
+        let (refined, considered) = parted(solution.refinement, prior);
         system.seek_shifts(refined);
         system.allows_single = false;
         system.prior = solution.prior.as_ref().map(|weights| {
@@ -239,14 +240,16 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     ) -> Result<Vec<f64>> {
         let mut change = vec![0.0; self.valid.len()];
         if self.considered.is_some() {
-            let mut moved = vec![0.0; slope.len()];
+            let others = self.others();
+            let mut moved = vec![0.0; others];
             moved.extend(wrong);
             let pulled = self.considering(|system| {
                 let pulled = product(system, &moved, control);
                 add_change(system, &mut change);
                 pulled
             })?;
-            slope.iter_mut().zip(pulled).for_each(|(slope, pulled)| *slope -= pulled);
+            let pulled = slope[..others].iter_mut().zip(pulled);
+            pulled.for_each(|(slope, pulled)| *slope -= pulled);
         }
         self.apply_inverse(slope, lack, control)?;
         let x = std::mem::take(&mut self.search.x);
@@ -275,12 +278,16 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             Functional::Gain(gain) => self.variance_of_gain(gain, lack, control),
             Functional::Shifts(shifts) => {
                 let mut pull = vec![0.0; self.system.size()];
-                let own = self.system.centred_pulls(shifts);
-                let others = pull.len() - own.as_flattened().len();
+                let own = self.system.centred_pulls(shifts.clone());
+                let others = self.others();
                 pull[others..].copy_from_slice(own.as_flattened());
                 self.apply_inverse(pull, lack, control)?;
+                // What was not refined has its prior's variance.
+                let kept = self.considered.iter().flat_map(|prior| prior.centred_pulls(&shifts));
+                let kept = kept.flatten().zip(self.considered_variances());
+                let kept: f64 = kept.map(|(q, v)| q * q * v).sum();
                 let no_gain = vec![0.0; self.valid.len()];
-                Ok(self.search.energy + self.variance_by_dark(&no_gain, control)?)
+                Ok(self.search.energy + kept + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -301,11 +308,12 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             variance += form(covariance, heights);
         }
         let (pull, seen) = self.pull_of_gain(&gain, control)?;
-        let others = pull.len();
+        let others = self.others();
         self.apply_inverse(pull, lack, control)?;
         variance += self.search.energy + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
+            x.truncate(others);
             x.resize(others + seen.len(), 0.0);
             let pulled = self.considering(|system| product(system, &x, control))?;
             let left = seen.iter().zip(&pulled[others..]).map(|(seen, pulled)| seen - pulled);
@@ -317,16 +325,17 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// Cᵀ g, and what of it considered shifts get, of a functional in the gauge.
     fn pull_of_gain(&mut self, gain: &[f64], control: &Control) -> Result<(Vec<f64>, Vec<f64>)> {
         let cells = self.system.state.beam.len();
-        let (others, none) = (self.system.size(), vec![0.0; gain.len()]);
-        let mut pull = if self.considered.is_some() {
-            self.considering(|system| pull_of(system, gain, &none, control))?
-        } else {
-            pull_of(&mut self.system, gain, &none, control)?
-        };
+        let (others, none) = (self.others(), vec![0.0; gain.len()]);
+        let mut pull = pull_of(&mut self.system, gain, &none, control)?;
         if let Some(drift) = &self.tilts.drift {
             pull[cells] += self.system.pass.workers.dot(drift, gain);
         }
-        let seen = pull.split_off(others);
+        let seen = if self.considered.is_some() {
+            let all = self.considering(|system| pull_of(system, gain, &none, control))?;
+            all[others..].to_vec()
+        } else {
+            Vec::new()
+        };
         Ok((pull, seen))
     }
 
@@ -366,6 +375,11 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         }
         self.apply_inverse(pull, lack, control)?;
         Ok(variance + found + self.search.energy)
+    }
+
+    /// How many unknowns come before the shifts.
+    fn others(&self) -> usize {
+        self.system.state.beam.len() + self.system.fluxes.columns.len()
     }
 
     fn considered_variances(&self) -> Vec<f64> {
@@ -440,6 +454,21 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             first += gains.len();
         });
         variance
+    }
+}
+
+/// The part of the prior on shifts that were refined, and the part along which they were not.
+fn parted(
+    refinement: Refinement,
+    prior: Option<ShiftPrior>,
+) -> (Option<ShiftPrior>, Option<ShiftPrior>) {
+    let along = |[row, col]: [f64; 2]| {
+        prior.clone().map(|prior| ShiftPrior { along: Some([row, col]), ..prior })
+    };
+    match refinement {
+        Refinement::Done => (prior, None),
+        Refinement::Along([row, col]) => (along([row, col]), along([-col, row])),
+        _ => (None, prior),
     }
 }
 

@@ -63,7 +63,8 @@ impl Case {
             Exposures::new(measurements, positions, flux, self.offset, &workers, &control).unwrap();
         let options = crate::Options::default();
         let fit = crate::calibrate(&exposures, &options, None, &workers, &control).unwrap();
-        let solution = Solution { refined: self.refined, unit: UNIT, ..fit.solution() };
+        let refinement = if self.refined { Refinement::Done } else { Refinement::Undetermined };
+        let solution = Solution { refinement, unit: UNIT, ..fit.solution() };
         let covariance = JointCovariance::new(&exposures, &solution, &workers, &control);
         visit(&mut covariance.unwrap(), &control);
     }
