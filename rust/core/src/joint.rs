@@ -45,7 +45,7 @@ pub(crate) use flux::Fluxes;
 pub(crate) use kernel::{Propagate, Row};
 pub(crate) use layout::Grid;
 pub(crate) use memory::{bytes_needed, bytes_needed_by_covariance};
-pub(crate) use outcome::{coefficients, components, freedom, range, unknowns, values_at_cells};
+pub(crate) use outcome::{coefficients, components, freedom, unknowns, values_at_cells};
 pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;

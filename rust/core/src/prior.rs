@@ -14,12 +14,21 @@
 use std::sync::Arc;
 
 use crate::connectivity::NONE;
+use crate::median::{MEDIAN_OF_SQUARES, median};
 
 /// The standard deviation A of M, relative to its mean, that is assumed where there is no light. With a larger
 /// one noise is fitted by M L at the price of M = 0, and the minimum is not at M near its mean.
 const SPREAD: f64 = 0.2;
 /// D of the faintest pixel without a prior, in units of σ²: its M is known to 10 %.
 pub(crate) const LIT: f64 = 100.0;
+/// D of the faintest reliable pixel in weak light, in units of σ²: its M is known to 4 %.
+const RELIABLE: f64 = 625.0;
+/// D of a bright pixel over that of one in weak light, at least: a quarter of the light.
+const WEAK: f64 = 16.0;
+/// The share of pixels that is fainter than a bright one: a few brighter ones do not count.
+const BRIGHT: f64 = 0.9;
+/// Pixels whose D is sampled for that.
+const SAMPLES: usize = 1024;
 
 /// The weights λ of the prior, and of which piece each pixel is.
 #[derive(Clone, Debug)]
@@ -38,6 +47,51 @@ pub(crate) struct Prior {
 pub(crate) fn weight(information: f64, variance: f64) -> f64 {
     let lacking = (1.0 - information / (LIT * variance)).max(0.0);
     variance / (SPREAD * SPREAD) * lacking * lacking
+}
+
+/// The least D above 0, and that of a bright pixel.
+pub(crate) fn range(information: &[f64]) -> [f64; 2] {
+    let seen = || information.iter().copied().filter(|d| *d > 0.0);
+    let step = information.len().div_ceil(SAMPLES) | 1;
+    let mut sample: Vec<f64> = seen().step_by(step).collect();
+    sample.sort_unstable_by(f64::total_cmp);
+    let bright = sample.get((sample.len() as f64 * BRIGHT) as usize).copied();
+    [seen().fold(f64::INFINITY, f64::min), bright.unwrap_or(0.0)]
+}
+
+/// The pixels in light so weak that the prior weighs more than the data, or that M is not reliable.
+pub(crate) fn held(weights: &[f64], information: &[f64], variance: f64) -> Vec<usize> {
+    let [_, bright] = range(information);
+    let reliable = (RELIABLE * variance).min(bright / WEAK);
+    let is_held = |(weight, d): (&f64, &f64)| weight > d || (*d > 0.0 && *d < reliable);
+    let pixels = weights.iter().zip(information).enumerate();
+    pixels.filter(|&(_, pixel)| is_held(pixel)).map(|(pixel, _)| pixel).collect()
+}
+
+/// The part of the pixels' unknowns that the data leave to the prior, as the expectation of F shows it, where M
+/// scatters about its mean by `scatter`:
+///
+/// ```text
+/// Σ_p (1 − h)² (1 + D s²/σ²),   h = D/(D + λ)
+/// ```
+///
+/// that is 1 − h where M scatters as the prior supposes.
+pub(crate) fn freed(weights: &[f64], information: &[f64], variance: f64, scatter: f64) -> f64 {
+    let pixels = weights.iter().zip(information).filter(|(weight, _)| **weight > 0.0);
+    let open = pixels.map(|(weight, d)| {
+        let left = weight / (d + weight);
+        left * left * (1.0 + d * scatter * scatter / variance)
+    });
+    open.sum()
+}
+
+/// The standard deviation of M about its mean, relative to that, in pixels without a prior; at most what the
+/// prior supposes.
+pub(crate) fn scatter(weights: &[f64], sensitivity: &[f64], mean: f64) -> f64 {
+    let free = sensitivity.iter().zip(weights).filter(|(_, weight)| **weight == 0.0);
+    let mut squares: Vec<f64> = free.map(|(m, _)| (m / mean - 1.0).powi(2)).collect();
+    let found = median(&mut squares, f64::total_cmp).unwrap_or(f64::INFINITY);
+    (found / MEDIAN_OF_SQUARES).sqrt().min(SPREAD)
 }
 
 impl Prior {

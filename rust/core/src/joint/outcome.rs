@@ -17,14 +17,6 @@ pub(crate) fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
     system.pass.exposures.used().saturating_sub(pixels + unknowns(system)).max(1) as f64
 }
 
-/// The least D above 0, and that of a bright pixel: nine of ten are fainter.
-pub(crate) fn range(information: &[f64]) -> [f64; 2] {
-    let mut seen: Vec<f64> = information.iter().copied().filter(|d| *d > 0.0).collect();
-    seen.sort_unstable_by(f64::total_cmp);
-    let bright = seen.get(seen.len() * 9 / 10).copied().unwrap_or(0.0);
-    [seen.first().copied().unwrap_or(f64::INFINITY), bright]
-}
-
 pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     let seen = system.weights.iter().filter(|&&weight| weight > 0.0).count();
     let params = system.size() - system.state.beam.len();

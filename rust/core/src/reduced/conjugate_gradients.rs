@@ -117,6 +117,10 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         self.two_level.prepare(&self.reduced, control)
     }
 
+    pub(crate) const fn workers(&self) -> &'m Workers {
+        self.workers
+    }
+
     /// Forgets the preconditioner, since the prior is another.
     pub(crate) fn renew(&mut self) {
         self.two_level.forget();

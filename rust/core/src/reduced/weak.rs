@@ -159,22 +159,4 @@ impl<T: Real> Reduced<'_, '_, T> {
             f64::from(padding.row(&weak.weights, row)[col]).sqrt() * signs[row][col]
         });
     }
-
-    /// D of each pixel, without the prior, in the units of F.
-    pub(crate) fn information(&self) -> Vec<f64> {
-        let (padding, cols) = (self.padding, self.exposures.sensor().cols);
-        let mut found = Vec::with_capacity(self.exposures.sensor().len());
-        for row in 0..self.exposures.sensor().rows {
-            for col in 0..cols {
-                let inverse = f64::from(padding.row(&self.inverse_diagonal, row)[col]);
-                let own = self
-                    .weak
-                    .as_ref()
-                    .map_or(0.0, |w| f64::from(padding.row(&w.weights, row)[col]));
-                let whole = if inverse > 0.0 { 1.0 / inverse } else { 0.0 };
-                found.push((whole - own).max(0.0) / self.scale.slope());
-            }
-        }
-        found
-    }
 }

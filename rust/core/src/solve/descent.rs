@@ -20,8 +20,7 @@ const MOST_SWEEPS: u64 = 1_000_000;
 const TINY_ERROR: f64 = 1e-9;
 
 /// Sweeps until the estimated error of M is at most the tolerance, the sweeps are used up, or the
-/// estimate no longer falls. Returns the pixels too that the prior holds more than their
-/// measurements, and F + R at the result.
+/// estimate no longer falls. Returns what is known of weak light too, and F + R at the result.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
@@ -32,7 +31,7 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     start: Option<&Solution<'_>>,
     workers: &'m Workers,
     control: &Control,
-) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>, f64)> {
+) -> Result<(Estimate<'m, 'a, T>, History, WeakLight, f64)> {
     let limit = options.limit(MOST_SWEEPS)?;
     let mut estimate = Estimate::new(exposures, workers, control);
     if let Some(start) = start {
@@ -72,7 +71,7 @@ pub(super) fn minimise<'m, 'a, T: Real>(
             next_look = limit.min(sweep + wait);
             continue;
         };
-        return Ok((estimate, History { looks, ended }, weak.held, found));
+        return Ok((estimate, History { looks, ended }, weak, found));
     }
 }
 

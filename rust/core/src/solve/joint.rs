@@ -148,7 +148,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         if self.corrects_length(&linear.1) {
             return Ok(None);
         }
-        if self.weak.update_joint(&mut self.system)? {
+        if self.weak.update_joint(&mut self.system, control)? {
             linear = self.system.linearise(control)?;
             self.preconditioner = None;
         }
@@ -203,7 +203,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             return Ok(linear);
         }
         if !self.system.pass.exposures.variance_is_known() {
-            let freedom = joint::freedom(&self.system) + self.weak.held.len() as f64;
+            let freedom = joint::freedom(&self.system) + self.weak.freed;
             self.system.unit = self.system.misfit / freedom;
         }
         self.system.renew(control)
@@ -310,9 +310,12 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let history = History { looks: self.looks, ended };
         let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
-        let held = self.weak.held;
+        let (held, freed) = system.prior.as_ref().map_or((Vec::new(), 0.0), |prior| {
+            let (information, m) = (system.information(), &fit.sensitivity);
+            self.weak.held(&prior.weights, &information, m, system.mean)
+        });
         fit.degrees_of_freedom =
-            degrees_of_freedom(system, &fit, without_offset.len()) + held.len() as i64;
+            degrees_of_freedom(system, &fit, without_offset.len()) + freed.round() as i64;
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
         let theta = system.state.theta.first().copied().unwrap_or_default();
         let fluxes = fitted.then(|| FluxGauge {

@@ -38,8 +38,7 @@ const MOST_CURVED: f64 = 0.1;
 const TYPICAL: u64 = 60;
 
 /// Minimises F until the estimated error of M is at most the tolerance, the products are used up,
-/// or the estimate no longer falls. Returns the pixels too that the prior holds more than their
-/// measurements.
+/// or the estimate no longer falls. Returns what is known of weak light too.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
@@ -50,7 +49,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     start: Option<&Solution<'_>>,
     workers: &'m Workers,
     control: &Control,
-) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>)> {
+) -> Result<(Estimate<'m, 'a, T>, History, WeakLight)> {
     let limit = options.limit(MOST_PRODUCTS)?;
     let scale = Scale::of(exposures);
     let mut estimate = start::estimate(exposures, start, workers, control)?;
@@ -97,7 +96,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             continue;
         }
         if let Some(ended) = ended {
-            return Ok((estimate, History { looks, ended }, weak.held));
+            return Ok((estimate, History { looks, ended }, weak));
         }
         estimate.forget_beams();
         let total = forecast(&looks, options.tolerance).min(limit);

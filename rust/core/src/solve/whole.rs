@@ -34,7 +34,7 @@ pub(super) fn minimise<T: Real>(
     memory::check(bytes_needed(exposures), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
-    let (mut estimate, history, mut held, objective) = match options.method {
+    let (mut estimate, history, weak, objective) = match options.method {
         Method::Multiscale => {
             let found = multiscale::minimise(exposures, options, start, workers, control)?;
             let objective = found.1.last().objective;
@@ -46,6 +46,13 @@ pub(super) fn minimise<T: Real>(
     };
     let prior = estimate.prior.take();
     let misfit = objective - prior.clone().map_or(0.0, |mut p| p.at(&estimate.sensitivity));
+    let (mut held, mut freed) = (Vec::new(), 0.0);
+    if let Some(prior) = &prior {
+        let (information, m) = (estimate.information(control)?, &estimate.sensitivity);
+        let mean = m.iter().sum::<f64>() / m.len() as f64;
+        let weights: Vec<f64> = prior.weights.iter().map(|weight| weight / (mean * mean)).collect();
+        (held, freed) = weak.held(&weights, &information, m, mean);
+    }
     // After the solver, whose vectors then free memory for the sets.
     let (sensitivity, values) = estimate.into_maps();
     let dead = without_response(exposures, &sensitivity, &values, &history);
@@ -75,7 +82,7 @@ pub(super) fn minimise<T: Real>(
         shifts: exposures.positions().shifts.clone(),
         offset: None,
         flags: Vec::new(),
-        degrees_of_freedom: degrees_of_freedom(exposures.used(), held.len(), &components),
+        degrees_of_freedom: degrees_of_freedom(exposures.used(), freed, &components),
         prior: prior.map(|prior| prior.weights),
         components,
         misfit,
@@ -107,9 +114,10 @@ fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every
-/// pixel seen has its unknown, unless the prior holds it; a cell that only pixels without response see has none that F depends on.
-fn degrees_of_freedom(used: usize, held: usize, components: &Components) -> i64 {
+/// pixel seen has its unknown, but for what is left to the prior; a cell that only pixels without response see has
+/// none that F depends on.
+fn degrees_of_freedom(used: usize, freed: f64, components: &Components) -> i64 {
     let cells = components.cells.iter().filter(|&&label| label != NONE).count();
     let unknowns = components.seen + cells - components.sizes.len();
-    (used + held) as i64 - unknowns as i64
+    used as i64 + freed.round() as i64 - unknowns as i64
 }

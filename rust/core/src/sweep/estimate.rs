@@ -9,6 +9,7 @@ use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
 use crate::geometry::View;
+use crate::information;
 use crate::median::{MEDIAN_OF_SQUARES, median};
 use crate::padded::Padding;
 use crate::parallel::Workers;
@@ -161,9 +162,37 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         (IN_CACHE / row).max(4 * BAND * self.workers.count()).next_multiple_of(BAND)
     }
 
+    /// D = Σ w c² L² of each pixel, with the best L for equal pixels but for bright ones.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
+    pub(crate) fn first_information(
+        exposures: &'m Exposures<'a, T>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        let mut first = Self::new(exposures, workers, control);
+        first.start_bright(control)?;
+        first.with_best_beam(control, |_, _| Vec::new())?;
+        first.information(control)
+    }
+
+    /// D of each pixel with the L that there is.
+    pub(crate) fn information(&self, control: &Control) -> Result<Vec<f64>> {
+        let (geometry, Shape { rows, cols }) =
+            (self.exposures.geometry(), self.exposures.sensor());
+        let light = |k: usize| {
+            let place = &geometry.placements[k];
+            let (beam, width) = (&self.beams[place.view], geometry.views[place.view].shape.cols);
+            let row = |row: usize| &beam[(row + place.row) * width + place.col..][..cols];
+            (0..rows).flat_map(row).copied().collect()
+        };
+        information::of_sensor(self.exposures, self.exposures.flux(), light, self.workers, control)
+    }
+
     /// The variance of a measurement of weight 1: the median of a sample of squared residuals, of which a
-    /// few false ones do not move it, for as many degrees of freedom as `held` pixels without own M leave.
-    pub(crate) fn variance(&self, held: usize) -> f64 {
+    /// few false ones do not move it, with `freed` unknowns left to a prior.
+    pub(crate) fn variance(&self, freed: f64) -> f64 {
         let Shape { rows, cols } = self.exposures.sensor();
         let geometry = self.exposures.geometry();
         let mut squares = Vec::new();
@@ -188,11 +217,10 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
             }
         }
         let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
-        let unknowns = (rows * cols).saturating_sub(held) + cells;
-        let used = self.exposures.used();
-        let freedom = used.saturating_sub(unknowns).max(1);
+        let used = self.exposures.used() as f64;
+        let freedom = (used + freed - (rows * cols + cells) as f64).max(1.0);
         let median = median(&mut squares, f64::total_cmp).unwrap_or(0.0);
-        median / MEDIAN_OF_SQUARES * used as f64 / freedom as f64
+        median / MEDIAN_OF_SQUARES * used / freedom
     }
 
     /// Takes M as given; what is not a number becomes 1.
