@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::kernel::{STRETCH, Scratch, improve, measure, quotient};
-use super::lines::{BeamRow, darkest, pixel_lines};
+use super::lines::{BeamRow, darkest, pixel_lines, stands_out};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
@@ -66,13 +66,20 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                 if control.is_cancelled() {
                     return;
                 }
-                let row = darkest(exposures, band * BAND + index, &mut scratch);
+                let row_of_sensor = band * BAND + index;
+                let row = darkest(exposures, row_of_sensor, &mut scratch);
                 for (col, m) in pixels.iter_mut().enumerate() {
-                    let around = &row[col.saturating_sub(AROUND)..cols.min(col + AROUND + 1)];
+                    let range = col.saturating_sub(AROUND)..cols.min(col + AROUND + 1);
+                    let around = &row[range.clone()];
                     // Most are settled by the two at the ends.
                     if row[col] > BRIGHT * around[0].min(around[around.len() - 1]) {
                         let median = median(&mut around.to_vec(), f64::total_cmp).unwrap_or(0.0);
-                        if median > 0.0 && row[col] > BRIGHT * median && row[col].is_finite() {
+                        let bright = median > 0.0 && row[col] > BRIGHT * median;
+                        let place = [row_of_sensor, col];
+                        if bright
+                            && row[col].is_finite()
+                            && stands_out(exposures, place, range, BRIGHT)
+                        {
                             *m = row[col] / median;
                         }
                     }
