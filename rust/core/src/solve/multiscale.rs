@@ -29,6 +29,8 @@ const MOST_PRODUCTS: u64 = 100_000;
 const AIM: f64 = 0.8;
 /// The most that one step reduces the error by: single precision holds no more.
 const PRECISION: f64 = 1e-5;
+/// An estimated relative error at the start beyond which a step leads nowhere.
+const LOST: f64 = 100.0;
 /// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
 const RESCUE_SWEEPS: u64 = 32;
 const MOST_RESCUES: u32 = 8;
@@ -85,7 +87,9 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
         let ended = ended(&looks, &smallest, options, limit, noise);
-        if ended == Some(Ended::Stalled) && !smallest.settled && rescues < MOST_RESCUES {
+        let lost = looks.len() == 1 && !(looks[0].error < LOST);
+        let stalled = ended == Some(Ended::Stalled);
+        if (lost || stalled) && !smallest.settled && rescues < MOST_RESCUES {
             rescues += 1;
             smallest.stuck = false;
             for _ in 0..RESCUE_SWEEPS.min(limit.saturating_sub(products)) {

@@ -20,7 +20,7 @@ use crate::sweep::Estimate;
 
 /// D of the faintest pixel that single precision serves, as a share of a bright pixel's: fainter ones have a
 /// prior even without noise.
-const FAINTEST: f64 = 1e-12;
+const FAINTEST: f64 = 1e-24;
 /// How much D changes at most from the first beam on.
 const CHANGE: f64 = 4.0;
 /// Bytes for each pixel and each cell that the prior takes at its fullest: D, λ, pieces, λ in the linear problem,
