@@ -29,8 +29,10 @@ const MOST_PRODUCTS: u64 = 100_000;
 const AIM: f64 = 0.8;
 /// The most that one step reduces the error by: single precision holds no more.
 const PRECISION: f64 = 1e-5;
-/// An estimated relative error at the start beyond which a step leads nowhere.
+/// An estimated relative error beyond which a step leads nowhere.
 const LOST: f64 = 100.0;
+/// The largest change of an M by one step, relative to the mean.
+const LONGEST: f64 = 4.0;
 /// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
 const RESCUE_SWEEPS: u64 = 32;
 const MOST_RESCUES: u32 = 8;
@@ -59,7 +61,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     let mut smallest = Smallest::default();
     let mut weak = WeakLight::new();
     let mut looks: Vec<Look> = Vec::new();
-    let (mut halvings, mut rescues) = (0, 0);
+    let (mut halvings, mut rescues, mut length) = (0, 0, 1.0);
     let mut products = 0;
     loop {
         let mut objective = estimate.slopes(scale.slope(), &mut search.residual, control)?;
@@ -74,7 +76,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             halvings += 1;
             // The last time, what is left of the step is taken back.
             let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS));
-            estimate.advance(&search.x, -share);
+            estimate.advance(&search.x, -share * length);
             continue;
         }
         let stuck = halvings > MOST_HALVINGS;
@@ -87,7 +89,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
         let ended = ended(&looks, &smallest, options, limit, noise);
-        let lost = looks.len() == 1 && !(looks[0].error < LOST);
+        let lost = looks.last().is_some_and(|last| !(last.error < LOST));
         let stalled = ended == Some(Ended::Stalled);
         if (lost || stalled) && !smallest.settled && rescues < MOST_RESCUES {
             rescues += 1;
@@ -115,7 +117,9 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             }
             products += 1;
         }
-        estimate.advance(&search.x, 1.0);
+        let found = search.found();
+        length = if found > LONGEST { LONGEST / found } else { 1.0 };
+        estimate.advance(&search.x, length);
     }
 }
 
