@@ -22,6 +22,9 @@ const BLOCK: usize = 1 << 16;
 /// No eigenvalue that matters is smaller than 1/this: single precision cannot distinguish it from 0.
 const LONGEST_STEP: f64 = 1e6;
 
+/// The share of r · P⁻¹ r at the start that single precision does not resolve: Ritz values from there on are
+/// those of rounding.
+const UNRESOLVED: f64 = 4e-12;
 /// A relative error that is rounding alone.
 const ROUNDING: f64 = 4.0 * f64::EPSILON;
 
@@ -52,8 +55,9 @@ pub(crate) struct ConjugateGradients<'m, 'a, T> {
     pub(crate) x: Vec<f32>,
     direction: Vec<f32>,
     product: Vec<f32>,
-    /// r · P⁻¹ r.
+    /// r · P⁻¹ r, and that at the start.
     square: f64,
+    first_square: f64,
     /// The largest size of P⁻¹ r, in the units of M.
     largest: f64,
     /// x · b, which rises to b · S⁻¹ b: the sum of a r · P⁻¹ r over the steps.
@@ -80,6 +84,7 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
             direction,
             product,
             square: 0.0,
+            first_square: 0.0,
             largest: 0.0,
             energy: 0.0,
             ritz: Ritz::default(),
@@ -143,6 +148,7 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         self.ritz = Ritz::default();
         self.energy = 0.0;
         self.square = self.descend(0.0);
+        self.first_square = self.square;
         control.check()?;
         self.largest = self.turn(0.0, 0.0);
         Ok(())
@@ -181,6 +187,11 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
             && size.is_finite()
             && self.two_level.sees_large_scales();
         if known { size / self.reduced.mean } else { f64::INFINITY }
+    }
+
+    /// Whether an iteration more would resolve nothing.
+    pub(crate) fn is_exhausted(&self) -> bool {
+        self.square <= UNRESOLVED * self.first_square
     }
 
     /// Whether what is left is rounding alone.
