@@ -29,8 +29,6 @@ const MOST_PRODUCTS: u64 = 100_000;
 const AIM: f64 = 0.8;
 /// The most that one step reduces the error by: single precision holds no more.
 const PRECISION: f64 = 1e-5;
-/// An estimated relative error beyond which a step leads nowhere.
-const LOST: f64 = 100.0;
 /// The largest change of an M by one step, relative to the mean.
 const LONGEST: f64 = 4.0;
 /// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
@@ -89,9 +87,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
         let ended = ended(&looks, &smallest, options, limit, noise);
-        let lost = looks.last().is_some_and(|last| !(last.error < LOST));
-        let stalled = ended == Some(Ended::Stalled);
-        if (lost || stalled) && !smallest.settled && rescues < MOST_RESCUES {
+        if ended == Some(Ended::Stalled) && !smallest.settled && rescues < MOST_RESCUES {
             rescues += 1;
             smallest.stuck = false;
             for _ in 0..RESCUE_SWEEPS.min(limit.saturating_sub(products)) {
