@@ -186,8 +186,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
 
     /// D of each pixel with the L that there is.
     pub(crate) fn information(&self, control: &Control) -> Result<Vec<f64>> {
-        let (geometry, Shape { rows, cols }) =
-            (self.exposures.geometry(), self.exposures.sensor());
+        let (geometry, Shape { rows, cols }) = (self.exposures.geometry(), self.exposures.sensor());
         let light = |k: usize| {
             let place = &geometry.placements[k];
             let (beam, width) = (&self.beams[place.view], geometry.views[place.view].shape.cols);
