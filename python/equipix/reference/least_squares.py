@@ -26,7 +26,7 @@ def solve_dense(
     flux: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
     prior: ArrayLike | None = None,
-    steps: int = 20,
+    steps: int = 200,
 ) -> Solution:
     """Minimise F by Gauss-Newton steps, each a dense least-squares problem of least norm.
 

@@ -27,7 +27,9 @@ const RELIABLE: f64 = 625.0;
 const WEAK: f64 = 16.0;
 /// The share of pixels that is fainter than a bright one: a few brighter ones do not count.
 const BRIGHT: f64 = 0.9;
-/// Pixels whose D is sampled for that.
+/// One in so many measurements is in the faintest light.
+const FAINT: usize = 10;
+/// Pixels whose D is sampled for a bright one.
 const SAMPLES: usize = 1024;
 
 /// The weights λ of the prior, and of which piece each pixel is.
@@ -57,6 +59,19 @@ pub(crate) fn range(information: &[f64]) -> [f64; 2] {
     sample.sort_unstable_by(f64::total_cmp);
     let bright = sample.get((sample.len() as f64 * BRIGHT) as usize).copied();
     [seen().fold(f64::INFINITY, f64::min), bright.unwrap_or(0.0)]
+}
+
+/// The variance of a measurement of weight 1, from the squares of residuals in units of their standard deviations
+/// at such a weight, each with its share of D: the median of those in the faintest light. Where light is bright,
+/// M that is not yet found shows too.
+pub(crate) fn variance(mut samples: Vec<[f64; 2]>) -> f64 {
+    let faint = samples.len().div_ceil(FAINT);
+    if samples.is_empty() {
+        return 0.0;
+    }
+    samples.select_nth_unstable_by(faint - 1, |a, b| a[0].total_cmp(&b[0]));
+    let mut squares: Vec<f64> = samples[..faint].iter().map(|sample| sample[1]).collect();
+    median(&mut squares, f64::total_cmp).unwrap_or(0.0) / MEDIAN_OF_SQUARES
 }
 
 /// The pixels in light so weak that the prior weighs more than the data, or that M is not reliable.

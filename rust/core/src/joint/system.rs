@@ -27,8 +27,8 @@ use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
 use crate::geometry::TAPS;
-use crate::median::{MEDIAN_OF_SQUARES, median};
 use crate::parallel::Workers;
+use crate::prior;
 
 /// A determinant that is rounding alone, of two columns that are degenerate in a pixel.
 const SINGULAR: f64 = 1e-12;
@@ -257,12 +257,12 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         information
     }
 
-    /// The variance of a measurement of weight 1: the median of a sample of squared residuals, of which a
-    /// few false ones do not move it, with so many degrees of freedom.
+    /// The variance of a measurement of weight 1: from a sample of residuals, with so many degrees of
+    /// freedom.
     pub(crate) fn variance(&self, freedom: f64) -> f64 {
         let Shape { rows, cols } = self.pass.exposures.sensor();
         let count = self.pass.exposures.count();
-        let (mut squares, mut scratch) = (Vec::new(), vec![0.0; cols]);
+        let (mut samples, mut scratch) = (Vec::new(), vec![0.0; cols]);
         for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
             let known = self.pass.row(row);
             let part = |index: usize| known.get(index * cols..(index + 1) * cols);
@@ -275,15 +275,15 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                         Stretch::Weighted(values, weights) => (values[col], weights[col]),
                     };
                     let at = |part: Option<&[f64]>| part.map_or(0.0, |part| part[col]);
-                    let model = at(part(k)) * at(sensitivity) + at(offset);
+                    let light = at(part(k));
+                    let left = value.to_f64() - light * at(sensitivity) - at(offset);
                     if weight > 0.0 {
-                        squares.push(weight * (value.to_f64() - model).powi(2));
+                        samples.push([weight * light * light, weight * left * left]);
                     }
                 }
             }
         }
-        let median = median(&mut squares, f64::total_cmp).unwrap_or(0.0);
-        median / MEDIAN_OF_SQUARES * self.pass.exposures.used() as f64 / freedom
+        prior::variance(samples) * self.pass.exposures.used() as f64 / freedom
     }
 
     /// F and half the slope of −F, with the penalty and the priors.

@@ -21,6 +21,8 @@ use crate::sweep::Estimate;
 /// D of the faintest pixel that single precision serves, as a share of a bright pixel's: fainter ones have a
 /// prior even without noise.
 const FAINTEST: f64 = 1e-24;
+/// A variance of this share of the stated one, or less, contradicts it: there is no noise.
+const CONTRADICTED: f64 = 0.1;
 /// How much D changes at most from the first beam on.
 const CHANGE: f64 = 4.0;
 /// Bytes for each pixel and each cell that the prior takes at its fullest: D, λ, pieces, λ in the linear problem,
@@ -51,7 +53,8 @@ impl WeakLight {
 
     /// Takes this noise; whether σ² falls.
     fn hears<T: Real>(&mut self, exposures: &Exposures<'_, T>, noise: f64) -> bool {
-        self.noise = if exposures.variance_is_known() { noise.min(1.0) } else { noise };
+        let as_stated = exposures.variance_is_known() && noise >= CONTRADICTED;
+        self.noise = if as_stated { 1.0 } else { noise };
         self.noise.log2().ceil().exp2() < self.variance
     }
 

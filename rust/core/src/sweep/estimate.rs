@@ -10,10 +10,10 @@ use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
 use crate::geometry::View;
 use crate::information;
-use crate::median::{MEDIAN_OF_SQUARES, median};
+use crate::median::median;
 use crate::padded::Padding;
 use crate::parallel::Workers;
-use crate::prior::Prior;
+use crate::prior::{self, Prior};
 
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
@@ -196,12 +196,12 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         information::of_sensor(self.exposures, self.exposures.flux(), light, self.workers, control)
     }
 
-    /// The variance of a measurement of weight 1: the median of a sample of squared residuals, of which a
-    /// few false ones do not move it, with `freed` unknowns left to a prior.
+    /// The variance of a measurement of weight 1 from a sample of residuals, with `freed` unknowns left to a
+    /// prior.
     pub(crate) fn variance(&self, freed: f64) -> f64 {
         let Shape { rows, cols } = self.exposures.sensor();
         let geometry = self.exposures.geometry();
-        let mut squares = Vec::new();
+        let mut samples = Vec::new();
         let mut weights = vec![0.0; cols];
         for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
             for (k, place) in geometry.placements.iter().enumerate() {
@@ -217,7 +217,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                     if weight > 0.0 {
                         let model = self.exposures.flux()[k] * light[col];
                         let left = value.to_f64() - model * self.sensitivity[row * cols + col];
-                        squares.push(weight * left * left);
+                        samples.push([weight * model * model, weight * left * left]);
                     }
                 }
             }
@@ -225,8 +225,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
         let used = self.exposures.used() as f64;
         let freedom = (used + freed - (rows * cols + cells) as f64).max(1.0);
-        let median = median(&mut squares, f64::total_cmp).unwrap_or(0.0);
-        median / MEDIAN_OF_SQUARES * used / freedom
+        prior::variance(samples) * used / freedom
     }
 
     /// Takes M as given; what is not a number becomes 1.
