@@ -74,6 +74,7 @@ CHAIN = (
     {"fit"},
     {"joint", "reduced"},
     {"beam", "coarse", "convergence", "ritz", "sweep"},
+    {"prior"},
     {"connectivity", "information"},
     {"exposures"},
     {"padded"},

@@ -12,6 +12,7 @@ from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
 from equipix.reference.uncertainty import covariance
+from equipix.reference.weak_light import weak_light_prior
 
 __all__ = [
     "JointSolution",
@@ -27,4 +28,5 @@ __all__ = [
     "multiscale",
     "objective",
     "solve_dense",
+    "weak_light_prior",
 ]

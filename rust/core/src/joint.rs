@@ -50,6 +50,6 @@ pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
 pub(crate) use shift_information::Directions;
-pub(crate) use system::System;
+pub(crate) use system::{Prior, System};
 pub(crate) use unknowns::{ShiftPrior, State};
 pub(crate) use workspace::Workspace;

@@ -196,6 +196,7 @@ mod padded;
 pub mod parallel;
 #[doc(hidden)]
 pub mod parts;
+mod prior;
 mod random;
 mod reduced;
 mod ritz;

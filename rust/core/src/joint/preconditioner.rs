@@ -98,7 +98,8 @@ impl Preconditioner {
                 }
             }
         }
-        let coarse = Coarse::of_blocks(&hats, &own, entries, control)?;
+        let of_prior = prior_of_hats(system, &hats);
+        let coarse = Coarse::of_blocks(&hats, &of_prior, &own, entries, control)?;
         control.check()?;
         let waves = Waves::new(system, &blocks, seen);
         let rim = Rim::new(system, control)?;
@@ -196,6 +197,28 @@ impl Preconditioner {
             }
         }
     }
+}
+
+/// What the prior of M adds to the hats' own elements, M² D λ/(D + λ) of each pixel in the middle of the cells
+/// that it sees; empty without one.
+fn prior_of_hats<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<f64> {
+    let Some(prior) = &system.prior else { return Vec::new() };
+    let (cols, count) = (system.pass.exposures.sensor().cols, system.pass.exposures.count());
+    let origin = system.pass.grid.geometry.origin;
+    let (mut own, information) = (vec![0.0; hats.count()], system.information());
+    let [sensitivity, _] = system.pixels();
+    let weak = prior.weights.iter().enumerate().filter(|(_, weight)| **weight > 0.0);
+    for (pixel, weight) in weak {
+        let d = information[pixel];
+        let share = sensitivity[pixel].powi(2) * d * weight / (d + weight) / count as f64;
+        for k in 0..count {
+            let place = system.pass.grid.place(k, [pixel / cols, pixel % cols].map(|x| x as f64));
+            let [row, col] =
+                [0, 1].map(|i| place[i] + system.state.shifts[k][i] + origin[i] as f64);
+            hats.over(row, col).into_iter().for_each(|(hat, height)| own[hat] += share * height);
+        }
+    }
+    own
 }
 
 /// As many rows of cells as the filter takes.

@@ -24,13 +24,17 @@ use super::unknowns::{ShiftPrior, State};
 use super::workspace::Sums;
 use crate::control::Control;
 use crate::error::Result;
-use crate::exposures::Exposures;
-use crate::frames::Real;
+use crate::exposures::{Exposures, Stretch};
+use crate::frames::{Real, Shape};
 use crate::geometry::TAPS;
 use crate::parallel::Workers;
+use crate::prior;
 
 /// A determinant that is rounding alone, of two columns that are degenerate in a pixel.
 const SINGULAR: f64 = 1e-12;
+
+/// Rows and columns whose residuals are sampled.
+const SAMPLED: usize = 64;
 
 /// The problem at a state.
 pub(crate) struct System<'m, 'a, T> {
@@ -61,6 +65,16 @@ pub(crate) struct System<'m, 'a, T> {
     is_weighed_anew: bool,
     /// Whether the penalty counts more cells than at the state linearised before.
     pub(crate) sees_more: bool,
+    /// The prior of M in weak light, and R there.
+    pub(crate) prior: Option<Prior>,
+    of_prior: f64,
+}
+
+/// The prior of M, M = mean ± 1/√weight, in the pixels in weak light.
+pub(crate) struct Prior {
+    /// Row by row; 0 elsewhere.
+    pub(crate) weights: Vec<f64>,
+    pub(crate) mean: f64,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -89,6 +103,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             allows_single: true,
             is_weighed_anew: false,
             sees_more: false,
+            prior: None,
+            of_prior: 0.0,
             state,
         }
     }
@@ -164,6 +180,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let found = found?;
         self.append(&found, &mut pull);
         (self.misfit, self.pull) = (found.objective, pull);
+        self.of_prior = self.misfit_of_prior();
         self.mean = self.mean_sensitivity();
         // Cells come into sight where shifts move.
         if self.weights.is_empty() || self.shift_prior.is_some() {
@@ -190,6 +207,12 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         control: &Control,
     ) -> Result<Sums> {
         let views = self.pass.views_of(beam);
+        let cols = self.pass.exposures.sensor().cols;
+        let of_row = |row: usize| {
+            let weights = self.prior.as_ref().map(|prior| &prior.weights[row * cols..][..cols]);
+            weights.unwrap_or_default()
+        };
+        let mean = self.prior.as_ref().map_or(1.0, |prior| prior.mean);
         self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
             workspace.values().clear();
             pass.see(&views, row_index, workspace);
@@ -204,9 +227,63 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see_slopes(&views, row_index, workspace);
             let (weights, values, sums) = workspace.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
-            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular };
+            let prior = of_row(row_index);
+            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular, prior, mean };
             found.objective += pulp::Arch::new().dispatch(eliminate);
         })
+    }
+
+    /// R = Σ λ (M − μ)².
+    fn misfit_of_prior(&self) -> f64 {
+        let Some(prior) = &self.prior else { return 0.0 };
+        let (mut weights, mut total) = (prior.weights.iter(), 0.0);
+        self.pass.for_rows(|[sensitivity, ..]| {
+            for (m, weight) in sensitivity.iter().zip(weights.by_ref()) {
+                total += weight * (m - prior.mean).powi(2);
+            }
+        });
+        total
+    }
+
+    /// D of each pixel without the prior; 0 without a measurement.
+    pub(crate) fn information(&self) -> Vec<f64> {
+        let mut information = Vec::with_capacity(self.pass.exposures.sensor().len());
+        self.pass.for_rows(|[_, inverse, ..]| {
+            information.extend(inverse.iter().map(|&i| if i > 0.0 { 1.0 / i } else { 0.0 }));
+        });
+        for (d, own) in information.iter_mut().zip(self.prior.iter().flat_map(|p| &p.weights)) {
+            *d = (*d - own).max(0.0);
+        }
+        information
+    }
+
+    /// The variance of a measurement of weight 1: from a sample of residuals, with so many degrees of
+    /// freedom.
+    pub(crate) fn variance(&self, freedom: f64) -> f64 {
+        let Shape { rows, cols } = self.pass.exposures.sensor();
+        let count = self.pass.exposures.count();
+        let (mut samples, mut scratch) = (Vec::new(), vec![0.0; cols]);
+        for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
+            let known = self.pass.row(row);
+            let part = |index: usize| known.get(index * cols..(index + 1) * cols);
+            let (sensitivity, offset) = (part(count), part(count + 3));
+            for k in 0..count {
+                let measured = self.pass.exposures.stretch(k, row, 0..cols, &mut scratch);
+                for col in (0..cols).step_by(cols.div_ceil(SAMPLED)) {
+                    let (value, weight) = match &measured {
+                        Stretch::Uniform(values, weight) => (values[col], *weight),
+                        Stretch::Weighted(values, weights) => (values[col], weights[col]),
+                    };
+                    let at = |part: Option<&[f64]>| part.map_or(0.0, |part| part[col]);
+                    let light = at(part(k));
+                    let left = value.to_f64() - light * at(sensitivity) - at(offset);
+                    if weight > 0.0 {
+                        samples.push([weight * light * light, weight * left * left]);
+                    }
+                }
+            }
+        }
+        prior::variance(samples) * self.pass.exposures.used() as f64 / freedom
     }
 
     /// F and half the slope of −F, with the penalty and the priors.
@@ -229,12 +306,21 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         }
         let mut slope = self.pass.workers.filled(self.pull.len(), 0.0, control);
         slope.copy_from_slice(&self.pull);
-        let mut objective = self.misfit + self.pull_by_priors(&mut slope);
+        let mut objective = self.misfit + self.of_prior + self.pull_by_priors(&mut slope);
         if let Some(penalty) = &self.penalty {
             objective += penalty.pull(&mut slope[..self.state.beam.len()], self.pass.workers);
         }
+        self.balance(&mut slope[..self.state.beam.len()]);
         control.check()?;
         Ok((objective, slope))
+    }
+
+    /// A prior of M pulls at the multiple of the beam, which is held: what pulls at cells is without that.
+    fn balance(&self, pull: &mut [f64]) {
+        if self.prior.is_some() {
+            let multiple = self.pass.workers.dot(&self.state.beam, pull);
+            self.pass.workers.add_multiple(pull, -multiple, &self.scale);
+        }
     }
 
     /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam, which is not determined.
@@ -305,10 +391,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
-        if self.is_single() {
-            return self.multiply_single(x, product, share, control);
-        }
-        self.multiply_double(x, product, share, control)
+        let largest = if self.is_single() {
+            self.multiply_single(x, product, share, control)?
+        } else {
+            self.multiply_double(x, product, share, control)?
+        };
+        self.balance(&mut product[..self.state.beam.len()]);
+        Ok(largest)
     }
 
     /// [`multiply`](Self::multiply) in double precision.

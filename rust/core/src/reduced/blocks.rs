@@ -31,10 +31,12 @@ pub(super) fn coarse_spaces<T: Real>(
         .chunks_exact(geometry.placements.len())
         .enumerate()
         .map(|(block, weights)| blocks.entries(block, weights, hats, geometry));
-    let coarse = Coarse::of_blocks(hats, &[], entries, control)?;
+    let coarse = Coarse::of_blocks(hats, &reduced.prior_of_hats(hats), &[], entries, control)?;
     control.check()?;
     let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
-    let seen = seen(reduced.exposures, &finer);
+    // What a prior holds is no wave.
+    let without = reduced.weak.is_some();
+    let seen = if without { Vec::new() } else { seen(reduced.exposures, &finer) };
     let spots: Vec<Vec<Spot>> = match &seen[..] {
         [] => Vec::new(),
         _ => weights

@@ -11,6 +11,7 @@
 
 use super::options::Options;
 use super::start;
+use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::convergence::{
     Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, rounding, stalled_since,
@@ -31,6 +32,8 @@ const AIM: f64 = 0.8;
 const PRECISION: f64 = 1e-5;
 /// The most that the first step reduces the error by: what noise makes of a logarithm is left.
 const BY_LOGARITHMS: f64 = 1e-4;
+/// The largest change of an M by one step, relative to the mean.
+const LONGEST: f64 = 4.0;
 /// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
 const RESCUE_SWEEPS: u64 = 32;
 const MOST_RESCUES: u32 = 8;
@@ -40,8 +43,7 @@ const MOST_CURVED: f64 = 0.1;
 const TYPICAL: u64 = 60;
 
 /// Minimises F until the estimated error of M is at most the tolerance, the products are used up,
-/// or the estimate no longer falls. Returns the pixels too that their measurements leave almost no
-/// weight.
+/// or the estimate no longer falls. Returns what is known of weak light too.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
@@ -52,23 +54,27 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     start: Option<&Solution<'_>>,
     workers: &'m Workers,
     control: &Control,
-) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>)> {
+) -> Result<(Estimate<'m, 'a, T>, History, WeakLight)> {
     let limit = options.limit(MOST_PRODUCTS)?;
     let scale = Scale::of(exposures);
     let mut estimate = start::estimate(exposures, start, workers, control)?;
     let mut search = ConjugateGradients::new(exposures, workers, control);
     let mut smallest = Smallest::default();
+    let mut weak = WeakLight::new();
     let mut looks: Vec<Look> = Vec::new();
-    let (mut halvings, mut rescues) = (0, 0);
+    let (mut halvings, mut rescues, mut length) = (0, 0, 1.0);
     let mut products = 0;
     let mut by_logarithms = start.is_none();
     loop {
-        let (scale, slopes) = (scale.slope(), &mut search.residual);
-        let objective = if by_logarithms && looks.is_empty() {
-            estimate.slopes::<Logarithmic>(scale, slopes, control)?
-        } else {
-            estimate.slopes::<Plain>(scale, slopes, control)?
+        let first = by_logarithms && looks.is_empty();
+        let slopes = |estimate: &mut Estimate<'m, 'a, T>, slopes: &mut [f32]| {
+            if first {
+                estimate.slopes::<Logarithmic>(scale.slope(), slopes, control)
+            } else {
+                estimate.slopes::<Plain>(scale.slope(), slopes, control)
+            }
         };
+        let mut objective = slopes(&mut estimate, &mut search.residual)?;
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
@@ -87,12 +93,16 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             halvings += 1;
             // The last time, what is left of the step is taken back.
             let share = 0.5_f64.powi(halvings.min(MOST_HALVINGS));
-            estimate.advance::<Plain>(&search.x, -share);
+            estimate.advance::<Plain>(&search.x, -share * length);
             continue;
         }
         let stuck = halvings > MOST_HALVINGS;
         halvings = 0;
-        search.start(&estimate.sensitivity, estimate.beams(), control)?;
+        if weak.update(&mut estimate, &mut search, control)? {
+            objective = slopes(&mut estimate, &mut search.residual)?;
+            products += 1;
+        }
+        search.start(&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref(), control)?;
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
         let ended = ended(&looks, &smallest, options, limit, noise);
@@ -100,23 +110,18 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             rescues += 1;
             smallest.stuck = false;
             for _ in 0..RESCUE_SWEEPS.min(limit.saturating_sub(products)) {
-                estimate.sweep(control)?;
+                weak::sweep(&mut estimate, &mut search, control)?;
                 products += 1;
             }
             search.forget(control);
             continue;
         }
         if let Some(ended) = ended {
-            for (pixel, step) in search.left_out() {
-                estimate.sensitivity[pixel] += step;
-            }
-            let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
-            return Ok((estimate, History { looks, ended }, left_out));
+            return Ok((estimate, History { looks, ended }, weak));
         }
         estimate.forget_beams();
         let total = forecast(&looks, options.tolerance).min(limit);
         let aim = AIM * options.tolerance;
-        let first = by_logarithms && looks.len() == 1;
         let reachable = if first { search.largest() * BY_LOGARITHMS } else { reachable(&search) };
         while products + 1 < limit {
             control.report("calibrate", products, total.max(products));
@@ -127,10 +132,12 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             }
             products += 1;
         }
+        let found = search.found();
+        length = if found > LONGEST { LONGEST / found } else { 1.0 };
         if first {
             estimate.advance::<Logarithmic>(&search.x, 1.0);
         } else {
-            estimate.advance::<Plain>(&search.x, 1.0);
+            estimate.advance::<Plain>(&search.x, length);
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Where the loops start: at equal pixels, or at another fit.
 
+use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -7,7 +8,8 @@ use crate::fit::Solution;
 use crate::frames::Real;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
 use crate::parallel::Workers;
-use crate::sweep::Estimate;
+use crate::reduced::ConjugateGradients;
+use crate::sweep::{Estimate, Plain};
 
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
@@ -55,9 +57,13 @@ fn swept<T: Real>(
     control: &Control,
 ) -> Result<State> {
     let mut estimate = estimate(exposures, None, workers, control)?;
+    let mut search = ConjugateGradients::new(exposures, workers, control);
+    estimate.slopes::<Plain>(1.0, &mut search.residual, control)?;
+    WeakLight::new().update(&mut estimate, &mut search, control)?;
     for _ in 0..FIRST_SWEEPS {
-        estimate.sweep(control)?;
+        weak::sweep(&mut estimate, &mut search, control)?;
     }
+    drop(search);
     let geometry = exposures.geometry();
     let (known, places) = (&estimate.beams()[0], geometry.views[0].places);
     let value = |row, col| known[places.at(row, col)];

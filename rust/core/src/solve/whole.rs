@@ -34,23 +34,46 @@ pub(super) fn minimise<T: Real>(
     memory::check(bytes_needed(exposures), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
-    let (estimate, history, left_out, misfit) = match options.method {
+    let (mut estimate, history, weak, objective) = match options.method {
         Method::Multiscale => {
             let found = multiscale::minimise(exposures, options, start, workers, control)?;
-            let misfit = found.1.last().objective;
-            (found.0, found.1, found.2, misfit)
+            let objective = found.1.last().objective;
+            (found.0, found.1, found.2, objective)
         }
         Method::CoordinateDescent => {
             descent::minimise(exposures, options, start, workers, control)?
         }
     };
+    let prior = estimate.prior.take();
+    let misfit = objective - prior.clone().map_or(0.0, |mut p| p.at(&estimate.sensitivity));
+    let (mut held, mut freed) = (Vec::new(), 0.0);
+    if let Some(prior) = &prior {
+        let (information, m) = (estimate.information(control)?, &estimate.sensitivity);
+        let mean = m.iter().sum::<f64>() / m.len() as f64;
+        let weights: Vec<f64> = prior.weights.iter().map(|weight| weight / (mean * mean)).collect();
+        (held, freed) = weak.held(&weights, &information, m, mean);
+    }
     // After the solver, whose vectors then free memory for the sets.
     let (sensitivity, values) = estimate.into_maps();
     let dead = without_response(exposures, &sensitivity, &values, &history);
     let mut ties = vec![Tie::Firm; sensitivity.len()];
-    left_out.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
+    held.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
     dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
-    let components = Components::of(exposures, &ties, control)?;
+    let mut components = Components::of(exposures, &ties, control)?;
+    if let Some(prior) = &prior {
+        // Weak pixels apart from the largest part stand out by noise.
+        let apart = |&pixel: &usize| {
+            prior.weights[pixel] > 0.0 && components.pixels[pixel] > 0 && ties[pixel] == Tie::Firm
+        };
+        let more: Vec<usize> = (0..ties.len()).filter(apart).collect();
+        if !more.is_empty() {
+            more.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
+            held.extend(more);
+            held.sort_unstable();
+            components = Components::of(exposures, &ties, control)?;
+        }
+        components.adopt(exposures, &prior.pieces, &ties, control)?;
+    }
     let Geometry { beam: shape, origin, .. } = *exposures.geometry();
     let fit = Fit {
         sensitivity,
@@ -59,7 +82,8 @@ pub(super) fn minimise<T: Real>(
         shifts: exposures.positions().shifts.clone(),
         offset: None,
         flags: Vec::new(),
-        degrees_of_freedom: degrees_of_freedom(exposures.used(), &components),
+        degrees_of_freedom: degrees_of_freedom(exposures.used(), freed, &components),
+        prior: prior.map(|prior| prior.weights),
         components,
         misfit,
         history,
@@ -68,7 +92,7 @@ pub(super) fn minimise<T: Real>(
         leaves_tilt: false,
         smallest_ritz: None,
     };
-    Ok(Found { fit, left_out, dead, without_offset: Vec::new(), fluxes: None })
+    Ok(Found { fit, held, dead, without_offset: Vec::new(), fluxes: None })
 }
 
 /// What a solver holds beside the measurements at its fullest, in bytes: a search
@@ -90,9 +114,10 @@ fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every
-/// pixel seen has its unknown; a cell that only pixels without response see has none that F depends on.
-fn degrees_of_freedom(used: usize, components: &Components) -> i64 {
+/// pixel seen has its unknown, but for what is left to the prior; a cell that only pixels without response see has
+/// none that F depends on.
+fn degrees_of_freedom(used: usize, freed: f64, components: &Components) -> i64 {
     let cells = components.cells.iter().filter(|&&label| label != NONE).count();
     let unknowns = components.seen + cells - components.sizes.len();
-    used as i64 - unknowns as i64
+    used as i64 + freed.round() as i64 - unknowns as i64
 }

@@ -3,15 +3,17 @@
 use std::ops::Range;
 
 use super::kernel::{Difference, Plain, STRETCH, Scratch, improve, measure, quotient};
-use super::lines::{BeamRow, darkest, pixel_lines};
+use super::lines::{BeamRow, darkest, pixel_lines, stands_out};
 use crate::control::Control;
 use crate::error::Result;
-use crate::exposures::Exposures;
+use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
 use crate::geometry::View;
+use crate::information;
 use crate::median::median;
 use crate::padded::Padding;
 use crate::parallel::Workers;
+use crate::prior::{self, Prior};
 
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
@@ -23,6 +25,9 @@ const UNLIKE: f64 = 4.0;
 /// So many pixels on either side of it.
 const AROUND: usize = 4;
 
+/// Rows and columns whose residuals are sampled.
+const SAMPLED: usize = 64;
+
 /// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
 pub struct Estimate<'m, 'a, T> {
     exposures: &'m Exposures<'a, T>,
@@ -31,6 +36,8 @@ pub struct Estimate<'m, 'a, T> {
     pub sensitivity: Vec<f64>,
     /// L in each of the geometry's views; 0 without a measurement.
     beams: Vec<Vec<f64>>,
+    /// The prior of M, where light is weak.
+    pub(crate) prior: Option<Prior>,
 }
 
 impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
@@ -42,6 +49,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
             workers,
             sensitivity: workers.filled(exposures.sensor().len(), 1.0, control),
             beams: vec![Vec::new(); exposures.geometry().views.len()],
+            prior: None,
         }
     }
 
@@ -60,20 +68,23 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                 if control.is_cancelled() {
                     return;
                 }
-                let row = darkest(exposures, band * BAND + index, &mut scratch);
+                let row_of_sensor = band * BAND + index;
+                let row = darkest(exposures, row_of_sensor, &mut scratch);
                 for (col, m) in pixels.iter_mut().enumerate() {
-                    let around = &row[col.saturating_sub(AROUND)..cols.min(col + AROUND + 1)];
+                    let range = col.saturating_sub(AROUND)..cols.min(col + AROUND + 1);
+                    let around = &row[range.clone()];
                     // Most are settled by the two at the ends.
                     let ends = [around[0], around[around.len() - 1]];
                     let [low, high] = [ends[0].min(ends[1]), ends[0].max(ends[1])];
                     if row[col] > UNLIKE * low || UNLIKE * row[col] < high {
                         let median = median(&mut around.to_vec(), f64::total_cmp).unwrap_or(0.0);
-                        let ratio = row[col] / median;
-                        if median > 0.0
-                            && ratio.is_finite()
-                            && !(1.0 / UNLIKE..UNLIKE).contains(&ratio)
-                        {
-                            *m = ratio;
+                        let place = [row_of_sensor, col];
+                        let bright = row[col] > UNLIKE * median
+                            && stands_out(exposures, place, &range, |y, m| y > UNLIKE * m);
+                        let dark = UNLIKE * row[col] < median
+                            && stands_out(exposures, place, &range, |y, m| UNLIKE * y < m);
+                        if median > 0.0 && row[col].is_finite() && (bright || dark) {
+                            *m = row[col] / median;
                         }
                     }
                 }
@@ -92,8 +103,9 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         })
     }
 
-    /// Updates all L; writes half the slope of −F along each pixel's M, times `scale`, to `slopes`
-    /// and returns F. With logarithmic differences it is the slope of the problem of ln L and ln M.
+    /// Updates all L; writes half the slope of −F − R along each pixel's M, times `scale`, to `slopes`
+    /// and returns F + R, R being that of the prior. With logarithmic differences it is the slope of the
+    /// problem of ln L and ln M.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
@@ -105,10 +117,13 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     ) -> Result<f64> {
         let padding = Padding::of(self.exposures.geometry());
         let body = padding.body_mut(slopes);
-        self.with_best_beam::<D>(control, |estimate, rows| {
+        let sensitivity = &self.sensitivity;
+        let of_prior = self.prior.as_mut().map_or(0.0, |prior| prior.at(sensitivity));
+        let misfit = self.with_best_beam::<D>(control, |estimate, rows| {
             let body = &mut body[rows.start * padding.width..rows.end * padding.width];
             estimate.measure_slopes::<D>(rows, scale, &padding, body, control)
-        })
+        })?;
+        Ok(misfit + of_prior)
     }
 
     /// Allocates L where there is none, by the threads that will use it.
@@ -165,6 +180,65 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         let Shape { cols, .. } = self.exposures.sensor();
         let row = cols * self.exposures.count() * size_of::<T>();
         (IN_CACHE / row).max(4 * BAND * self.workers.count()).next_multiple_of(BAND)
+    }
+
+    /// D = Σ w c² L² of each pixel, with the best L for equal pixels but for bright ones.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
+    pub(crate) fn first_information(
+        exposures: &'m Exposures<'a, T>,
+        workers: &'m Workers,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        let mut first = Self::new(exposures, workers, control);
+        first.start(control)?;
+        first.with_best_beam::<Plain>(control, |_, _| Vec::new())?;
+        first.information(control)
+    }
+
+    /// D of each pixel with the L that there is.
+    pub(crate) fn information(&self, control: &Control) -> Result<Vec<f64>> {
+        let (geometry, Shape { rows, cols }) = (self.exposures.geometry(), self.exposures.sensor());
+        let light = |k: usize| {
+            let place = &geometry.placements[k];
+            let (beam, width) = (&self.beams[place.view], geometry.views[place.view].shape.cols);
+            let row = |row: usize| &beam[(row + place.row) * width + place.col..][..cols];
+            (0..rows).flat_map(row).copied().collect()
+        };
+        information::of_sensor(self.exposures, self.exposures.flux(), light, self.workers, control)
+    }
+
+    /// The variance of a measurement of weight 1 from a sample of residuals, with `freed` unknowns left to a
+    /// prior.
+    pub(crate) fn variance(&self, freed: f64) -> f64 {
+        let Shape { rows, cols } = self.exposures.sensor();
+        let geometry = self.exposures.geometry();
+        let mut samples = Vec::new();
+        let mut weights = vec![0.0; cols];
+        for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
+            for (k, place) in geometry.placements.iter().enumerate() {
+                let width = geometry.views[place.view].shape.cols;
+                let light =
+                    &self.beams[place.view][(row + place.row) * width + place.col..][..cols];
+                let measured = self.exposures.stretch(k, row, 0..cols, &mut weights);
+                for col in (0..cols).step_by(cols.div_ceil(SAMPLED)) {
+                    let (value, weight) = match &measured {
+                        Stretch::Uniform(values, weight) => (values[col], *weight),
+                        Stretch::Weighted(values, weights) => (values[col], weights[col]),
+                    };
+                    if weight > 0.0 {
+                        let model = self.exposures.flux()[k] * light[col];
+                        let left = value.to_f64() - model * self.sensitivity[row * cols + col];
+                        samples.push([weight * model * model, weight * left * left]);
+                    }
+                }
+            }
+        }
+        let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
+        let used = self.exposures.used() as f64;
+        let freedom = (used + freed - (rows * cols + cells) as f64).max(1.0);
+        prior::variance(samples) * used / freedom
     }
 
     /// Takes M as given; what is not a number becomes 1.
@@ -323,6 +397,12 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                         &mut scratch,
                     );
                     objective += measure::<T, D>(&lines, sought, &mut found, &mut weights);
+                    if let Some(prior) = &self.prior {
+                        let pixels = stretch.clone().map(|col| row * cols + col).zip(sought);
+                        for (found, (pixel, &m)) in found.iter_mut().zip(pixels) {
+                            *found += prior.slope(pixel, m);
+                        }
+                    }
                     for (slope, found) in slopes[stretch].iter_mut().zip(&found) {
                         *slope = (found * scale) as f32;
                     }
