@@ -98,7 +98,8 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         }
         let stuck = halvings > MOST_HALVINGS;
         halvings = 0;
-        if weak.update(&mut estimate, &mut search, control)? {
+        // Residuals of equal pixels are no noise.
+        if !first && weak.update(&mut estimate, &mut search, control)? {
             objective = slopes(&mut estimate, &mut search.residual)?;
             products += 1;
         }
