@@ -1,8 +1,8 @@
 //! Where light is weak: the noise that decides it, and the prior of M there.
 //!
-//! λ follows from D at the first beam, that of equal pixels, and from the variance σ² of a measurement of weight
-//! 1. So all methods have the same. σ² is that of residuals, rounded up to a power of 2. It only falls as the fit
-//! goes on, and λ with it, so that F + R never rises.
+//! λ follows from D at the first beam, that of equal pixels, and from the variance σ² of a measurement of unit
+//! weight, so all methods have the same. σ² is that of residuals, rounded up to a power of 2. It only falls as the
+//! fit goes on, and λ with it, so that F + R never rises.
 
 use std::sync::Arc;
 
@@ -68,12 +68,13 @@ impl WeakLight {
         control: &Control,
     ) -> Result<Option<Option<Prior>>> {
         let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
-        // Not a number where there is no light at all.
-        if !(variance < self.variance) {
-            return Ok(None);
+        // Neither holds where there is no light at all, and no number.
+        let falls = variance < self.variance;
+        if falls {
+            self.variance = variance;
         }
-        self.variance = variance;
-        if self.first.is_none() && !(least < CHANGE * LIT * variance) {
+        let is_weak = self.first.is_some() || least < CHANGE * LIT * variance;
+        if !falls || !is_weak {
             return Ok(None);
         }
         let first = match self.first.take() {
