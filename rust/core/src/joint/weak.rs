@@ -38,7 +38,7 @@ impl<T: Real> System<'_, '_, T> {
     pub(crate) fn variance(&self, freedom: f64) -> f64 {
         let Shape { rows, cols } = self.pass.exposures.sensor();
         let count = self.pass.exposures.count();
-        let (mut samples, mut scratch) = (Vec::new(), vec![0.0; cols]);
+        let (mut squares, mut scratch) = (Vec::new(), vec![0.0; cols]);
         for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
             let known = self.pass.row(row);
             let part = |index: usize| known.get(index * cols..(index + 1) * cols);
@@ -54,12 +54,12 @@ impl<T: Real> System<'_, '_, T> {
                     let light = at(part(k));
                     let left = value.to_f64() - light * at(sensitivity) - at(offset);
                     if weight > 0.0 {
-                        samples.push([weight * light * light, weight * left * left]);
+                        squares.push(weight * left * left);
                     }
                 }
             }
         }
-        prior::variance(samples) * self.pass.exposures.used() as f64 / freedom
+        prior::variance(squares) * self.pass.exposures.used() as f64 / freedom
     }
 
     /// A prior of M pulls at the multiple of the beam, which is held: what pulls at cells is without that.

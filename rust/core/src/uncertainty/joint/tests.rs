@@ -145,7 +145,12 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
         case.visit(|covariance, control| {
             let (pixels, size) = (covariance.valid.len(), covariance.system.size());
             let shifts = covariance.considered_variances().len();
-            let (x, gain) = (random_vector(size, 11), random_vector(pixels, 12));
+            let (mut x, gain) = (random_vector(size, 11), random_vector(pixels, 12));
+            // A prior holds the multiple of the beam, so that no solution contains it.
+            let cells = covariance.system.state.beam.len();
+            if case.held {
+                covariance.system.take_scale_out(&mut x[..cells]);
+            }
             let wrong: Vec<f64> = random_vector(shifts, 13).iter().map(|z| 0.1 * z).collect();
             // b = S x + S_d δ, which x solves.
             let whole = [&x[..], &wrong].concat();
