@@ -36,6 +36,7 @@ mod tests;
 mod tiles;
 mod unknowns;
 mod waves;
+mod weak;
 mod wide;
 mod workspace;
 
@@ -50,6 +51,6 @@ pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
 pub(crate) use shift_information::Directions;
-pub(crate) use system::{Prior, System};
-pub(crate) use unknowns::{ShiftPrior, State};
+pub(crate) use system::System;
+pub(crate) use unknowns::{Prior, ShiftPrior, State};
 pub(crate) use workspace::Workspace;

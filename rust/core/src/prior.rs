@@ -27,8 +27,6 @@ const RELIABLE: f64 = 625.0;
 const WEAK: f64 = 16.0;
 /// The share of pixels that is fainter than a bright one: a few brighter ones do not count.
 const BRIGHT: f64 = 0.9;
-/// One in so many measurements is in the faintest light.
-const FAINT: usize = 10;
 /// Pixels whose D is sampled for a bright one.
 const SAMPLES: usize = 1024;
 
@@ -61,16 +59,9 @@ pub(crate) fn range(information: &[f64]) -> [f64; 2] {
     [seen().fold(f64::INFINITY, f64::min), bright.unwrap_or(0.0)]
 }
 
-/// The variance of a measurement of weight 1, from the squares of residuals in units of their standard deviations
-/// at such a weight, each with its share of D: the median of those in the faintest light. Where light is bright,
-/// M that is not yet found shows too.
-pub(crate) fn variance(mut samples: Vec<[f64; 2]>) -> f64 {
-    let faint = samples.len().div_ceil(FAINT);
-    if samples.is_empty() {
-        return 0.0;
-    }
-    samples.select_nth_unstable_by(faint - 1, |a, b| a[0].total_cmp(&b[0]));
-    let mut squares: Vec<f64> = samples[..faint].iter().map(|sample| sample[1]).collect();
+/// The variance of a measurement of weight 1 from squares of residuals: their median, which a few false ones do
+/// not move.
+pub(crate) fn variance(mut squares: Vec<f64>) -> f64 {
     median(&mut squares, f64::total_cmp).unwrap_or(0.0) / MEDIAN_OF_SQUARES
 }
 

@@ -20,21 +20,17 @@ use super::kernel::{Eliminate, Propagate};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
-use super::unknowns::{ShiftPrior, State};
+use super::unknowns::{Prior, ShiftPrior, State};
 use super::workspace::Sums;
 use crate::control::Control;
 use crate::error::Result;
-use crate::exposures::{Exposures, Stretch};
-use crate::frames::{Real, Shape};
+use crate::exposures::Exposures;
+use crate::frames::Real;
 use crate::geometry::TAPS;
 use crate::parallel::Workers;
-use crate::prior;
 
 /// A determinant that is rounding alone, of two columns that are degenerate in a pixel.
 const SINGULAR: f64 = 1e-12;
-
-/// Rows and columns whose residuals are sampled.
-const SAMPLED: usize = 64;
 
 /// The problem at a state.
 pub(crate) struct System<'m, 'a, T> {
@@ -53,7 +49,7 @@ pub(crate) struct System<'m, 'a, T> {
     /// Σ w c² M² of the pixels that see a cell, by their factors.
     pub(crate) weights: Vec<f64>,
     /// D a/(aᵀD a) with these weights D and the coefficients a.
-    scale: Vec<f64>,
+    pub(super) scale: Vec<f64>,
     pub(crate) penalty: Option<Penalty>,
     /// A faster product where it serves, and whether it is of the state last linearised.
     fused: Option<Fused>,
@@ -68,13 +64,6 @@ pub(crate) struct System<'m, 'a, T> {
     /// The prior of M in weak light, and R there.
     pub(crate) prior: Option<Prior>,
     of_prior: f64,
-}
-
-/// The prior of M, M = mean ± 1/√weight, in the pixels in weak light.
-pub(crate) struct Prior {
-    /// Row by row; 0 elsewhere.
-    pub(crate) weights: Vec<f64>,
-    pub(crate) mean: f64,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -233,59 +222,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         })
     }
 
-    /// R = Σ λ (M − μ)².
-    fn misfit_of_prior(&self) -> f64 {
-        let Some(prior) = &self.prior else { return 0.0 };
-        let (mut weights, mut total) = (prior.weights.iter(), 0.0);
-        self.pass.for_rows(|[sensitivity, ..]| {
-            for (m, weight) in sensitivity.iter().zip(weights.by_ref()) {
-                total += weight * (m - prior.mean).powi(2);
-            }
-        });
-        total
-    }
-
-    /// D of each pixel without the prior; 0 without a measurement.
-    pub(crate) fn information(&self) -> Vec<f64> {
-        let mut information = Vec::with_capacity(self.pass.exposures.sensor().len());
-        self.pass.for_rows(|[_, inverse, ..]| {
-            information.extend(inverse.iter().map(|&i| if i > 0.0 { 1.0 / i } else { 0.0 }));
-        });
-        for (d, own) in information.iter_mut().zip(self.prior.iter().flat_map(|p| &p.weights)) {
-            *d = (*d - own).max(0.0);
-        }
-        information
-    }
-
-    /// The variance of a measurement of weight 1: from a sample of residuals, with so many degrees of
-    /// freedom.
-    pub(crate) fn variance(&self, freedom: f64) -> f64 {
-        let Shape { rows, cols } = self.pass.exposures.sensor();
-        let count = self.pass.exposures.count();
-        let (mut samples, mut scratch) = (Vec::new(), vec![0.0; cols]);
-        for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
-            let known = self.pass.row(row);
-            let part = |index: usize| known.get(index * cols..(index + 1) * cols);
-            let (sensitivity, offset) = (part(count), part(count + 3));
-            for k in 0..count {
-                let measured = self.pass.exposures.stretch(k, row, 0..cols, &mut scratch);
-                for col in (0..cols).step_by(cols.div_ceil(SAMPLED)) {
-                    let (value, weight) = match &measured {
-                        Stretch::Uniform(values, weight) => (values[col], *weight),
-                        Stretch::Weighted(values, weights) => (values[col], weights[col]),
-                    };
-                    let at = |part: Option<&[f64]>| part.map_or(0.0, |part| part[col]);
-                    let light = at(part(k));
-                    let left = value.to_f64() - light * at(sensitivity) - at(offset);
-                    if weight > 0.0 {
-                        samples.push([weight * light * light, weight * left * left]);
-                    }
-                }
-            }
-        }
-        prior::variance(samples) * self.pass.exposures.used() as f64 / freedom
-    }
-
     /// F and half the slope of −F, with the penalty and the priors.
     fn whole(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         let mut scale = std::mem::take(&mut self.scale);
@@ -313,14 +249,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.balance(&mut slope[..self.state.beam.len()]);
         control.check()?;
         Ok((objective, slope))
-    }
-
-    /// A prior of M pulls at the multiple of the beam, which is held: what pulls at cells is without that.
-    fn balance(&self, pull: &mut [f64]) {
-        if self.prior.is_some() {
-            let multiple = self.pass.workers.dot(&self.state.beam, pull);
-            self.pass.workers.add_multiple(pull, -multiple, &self.scale);
-        }
     }
 
     /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam, which is not determined.
@@ -358,14 +286,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             of_shifts.for_each(|(slope, pull)| *slope -= self.unit * pull);
         }
         objective
-    }
-
-    /// How many pixels have a measurement.
-    pub(crate) fn measured(&self) -> usize {
-        let mut count = 0;
-        self.pass
-            .for_rows(|[_, inverse, ..]| count += inverse.iter().filter(|i| **i > 0.0).count());
-        count
     }
 
     /// The pixels whose measurements do not distinguish an offset from a gain, where one is sought.

@@ -1,8 +1,8 @@
 //! Where light is weak: the noise that decides it, and the prior of M there.
 //!
-//! λ follows from D at the first beam, that of equal pixels, and from the variance σ² of a measurement of weight
-//! 1. So all methods have the same. σ² is that of residuals, rounded up to a power of 2. It only falls as the fit
-//! goes on, and λ with it, so that F + R never rises.
+//! λ follows from D at the first beam, that of equal pixels, and from the variance σ² of a measurement of unit
+//! weight, so all methods have the same. σ² is that of residuals, rounded up to a power of 2. It only falls as the
+//! fit goes on, and λ with it, so that F + R never rises.
 
 use std::sync::Arc;
 
@@ -21,19 +21,10 @@ use crate::sweep::{Estimate, Plain};
 /// D of the faintest pixel that single precision serves, as a share of a bright pixel's: fainter ones have a
 /// prior even without noise.
 const FAINTEST: f64 = 1e-24;
-/// A variance of this share of the stated one, or less, contradicts it: there is no noise.
-const CONTRADICTED: f64 = 0.1;
 /// How much D changes at most from the first beam on.
 const CHANGE: f64 = 4.0;
-/// Bytes for each pixel and each cell that the prior takes at its fullest: D, λ, pieces, λ in the linear problem,
-/// and the first M and L with the light of one exposure.
-const BYTES: [u64; 2] = [40, 8];
-
-/// D at the first beam and the piece of connected pixels of each pixel.
-struct First {
-    information: Vec<f64>,
-    pieces: Arc<[i32]>,
-}
+/// Bytes for each pixel and each cell of each view that the first D takes: D, M and L.
+const BYTES: [u64; 2] = [16, 8];
 
 /// The prior while it is sought.
 pub(crate) struct WeakLight {
@@ -41,20 +32,22 @@ pub(crate) struct WeakLight {
     noise: f64,
     /// σ² of the prior.
     variance: f64,
-    first: Option<First>,
+    /// D at the first beam, once light may be weak.
+    first: Option<Vec<f64>>,
+    /// The piece of connected pixels of each pixel, once one has a prior.
+    pieces: Option<Arc<[i32]>>,
     /// How many unknowns the data leave to the prior.
     pub(super) freed: f64,
 }
 
 impl WeakLight {
     pub(super) const fn new() -> Self {
-        Self { noise: 0.0, variance: f64::INFINITY, first: None, freed: 0.0 }
+        Self { noise: 0.0, variance: f64::INFINITY, first: None, pieces: None, freed: 0.0 }
     }
 
     /// Takes this noise; whether σ² falls.
     fn hears<T: Real>(&mut self, exposures: &Exposures<'_, T>, noise: f64) -> bool {
-        let as_stated = exposures.variance_is_known() && noise >= CONTRADICTED;
-        self.noise = if as_stated { 1.0 } else { noise };
+        self.noise = if exposures.variance_is_known() { noise.min(1.0) } else { noise };
         self.noise.log2().ceil().exp2() < self.variance
     }
 
@@ -68,27 +61,32 @@ impl WeakLight {
         control: &Control,
     ) -> Result<Option<Option<Prior>>> {
         let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
-        // Not a number where there is no light at all.
-        if !(variance < self.variance) {
+        // Neither holds where there is no light at all, and no number.
+        let falls = variance < self.variance;
+        if falls {
+            self.variance = variance;
+        }
+        let is_weak = self.first.is_some() || least < CHANGE * LIT * variance;
+        if !falls || !is_weak {
             return Ok(None);
         }
-        self.variance = variance;
-        if self.first.is_none() && !(least < CHANGE * LIT * variance) {
-            return Ok(None);
-        }
-        let first = match self.first.take() {
-            Some(first) => first,
-            None => First::of(exposures, pieces, workers, control)?,
+        let information = match self.first.take() {
+            Some(information) => information,
+            None => first_information(exposures, workers, control)?,
         };
-        let pixels = first.information.iter().zip(&*first.pieces);
-        let weight =
-            |(&d, &piece): (&f64, &i32)| if piece < 0 { 0.0 } else { prior::weight(d, variance) };
-        let weights: Arc<[f64]> = pixels.map(weight).collect();
-        self.freed = prior::freed(&weights, &first.information, variance, 0.0);
-        let pieces = Arc::clone(&first.pieces);
-        self.first = Some(first);
-        let some = weights.iter().any(|&weight| weight > 0.0);
-        Ok(Some(some.then(|| Prior::new(weights, pieces))))
+        let is_seen = |d: f64| d > 0.0;
+        let weight = |&d: &f64| if is_seen(d) { prior::weight(d, variance) } else { 0.0 };
+        let weights: Arc<[f64]> = information.iter().map(weight).collect();
+        self.freed = prior::freed(&weights, &information, variance, 0.0);
+        let prior = if weights.iter().any(|&weight| weight > 0.0) {
+            let found = self.pieces.take().map_or_else(|| pieces(&information), Ok)?;
+            self.pieces = Some(Arc::clone(&found));
+            Some(Prior::new(weights, found))
+        } else {
+            None
+        };
+        self.first = Some(information);
+        Ok(Some(prior))
     }
 
     /// Gives an estimate, whose beam is up to date, the prior that follows from it; whether it has changed.
@@ -157,21 +155,18 @@ impl WeakLight {
     }
 }
 
-impl First {
-    fn of<T: Real>(
-        exposures: &Exposures<'_, T>,
-        pieces: impl FnOnce(&[f64]) -> Result<Arc<[i32]>>,
-        workers: &Workers,
-        control: &Control,
-    ) -> Result<Self> {
-        let sizes = [exposures.sensor().len() as u64, exposures.geometry().beam.len() as u64];
-        memory::check(BYTES[0] * sizes[0] + BYTES[1] * sizes[1], || {
-            format!("weak light in {} exposures of {}", exposures.count(), exposures.sensor())
-        })?;
-        let information = Estimate::first_information(exposures, workers, control)?;
-        let pieces = pieces(&information)?;
-        Ok(Self { information, pieces })
-    }
+/// D at the first beam.
+fn first_information<T: Real>(
+    exposures: &Exposures<'_, T>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let (pixels, geometry) = (exposures.sensor().len(), exposures.geometry());
+    let cells: usize = geometry.views.iter().map(|view| view.shape.len()).sum();
+    memory::check(BYTES[0] * pixels as u64 + BYTES[1] * cells as u64, || {
+        format!("weak light in {} exposures of {}", exposures.count(), exposures.sensor())
+    })?;
+    Estimate::first_information(exposures, workers, control)
 }
 
 /// A sweep of coordinate descent; returns F + R before it where there is a prior, else F after it.

@@ -100,7 +100,7 @@ pub(super) fn minimise<T: Real>(
 ///
 /// | array | in bytes |
 /// |---|---|
-/// | M | 8 for each pixel |
+/// | M, and D at the first beam where light may be weak | 16 for each pixel |
 /// | L | 8 for each cell of each view |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
@@ -110,7 +110,7 @@ fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let views = geometry.views.len() as u64;
     let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
-    8 * pixels + 8 * views * cells + turned + reduced::bytes_needed(exposures)
+    16 * pixels + 8 * views * cells + turned + reduced::bytes_needed(exposures)
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every

@@ -200,13 +200,18 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     /// D of each pixel with the L that there is.
     pub(crate) fn information(&self, control: &Control) -> Result<Vec<f64>> {
         let (geometry, Shape { rows, cols }) = (self.exposures.geometry(), self.exposures.sensor());
-        let light = |k: usize| {
-            let place = &geometry.placements[k];
-            let (beam, width) = (&self.beams[place.view], geometry.views[place.view].shape.cols);
-            let row = |row: usize| &beam[(row + place.row) * width + place.col..][..cols];
-            (0..rows).flat_map(row).copied().collect()
-        };
-        information::of_sensor(self.exposures, self.exposures.flux(), light, self.workers, control)
+        let mut found = self.workers.filled(rows * cols, 0.0, control);
+        self.workers.map_blocks(&mut found, cols, |row, sums| {
+            let exposures = geometry.placements.iter().zip(self.exposures.flux()).enumerate();
+            for (k, (place, &flux)) in exposures {
+                let width = geometry.views[place.view].shape.cols;
+                let light =
+                    &self.beams[place.view][(row + place.row) * width + place.col..][..cols];
+                information::add(self.exposures, k, [row, 0], flux, light, sums);
+            }
+        });
+        control.check()?;
+        Ok(found)
     }
 
     /// The variance of a measurement of weight 1 from a sample of residuals, with `freed` unknowns left to a
@@ -214,7 +219,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     pub(crate) fn variance(&self, freed: f64) -> f64 {
         let Shape { rows, cols } = self.exposures.sensor();
         let geometry = self.exposures.geometry();
-        let mut samples = Vec::new();
+        let mut squares = Vec::new();
         let mut weights = vec![0.0; cols];
         for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
             for (k, place) in geometry.placements.iter().enumerate() {
@@ -230,7 +235,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                     if weight > 0.0 {
                         let model = self.exposures.flux()[k] * light[col];
                         let left = value.to_f64() - model * self.sensitivity[row * cols + col];
-                        samples.push([weight * model * model, weight * left * left]);
+                        squares.push(weight * left * left);
                     }
                 }
             }
@@ -238,7 +243,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
         let used = self.exposures.used() as f64;
         let freedom = (used + freed - (rows * cols + cells) as f64).max(1.0);
-        prior::variance(samples) * used / freedom
+        prior::variance(squares) * used / freedom
     }
 
     /// Takes M as given; what is not a number becomes 1.
