@@ -66,15 +66,12 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     let mut products = 0;
     let mut by_logarithms = start.is_none();
     loop {
-        let first = by_logarithms && looks.is_empty();
-        let slopes = |estimate: &mut Estimate<'m, 'a, T>, slopes: &mut [f32]| {
-            if first {
-                estimate.slopes::<Logarithmic>(scale.slope(), slopes, control)
-            } else {
-                estimate.slopes::<Plain>(scale.slope(), slopes, control)
-            }
+        let slope = scale.slope();
+        let mut objective = if by_logarithms && looks.is_empty() {
+            estimate.slopes::<Logarithmic>(slope, &mut search.residual, control)?
+        } else {
+            estimate.slopes::<Plain>(slope, &mut search.residual, control)?
         };
-        let mut objective = slopes(&mut estimate, &mut search.residual)?;
         products += 1;
         // F is no parabola in M far from its minimum: a step may be too long. It is shortened even
         // where that takes more products than allowed.
@@ -82,12 +79,20 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         let highest = looks.last().map_or(f64::INFINITY, |last| last.objective + noise);
         // A number that is none is no fall either.
         let fell = objective <= highest;
-        if !fell && by_logarithms && looks.len() == 1 {
-            // Of noise alone logarithms say nothing.
-            by_logarithms = false;
-            looks.clear();
-            estimate.start(control)?;
-            continue;
+        if by_logarithms && looks.len() == 1 {
+            if fell {
+                weak.update(&mut estimate, &mut search, control)?;
+            }
+            if !fell || estimate.prior.is_some() {
+                // Logarithms of noise say nothing.
+                by_logarithms = false;
+                (weak, estimate.prior) = (WeakLight::new(), None);
+                smallest = Smallest::default();
+                search.renew();
+                looks.clear();
+                estimate.start(control)?;
+                continue;
+            }
         }
         if !fell && halvings <= MOST_HALVINGS {
             halvings += 1;
@@ -98,9 +103,9 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         }
         let stuck = halvings > MOST_HALVINGS;
         halvings = 0;
-        // Residuals of equal pixels are no noise.
+        let first = by_logarithms && looks.is_empty();
         if !first && weak.update(&mut estimate, &mut search, control)? {
-            objective = slopes(&mut estimate, &mut search.residual)?;
+            objective = estimate.slopes::<Plain>(slope, &mut search.residual, control)?;
             products += 1;
         }
         search.start(&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref(), control)?;

@@ -193,6 +193,8 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
     ) -> Result<Vec<f64>> {
         let mut first = Self::new(exposures, workers, control);
         first.start(control)?;
+        // What a dark pixel shows is noise, which has no part in the prior.
+        first.sensitivity.iter_mut().for_each(|m| *m = m.max(1.0));
         first.with_best_beam::<Plain>(control, |_, _| Vec::new())?;
         first.information(control)
     }
