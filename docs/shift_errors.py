@@ -1,6 +1,6 @@
 """Compare errors of refined shifts and of M with their standard deviations.
 
-``python docs/shift_errors.py`` prints, over 100 experiments for each beam, z: the rms error over the
+``python docs/shift_errors.py`` prints z over 100 experiments for each beam: the rms error over the
 stated standard deviation, with its own standard error from the scatter of the experiments.
 """
 
@@ -30,7 +30,7 @@ def fringes(contrast: float, *, crossed: bool) -> simulate.Beam:
 
 
 def one(beam: simulate.Beam, seed: int) -> tuple[float, float, str]:
-    """Give mean squares of z of M and of the shifts less their mean, and whether these are refined."""
+    """Give mean squares of z of M and of shifts less their mean, and whether these are refined."""
     rng = np.random.default_rng(seed)
     measured = CROSS + STD * rng.standard_normal(CROSS.shape)
     truth = 1 + rng.uniform(-0.05, 0.05, SHAPE)

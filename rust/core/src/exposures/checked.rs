@@ -208,6 +208,13 @@ impl<'a, T: Real> Exposures<'a, T> {
         tallies.map(|(tally, c)| tally.weight * c * c).collect()
     }
 
+    /// The share of each exposure in all weights.
+    pub(crate) fn shares(&self) -> Vec<f64> {
+        let weights = self.exposure_weights();
+        let total: f64 = weights.iter().sum();
+        weights.iter().map(|weight| weight / total).collect()
+    }
+
     /// Calls `visit(pixel, cell)` for each used measurement.
     ///
     /// # Errors

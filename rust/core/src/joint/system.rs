@@ -104,13 +104,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         std::mem::replace(&mut self.shift_prior, prior)
     }
 
-    /// The share of each exposure in all weights.
-    pub(super) fn shares_of_exposures(&self) -> Vec<f64> {
-        let weights = self.pass.exposures.exposure_weights();
-        let total: f64 = weights.iter().sum();
-        weights.iter().map(|weight| weight / total).collect()
-    }
-
     /// Whether shifts are sought.
     pub(crate) const fn seeks_shifts(&self) -> bool {
         self.shift_prior.is_some()

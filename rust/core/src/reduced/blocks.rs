@@ -62,10 +62,7 @@ fn seen<T: Real>(exposures: &Exposures<'_, T>, hats: &Hats) -> Vec<SeenWave> {
         return Vec::new();
     }
     let places = Places(&exposures.geometry().placements);
-    let weights = exposures.exposure_weights();
-    let weighed = weights.iter().zip(exposures.flux()).map(|(weight, c)| weight * c * c);
-    let total: f64 = weighed.clone().sum();
-    let shares: Vec<f64> = weighed.map(|weight| weight / total).collect();
+    let shares = exposures.shares();
     let reach = [0, 1].map(|axis| {
         let along = places.0.iter().map(|place| [place.row, place.col][axis]);
         along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
