@@ -79,20 +79,14 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
         let highest = looks.last().map_or(f64::INFINITY, |last| last.objective + noise);
         // A number that is none is no fall either.
         let fell = objective <= highest;
-        if by_logarithms && looks.len() == 1 {
-            if fell {
-                weak.update(&mut estimate, &mut search, control)?;
-            }
-            if !fell || estimate.prior.is_some() {
-                // Logarithms of noise say nothing.
-                by_logarithms = false;
-                (weak, estimate.prior) = (WeakLight::new(), None);
-                smallest = Smallest::default();
-                search.renew();
-                looks.clear();
-                estimate.start(control)?;
-                continue;
-            }
+        if by_logarithms && looks.len() == 1 && (!fell || WeakLight::may_be(&estimate, &search)) {
+            // Logarithms of noise say nothing.
+            by_logarithms = false;
+            smallest = Smallest::default();
+            search.renew();
+            looks.clear();
+            estimate.start(control)?;
+            continue;
         }
         if !fell && halvings <= MOST_HALVINGS {
             halvings += 1;

@@ -89,6 +89,19 @@ impl WeakLight {
         Ok(Some(prior))
     }
 
+    /// Whether residuals are so large, or light so weak, that some pixels may need a prior.
+    pub(super) fn may_be<T: Real>(
+        estimate: &Estimate<'_, '_, T>,
+        search: &ConjugateGradients<'_, '_, T>,
+    ) -> bool {
+        let exposures = search.reduced.exposures;
+        let mut weak = Self::new();
+        weak.hears(exposures, estimate.variance(0.0));
+        let [least, bright] = search.reduced.range;
+        let variance = weak.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
+        least < CHANGE * LIT * variance
+    }
+
     /// Gives an estimate, whose beam is up to date, the prior that follows from it; whether it has changed.
     pub(super) fn update<T: Real>(
         &mut self,

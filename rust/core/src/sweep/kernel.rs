@@ -59,8 +59,9 @@ impl Difference for Plain {
     }
 }
 
-/// A measurement is no further from its model than by this factor: what is nearly dark has no logarithm.
-const FARTHEST: f64 = 1000.0;
+/// A measurement that is further from its model than by this factor differs plainly: what is nearly dark, such as
+/// a pixel under dust in one exposure, has no logarithm.
+const FARTHEST: f64 = 200.0;
 /// The longest step of a logarithm.
 const LONGEST: f64 = 7.0;
 
@@ -69,8 +70,9 @@ impl Difference for Logarithmic {
 
     #[inline(always)]
     fn of(value: f64, model: f64) -> f64 {
-        let ratio = (value / model).clamp(1.0 / FARTHEST, FARTHEST);
-        if model > 0.0 { model * logarithm(ratio) } else { value - model }
+        let ratio = value / model;
+        let is_near = model > 0.0 && ratio > 1.0 / FARTHEST && ratio < FARTHEST;
+        if is_near { model * logarithm(ratio) } else { value - model }
     }
 
     #[inline(always)]
