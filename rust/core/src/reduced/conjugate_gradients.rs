@@ -138,6 +138,23 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         terms.for_each(|((x, b), inverse)| *x = b * inverse);
     }
 
+    /// Takes out of the right-hand side what lies along the gauge direction M, in which S is 0: b is orthogonal
+    /// to M but for differences that do not add up.
+    pub(crate) fn take_gauge_out(&mut self) {
+        let Reduced { sensitivity, inverse_diagonal, .. } = &self.reduced;
+        let places = self.residual.iter().zip(sensitivity).zip(inverse_diagonal);
+        let [mut along, mut weight] = [0.0; 2];
+        for ((&b, &m), &inverse) in places.filter(|(_, inverse)| **inverse > 0.0) {
+            along += f64::from(b) * f64::from(m);
+            weight += f64::from(m).powi(2) / f64::from(inverse);
+        }
+        let share = (along / weight) as f32;
+        let places = self.residual.iter_mut().zip(sensitivity).zip(inverse_diagonal);
+        for ((b, m), inverse) in places.filter(|(_, inverse)| **inverse > 0.0) {
+            *b -= share * m / inverse;
+        }
+    }
+
     /// Starts from x = 0, where the residual is b, with the S that there is.
     ///
     /// # Errors

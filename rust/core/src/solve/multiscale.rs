@@ -102,7 +102,12 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
             objective = estimate.slopes::<Plain>(slope, &mut search.residual, control)?;
             products += 1;
         }
-        search.start(&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref(), control)?;
+        let (m, beams, prior) = (&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref());
+        search.linearise(m, beams, prior, control)?;
+        if first {
+            search.take_gauge_out();
+        }
+        search.begin(control)?;
         looks.push(Look { sweep: products, objective, error: smallest.error(&search) });
         smallest.stuck |= stuck;
         let ended = ended(&looks, &smallest, options, limit, noise);
