@@ -138,6 +138,7 @@
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
 //!
+//! response        response curves from levels of a uniform source  (uses parallel and below)
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
 //! centroid        a spot's centroid with its standard error     (uses connectivity)
@@ -196,6 +197,7 @@ pub mod parallel;
 pub mod parts;
 mod random;
 mod reduced;
+pub mod response;
 mod ritz;
 pub mod solve;
 pub mod statistics;
