@@ -49,8 +49,8 @@ def main() -> None:
         )
         print(
             f"{exposures} exposures: {best}, tilt from drift {1 / drift:.1f} times smaller, noise "
-            f"{noise:.2f} times that of the cross; a linear trend: {best.budget.trend_told:.1%} "
-            f"told from a tilt; {seconds:.1f} s"
+            f"{noise:.2f} times that of the cross; a linear trend: "
+            f"{best.budget.distinct_trend:.1%} distinct from a tilt; {seconds:.1f} s"
         )
         budgets.append(best.budget)
     draw_plans(budgets).savefig(FOLDER / "plan.png", **SAVED)

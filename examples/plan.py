@@ -28,7 +28,7 @@ def main() -> None:
     best = plan.suggest(SENSOR, 5, 20, **CAUSES)[0]
     print("suggested:", best.budget)
     print("in this order (row, col):", best.shifts.tolist())
-    shares = plan.trend_told(cross), plan.trend_told(best.shifts)
+    shares = plan.distinct_trend(cross), plan.distinct_trend(best.shifts)
     print(f"of a linear drift {shares[0]:.1%} and {shares[1]:.1%} do not look like a tilt")
 
     # The experiment with all three errors, simulated with a known sensitivity.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import textwrap
@@ -208,6 +209,7 @@ FRAMES = np.zeros((3, 4, 5), np.uint8)
         ([None], {}, r"'source\[0\]' has dtype object"),
         (FRAMES, {"dark": np.zeros((5, 4))}, r"'dark' has shape \(5, 4\), expected \(4, 5\)"),
         (FRAMES, {"dark": np.zeros(4)}, "'dark' has shape"),
+        (FRAMES, {"dark": np.full((4, 5), np.nan)}, "'dark' holds no finite number"),
         (FRAMES, {"saturation": np.nan}, "'saturation' is nan"),
         (FRAMES, {"saturation": "full"}, "'saturation' is 'full'"),
         (FRAMES, {"workers": 0}, "'workers' is 0"),
@@ -313,13 +315,79 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         equipix.average(tmp_path)
 
 
-def test_a_mask_is_refused_where_it_would_be_lost() -> None:
-    frames = np.ma.masked_greater(np.arange(24.0).reshape(2, 3, 4), 20)
-    with pytest.raises(InputError, match=r"'source' is a masked array.*NaN"):
-        equipix.average(frames)
+@pytest.mark.parametrize("dtype", ["uint16", "float32", "float64"])
+@pytest.mark.parametrize("as_list", [False, True], ids=["array", "list"])
+def test_masked_samples_do_not_count(dtype: str, as_list: bool) -> None:
+    """A frame with samples of 60 000 over a scene of 100, masked by numpy.ma."""
+    values = np.random.default_rng(1).integers(98, 104, (7, 5, 6)).astype(dtype)
+    spoilt = np.zeros(values.shape, bool)
+    spoilt[3, 1:3, 2:5] = True
+    frames = np.ma.array(np.where(spoilt, dtype_of(dtype)(60_000), values), mask=spoilt)
+    found = equipix.average(list(frames) if as_list else frames)
+    wanted = equipix.average(np.where(spoilt, np.nan, values.astype("float64")))
+    np.testing.assert_array_equal(found.count, wanted.count)
+    # Sums of seven whole numbers are exact.
+    np.testing.assert_array_equal(found.mean, wanted.mean)
+    np.testing.assert_allclose(found.variance, wanted.variance, rtol=8 * np.finfo(float).eps)
+
+
+def dtype_of(name: str) -> type:
+    return np.dtype(name).type
+
+
+def test_masked_whole_numbers_keep_their_saturation_level() -> None:
+    values = np.full((2, 3, 4), 255, np.uint8)
+    frames = np.ma.array(values, mask=np.zeros(values.shape, bool))
+    frames[0, 0, 0] = np.ma.masked
+    assert equipix.average(frames).saturated.sum() == 2 * 3 * 4 - 1
+
+
+def test_frames_with_a_mask_and_without_are_not_mixed() -> None:
+    frame = np.ones((3, 4))
+    with pytest.raises(InputError, match=r"'source\[1\]' is a MaskedArray, expected a ndarray"):
+        equipix.average([frame, np.ma.masked_equal(frame, 2)])
+
+
+def test_masked_pixels_have_no_mean() -> None:
+    frames = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
+    mask = np.zeros((3, 4), bool)
+    mask[1, 2] = True
+    found, whole = equipix.average(frames, mask=mask), equipix.average(frames)
+    assert found.count[1, 2] == found.saturated[1, 2] == 0
+    for name, values in found.maps.items():
+        assert np.isnan(values[mask]).all() or not values[mask].any()
+        np.testing.assert_array_equal(values[~mask], whole.maps[name][~mask])
+
+
+@pytest.mark.parametrize(
+    "mask", [np.zeros((3, 4)), np.zeros((4, 3), bool), np.ones((3, 4), bool), "mask"]
+)
+def test_a_mask_that_is_none_is_refused(mask: object) -> None:
+    with pytest.raises(InputError, match="'mask'"):
+        equipix.average(np.ones((2, 3, 4)), mask=mask)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("level", [0, -1, float("nan")])
 def test_a_saturation_level_is_above_0(level: float) -> None:
     with pytest.raises(InputError, match=r"'saturation' is .*above 0"):
         equipix.average(np.ones((2, 3, 4)), saturation=level)
+
+
+@pytest.mark.parametrize("name", ["variance", "variance_of_mean", "count", "saturated", "dark"])
+def test_statistics_of_different_shapes_are_refused_by_name(name: str) -> None:
+    good, other = equipix.average(np.ones((3, 4, 5))), equipix.average(np.ones((3, 4, 6)))
+    wrong = other if name == "dark" else getattr(other, name)
+    with pytest.raises(InputError, match=rf"'{name}' of FrameStatistics has shape \(4, 6\)"):
+        dataclasses.replace(good, **{name: wrong})
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_a_variance_that_is_none_is_refused(value: float) -> None:
+    rng = np.random.default_rng(1)
+    shifts = [(0, 0), (0, 3), (3, 0)]
+    frames = [equipix.average(rng.normal(1000, 5, (4, 20, 30))) for _ in shifts]
+    variance = frames[1].variance.copy()
+    variance[2, 3] = value
+    frames[1] = dataclasses.replace(frames[1], variance=variance)
+    with pytest.raises(InputError, match=f"exposure 1: 'variance' holds {value:g}, expected"):
+        equipix.calibrate(frames, shifts)

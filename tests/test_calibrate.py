@@ -108,6 +108,20 @@ class TestAgainstReference:
         assert equipix.calibrate(frames, CROSS).sensitivity.dtype == np.float64
         assert equipix.calibrate(frames.astype(np.float32), CROSS).sensitivity.dtype == np.float32
 
+    def test_arrays_of_the_fit_are_read_only(self):
+        # std_of, predict and a later start read them again.
+        frames, _ = measured((16, 18))
+        cal = equipix.calibrate(frames, CROSS + 0.25 * np.eye(5, 2), uncertainty=True)
+        fit = cal.weighted.fit
+        arrays = [cal.sensitivity, cal.beam, cal.beam_coefficients, cal.component_labels]
+        arrays += [*vars(cal.history).values(), fit.flags, fit.information(workers=1)]
+        arrays += [fit.beam.light((16, 18), (0, 0), 0, workers=1)]
+        for array in arrays:
+            with pytest.raises(ValueError, match="read-only"):
+                array[...] = 0
+            with pytest.raises(ValueError, match="WRITEABLE"):
+                array.flags.writeable = True
+
 
 class TestAgainstTruth:
     def test_without_noise_the_truth_comes_back_to_rounding(self):
@@ -354,8 +368,8 @@ class TestFrameStatistics:
         frames, truth = measured((30, 40), noise=0)
         raw = np.rint(frames[:, None] * 200).astype(np.uint8)
         raw[2, :, 5, 6] = 255
-        averages = [equipix.average(each) for each in raw]
-        cal = equipix.calibrate(averages, CROSS, variance=np.ones(5))
+        averages = [equipix.average(each, dark=np.zeros(truth.shape)) for each in raw]
+        cal = equipix.calibrate(averages, CROSS, variance=np.full(5, 1 / 12))
         assert np.argwhere(cal.flags == Flag.SATURATED).tolist() == [[5, 6]]
         # The other four exposures determine the pixel, to the rounding of 200 DN.
         assert cal.sensitivity[5, 6] == pytest.approx(truth[5, 6], abs=5 / 200)

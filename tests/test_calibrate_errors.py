@@ -2,19 +2,41 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 import equipix
 from equipix import io
+from equipix._types import Method
 from equipix.calibration.saved import FORMAT
 from equipix.errors import ConvergenceWarning, FileError, InputError, ShiftRoundingWarning
+from equipix.exposures.options import FitOptions
+from equipix.exposures.positions import Positions
+from equipix.shifts import Rounding
 
 CROSS = equipix.cross_pattern(2, 3)
 
 
 def frames(shape=(5, 8, 9)):
     return np.random.default_rng(0).uniform(0.5, 1.5, shape)
+
+
+class Lengths:
+    """An array with a unit, which NumPy would drop."""
+
+    def __init__(self, values, unit):
+        self.values, self.unit = values, unit
+
+    def __array__(self, *args, **kwargs):
+        return np.array(self.values, *args, **kwargs)
+
+
+class Length(float):
+    """A number with a unit."""
+
+    units = "um"
 
 
 def changed(**options):
@@ -45,7 +67,11 @@ def with_value(array, place, value):
         ({"shifts": with_value(CROSS, (3, 0), np.inf)}, "'shifts' of exposure 3 is .*inf"),
         ({"shifts": with_value(CROSS, (4, 0), 8)}, "'shifts' of exposure 4 is .* row part"),
         ({"shifts": with_value(CROSS, (4, 1), -1e300)}, "'shifts' of exposure 4 .* column part"),
-        ({"frames": np.full((5, 8, 9), np.nan)}, "'mask' leaves no measurement"),
+        ({"shifts": with_value(CROSS, (4, 1), 1e10)}, r"\(.*, 1e\+10\).*micrometres"),
+        ({"shifts": [["9.3 um", "0 um"]] * 5}, "'shifts' holds '9.3 um', expected numbers of"),
+        ({"shifts": Lengths(CROSS, "um")}, "'shifts' has the unit um, expected .* pixel pitch"),
+        ({"shifts": [(Length(9), 0.0)] * 5}, "'shifts' has the unit um"),
+        ({"frames": np.full((5, 8, 9), np.nan)}, "'frames' holds no finite number"),
         ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
         ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
         ({"mask": np.zeros((9, 8), bool)}, r"'mask' has shape \(9, 8\), expected \(8, 9\) or"),
@@ -56,6 +82,7 @@ def with_value(array, place, value):
         ({"frames": with_value(frames(), 4, 0)}, "'frames' of exposure 4 have a median"),
         ({"variance": np.ones(4)}, "'variance' has 4 entries"),
         ({"variance": np.ones((5, 8, 8))}, "'variance' has shape"),
+        ({"variance": 9.0}, r"'variance' has shape \(\), expected \(5,\) or \(5, "),
         ({"variance": with_value(np.ones(5), 2, 0)}, "'variance' of exposure 2 is 0"),
         ({"variance": with_value(np.ones(5), 2, -1)}, "'variance' of exposure 2 is -1"),
         ({"variance": with_value(np.ones(5), 2, np.nan)}, "'variance' of exposure 2 is NaN"),
@@ -104,19 +131,36 @@ def test_one_position_is_refused_where_the_solver_would_search_in_vain(shift, op
 
 def test_an_unmet_tolerance_says_what_would_meet_it():
     with pytest.warns(ConvergenceWarning, match="allow more sweeps"):
-        equipix.calibrate(frames(), CROSS, max_sweeps=2)
+        equipix.calibrate(frames(), CROSS, max_sweeps=8)
     with pytest.warns(ConvergenceWarning, match="no longer decreasing: use a larger"):
         equipix.calibrate(frames(), CROSS, tolerance=1e-300)
 
 
 def test_a_rounded_shift_is_named_with_what_to_do():
     with pytest.warns(ShiftRoundingWarning, match=r"exposure 2 \(from 0\) is .*0\.3.* move the"):
-        equipix.calibrate(
+        cal = equipix.calibrate(
             frames(),
             with_value(CROSS, (2, 0), 0.3),
             method="coordinate-descent",
             tolerance=1e-3,
         )
+    assert [verdict.kind for verdict in cal.verdicts] == ["rounding"]
+    np.testing.assert_array_equal(cal.shifts, with_value(CROSS, (2, 0), 0))
+
+
+@pytest.mark.parametrize(
+    ("shift", "std", "noticeable"),
+    [(0.019, 0, False), (0.021, 0, True), (0.059, 0.02, False), (0.061, 0.02, True)],
+)
+def test_a_rounding_within_0_02_pixel_or_three_standard_errors_is_none(shift, std, noticeable):
+    positions = Positions.of(with_value(CROSS, (3, 1), shift))
+    rounding = positions.whole(np.full((5, 2), std)).rounding
+    assert rounding == (Rounding(3, [CROSS[3, 0], shift]) if noticeable else None)
+
+
+def test_the_core_decides_which_method_needs_whole_shifts():
+    needs = {method: FitOptions(method).whole_shifts for method in get_args(Method)}
+    assert needs == {"multiscale": False, "coordinate-descent": True}
 
 
 def test_any_number_of_sweeps_may_be_allowed():

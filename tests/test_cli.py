@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import average, cli, load, simulate
+from equipix import FrameStatistics, average, cli, simulate
 from equipix.frames import load_statistics
 from equipix.io import read_frames
 
@@ -82,7 +82,7 @@ def test_calibrate_reports_what_it_saved(run, experiment, tmp_path):
     )
     assert (status, err) == (0, "")
     result = json.loads(out)
-    saved = load(output)
+    saved = equipix.load(output)
     assert result["sweeps"] == saved.sweeps
     assert result["converged"] is True
     assert result["shape"] == list(SHAPE)
@@ -97,7 +97,28 @@ def test_warnings_are_one_line_each(run, experiment, tmp_path):
     )
     assert status == 0
     assert json.loads(out)["converged"] is False
-    assert re.fullmatch(r"equipix: warning: not converged after 5 sweeps[^\n]*\n", err)
+    assert re.fullmatch(r"equipix: warning: not converged after \d sweeps[^\n]*\n", err)
+
+
+def test_verdicts_and_rejected_values_are_reported(run, experiment, tmp_path):
+    output = tmp_path / "cal.tif"
+    command = ("calibrate", experiment, "-o", output, "--max-sweeps", "2", "--robust")
+    status, out, err = run(*command)
+    assert status == 0
+    assert re.search(r"\nverdicts +convergence\n", out)
+    saved = equipix.load(output)
+    (verdict,) = saved.verdicts
+    assert verdict.message in err
+    inspected = json.loads(run("inspect", output, "--json")[1])
+    calibrated = json.loads(run(*command, "--force", "--json")[1])
+    for told in (inspected, calibrated):
+        assert told["verdicts"] == [{"kind": "convergence", "message": verdict.message}]
+        assert told["is_partial"] is False
+        assert list(told["rejected_values"]) == ["p0", "p1", "p2", "p3", "p4"]
+        assert list(told["rejected_values"].values()) == saved.metadata["rejected"]
+    out = run("inspect", output)[1]
+    assert re.search(rf"\nverdicts +convergence: {re.escape(verdict.message)}\n", out)
+    assert re.search(r"\nrejected values +p0 \d+, p1 ", out)
 
 
 def test_inspect_shows_the_calibration(run, calibration):
@@ -106,6 +127,7 @@ def test_inspect_shows_the_calibration(run, calibration):
     for line in (r"shape +64 × 80", r"converged +yes", r"flagged pixels +DO_NOT_USE 8"):
         assert re.search(line, out)
     assert re.search(r"shift sign +undetermined", out)
+    assert re.search(r"orientation +the data do not determine.*compare the axes of the stage", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
     assert json.loads(out)["metadata"]["sensor"]["bit_depth"] == 12
@@ -133,9 +155,40 @@ def test_inspect_says_what_is_no_calibration(run, experiment, tmp_path):
     frames, mean = experiment.parent / "frames/p0.tif", tmp_path / "mean.tif"
     assert run("average", frames, "-o", mean)[0] == 0
     np.savez(tmp_path / "arrays.npz", values=np.ones(3))
-    refused(run("inspect", mean), mean, "holds frame statistics, expected calibration")
+    refused(run("compare", mean, mean), mean, "holds frame statistics, expected calibration")
     for other in (frames, tmp_path / "arrays.npz"):
         refused(run("inspect", other), other, "holds neither a calibration", "did not write it")
+
+
+def test_inspect_shows_an_average(run, experiment, tmp_path):
+    frames, dark = experiment.parent / "frames/p0.tif", experiment.parent / "dark/dark.tif"
+    mean = tmp_path / "mean.npz"
+    run("average", frames, "--dark", dark, "--saturation", "4095", "-o", mean)
+    status, out, _ = run("inspect", mean, "--json")
+    told = json.loads(out)
+    assert status == 0
+    assert (told["shape"], told["frames"], told["saturation"]) == (list(SHAPE), 6, 4095)
+    assert told["dark_frames"] == FrameStatistics.load(mean).dark.count.max()
+    assert told["mean"] == pytest.approx(FrameStatistics.load(mean).mean.mean())
+    assert "saturated pixels" in run("inspect", mean)[1]
+    run("average", frames, "-o", mean, "--force")
+    assert re.search(r"\nsaturation +65535\n", run("inspect", mean)[1])
+
+
+def test_a_file_is_not_averaged_twice(run, experiment, tmp_path):
+    frames, copy, out = (
+        experiment.parent / "frames/p0.tif",
+        tmp_path / "copy.tif",
+        tmp_path / "m.tif",
+    )
+    copy.write_bytes(frames.read_bytes())
+    refused(run("average", frames, frames, "-o", out), "'p0.tif' stands twice in the frames")
+    refused(run("average", frames, copy, "-o", out), "'p0.tif' and 'copy.tif' are the same images")
+    refused(
+        run("average", frames, "--dark", frames, "-o", out), "'p0.tif' stands in the frames and"
+    )
+    refused(run("average", frames, "--dark", copy, "-o", out), "are the same images, and stand in")
+    assert not out.exists()
 
 
 def test_average_writes_statistics(run, experiment, tmp_path):
@@ -155,7 +208,7 @@ def test_average_writes_statistics(run, experiment, tmp_path):
 
 def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_path):
     inputs = [experiment.parent / f"frames/p{k}.tif" for k in range(2)]
-    expected = load(calibration).correct(read_frames(inputs), flagged="replace")
+    expected = equipix.load(calibration).correct(read_frames(inputs), flagged="replace")
     one, folder = tmp_path / "all.tif", tmp_path / "corrected"
     for output in (one, folder):
         status, out, _ = run(
@@ -424,21 +477,33 @@ class TestPlan:
         status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
         assert status == 0
         found = json.loads(out)["patterns"]
-        assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(3, 1)}
+        assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(5, 1)}
 
-    def test_warns_of_drift_that_was_given(self, run):
-        command = ("plan", "--shape", 64, 80, "--max-shift", 9, 9)
-        status, out, err = run(*command)
-        assert (status, err) == (0, "")
+    def test_judges_each_pattern_that_it_finds(self, run):
+        status, out, err = run("plan", "--shape", 300, 400, "--max-shift", 9, 9)
+        assert status == 0
         assert "tilt from lamp drift" in out
-        err = run(*command, "--drift", "1e-4")[2]
-        assert err.startswith("equipix: warning: lamp drift will tilt")
+        warned = re.findall(r"^equipix: warning: pattern (\d): lamp drift will", err, re.MULTILINE)
+        assert warned == ["1", "2", "3"]
+
+    def test_judges_shifts_between_pixels(self, run):
+        shifts = "0,0 0,11.4 0,19.7 11.2,0 19.5,0"
+        status, out, err = run(
+            "plan", "--shape", 64, 80, "--shifts", shifts, "--drift", 0, "--json"
+        )
+        assert (status, err) == (0, "")
+        assert json.loads(out)["patterns"][0]["components"] == 1
+        _, _, err = run(
+            "plan", "--shape", 64, 80, "--drift", 0,
+            "--shifts", "0,0 0,2.5 0,7.5 2.5,0 7.5,0",
+        )  # fmt: skip
+        assert "do not constrain a wave of (0." in err
 
     def test_a_single_row(self, run, tmp_path):
         command = ("plan", "--shape", 1, 40, "-o", tmp_path / "plan.png", "--drift", 0, "--json")
         status, out, err = run(*command, "--max-shift", 5, 5)
         assert (status, err) == (0, "")
-        assert json.loads(out)["patterns"][0]["shifts"] == [[0, 0], [0, 1]]
+        assert json.loads(out)["patterns"][0]["components"] == 1
 
     @pytest.mark.parametrize(
         ("arguments", "words"),

@@ -101,6 +101,41 @@ def test_a_tilt_stands_out_at_large_scales(experiments):
     assert result.rms[0] < 1.5 * result.predicted_rms[0]
 
 
+def test_an_undetermined_tilt_is_no_difference(experiments, tmp_path, capsys):
+    """The same frames with known fluxes and with free ones, whose slope is set to 0."""
+    truth, _, _ = experiments
+    shifts = equipix.cross_pattern(7, 11)
+    beam = simulate.gaussian_beam(SHAPE, width=400)
+    frames = simulate.exposures(truth, beam, shifts)
+    frames += NOISE * np.random.default_rng(2).standard_normal(frames.shape)
+    known = equipix.calibrate(frames, shifts)
+    with pytest.warns(errors.IdentifiabilityWarning, match="leave a tilt"):
+        free = equipix.calibrate(frames, shifts, flux="fit")
+    result = equipix.compare([known, free, known])
+    assert result.open_tilt.tolist() == [True, False, True]
+    # Fitting two fluxes more of 61 440 values changes M by much less than the noise of its means.
+    assert result.block_rms[0] < NOISE / 16
+    assert abs(result.difference(0)).max() == pytest.approx(result.largest[0])
+    assert np.sqrt(np.mean(result.agreement**2)) < NOISE / 16
+    # A calibration whose tilt is determined is compared with it.
+    tilted = type(known)(
+        **(
+            vars(known)
+            | {"sensitivity": known.sensitivity * np.exp(np.linspace(0, 0.02, SHAPE[1]))}
+        )
+    )
+    assert equipix.compare([known, tilted]).block_rms[0] > 0.005
+    assert equipix.compare([tilted, free]).block_rms[0] < NOISE / 16
+    files = [str(tmp_path / name) for name in ("known.npz", "free.npz")]
+    for file, calibration in zip(files, (known, free), strict=True):
+        calibration.save(file)
+    with pytest.raises(SystemExit):
+        cli.main(["compare", *files])
+    assert (
+        "left out: free fluxes leave it undetermined in one or more of" in capsys.readouterr().out
+    )
+
+
 def test_the_gauge_and_bad_pixels_play_no_part(experiments):
     _, calibrations, _ = experiments
     first, second, _ = calibrations

@@ -13,7 +13,6 @@ from equipix import Flag, cli, io, loading, simulate
 from equipix.correction.apply import apply
 from equipix.correction.files import correct_files
 from equipix.errors import FileError, InputError
-from equipix.frames import save_statistics
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -163,7 +162,7 @@ class TestLoad:
     def test_refuses_an_unknown_kind_by_name(self, bent, tmp_path, monkeypatch):
         bent.save(tmp_path / "bent.npz")
         monkeypatch.delitem(loading.READERS, "bent response")
-        with pytest.raises(FileError, match="holds bent response, expected calibration that equ"):
+        with pytest.raises(FileError, match="holds bent response, expected calibration that"):
             equipix.load(tmp_path / "bent.npz")
 
     @pytest.mark.parametrize("content", [{}, {"kind": None}, {"kind": ["calibration"]}, [1], 3])
@@ -173,8 +172,20 @@ class TestLoad:
         with pytest.raises(FileError, match="holds .*, expected calibration that equipix has"):
             equipix.load(path)
 
-    def test_says_what_frame_statistics_are(self, tmp_path):
-        save_statistics(tmp_path / "mean.tif", equipix.average(raw_frames()))
+    @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+    def test_gives_back_averaged_frames(self, tmp_path, suffix):
+        frames = raw_frames()
+        dark = equipix.average(frames[:1], saturation=4000)
+        mean = equipix.average(frames, dark=dark, saturation=4095)
+        mean.save(tmp_path / f"mean{suffix}")
+        read = equipix.FrameStatistics.load(tmp_path / f"mean{suffix}")
+        for old, new in ((mean, read), (dark, read.dark)):
+            assert old.saturation == new.saturation
+            for name, values in old.maps.items():
+                np.testing.assert_array_equal(new.maps[name], values)
+
+    def test_says_what_frame_statistics_are_where_they_are_no_correction(self, tmp_path):
+        equipix.average(raw_frames()).save(tmp_path / "mean.tif")
         with pytest.raises(
             FileError, match="holds frame statistics, .*mean and variance of av.*--"
         ):

@@ -25,7 +25,7 @@ import equipix
 from equipix import simulate
 from equipix.calibration.verdicts import _CATEGORIES as CATEGORIES
 from equipix.cli.app import app
-from equipix.experiment.manifest import Manifest
+from equipix.experiment.manifest import Manifest, Sensor
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -84,22 +84,28 @@ def test_the_commands_of_the_readme_run(tmp_path):
 
 
 def test_the_experiment_of_the_readme_is_one():
-    (text,) = blocks("toml")
+    text, region = blocks("toml")
     assert len(Manifest.model_validate(tomllib.loads(text)).exposure) == 3
+    assert len(Sensor.model_validate(tomllib.loads(region)["sensor"]).region) == 1
 
 
-def manifest_keys() -> dict[str, str]:
+def manifest_keys(model: type[BaseModel] = Manifest, within: str = "") -> dict[str, str]:
     """The default of every key of an experiment.toml, as the README writes it."""
     keys = {}
-    for name, field in Manifest.model_fields.items():
-        tables = [
-            each for each in (field.annotation, *get_args(field.annotation)) if is_table(each)
-        ]
-        if not tables:
-            keys[name] = default(field)
+    for name, field in model.model_fields.items():
+        tables = tables_in(field.annotation)
+        if not tables or (not field.is_required() and field.default is None):
+            keys[within + name] = default(field)
         for each in tables:
-            keys |= {f"{name}.{key}": default(of) for key, of in each.model_fields.items()}
+            keys |= manifest_keys(each, f"{within}{name}.")
     return keys
+
+
+def tables_in(annotation: object) -> list[type[BaseModel]]:
+    """The tables that a key holds, in a list or alone."""
+    if is_table(annotation):
+        return [annotation]
+    return [table for each in get_args(annotation) for table in tables_in(each)]
 
 
 def is_table(annotation: object) -> bool:
@@ -109,7 +115,8 @@ def is_table(annotation: object) -> bool:
 def default(field: FieldInfo) -> str:
     if field.is_required():
         return "required"
-    return {None: "none", "": "empty"}.get(field.default, str(field.default))
+    text = {None: "none", "": "empty"}.get(field.default, str(field.default))
+    return text.lower() if isinstance(field.default, bool) else text
 
 
 def test_the_readme_describes_every_key_of_an_experiment_and_its_default():
@@ -226,6 +233,7 @@ def test_the_example_between_pixels(capsys):
 
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+@pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
 def test_the_example_of_a_monitor(capsys):
     steady, monitor = figures("drift_monitor", capsys)
     # 1 % against 0.02 % of error in the fluxes makes as much of a difference in the tilt.

@@ -104,27 +104,27 @@ class TestTrend:
         wanted = np.sum(left**2) / np.sum((times - times.mean()) ** 2)
         # Shares of a whole of 1, found by two factorisations of this condition.
         limit = 100 * EPS * np.linalg.cond(affine)
-        assert drift.trend_told(shifts, times) == pytest.approx(wanted, abs=limit)
+        assert drift.distinct_trend(shifts, times) == pytest.approx(wanted, abs=limit)
 
     def test_does_not_depend_on_units(self):
         rng = np.random.default_rng(3)
         times = rng.uniform(0, 600, 5)
-        told = drift.trend_told(CROSS, times)
+        told = drift.distinct_trend(CROSS, times)
         turned = CROSS @ np.array([[2.0, 1.0], [-1.0, 3.0]]) + 7
-        assert drift.trend_told(turned, times) == pytest.approx(told, abs=100 * EPS)
+        assert drift.distinct_trend(turned, times) == pytest.approx(told, abs=100 * EPS)
         # Each of five times, of a spread of some 200, is rounded to half an eps of 1e6; the share
         # goes with their square.
         limit = 5 * EPS * 1e6 / 200
-        assert drift.trend_told(CROSS, 1e6 + times) == pytest.approx(told, abs=limit)
+        assert drift.distinct_trend(CROSS, 1e6 + times) == pytest.approx(told, abs=limit)
 
     def test_at_its_ends(self):
-        assert drift.trend_told(CROSS, CROSS @ (2.0, 3.0)) == pytest.approx(0, abs=100 * EPS)
-        assert drift.trend_told(CROSS, np.full(5, 60.0)) == 1
-        assert drift.trend_told(np.ones((5, 2)), np.arange(5)) == 1
+        assert drift.distinct_trend(CROSS, CROSS @ (2.0, 3.0)) == pytest.approx(0, abs=100 * EPS)
+        assert drift.distinct_trend(CROSS, np.full(5, 60.0)) == 1
+        assert drift.distinct_trend(np.ones((5, 2)), np.arange(5)) == 1
 
     def test_the_plan_and_the_warning_agree(self):
-        told = drift.trend_told(CROSS, np.arange(5))
-        assert plan.trend_told(CROSS) == told
+        told = drift.distinct_trend(CROSS, np.arange(5))
+        assert plan.distinct_trend(CROSS) == told
         frames = simulate.exposures(np.ones((24, 32)), simulate.gaussian_beam((24, 32)), CROSS)
         times = {"flux": "linear", "time": [0.0, 10.0, 20.0, 30.0, 40.0]}
         advised = verdicts.on_plan(exposures_of(frames, CROSS, **times))

@@ -61,6 +61,20 @@ def test_the_minimiser_that_errors_are_measured_from_is_that_of_dense_algebra():
         np.testing.assert_allclose(found.sensitivity, dense.sensitivity, rtol=0, atol=atol)
 
 
+def test_it_is_honest_where_a_coarse_tolerance_ends_a_fit():
+    """At most one of 162 errors is above twice the estimate, and none above three times."""
+    ratios = []
+    for seed in range(1000, 1081):
+        frames, shifts, mask = random_experiment(seed)
+        best = minimiser(frames, shifts, mask)
+        for tolerance in (1e-2, 1e-3):
+            stopped = equipix.calibrate(frames, shifts, mask=mask, tolerance=tolerance)
+            true = np.nanmax(abs(stopped.sensitivity - best.sensitivity))
+            ratios.append(true / stopped.error_estimate)
+    assert np.count_nonzero(np.array(ratios) > 2) <= 1
+    assert max(ratios) < 3
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_it_is_honest_wherever_a_run_is_stopped(method):
     ratios = []

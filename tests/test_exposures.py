@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import equipix
 from equipix import simulate
+from equipix.calibration import robust
+from equipix.calibration.weights import expected
 from equipix.errors import InputError
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
+from equipix.exposures.orientation import Orientation
 from equipix.exposures.positions import Positions, in_beam, variance_in_beam
+from equipix.noise import NoiseModel
 
 SHAPE = (9, 14)
 TURNS = (0, 90, 180, 270)
@@ -72,10 +80,11 @@ def test_a_window_of_exposures_has_the_sensitivity_of_its_part():
 
 def test_reversed_exposures_differ_in_the_sign_of_shifts_alone():
     exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2.5)])
-    other = exposures.reversed()
+    back = Orientation(rows=True, cols=True)
+    other = exposures.oriented(back)
     np.testing.assert_array_equal(other.positions.shifts, -exposures.positions.shifts)
     assert other.values is exposures.values
-    np.testing.assert_array_equal(other.reversed().positions.shifts, exposures.positions.shifts)
+    np.testing.assert_array_equal(other.oriented(back).positions.shifts, exposures.positions.shifts)
 
 
 def test_masks_add_up():
@@ -147,3 +156,95 @@ def test_fluxes_are_of_one_kind(given, kind, model):
 def test_fluxes_that_do_not_go_together_are_refused(given, message):
     with pytest.raises(InputError, match=message):
         Flux.of(*(given.get(name) for name in ("flux", "flux_std", "time")), 3)
+
+
+def test_chosen_exposures_keep_all_that_is_known_of_them():
+    rng = np.random.default_rng(5)
+    values = rng.uniform(1, 2, (5, 8, 9))
+    exposures = exposures_of(
+        values,
+        rng.uniform(-1, 1, (5, 2)),
+        variance=rng.uniform(1, 2, 5),
+        mask=rng.random((5, 8, 9)) < 0.1,
+        flux=rng.uniform(1, 2, 5),
+        flux_std=rng.uniform(0.1, 0.2, 5),
+        rotation=[0, 90, 180, 270, 0],
+        shift_std=rng.uniform(0.1, 0.2, (5, 2)),
+    )
+    models = tuple(NoiseModel(k + 1.0, 0.0) for k in range(5))
+    exposures = dataclasses.replace(exposures, noise=models)
+    indices = [4, 1, 2]
+    part = exposures.chosen(np.array(indices))
+    assert len(part) == 3
+    assert part.noise == tuple(models[k] for k in indices)
+    for name in ("values", "variance", "mask", "positions.shifts", "positions.rotation"):
+        assert_chosen(part, exposures, name, indices)
+    for name in ("positions.std", "flux.values", "flux.std"):
+        assert_chosen(part, exposures, name, indices)
+
+
+def assert_chosen(part, whole, name, indices):
+    taken, given = (operator.attrgetter(name)(each) for each in (part, whole))
+    np.testing.assert_array_equal(taken, [given[k] for k in indices])
+
+
+def test_what_all_exposures_share_stays_when_some_are_chosen():
+    variance = np.random.default_rng(6).uniform(1, 2, (4, 6, 7))
+    exposures = exposures_of(
+        np.ones((4, 6, 7)),
+        np.eye(4, 2),
+        variance=variance,
+        mask=np.eye(6, 7) > 0,
+        flux="linear",
+        time=[0, 5, 9, 11],
+    )
+    part = exposures.chosen(np.array([3, 0]))
+    np.testing.assert_array_equal(part.mask, np.eye(6, 7) > 0)
+    np.testing.assert_array_equal(part.variance, variance[[3, 0]])
+    assert part.flux.time.tolist() == [11, 0]
+    assert part.noise == ()
+
+
+class TestThreads:
+    """The number of threads that the caller gives is that of every evaluation of the beam."""
+
+    def test_are_passed_on_to_the_beam(self):
+        asked = []
+
+        def light(shape, shift, rotation, *, workers):
+            asked.append((shape, shift, rotation, workers))
+            return np.ones(shape)
+
+        fit = SimpleNamespace(
+            shifts=[[0.0, 0.0], [1.0, 2.5], [0.0, 0.0]],
+            flux=[1.0, 2.0, 1.0],
+            beam=SimpleNamespace(light=light),
+        )
+        exposures = exposures_of(np.ones((3, 8, 9)), np.zeros((3, 2)), rotation=[0, 180, 0])
+        seen = exposures.light(fit, 1, 7)
+        assert asked == [((8, 9), (1.0, 2.5), 180, 7)]
+        np.testing.assert_array_equal(seen, 2.0)
+
+    @pytest.mark.parametrize(
+        ("options", "caller"),
+        [
+            ({}, Exposures.residual),
+            ({"robust": True}, robust._seen),
+            ({"variance": NoiseModel(1e-3, 1e-9)}, expected),
+        ],
+        ids=["sign", "robust", "noise model"],
+    )
+    def test_are_those_of_the_caller_throughout(self, monkeypatch, options, caller):
+        asked, light = [], Exposures.light
+
+        def spied(self, fit, exposure, workers):
+            asked.append((sys._getframe(1).f_code.co_name, workers))
+            return light(self, fit, exposure, workers)
+
+        monkeypatch.setattr(Exposures, "light", spied)
+        shape, shifts = (48, 56), equipix.cross_pattern(5, 7)
+        frames = simulate.exposures(np.ones(shape), simulate.wavy_beam(shape, rng=3), shifts)
+        frames += 1e-3 * np.random.default_rng(1).standard_normal(frames.shape)
+        equipix.calibrate(frames, shifts, workers=2, **options)
+        assert [name for name, _ in asked].count(caller.__name__) >= len(shifts)
+        assert {workers for _, workers in asked} == {2}

@@ -12,12 +12,14 @@ from equipix.cli import main
 SHAPE, SHIFTS = (96, 128), equipix.cross_pattern(11, 19)
 
 
-def virtual_experiment(seed, *, bit_depth=8, **how):
+def virtual_experiment(seed, *, bit_depth=8, frames=12, **how):
     """An experiment of a camera of few bits, some of whose samples saturate where it is bright."""
     rng = np.random.default_rng(seed)
     truth = simulate.cosine_sensitivity(SHAPE, rng=rng)
     beam = simulate.gaussian_beam(SHAPE, width=150)
-    return simulate.experiment(truth, beam, SHIFTS, frames=12, bit_depth=bit_depth, rng=rng, **how)
+    return simulate.experiment(
+        truth, beam, SHIFTS, frames=frames, bit_depth=bit_depth, rng=rng, **how
+    )
 
 
 def statistics_of(virtual, level):
@@ -156,7 +158,52 @@ def test_averages_saved_and_loaded_one_by_one_calibrate(tmp_path):
 def test_exact_data_confirm_their_sign():
     """Whole numbers without noise: F is 0 with the right shifts."""
     rows, cols = np.indices((90, 100))
-    beam = 500 + 3 * rows + 7 * cols + rows * cols % 11
+    beam = 500 + 3 * rows + 7 * cols + rows * cols % 61
     shifts = [(0, 0), (0, 5), (7, 0), (5, 9)]
     frames = [beam[r : r + 60, c : c + 64].astype(float) for r, c in shifts]
     assert equipix.calibrate(np.array(frames), shifts).shift_sign == "confirmed"
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    """An experiment of one frame an exposure: averages, and its file."""
+    virtual = virtual_experiment(8, bit_depth=12, frames=1, stage_error=0.0)
+    manifest = with_given_shifts(virtual.write(tmp_path_factory.mktemp("single") / "experiment"))
+    return statistics_of(virtual, virtual.camera.full_scale), manifest
+
+
+class TestSingleFrames:
+    """They show no noise: all weights are equal, and residuals determine the noise."""
+
+    def test_give_the_same_from_averages_and_files(self, single):
+        averages, manifest = single
+        arrays = equipix.calibrate(averages, SHIFTS, uncertainty=True)
+        files = equipix.Experiment.load(manifest).run(uncertainty=True)
+        for cal in (arrays, files):
+            assert cal.metadata["options"]["weights"] == "equal"
+            assert cal.verdicts == ()
+        np.testing.assert_array_equal(arrays.flags, files.flags)
+        difference = np.abs(arrays.sensitivity - files.sensitivity)
+        assert np.nanmax(difference / arrays.sensitivity_std) < 0.01
+
+    def test_have_the_standard_deviations_of_equal_weights(self, single):
+        averages, _ = single
+        cal = equipix.calibrate(averages, SHIFTS, uncertainty=True)
+        given = np.full(len(averages), cal.reduced_chi2)
+        known = equipix.calibrate(averages, SHIFTS, variance=given, uncertainty=True)
+        assert known.reduced_chi2 == pytest.approx(1, rel=1e-9)
+        # The same equations in another unit: each draw stops at its own tolerance.
+        np.testing.assert_allclose(cal.sensitivity_std, known.sensitivity_std, rtol=1e-3)
+
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_take_a_variance_that_is_given(self, single):
+        averages, _ = single
+        cal = equipix.calibrate(averages, SHIFTS, variance=np.full(5, 900.0))
+        assert cal.metadata["options"]["weights"] == "variances"
+
+    def test_have_residuals_in_their_unit(self, single):
+        averages, _ = single
+        cal = equipix.calibrate(averages, SHIFTS)
+        left = cal.residuals(averages)
+        means = np.stack([each.mean for each in averages])
+        np.testing.assert_array_equal(left, cal.residuals(means))

@@ -513,8 +513,9 @@ def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cal{suffix}"
-    frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), [(0, 0), (0, 1)])
-    cal = equipix.calibrate(np.concatenate([frames, frames]), [(0, 0), (0, 1), (1, 0), (0, 0)])
+    shifts = [(0, 0), (0, 1), (1, 0), (0, 0)]
+    frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), shifts)
+    cal = equipix.calibrate(frames, shifts)
     left_out = np.zeros((4, 8, 9), bool)
     dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out).save(path)
     pages, content = io.load_pages(path)

@@ -16,6 +16,7 @@ import equipix
 from equipix import Flag, reference, simulate
 from equipix.errors import (
     ConvergenceWarning,
+    DriftWarning,
     IdentifiabilityWarning,
     InputError,
     MisfitWarning,
@@ -132,7 +133,7 @@ class TestReference:
     @pytest.mark.parametrize("flux", [None, np.full(5, 2.0)])
     def test_one_level_cannot_tell_gain_from_offset(self, flux):
         frames, measured = small(2, SMALL_CROSS)
-        with pytest.raises(InputError, match="offset and gain cannot be told apart"):
+        with pytest.raises(InputError, match="offset and gain are degenerate"):
             equipix.calibrate(frames, SMALL_CROSS, flux=flux, dark="fit", **measured)
 
     def test_a_pixel_with_one_measurement_tells_no_offset(self):
@@ -269,6 +270,7 @@ class TestFluxes:
             assert np.abs(tilt).max() < 4 * one
             assert np.abs(free.flux / flux - 1).max() < 4 * one
 
+    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
     @pytest.mark.parametrize("is_between", [False, True], ids=["whole", "between"])
     def test_without_one_the_tilt_is_left_to_the_gauge(self, is_between):
         rng = np.random.default_rng(4)
@@ -285,11 +287,59 @@ class TestFluxes:
         np.testing.assert_allclose(told.T @ np.log(cal.flux), told.T @ np.log(flux), atol=1e-4)
 
         # Taken as equal, what is affine in the shifts becomes a tilt: section 5.
-        steady = equipix.calibrate(frames, shifts, tolerance=1e-5)
+        with pytest.warns(DriftWarning, match="the data contradict the fluxes"):
+            steady = equipix.calibrate(frames, shifts, tolerance=1e-5)
         affine = np.linalg.lstsq(hidden, np.log(flux))[0][1:]
         tilt = slope(np.log(steady.sensitivity / truth))
         # What is not affine leaves residuals, not tilts, but for some percent at edges.
         np.testing.assert_allclose(tilt, -affine, atol=0.1 * np.abs(affine).max())
+
+    @pytest.mark.parametrize("level", [0.36, 0.38])
+    def test_pixels_at_a_limit_of_the_range_count_for_both_or_none(self, level):
+        # These columns are near half of the mean, 0.76 and 0.77: the tilt that is removed moves
+        # some of them across that limit.
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        truth[:, :24] *= level
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.02, 1.03, 0.98, 0.99]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit")
+        # Sums of 3072 terms of size 1, in double precision.
+        assert np.abs(cal.tilt).max() < 1e-13
+
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_pixels_that_contradict_themselves_count_for_neither(self):
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.01, 0.99, 1.02, 0.98]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        frames += 1e-3 * np.random.default_rng(4).standard_normal(frames.shape)
+        frames[:, 40, 50] *= [1, 0.5, 1.4, 0.7, 1.9]
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit", robust=True)
+        assert cal.flags[40, 50] & equipix.Flag.UNRELIABLE_FLAT
+        assert np.isfinite(cal.sensitivity[40, 50])
+        assert np.abs(cal.tilt).max() < 1e-13
+        counted = np.isfinite(cal.sensitivity) & (cal.flags & equipix.Flag.UNRELIABLE_FLAT == 0)
+        assert cal.sensitivity[counted].mean() == pytest.approx(1, abs=1e-13)
+
+    def test_the_tilt_of_the_gauge_is_that_of_the_result(self):
+        # A part of weak response and a dead pixel count for neither.
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.paper_sensitivity(shape, rng=3)
+        truth[:16, :16] *= 0.3
+        truth[30, 40] = 0
+        beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.01, 0.99, 1.02, 0.98]
+        frames = simulate.exposures(truth, beam, shifts, flux=flux)
+        frames += 1e-3 * np.random.default_rng(4).standard_normal(frames.shape)
+        with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
+            cal = equipix.calibrate(frames, shifts, flux="fit")
+        assert (cal.flags[:16, :16] == 0).all()
+        assert (cal.sensitivity[:16, :16] < 0.5).all()
+        assert cal.flags[30, 40] != 0
+        # Sums of 3072 terms of size 1, in double precision.
+        assert np.abs(cal.tilt).max() < 1e-13
 
     def test_a_monitor_limits_the_tilt(self):
         monitor = 1e-4

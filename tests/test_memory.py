@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -112,9 +113,11 @@ def test_a_process_is_refused_or_finishes_whatever_its_limit():
 
 
 def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
-    lines = ['[dark]\nframes = "0.tif"']
+    lines = ['[dark]\nframes = "dark.tif"']
+    write_frames(tmp_path / "dark.tif", np.zeros((2, 800, 800), np.uint16), nbytes=0)
     for k, shift in enumerate(CROSS.tolist()):
-        write_frames(tmp_path / f"{k}.tif", np.ones((2, 800, 800), np.uint16), nbytes=0)
+        frames = np.full((2, 800, 800), k + 1, np.uint16)
+        write_frames(tmp_path / f"{k}.tif", frames, nbytes=0)
         lines.append(f'[[exposure]]\nname = "{k}"\nframes = "{k}.tif"\nshift = {shift}')
     experiment = tmp_path / "experiment.toml"
     experiment.write_text("\n".join(lines))
@@ -135,9 +138,49 @@ def test_the_command_says_so_in_one_line_and_leaves_the_disk_alone(tmp_path):
 def test_a_small_job_runs_beside_a_low_limit():
     code = f"""
 import numpy as np, equipix
+np.ones((2, 2)) @ np.ones((2, 2))  # BLAS takes its buffers, and would end the process without them
 limit(40 * 10**6)
 frames = np.random.default_rng(0).uniform(1, 2, (5, 40, 50))
 equipix.calibrate(frames, {CROSS.tolist()}, tolerance=1e-3, workers=1)
 """
     done = run(code)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("options", "stacks", "masks", "images"),
+    [
+        ({"variance": equipix.NoiseModel(1e-3, 1e-9)}, 2, 0, 6),
+        ({"robust": True}, 2, 3, 11),
+        ({"variance": equipix.NoiseModel(1e-3, 1e-9), "robust": True}, 3, 3, 12),
+    ],
+    ids=["noise model", "robust", "both"],
+)
+def test_numpy_takes_little_beside_the_data(options, stacks, masks, images):
+    """Weights that depend on the fit take a few arrays of the data's size, the rest one by one.
+
+    Beside the data there are at the peak `stacks` of its size and dtype, `masks` of its size, and
+    `images` of one exposure in float64:
+
+    - noise model: variances at the medians and at the first fit; the medians, and of one exposure
+      light, c times light, signal, signal or median, variance.
+    - robust: deviations of values used and left out; masks of values given, without dust, left
+      out; response, information of pixels and cells, and of one exposure light, weight, squares of
+      either, two shares, spread, residual.
+    - both: those of robust, the variances, and the medians.
+
+    Images of bool are together below one image in float64.
+    """
+    shape, shifts = (960, 1200), equipix.cross_pattern(5, 7)
+    beam = equipix.simulate.gaussian_beam(shape)
+    frames = equipix.simulate.exposures(np.ones(shape), beam, shifts)
+    frames += 1e-3 * np.random.default_rng(1).standard_normal(frames.shape)
+    frames = frames.astype(np.float32)
+    tracemalloc.start()
+    try:
+        equipix.calibrate(frames, shifts, tolerance=1e-2, **options)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    ceiling = stacks * frames.nbytes + masks * frames.size + images * 8 * frames[0].size
+    assert peak < ceiling

@@ -9,6 +9,8 @@ import spectrum
 ARMS = [(11, 19), (5, 7)]
 
 
+# Without noise, exposures of a uniform beam are equal.
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 @pytest.mark.parametrize("arms", ARMS)
 @pytest.mark.parametrize("cycles", [0.004, 0.05, 0.3])
 def test_a_sweep_removes_what_the_symbol_says(arms, cycles):

@@ -45,13 +45,14 @@ class TestTheHardCase:
     """Section 3 of the paper with a large-scale part: what takes 1e5 sweeps."""
 
     @pytest.mark.parametrize("shape", [(240, 320), (582, 782)])
-    def test_a_certified_1e_6_takes_75_products(self, shape):
+    def test_a_certified_1e_6_takes_45_products(self, shape):
         frames, truth = hard_case(shape)
         cal = equipix.calibrate(frames, HARD_CROSS)
         assert cal.converged
         assert cal.error_estimate <= 1e-6
         assert abs(cal.sensitivity / truth - 1).max() < 1e-6
-        assert cal.sweeps <= 75
+        # Without the waves in the coarse space it takes 59.
+        assert cal.sweeps <= 45
 
     @pytest.mark.parametrize("shape", [(240, 320), (582, 782)])
     def test_in_single_precision_too(self, shape):
@@ -59,7 +60,8 @@ class TestTheHardCase:
         single = frames.astype(np.float32)
         cal = equipix.calibrate(single, HARD_CROSS)
         assert cal.converged
-        assert cal.sweeps <= 75
+        # Without the waves in the coarse space it takes 59.
+        assert cal.sweeps <= 45
         # What the rounding of the data does, and then that of the result.
         exact = equipix.calibrate(single.astype(np.float64), HARD_CROSS, tolerance=1e-10)
         rounding = abs(exact.sensitivity / truth - 1).max() + EPS["float32"]
@@ -293,6 +295,8 @@ class TestSingularCoarseMatrices:
         assert abs(others / others.mean() - 1).max() < 10 * 1e-6
 
 
+# The frames have no noise, their variances do.
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestAlmostNoWeight:
     """Pixels whose weight is below a millionth of the mean."""
 

@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import errors, simulate
 from equipix.defects import dead_pixels, hot_pixels
+from equipix.exposures.front import exposures_of
 from equipix.noise import NoiseModel
 
 CROSS = equipix.cross_pattern(5, 7)
@@ -26,7 +27,7 @@ def raw():
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_unit_of_the_frames_plays_no_part(raw, unit):
-    options = {"max_sweeps": 30, "tolerance": 1e-9}
+    options = {"max_sweeps": 15, "tolerance": 1e-9}
     with pytest.warns(errors.ConvergenceWarning):
         plain = equipix.calibrate([equipix.average(each) for each in raw], CROSS, **options)
     with pytest.warns(errors.ConvergenceWarning):
@@ -54,12 +55,39 @@ def test_frames_that_are_all_equal_have_no_model(raw):
         equipix.calibrate(same, CROSS)
 
 
-def test_exposures_that_saturate_everywhere_are_named(raw):
-    averages = [
-        equipix.average(each, saturation=1e-9 if k == 3 else None) for k, each in enumerate(raw)
-    ]
-    with pytest.raises(errors.InputError, match="every pixel of exposure 3 saturates"):
-        equipix.calibrate(averages, CROSS)
+class TestSaturatedExposures:
+    """One text for averages, arrays and files: which exposure, what share, what to do."""
+
+    def test_of_averages_are_named(self, raw):
+        averages = [
+            equipix.average(each, saturation=1e-9 if k == 3 else None) for k, each in enumerate(raw)
+        ]
+        with pytest.raises(
+            errors.InputError, match=SATURATES.format("'frames': exposure 3", "100.0", "")
+        ):
+            equipix.calibrate(averages, CROSS)
+
+    def test_of_arrays_are_named(self, raw):
+        frames = raw.mean(axis=1)
+        frames[3] *= 10
+        frames[3, :, :5] = np.nan
+        words = SATURATES.format("'frames': exposure 3", "90.0", " of 3000 DN")
+        with pytest.raises(errors.InputError, match=words):
+            equipix.calibrate(frames, CROSS, saturation=3000)
+        frames[3, 7, 8] = 2999
+        assert exposures_of(frames, CROSS, saturation=3000).usable(3).sum() == 1
+
+    def test_of_the_dark_are_named(self, raw):
+        dark = equipix.average(np.full((2, *raw.shape[2:]), 255, np.uint8))
+        averages = [equipix.average(each, dark=dark) for each in raw]
+        with pytest.raises(errors.InputError, match=SATURATES.format("^'dark'", "100.0", "")):
+            equipix.calibrate(averages, CROSS)
+
+
+SATURATES = (
+    "{}: {}% of the pixels reach the saturation level{} and none is left to measure "
+    "with: expose less, or correct 'saturation'"
+)
 
 
 def test_a_pixel_without_samples_hides_no_defect():

@@ -16,6 +16,7 @@ from equipix.errors import (
     DriftWarning,
     IdentifiabilityWarning,
     InputError,
+    MisfitWarning,
     ShiftRoundingWarning,
 )
 from equipix.plan.noise import local_variance
@@ -55,8 +56,10 @@ def beam_of(shape, width):
 
 
 def solved(frames, shifts, tolerance):
-    """The relative error of M, the truth being 1."""
-    found = equipix.calibrate(frames, shifts, tolerance=tolerance, workers=1).sensitivity
+    """The relative error of M, the truth being 1, where drifts and shifts are wrong on purpose."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", (DriftWarning, MisfitWarning))
+        found = equipix.calibrate(frames, shifts, tolerance=tolerance, workers=1).sensitivity
     return simulate.relative_error(found, np.ones(found.shape))
 
 
@@ -137,8 +140,13 @@ class TestIdentify:
         assert plan.identify((48, 64), equipix.cross_pattern(4, 6) + 0.3).components == 4
 
     def test_other_parts_of_pixels_are_rounded_with_a_warning(self):
-        with pytest.warns(ShiftRoundingWarning):
-            found = plan.identify((48, 64), equipix.cross_pattern(4, 6) * 1.1)
+        shifts = equipix.cross_pattern(4, 6) * 1.1 + 0.3
+        words = (
+            r"exposure 1 \(from 0\) is \[0\.3, 4\.7\] \(limit 0\.02 from whole\), the first is "
+            r"\[0\.3, 0\.3\]: choose shifts that differ by whole pixels$"
+        )
+        with pytest.warns(ShiftRoundingWarning, match=words):
+            found = plan.identify((48, 64), shifts)
         assert found.components == plan.identify((48, 64), equipix.cross_pattern(4, 7)).components
 
     def test_says_what_it_found(self):
@@ -303,16 +311,16 @@ class TestSpectrum:
 class TestOrder:
     def test_of_the_cross_hides_a_trend(self):
         # Section 5 of the design: 3.5 % of the variance.
-        assert plan.trend_told(CROSS) == pytest.approx(0.035, abs=5e-4)
+        assert plan.distinct_trend(CROSS) == pytest.approx(0.035, abs=5e-4)
 
     @pytest.mark.parametrize("count", [4, 6, 11])
     def test_advised_hides_less(self, count):
         shifts = np.random.default_rng(count).integers(0, 40, (count, 2))
         order = plan.advise_order(shifts)
         assert sorted(order) == list(range(count))
-        told = plan.trend_told(shifts[order])
+        told = plan.distinct_trend(shifts[order])
         rng = np.random.default_rng(0)
-        others = [plan.trend_told(rng.permutation(shifts)) for _ in range(500)]
+        others = [plan.distinct_trend(rng.permutation(shifts)) for _ in range(500)]
         assert told >= max(others) - 1e-9
 
     def test_a_trend_in_the_advised_order_does_not_tilt(self):
@@ -322,13 +330,13 @@ class TestOrder:
             beam = simulate.gaussian_beam(shape)
             frames = simulate.exposures(np.ones(shape), beam, shifts, flux=1 + trend)
             tilts.append(np.linalg.norm(slopes(solved(frames, shifts, 1e-7))))
-        hidden = 1 - plan.trend_told(CROSS[plan.advise_order(CROSS)])
+        hidden = 1 - plan.distinct_trend(CROSS[plan.advise_order(CROSS)])
         # The tilt goes with the root of what is hidden, in a metric as lopsided as cov(d): its
         # eigenvalues are 96 and 24.
         assert tilts[1] < 2 * np.sqrt(hidden / 0.965) * tilts[0]
 
     def test_three_exposures_hide_every_trend(self):
-        assert plan.trend_told([(0, 0), (0, 3), (5, 0)]) == pytest.approx(0, abs=1e-12)
+        assert plan.distinct_trend([(0, 0), (0, 3), (5, 0)]) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -360,15 +368,28 @@ class TestSuggest:
         np.testing.assert_array_equal(first, second)
         assert (first.max(axis=0) <= (10, 20)).all()
         # In the order advised, which is one of its own.
-        told = plan.trend_told(first)
-        assert told == pytest.approx(plan.trend_told(first[plan.advise_order(first)]), abs=1e-9)
+        told = plan.distinct_trend(first)
+        assert told == pytest.approx(plan.distinct_trend(first[plan.advise_order(first)]), abs=1e-9)
 
-    def test_the_fewest(self):
-        # Two exposures compare pixels along one line only; three may have a lattice of index 1.
-        found = plan.suggest((40, 50), None, 12, drift=1e-6)[0].shifts
-        assert len(found) == 3
+    def test_five_unless_told(self):
+        found = plan.suggest((40, 50), None, 12, drift=0)[0].shifts
+        assert len(found) == 5
         assert plan.identify((40, 50), found).components == 1
-        assert len(plan.suggest((1, 50), None, 12, drift=1e-6)[0].shifts) == 2
+        # Fewer where the travel has fewer positions.
+        assert len(plan.suggest((1, 50), None, (0, 2), drift=0)[0].shifts) == 3
+
+    def test_not_all_at_the_corners(self):
+        """Distances differ, and no wave of the travel's period is left with little weight."""
+        travel = 30
+        for suggestion in plan.suggest((96, 128), 7, travel, drift=1e-5):
+            shifts = suggestion.shifts
+            inside = np.minimum(shifts, travel - shifts).max(axis=1) > 0.1 * travel
+            assert inside.any()
+            waves = 2j * np.pi * np.array([(1, 0), (0, 1), (1, 1), (2, 0), (0, 2)]) / travel
+            visible = 7 - np.abs(np.exp(waves @ shifts.T).sum(axis=1)) ** 2 / 7
+            # Of seven positions all at the corners λ is below 0.1 at each of them.
+            assert visible.min() > 0.5
+            assert plan.identify((96, 128), shifts).components == 1
 
     def test_tells_its_progress(self):
         told = []
@@ -382,6 +403,8 @@ class TestSuggest:
         with pytest.warns(DriftWarning):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)
         plan.suggest((64, 80), 4, 5, patterns=1)  # warnings are errors here
+        with pytest.warns(DriftWarning, match="pattern 1: "):
+            plan.suggest((300, 400), 4, 5, patterns=1)  # by a tenth of the noise
 
     @pytest.mark.parametrize(
         ("arguments", "options", "words"),
@@ -409,6 +432,15 @@ class TestBudget:
         budget = budget_of((64, 80), CROSS, noise=1e-3, drift=1e-5, shift_error=0.1, beam_width=99)
         assert budget.rms == pytest.approx(np.linalg.norm([*budget.rms_by_cause.values()]))
         assert all(value > 0 for value in budget.rms_by_cause.values())
+
+    def test_between_pixels(self):
+        """The errors are those of the nearest whole shifts, but a periodic wave is undetermined."""
+        moved = CROSS + np.random.default_rng(1).uniform(-0.2, 0.2, (5, 2))
+        between, whole = (budget_of((64, 80), each, noise=1) for each in (moved, CROSS))
+        assert between.components == 1
+        assert between.rms_by_cause["noise"] == whole.rms_by_cause["noise"]
+        with pytest.warns(IdentifiabilityWarning, match="do not constrain a wave"):
+            budget_of((64, 80), 2.5 * equipix.cross_pattern(1, 3), noise=1)
 
     def test_of_parts_that_nothing_compares(self):
         with pytest.warns(IdentifiabilityWarning, match="4 parts"):

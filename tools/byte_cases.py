@@ -160,6 +160,7 @@ CASES: dict[str, Callable[[], Any]] = {
         variance=[NOISY] * 6, flux="fit"
     ),
     "statistics": lambda: WHOLE.fit(statistics(WHOLE), uncertainty=True),
+    "statistics of single frames": lambda: WHOLE.fit(statistics(WHOLE, frames=1)),
     "statistics, saturated": lambda: STRUCTURED.fit(
         statistics(STRUCTURED, full_scale=2800, saturation=2800)
     ),

@@ -120,18 +120,18 @@ def with_odd_pixels(scene: Scene) -> NDArray[Any]:
 
 
 def statistics(
-    scene: Scene, *, full_scale: float = 4095.0, saturation: float = 4095.0
+    scene: Scene, *, frames: int = 8, full_scale: float = 4095.0, saturation: float = 4095.0
 ) -> list[Any]:
     """Averages of 12-bit frames less their dark; one pixel is far noisier than the others."""
     rng = np.random.default_rng(5)
     clean = 2500 * Scene(**{**vars(scene), "noise": 0.0}).frames
 
     def averaged(signal: NDArray[Any], **options: Any) -> Any:
-        electrons = rng.poisson(4 * signal, (8, *scene.shape)) / 4
+        electrons = rng.poisson(4 * signal, (frames, *scene.shape)) / 4
         digital = 60 + electrons + 2 * rng.standard_normal(electrons.shape)
-        digital[:, 12, 33] += 300 * rng.standard_normal(8)
-        frames = np.clip(np.rint(digital), 0, full_scale).astype(np.uint16)
-        return equipix.average(frames, **options)
+        digital[:, 12, 33] += 300 * rng.standard_normal(frames)
+        raw = np.clip(np.rint(digital), 0, full_scale).astype(np.uint16)
+        return equipix.average(raw, **options)
 
     dark = averaged(np.zeros(scene.shape))
     return [averaged(signal, dark=dark, saturation=saturation) for signal in clean]

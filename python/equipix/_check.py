@@ -10,11 +10,14 @@ import numpy as np
 from equipix.errors import InputError, InsufficientMemoryError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
 _MOST_WORKERS = 1024
+
+_PIXELS = ("", "pix", "pixel", "dimensionless")
+"""Units of a number of pixels, as packages for quantities name them."""
 
 
 @contextmanager
@@ -70,6 +73,7 @@ def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> N
 
 def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
     """Shifts as float64 of shape (n, 2), all finite."""
+    _refuse_units(shifts)
     array = as_array("shifts", shifts, ndim=2).astype(np.float64)
     if array.shape[1] != 2:
         raise InputError(f"'shifts' has shape {array.shape}, expected (n, 2): row and column")
@@ -79,6 +83,38 @@ def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
             f"'shifts' of exposure {k} is {array[k].tolist()}, expected finite numbers"
         )
     return array
+
+
+def _refuse_units(shifts: object) -> None:
+    """Refuse lengths with a unit, which NumPy drops, and texts."""
+    first = shifts
+    while isinstance(first, list | tuple) and first:
+        first = first[0]
+    for each in (shifts, first):
+        unit = getattr(each, "unit", getattr(each, "units", None))
+        if unit is not None and str(unit) not in _PIXELS:
+            raise InputError(
+                f"'shifts' has the unit {unit}, expected plain numbers of pixels: divide by the "
+                "pixel pitch, see 'From micrometres to pixels' in README"
+            )
+    if isinstance(first, str):
+        raise InputError(
+            f"'shifts' holds {first!r}, expected numbers of pixels without a unit: divide "
+            "micrometres by the pixel pitch"
+        )
+
+
+def check_maps(owner: str, maps: Mapping[str, ArrayLike]) -> None:
+    """Refuse maps of one sensor that are not of one shape (rows, cols), that of the first."""
+    shapes = {name: np.shape(values) for name, values in maps.items()}
+    first = next(iter(shapes))
+    for name, shape in shapes.items():
+        if len(shape) != 2:
+            raise InputError(f"'{name}' of {owner} has shape {shape}, expected (rows, cols)")
+        if shape != shapes[first]:
+            raise InputError(
+                f"'{name}' of {owner} has shape {shape}, expected {shapes[first]} like '{first}'"
+            )
 
 
 def check_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -116,6 +152,16 @@ def number(name: str, value: float) -> float:
         return float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
+
+
+def as_level(saturation: float | None) -> float | None:
+    """The saturation level, checked; None where there is none."""
+    if saturation is None:
+        return None
+    level = number("saturation", saturation)
+    if not level > 0:
+        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0 in DN, or None")
+    return level
 
 
 def as_tolerance(value: float) -> float:

@@ -16,8 +16,10 @@ __all__ = [
     "average_files",
     "file_format",
     "locate_spots",
+    "needs_whole_shifts",
     "planned_components",
     "read_file",
+    "slope_pixels",
 ]
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
@@ -63,6 +65,7 @@ class Exposures:
         offset: bool,
         variance: NDArray[Any] | None,
         mask: NDArray[Any] | None,
+        unreliable: NDArray[Any] | None,
         workers: int | None,
         progress: _Progress | None,
     ) -> Exposures: ...
@@ -114,8 +117,6 @@ class Fit:
     """What was found. `refinement` is "none", "not tried", "undetermined" or "refined"."""
 
     @property
-    def exposures(self) -> Exposures: ...
-    @property
     def sensitivity(self) -> NDArray[Any]: ...
     @property
     def beam(self) -> Beam: ...
@@ -163,6 +164,8 @@ class Fit:
         offset: bool,
         workers: int | None,
         progress: _Progress | None,
+        dark_variance: NDArray[Any] | None = None,
+        dark_misfit: bool = False,
     ) -> Uncertainty: ...
 
 @final
@@ -181,12 +184,17 @@ class Uncertainty:
     def shift_variances(self) -> list[list[float]] | None: ...
     @property
     def offset_variances(self) -> tuple[float, float] | None: ...
+    @property
+    def dark_misfit(self) -> float | None: ...
+    @property
+    def incomplete(self) -> int: ...
 
 def locate_spots(
     before: NDArray[Any],
     after: NDArray[Any],
     saturations: tuple[float | None, float | None],
 ) -> tuple[_Spot, _Spot]: ...
+def needs_whole_shifts(method: str) -> bool: ...
 def planned_components(
     shape: tuple[int, int],
     shifts: NDArray[Any],
@@ -194,3 +202,4 @@ def planned_components(
     rotation: list[int],
     mask: NDArray[Any] | None,
 ) -> tuple[NDArray[Any], list[int], int]: ...
+def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[Any]: ...

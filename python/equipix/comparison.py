@@ -42,6 +42,9 @@ class Comparison:
         The same of means over blocks of 16×16 pixels: what is left at large scales.
     largest : ndarray, shape (pairs,), float64
         Largest absolute relative difference of a pixel.
+    open_tilt : ndarray of bool, shape (pairs,)
+        Whether free fluxes leave the tilt of one of the two undetermined: then the slope of ln of
+        their ratio is no difference, and is left out of all figures.
     predicted_rms, predicted_block_rms : ndarray, shape (pairs,), float64, or None
         What the uncertainties of two independent calibrations predict for `rms` and `block_rms`.
     """
@@ -52,13 +55,17 @@ class Comparison:
     rms: NDArray[Any]
     block_rms: NDArray[Any]
     largest: NDArray[Any]
+    open_tilt: NDArray[np.bool_]
     predicted_rms: NDArray[Any] | None = None
     predicted_block_rms: NDArray[Any] | None = None
 
     def difference(self, pair: int) -> NDArray[Any]:
-        """Relative difference of the sensitivities of a pair, (M₁ − M₂)/M₂, shape (rows, cols)."""
+        """Relative difference of the sensitivities of a pair, (M₁ − M₂)/M₂, shape (rows, cols).
+
+        Without its slope where `open_tilt` is true.
+        """
         first, second = self.sensitivities[self.pairs[pair]]
-        return relative_error(first, second)
+        return _difference(first, second, bool(self.open_tilt[pair]))
 
 
 def compare(
@@ -91,7 +98,8 @@ def compare(
     -----
     Common errors of two calibrations, such as a wrong dark level, leave no difference. A shift
     error or lamp drift does: it differs between experiments and changes M at large scales, so it
-    dominates the block means.
+    dominates the block means. A tilt that free fluxes leave undetermined is no difference, and is
+    left out (`Comparison.open_tilt`).
 
     References
     ----------
@@ -125,16 +133,51 @@ def compare(
         raise InputError(f"'calibrations' are of sensors of shapes {shapes}, expected one shape")
     sensitivities = _in_one_gauge(calibrations)
     pairs = np.array(list(combinations(range(count), 2)))
-    differences = [relative_error(*sensitivities[pair]) for pair in pairs]
+    is_open = np.array([_leaves_tilt(each) for each in calibrations])
+    open_tilt = is_open[pairs].any(axis=1)
+    differences = [
+        _difference(sensitivities[i], sensitivities[j], bool(left))
+        for (i, j), left in zip(pairs, open_tilt, strict=True)
+    ]
+    compared = sensitivities
+    if is_open.any():
+        compared = np.stack([_levelled(each, sensitivities[0]) for each in sensitivities])
     return Comparison(
         sensitivities=sensitivities,
-        agreement=sensitivities.std(axis=0, ddof=1),
+        agreement=compared.std(axis=0, ddof=1),
         pairs=pairs,
+        open_tilt=open_tilt,
         rms=np.array([rms(each) for each in differences]),
         block_rms=np.array([rms(block_means(each)) for each in differences]),
         largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
         **_predictions(_expected(calibrations) if predicted is None else predicted, pairs, count),
     )
+
+
+def _leaves_tilt(calibration: Calibration) -> bool:
+    """Whether free fluxes leave the tilt of a calibration undetermined."""
+    std = calibration.tilt_std
+    if std is not None and not np.isfinite(std).all():
+        return True
+    return any(verdict.kind == "tilt" for verdict in calibration.verdicts)
+
+
+def _difference(first: NDArray[Any], second: NDArray[Any], open_tilt: bool) -> NDArray[Any]:
+    """Relative difference of two sensitivities, without its slope where a tilt is open."""
+    return relative_error(_levelled(first, second) if open_tilt else first, second)
+
+
+def _levelled(sensitivity: NDArray[Any], like: NDArray[Any]) -> NDArray[Any]:
+    """Sensitivity times the tilt that brings the slope of ln of the ratio to another to 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.log(sensitivity / like)
+    valid = np.isfinite(ratio)
+    places = np.indices(ratio.shape)[:, valid].T
+    places = places - places.mean(axis=0)
+    slope = np.linalg.lstsq(places, ratio[valid] - ratio[valid].mean())[0]
+    levelled = sensitivity.copy()
+    levelled[valid] *= np.exp(-places @ slope)
+    return np.asarray(levelled * (np.nanmean(like) / np.nanmean(levelled)))
 
 
 def _in_one_gauge(calibrations: Sequence[Calibration]) -> NDArray[Any]:

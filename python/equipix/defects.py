@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._readonly import ReadOnly
+from equipix.errors import InputError
 from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
@@ -32,8 +34,8 @@ _BLOCK = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
-    """Bad pixels found in the frames before any fit: maps (rows, cols) of bool, or None.
+class Findings(ReadOnly):
+    """Bad pixels found before the last fit: maps (rows, cols) of bool, or None.
 
     Attributes
     ----------
@@ -45,12 +47,48 @@ class Findings:
         A high dark level or much dark noise: see `hot_pixels`.
     noisy : ndarray of bool or None
         More scatter between frames than the noise explains: see `noisy_pixels`.
+    contradictory : ndarray of bool or None
+        Another response before than after some moment, as under dust that fell; or most of the
+        measurements left out by a robust calibration. The fit flags them, and their sensitivity
+        counts neither for its mean nor for its slope.
     """
 
     saturated: Bools | None = None
     dead: Bools | None = None
     hot: Bools | None = None
     noisy: Bools | None = None
+    contradictory: Bools | None = None
+
+
+def refuse_saturated(
+    which: str, values: Array, saturates: Bools, level: float | None, key: str = "saturation"
+) -> None:
+    """Refuse a frame whose saturated values leave none to measure with.
+
+    Parameters
+    ----------
+    which : str
+        The argument, and which of its frames.
+    values : ndarray, shape (rows, cols)
+        Its values.
+    saturates : ndarray of bool, shape (rows, cols)
+        Which of them saturate.
+    level : float or None
+        The saturation level in DN, where it is known.
+    key : str
+        The argument or key of a file that gives the level.
+
+    Raises
+    ------
+    InputError
+        If pixels saturate, and no other one holds a finite value.
+    """
+    if saturates.any() and not (np.isfinite(values) & ~saturates).any():
+        raise InputError(
+            f"{which}: {np.mean(saturates):.1%} of the pixels reach the saturation "
+            f"level{'' if level is None else f' of {level:g} DN'} and none is left to measure "
+            f"with: expose less, or correct '{key}'"
+        )
 
 
 def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:
@@ -132,7 +170,7 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
     return noisy & seen
 
 
-def odd_responses(
+def response_outliers(
     sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.

@@ -60,6 +60,35 @@ def slope_std(shifts: NDArray[Any], flux_std: ArrayLike) -> Floats:
     return np.asarray(found)
 
 
+def slope_covariance(shifts: NDArray[Any], flux_std: float, times: ArrayLike | None) -> Floats:
+    """Covariance of the slope of ln M, per pixel, that independent errors of the fluxes leave.
+
+    Parameters
+    ----------
+    shifts : ndarray, shape (n, 2)
+        Shifts (row, col) in pixels; both columns and 1 must be linearly independent.
+    flux_std : float
+        Standard deviation of ln c of each exposure.
+    times : array_like, shape (n,), or None
+        When each exposure was taken, where a trend of ln c linear in time was fitted.
+
+    Returns
+    -------
+    ndarray, shape (2, 2), float64
+        Part of ε² (XᵀX)⁻¹ for the shifts, the columns of X being 1, the shifts, and the times.
+    """
+    columns = affine_columns(shifts, times)
+    return np.asarray(flux_std**2 * np.linalg.inv(columns.T @ columns)[1:3, 1:3])
+
+
+def affine_columns(shifts: NDArray[Any], times: ArrayLike | None) -> Floats:
+    """Columns of ln c that leave no residual: 1, the shifts, and times if a trend is fitted."""
+    columns = [np.ones(len(shifts)), *shifts.T]
+    if times is not None:
+        columns.append(unit_times(np.asarray(times, np.float64)))
+    return np.stack(columns, axis=1)
+
+
 def tilt_std(shape: tuple[int, int], shifts: NDArray[Any], flux_std: ArrayLike) -> Floats:
     """Standard deviation of the tilt of ln M, edge to edge, that errors of the fluxes leave.
 
@@ -91,7 +120,7 @@ def tilt_rms(tilt: ArrayLike) -> Floats:
     return np.asarray(np.hypot(along_rows, along_cols) / np.sqrt(12))
 
 
-def trend_told(shifts: NDArray[Any], times: NDArray[Any]) -> float:
+def distinct_trend(shifts: NDArray[Any], times: NDArray[Any]) -> float:
     """Share of the variance of a trend linear in time that is distinguished from a tilt.
 
     Parameters

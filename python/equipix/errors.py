@@ -58,6 +58,18 @@ class AlreadyCorrectedWarning(EquipixWarning):
     """Frames to correct have been corrected before."""
 
 
+class MissingDarkWarning(EquipixWarning):
+    """Averages from which no dark was subtracted count as light."""
+
+
+class UnusedInputWarning(EquipixWarning):
+    """Part of what is given is not used."""
+
+
+class SaturationWarning(EquipixWarning):
+    """Values that probably saturate count as valid."""
+
+
 class MisfitWarning(EquipixWarning):
     """Residuals are larger than the variances given explain."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,14 +11,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native, io
-from equipix._check import as_array, as_floats, naming_memory, positive_workers
-from equipix.errors import InputError, UnsupportedFileError
+from equipix._check import (
+    as_array,
+    as_floats,
+    as_level,
+    check_maps,
+    naming_memory,
+    positive_workers,
+)
+from equipix._readonly import ReadOnly
+from equipix.errors import FileError, InputError, UnsupportedFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
     from os import PathLike
+    from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix._types import Progress
 
 _BATCH = 16  # frames handed over at once
 _BATCH_BYTES = 2**26
@@ -32,13 +42,14 @@ _PAGES = {
     "count": np.uint32,
     "saturated": np.uint32,
 }
+_COUNTS = ("count", "saturated")
 _DARK = "dark_"  # before the names of the dark's pages
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
 @dataclass(frozen=True, eq=False)
-class FrameStatistics:
-    """Mean and scatter of repeated frames of one scene.
+class FrameStatistics(ReadOnly):
+    """Mean and scatter of repeated frames of one scene, as read-only arrays.
 
     Attributes
     ----------
@@ -55,6 +66,10 @@ class FrameStatistics:
     dark : FrameStatistics or None
         The dark frames whose mean was subtracted, where they were given as statistics. They show
         which pixels are hot, and how noisy a frame without light is.
+    saturation : float or None
+        The level that samples were compared with, in DN; None if there was none.
+    raw : bool
+        Whether no dark was subtracted from whole numbers, as cameras write them.
     """
 
     mean: NDArray[Any]
@@ -63,11 +78,60 @@ class FrameStatistics:
     count: NDArray[Any]
     saturated: NDArray[Any]
     dark: FrameStatistics | None = None
+    saturation: float | None = None
+    raw: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse maps of different shapes."""
+        ReadOnly.__post_init__(self)
+        dark = {} if self.dark is None else {"dark": self.dark.mean}
+        check_maps("FrameStatistics", self.maps | dark)
 
     @property
     def maps(self) -> dict[str, NDArray[Any]]:
         """The five maps by their names."""
         return {name: getattr(self, name) for name in _PAGES}
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `FrameStatistics.load` reads.
+
+        `equipix.average`, experiment.toml and the command line take the file in the place of the
+        frames.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        save_statistics(path, self, force=force)
+
+    @staticmethod
+    def load(path: str | PathLike[str]) -> FrameStatistics:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : str or path
+            A .tif or .npz file.
+
+        Returns
+        -------
+        FrameStatistics
+            The averaged frames.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, holds something else, or was written in a newer format.
+        """
+        return load_statistics(path)
 
 
 def average(
@@ -75,8 +139,9 @@ def average(
     *,
     dark: FrameStatistics | ArrayLike | None = None,
     saturation: float | None = None,
+    mask: ArrayLike | None = None,
     workers: int | None = None,
-    progress: Callable[[int, int, str], object] | None = None,
+    progress: Progress | None = None,
 ) -> FrameStatistics:
     r"""Mean and variance of each pixel over any number of repeated frames.
 
@@ -84,8 +149,9 @@ def average(
     ----------
     source : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
         The frames, in DN. Of files, every page counts: grey TIFF, PNG, PGM and BMP, all of one
-        shape and depth. An iterable is taken one frame at a time and never collected, and files
-        are read in small batches, so memory does not grow with the number of frames.
+        shape and depth; the file of a saved average gives that average. An iterable is taken one
+        frame at a time and never collected, and files are read in small batches, so memory does not
+        grow with the number of frames. Masked samples of `numpy.ma` arrays do not count.
     dark : FrameStatistics or array of shape (rows, cols), optional
         Dark mean, subtracted from the mean, in DN; the variance of a `FrameStatistics` dark mean
         is added to that of the mean.
@@ -93,6 +159,8 @@ def average(
         Samples at or above this level are counted as saturated, in DN. By default the largest
         value of an integer dtype (give 4095 for 12 bits in a 16-bit file); floating-point frames
         are not tested then.
+    mask : array_like of bool, shape (rows, cols), optional
+        True = do not use: mean and variances of the pixel become NaN, its counts 0.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
     progress : callable, optional
@@ -138,97 +206,72 @@ def average(
     (array([[2., 2.]]), array([[2., 0.]]))
     """
     workers = positive_workers(workers)
-    level = _level(saturation)
+    level = as_level(saturation)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     frames = _paths_or_frames(source)
     with naming_memory("averaging"):
         if isinstance(frames, list):
-            maps = _average_files(frames, level, workers, progress)
+            statistics = _average_files(frames, level, workers, progress)
         else:
-            maps = _average_batches(_batches(frames), level, workers, progress, _length(source))
-        mean, variance, count, saturated = maps
-        statistics = FrameStatistics(mean, variance, variance / count, count, saturated)
-        return _subtract(statistics, offset)
+            batches = _batches(frames)
+            statistics = _average_batches(batches, level, workers, progress, _length(source))
+        return _masked(_subtract(statistics, offset), mask)
 
 
 def save_statistics(
     path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
 ) -> None:
-    """Write averaged frames to a .tif or .npz file.
-
-    Parameters
-    ----------
-    path : path
-        Output; its suffix names the format.
-    statistics : FrameStatistics
-        What `equipix.average` returned.
-    force : bool, optional
-        Replace a file that is there.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `force` is not set, or cannot be written.
-    """
-    pages = dict(statistics.maps)
-    if statistics.dark is not None:
-        pages |= {_DARK + name: values for name, values in statistics.dark.maps.items()}
-    io.save_pages(path, pages, {"format": _FORMAT, "kind": _KIND}, force=force)
+    """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
+    pages, dark = dict(statistics.maps), statistics.dark
+    content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
+    content |= {"saturation": statistics.saturation, "raw": statistics.raw}
+    if dark is not None:
+        pages |= {_DARK + name: values for name, values in dark.maps.items()}
+        content[_DARK + "saturation"] = dark.saturation
+    io.save_pages(path, pages, content, force=force)
 
 
 def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
-    """Read what `save_statistics` wrote.
+    """Read averaged frames; the parameter and errors are those of `FrameStatistics.load`."""
+    return read_statistics(path, *io.load_pages(path))
 
-    Parameters
-    ----------
-    path : path
-        A .tif or .npz file.
 
-    Returns
-    -------
-    FrameStatistics
-        The averaged frames.
-
-    Raises
-    ------
-    FileError
-        If the file is not readable or holds something else.
-    """
-    pages, metadata = io.load_pages(path)
-    io.check_format(path, metadata, _KIND, _FORMAT)
+def read_statistics(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> FrameStatistics:
+    """Make averages of the arrays and metadata of the file that `save_statistics` wrote."""
+    io.check_format(path, content, _KIND, _FORMAT)
     io.check_pages(path, pages, _PAGES)
     dark = None
     if _DARK + "mean" in pages:
         io.check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
-        dark = _of_pages(pages, _DARK)
-    return dataclasses.replace(_of_pages(pages), dark=dark)
+        dark = _of_pages(pages, content, _DARK)
+    raw = content.get("raw", False)
+    return dataclasses.replace(_of_pages(pages, content), dark=dark, raw=raw)
 
 
-def _of_pages(pages: dict[str, NDArray[Any]], before: str = "") -> FrameStatistics:
+def _of_pages(
+    pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
+) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    return FrameStatistics(mean, variance, of_mean, count, saturated)
+    level = content.get(before + "saturation")
+    return FrameStatistics(mean, variance, of_mean, count, saturated, saturation=level)
 
 
-def _level(saturation: float | None) -> float | None:
-    if saturation is None:
+def saved_shape(path: Path) -> tuple[int, int] | None:
+    """Rows and columns of the averages in a file; None of frames. A calibration is an error."""
+    if (kind := io.saved_kind(path)) is None:
         return None
-    try:
-        level = float(saturation)
-    except (TypeError, ValueError):
-        level = math.nan
-    if not level > 0:
-        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0 in DN, or None")
-    return level
+    if kind != _KIND:
+        io.refuse_saved(path)
+    rows, cols = load_statistics(path).mean.shape
+    return rows, cols
 
 
 def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
     """Paths as a list, an array as it is, other iterables as an iterator."""
-    if np.ma.is_masked(source):
-        raise InputError(
-            "'source' is a masked array, whose mask would be lost: fill the masked samples with NaN"
-        )
     if isinstance(source, np.ndarray):
-        return source
+        return source if np.ma.is_masked(source) else np.asarray(source)
     if isinstance(source, str | os.PathLike):
         return [source]
     try:
@@ -251,15 +294,59 @@ def _average_files(
     names: list[Any],
     level: float | None,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
-) -> tuple[NDArray[Any], ...]:
+    progress: Progress | None,
+) -> FrameStatistics:
     paths = io.find_files(names)
+    if any(path.suffix.lower() == ".npz" for path in paths):
+        return _saved(paths, level)
     try:
-        return _native.average_files(paths, level, workers, progress)
+        maps = _native.average_files(paths, level, workers, progress)
+        return _statistics(maps, io.frame_format(paths[0])[1], level)
     except UnsupportedFileError:
+        if any(saved_shape(path) for path in paths):
+            return _saved(paths, level)
         stream = io.stream_frames(paths, workers=workers)
         batches = _batches(frame for _, frames in stream for frame in frames)
         return _average_batches(batches, level, workers, progress, len(paths))
+
+
+def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
+    """Read the one average that is given in the place of frames."""
+    path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
+    if others:
+        raise FileError(
+            f"{path}: holds averaged frames, which cannot be averaged with other files: name one "
+            "saved average alone, or the frames of all"
+        )
+    statistics = load_statistics(path)
+    if level is not None and statistics.saturation not in (None, level):
+        raise FileError(
+            f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
+            f"{level:g}: average the frames again with it (saturation=, --saturation {level:g})"
+        )
+    return statistics
+
+
+def _statistics(
+    maps: tuple[NDArray[Any], ...], dtype: np.dtype[Any], level: float | None
+) -> FrameStatistics:
+    mean, variance, count, saturated = maps
+    return FrameStatistics(
+        mean,
+        variance,
+        variance / count,
+        count,
+        saturated,
+        saturation=_level_of(dtype, level),
+        raw=dtype.kind in "iu",
+    )
+
+
+def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
+    """Saturation level of samples of a dtype: the largest whole number, unless given."""
+    if level is None and dtype.kind in "iu":
+        return float(np.iinfo(dtype).max)
+    return level
 
 
 def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
@@ -272,11 +359,17 @@ def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
         size = _batch_size(frames[0])
         yield from (frames[start : start + size] for start in range(0, len(frames), size))
         return
-    first = as_array("source[0]", next(frames), ndim=2)
-    batch = np.empty((_batch_size(first), *first.shape), first.dtype)
+    first = _frame(0, next(frames))
+    empty = np.ma.empty if isinstance(first, np.ma.MaskedArray) else np.empty
+    batch = empty((_batch_size(first), *first.shape), first.dtype)
     filled = 0
     for index, item in enumerate(itertools.chain([first], frames)):
-        frame = as_array(f"source[{index}]", item, ndim=2)
+        frame = _frame(index, item)
+        if type(frame) is not type(first):
+            raise InputError(
+                f"'source[{index}]' is a {type(frame).__name__}, expected a {type(first).__name__}"
+                " like the first: give all frames as masked arrays, or none"
+            )
         if frame.shape != first.shape or frame.dtype != first.dtype:
             raise InputError(
                 f"'source[{index}]' is {frame.dtype} of shape {frame.shape}, expected"
@@ -291,6 +384,13 @@ def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
         yield batch[:filled]
 
 
+def _frame(index: int, item: Any) -> NDArray[Any]:
+    """Check one frame of an iterable; a masked array stays one."""
+    name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
+    frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
+    return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
+
+
 def _batch_size(frame: NDArray[Any]) -> int:
     return max(1, min(_BATCH, _BATCH_BYTES // max(1, frame.nbytes)))
 
@@ -299,28 +399,57 @@ def _average_batches(
     batches: Iterator[NDArray[Any]],
     level: float | None,
     workers: int | None,
-    progress: Callable[[int, int, str], object] | None,
+    progress: Progress | None,
     total: int,
-) -> tuple[NDArray[Any], ...]:
+) -> FrameStatistics:
     first = next(batches)
-    dtype = _sum_dtype(first.dtype)
-    if level is None and first.dtype.kind in "iu":
-        level = float(np.iinfo(first.dtype).max)
+    dtype, level = _sum_dtype(first), _level_of(first.dtype, level)
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, workers)
     done = 0
     for batch in itertools.chain([first], batches):
-        sums.add(np.ascontiguousarray(batch, dtype=dtype))
+        sums.add(np.ascontiguousarray(_unmasked(batch, dtype), dtype=dtype))
         done += len(batch)
         if progress is not None:
             progress(done, max(done, total), "average")
-    return sums.finish()
+    return _statistics(sums.finish(), first.dtype, level)
 
 
-def _sum_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Choose the dtype that frames are summed in: their own, or float64."""
+def _sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
+    """Choose the dtype that frames are summed in: their own, or float64.
+
+    Masked samples are summed as NaN, which does not count, so whole numbers need float64.
+    """
+    dtype = frames.dtype
     if dtype.kind not in "buif":
         raise InputError(f"'source' has dtype {dtype}, expected real numbers")
-    return np.dtype(dtype.name if dtype.name in _SUMMABLE else "float64")
+    masked = isinstance(frames, np.ma.MaskedArray) and dtype.kind != "f"
+    return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
+
+
+def _unmasked(batch: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return a batch with NaN in the place of masked samples."""
+    if not isinstance(batch, np.ma.MaskedArray):
+        return batch
+    return np.where(np.ma.getmaskarray(batch), dtype.type(np.nan), np.ma.getdata(batch))
+
+
+def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatistics:
+    """Return averages without the pixels of a mask."""
+    if mask is None:
+        return statistics
+    array = as_array("mask", mask, ndim=2)
+    shape = statistics.mean.shape
+    if array.dtype != np.bool_ or array.shape != shape:
+        raise InputError(
+            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}, True "
+            f"= do not use{': give mask != 0' if array.shape == shape else ''}"
+        )
+    if array.all():
+        raise InputError("'mask' is True in every pixel, expected some pixels to use")
+    maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
+    for name, values in maps.items():
+        values[array] = 0 if name in _COUNTS else np.nan
+    return dataclasses.replace(statistics, **maps)
 
 
 def _subtract(
@@ -328,17 +457,44 @@ def _subtract(
 ) -> FrameStatistics:
     if dark is None:
         return statistics
+    if statistics.dark is not None:
+        if isinstance(dark, FrameStatistics) and same_statistics(statistics.dark, dark):
+            return statistics
+        raise InputError(
+            "'source' is an average from which another dark than 'dark' is subtracted already: "
+            "give the frames, or the dark that was subtracted"
+        )
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
     mean = dark.mean if isinstance(dark, FrameStatistics) else dark
     if mean.shape != statistics.mean.shape:
         raise InputError(
             f"'dark' has shape {mean.shape}, expected {statistics.mean.shape} like the frames"
         )
+    if not np.isfinite(mean).any():
+        raise InputError("'dark' holds no finite number: give the mean of dark frames")
     variance = dark.variance_of_mean if isinstance(dark, FrameStatistics) else 0.0
-    return FrameStatistics(
-        statistics.mean - mean,
-        statistics.variance,
-        statistics.variance_of_mean + variance,
-        statistics.count,
-        statistics.saturated,
-        dark if isinstance(dark, FrameStatistics) else None,
+    return dataclasses.replace(
+        statistics,
+        mean=statistics.mean - mean,
+        variance_of_mean=statistics.variance_of_mean + variance,
+        dark=dark if isinstance(dark, FrameStatistics) else None,
+        raw=False,
     )
+
+
+def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:
+    """Refuse as a dark an average that holds no dark level; `place` is for the message."""
+    if dark.dark is not None:
+        raise InputError(
+            f"{place}: its dark was already subtracted; 'dark' needs frames or an average without "
+            "a dark"
+        )
+
+
+def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
+    """Whether two averages are the same measurement: one object, or equal to the last bit."""
+    if one is None or other is None or one is other:
+        return one is other
+    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)

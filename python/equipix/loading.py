@@ -1,4 +1,4 @@
-"""Corrections of any kind, read from the files that they were saved to."""
+"""Corrections of any kind and averaged frames, read from the files that they were saved to."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ if TYPE_CHECKING:
     from equipix.correction.protocol import Correction
 
 READERS = {
-    "calibration": ("equipix.calibration.result", "read_calibration"),
+    "calibration": ("equipix.calibration.reading", "read_calibration"),
+    "frame statistics": ("equipix.frames", "read_statistics"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes
-a correction of ``(path, pages, metadata)``."""
+the content of ``(path, pages, metadata)``."""
 
 _NO_CORRECTIONS = {
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
-    "themselves: equipix correct subtracts them as --dark",
+    "themselves: FrameStatistics.load reads them, equipix correct subtracts them as --dark",
 }
-"""Other kinds of files that equipix writes, and what they are."""
+"""Kinds of files that are no corrections, and what they are."""
 
 
 def load(path: str | PathLike[str]) -> Correction:
@@ -44,10 +45,17 @@ def load(path: str | PathLike[str]) -> Correction:
     Raises
     ------
     FileError
-        If the file cannot be read, holds something else, or was written in a newer format.
+        If the file cannot be read, holds something else, or was written in a newer format. Averaged
+        frames are read by `FrameStatistics.load`.
     """
-    correction: Correction = _load(path, READERS)
+    readers = {kind: reader for kind, reader in READERS.items() if kind not in _NO_CORRECTIONS}
+    correction: Correction = _load(path, readers)
     return correction
+
+
+def load_any(path: str | PathLike[str]) -> Any:
+    """Read a correction or averaged frames; the parameters and errors are those of `load`."""
+    return _load(path, READERS)
 
 
 def load_calibration(path: str | PathLike[str]) -> Calibration:

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix import _native
 from equipix._check import as_array
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from equipix._types import Floats
+    from equipix._types import Bools, Floats
 
 BLOCK = 16
 """Edge of the blocks, in pixels, whose means show errors at large scales."""
@@ -89,6 +90,29 @@ def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:
     total = np.sum(blocks, axis=(1, 3), where=valid)
     means: Floats = np.divide(total, count, where=count > 0, out=np.full((rows, cols), np.nan))
     return means
+
+
+def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> Bools:
+    """Find the pixels that count for the slope of ln M.
+
+    They are those of which M is determined, that are not flagged ``UNRELIABLE_FLAT``, and whose M
+    is from half to twice the mean of such.
+
+    Parameters
+    ----------
+    sensitivity : ndarray, shape (rows, cols)
+        M; NaN where undetermined.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        Where a pixel counts.
+    """
+    return _native.slope_pixels(
+        np.ascontiguousarray(sensitivity, np.float64), np.ascontiguousarray(flags, np.uint32)
+    )
 
 
 def tilt_weights(valid: NDArray[np.bool_]) -> Floats:

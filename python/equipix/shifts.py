@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from equipix import _native
-from equipix._check import as_array, as_shifts
-from equipix.errors import InputError, ShiftRoundingWarning, warn
+from equipix._check import as_array, as_level, as_shifts
+from equipix.errors import InputError
+from equipix.mending import hot_places, mended
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -58,7 +59,11 @@ class ShiftMeasurement:
 
 
 def measure_shift(
-    before: ArrayLike, after: ArrayLike, *, saturation: float | None = None
+    before: ArrayLike,
+    after: ArrayLike,
+    *,
+    saturation: float | None = None,
+    hot: ArrayLike | None = None,
 ) -> ShiftMeasurement:
     """Measure a move of the sensor, from a spot that is fixed in the beam.
 
@@ -71,6 +76,8 @@ def measure_shift(
     saturation : float, optional
         Level in DN that saturated samples reach; by default the largest value of an integer
         dtype, and none for floats. Give it for a camera of, say, 12 bits in 16-bit files: 4095.
+    hot : array_like of bool, shape (rows, cols), optional
+        Pixels that dark frames show to be hot.
 
     Returns
     -------
@@ -100,7 +107,9 @@ def measure_shift(
     that holds it and its blurred outline; the background is a cubic surface fitted around the
     window; single or paired hot and dead pixels are replaced by what their neighbours predict (but
     not a dead pixel right on a sharp outline, which moves the centroid of a disc of radius r by up
-    to 1/(2πr) pixel).
+    to 1/(2πr) pixel). An isolated pixel that saturates is hot if `hot` says so, or if it saturates
+    in every frame while the light around it is below 0.9 of the level: it takes the value that its
+    neighbours show, and does not count as a saturated spot.
 
     The standard error propagates the random noise of every pixel of the window and of the
     background's fit. The noise comes from the scatter of the frames; of a single image it is
@@ -127,7 +136,10 @@ def measure_shift(
             f"'after' has images of shape {frames['after'].shape[1:]}, expected those of 'before', "
             f"{frames['before'].shape[1:]}"
         )
-    levels = (_saturation(before, saturation), _saturation(after, saturation))
+    levels = (saturation_level(before, saturation), saturation_level(after, saturation))
+    known = None if hot is None else _hot(hot, frames["before"].shape[1:])
+    for (name, images), level in zip(frames.items(), levels, strict=True):
+        frames[name] = mended(images, hot_places(images, level, known))
     first, second = (
         Spot(np.array(position), np.array(std))
         for position, std in _native.locate_spots(frames["before"], frames["after"], levels)
@@ -171,8 +183,25 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     return np.array([(0, 0), (0, first), (0, second), (first, 0), (second, 0)], dtype=np.int64)
 
 
-def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.int64]:
-    """Shifts rounded to whole pixels, with a warning where that changes them noticeably.
+class Rounding(NamedTuple):
+    """The shift (row, col) of an exposure, in pixels, before it was rounded to whole ones."""
+
+    exposure: int
+    shift: list[float]
+
+    @property
+    def words(self) -> str:
+        """What was rounded, and the limit."""
+        return (
+            f"shifts are rounded to whole pixels: that of exposure {self.exposure} (from 0) is "
+            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole)"
+        )
+
+
+def round_shifts(
+    shifts: ArrayLike, std: ArrayLike | None = None
+) -> tuple[NDArray[np.int64], Rounding | None]:
+    """Shifts rounded to whole pixels, and the largest rounding that is noticeable.
 
     Parameters
     ----------
@@ -183,33 +212,25 @@ def round_shifts(shifts: ArrayLike, std: ArrayLike | None = None) -> NDArray[np.
 
     Returns
     -------
-    ndarray, shape (n, 2), int64
+    whole : ndarray, shape (n, 2), int64
         The nearest whole shifts.
+    rounding : Rounding or None
+        Where a shift is more than 0.02 pixel and more than three standard errors from whole.
 
     Raises
     ------
     InputError
         If a shift is not a finite number.
-
-    Warns
-    -----
-    ShiftRoundingWarning
-        If a shift is more than 0.02 pixel and more than three standard errors from whole.
     """
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
     exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
     whole = np.rint(exact)
     known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
-    noticeable = np.abs(exact - whole) > np.maximum(_UNNOTICED, 3 * known)
-    if noticeable.any():
-        worst = np.unravel_index(np.argmax(np.abs(exact - whole) * noticeable), exact.shape)
-        warn(
-            f"shifts are rounded to whole pixels: that of exposure {worst[0]} (from 0) is "
-            f"{np.round(exact[worst[0]], 3).tolist()} (limit {_UNNOTICED:g} from whole): use "
-            "method='multiscale', or move the sensor by whole pixels",
-            ShiftRoundingWarning,
-        )
-    return whole.astype(np.int64)
+    change = np.abs(exact - whole)
+    change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
+    worst = int(change.max(axis=1).argmax())
+    rounding = Rounding(worst, exact[worst].tolist()) if change[worst].any() else None
+    return whole.astype(np.int64), rounding
 
 
 def _frames(name: str, values: ArrayLike) -> NDArray[Any]:
@@ -220,13 +241,18 @@ def _frames(name: str, values: ArrayLike) -> NDArray[Any]:
     return array if array.ndim == 3 else array[np.newaxis]
 
 
-def _saturation(values: ArrayLike, saturation: float | None) -> float | None:
+def _hot(hot: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    array = as_array("hot", hot, ndim=2)
+    if array.dtype != np.bool_ or array.shape != shape:
+        raise InputError(
+            f"'hot' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}"
+        )
+    return array
+
+
+def saturation_level(values: ArrayLike, saturation: float | None) -> float | None:
     """Level given, or the largest value of the caller's integer dtype."""
     if saturation is None:
         dtype = np.asarray(values).dtype
         return float(np.iinfo(dtype).max) if dtype.kind in "iu" else None
-    if isinstance(saturation, bool) or not isinstance(saturation, int | float | np.number):
-        raise InputError(f"'saturation' is {saturation!r}, expected a level in DN or None")
-    if np.isnan(saturation):
-        raise InputError("'saturation' is NaN, expected a level in DN or None")
-    return float(saturation)
+    return as_level(saturation)

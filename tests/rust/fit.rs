@@ -131,6 +131,8 @@ fn cases() -> Vec<(&'static str, Case)> {
     ]
 }
 
+/// Iterations before an estimate of the error is made, of any fit.
+const ESTIMATED: f64 = 10.0;
 const TO: Options = Options { method: Method::Multiscale, tolerance: 1e-6, max_sweeps: None };
 
 /// Σ w (y − c L M − O)², L being the light of the beam that was fitted.
@@ -177,7 +179,9 @@ fn a_start_leads_to_the_same_minimum_in_fewer_passes() {
             let again = case.fit(&frames, variance, &TO, Some(&first));
             assert_eq!(again.history.ended, Ended::Converged, "{name}");
             let passes = [&again, &scratch].map(|fit| fit.history.last().sweep as f64);
-            assert!(passes[0] < share * passes[1], "{name}: {passes:?}");
+            // Of the passes beyond those that an estimate of the error takes from any start.
+            let [started, whole] = passes.map(|count| count - ESTIMATED);
+            assert!(started < share * whole, "{name}: {passes:?}");
             // Both are within the tolerance of the minimum, by an estimate that is at most 3.6 times
             // too small on small problems (docs/estimate.py).
             for (a, b) in again.sensitivity.iter().zip(&scratch.sensitivity) {

@@ -249,6 +249,23 @@ fn free_fluxes_leave_the_tilt_to_the_gauge() {
 }
 
 #[test]
+fn a_pixel_without_an_offset_does_not_count_for_the_slope_of_the_gauge() {
+    let experiment = noisy(SMALL, &CROSS).at_two_levels().experiment().with_lamp(Lamp::Free);
+    let (pixels, lost) = (SMALL[0] * SMALL[1], 10);
+    // One measurement of a pixel is left, which determines no offset.
+    let mask = (0..experiment.frames.len()).map(|i| i >= pixels && i % pixels == lost).collect();
+    let experiment = Experiment { mask, ..experiment };
+    let answer = fit(&experiment, Options::to(TOLERANCE)).unwrap();
+    assert!(answer.leaves_tilt && answer.sensitivity[lost].is_nan());
+    let known = answer.sensitivity.iter().map(|m| if m.is_finite() { *m } else { 0.0 });
+    let logs: Vec<f64> =
+        answer.sensitivity.iter().map(|m| if m.is_finite() { m.ln() } else { 0.0 }).collect();
+    let slope = Gauge::new(&experiment, &known.collect::<Vec<_>>()).slope(&logs);
+    // Sums of 71 logarithms of up to a tenth, of a normal matrix whose condition is some thousand.
+    assert!(slope.iter().all(|slope| slope.abs() < 1e4 * f64::EPSILON), "{slope:?}");
+}
+
+#[test]
 fn a_prior_that_is_true_changes_nothing() {
     for (shifts, degrees) in [(CROSS, [0; 5]), (BETWEEN, [180; 5]), (CROSS, TURNED)] {
         let simulation = exact(&shifts, &degrees).with_flux(&DRIFT);

@@ -7,8 +7,8 @@ mod dense;
 mod simulation;
 
 use common::{
-    Answer, ErrorMap, Experiment, Lamp, Noise, Options, error_map, fit, offset_variances,
-    shift_variances, variances,
+    Answer, ErrorMap, Experiment, Lamp, Noise, Options, error_map, fit, misfit_by_dark,
+    offset_variances, shift_variances, variances,
 };
 use dense::covariance::Covariance;
 use simulation::{
@@ -24,6 +24,10 @@ const SINGLE: f64 = 1e-5;
 /// The relative standard error that a map is made to, and the most draws that it takes.
 const EXACTNESS: f64 = 0.02;
 const MOST_DRAWS: f64 = 400.0;
+/// What a dark adds to F for each pixel is exact where it is more.
+const NEGLIGIBLE: f64 = 1e-3;
+/// Draws of what a dark adds to F, on a sensor so small.
+const DRAWS_OF_MISFIT: f64 = 64.0;
 
 /// An answer with its covariance.
 struct Case {
@@ -54,7 +58,24 @@ impl Case {
         let found = variances(&self.experiment, &self.answer, functionals, 1).unwrap();
         assert!(found.len() == functionals.len());
         for (found, functional) in found.iter().zip(functionals) {
-            check_ratio(found / self.covariance.variance(functional));
+            self.check_ratio(found / self.covariance.variance(functional));
+        }
+    }
+
+    /// A variance by the dense one: what it may lack, and rounding. The part of a dark is a square of the
+    /// solution of a linear problem, and wrong by twice its error, which is the root of what it may lack.
+    fn check_ratio(&self, ratio: f64) {
+        let by_dark = if self.experiment.dark.is_empty() { 0.0 } else { 2.0 * LACK };
+        let range = 1.0 - LACK - by_dark..=1.0 + SINGLE + by_dark;
+        assert!(range.contains(&ratio), "{ratio}");
+    }
+
+    /// The variances of the shifts are the dense ones, less what they may lack.
+    fn check_shifts(&self) {
+        let found = shift_variances(&self.experiment, &self.answer, 1).unwrap();
+        let wanted = self.covariance.of_shifts.as_flattened();
+        for (found, wanted) in found.as_flattened().iter().zip(wanted) {
+            self.check_ratio(found / wanted);
         }
     }
 
@@ -77,7 +98,7 @@ impl Case {
     /// A map is made of draws, whose covariance between the pixels follows from the part R of Cov M that is
     /// drawn: a mean over n draws of squares of normal values scatters by 2 R²/n. So relative errors of the
     /// deviations scatter by C = R²/(2 n v v), v being the variances; their mean and their mean square must
-    /// be those of such errors.
+    /// be those of such errors. The part of R that M follows at once has no scatter of its own.
     fn check_map(&self) {
         let map = error_map(&self.experiment, &self.answer, 1).unwrap();
         let undetermined = map.std.iter().zip(&self.answer.sensitivity);
@@ -103,10 +124,11 @@ impl Case {
 
     /// The trace of C, the sum of its elements, and that of their squares.
     fn scatter(&self, map: &ErrorMap) -> [f64; 3] {
-        let Covariance { pixels, drawn, .. } = &self.covariance;
+        let Covariance { pixels, drawn, followed, .. } = &self.covariance;
         let element = |p: usize, q: usize| {
             let size = self.covariance.std(p) * self.covariance.std(q);
-            (drawn[p * pixels + q] / size).powi(2) / (2.0 * map.draws as f64)
+            let squares = drawn[p * pixels + q].powi(2) - followed[p * pixels + q].powi(2);
+            squares / size.powi(2) / (2.0 * map.draws as f64)
         };
         let pairs = || self.known().flat_map(|p| self.known().map(move |q| (p, q)));
         [
@@ -115,11 +137,6 @@ impl Case {
             pairs().map(|(p, q)| element(p, q).powi(2)).sum(),
         ]
     }
-}
-
-/// A variance by the dense one: what it may lack, and rounding.
-fn check_ratio(ratio: f64) {
-    assert!((1.0 - LACK..=1.0 + SINGLE).contains(&ratio), "{ratio}");
 }
 
 fn noisy(shape: [usize; 2], shifts: &[[f64; 2]]) -> Simulation {
@@ -225,7 +242,7 @@ fn functionals_and_offsets_at_two_levels() {
         let case = Case::new(experiment);
         case.check_functionals(&case.functionals());
         let [along, alone] = offset_variances(&case.experiment, &case.answer, 1).unwrap();
-        check_ratio(along / case.covariance.along);
+        case.check_ratio(along / case.covariance.along);
         // Sums of ten terms, in a determinant that loses ten times as much.
         assert!((alone / case.covariance.alone - 1.0).abs() < 1e3 * f64::EPSILON);
     }
@@ -236,11 +253,7 @@ fn check_refined(std: &[[f64; 2]], degrees: &[i64]) {
         let case = Case::new(experiment);
         assert!(case.answer.refined);
         case.check_functionals(&case.functionals());
-        let found = shift_variances(&case.experiment, &case.answer, 1).unwrap();
-        let wanted = case.covariance.of_shifts.as_flattened();
-        for (found, wanted) in found.as_flattened().iter().zip(wanted) {
-            check_ratio(found / wanted);
-        }
+        case.check_shifts();
     }
 }
 
@@ -265,6 +278,64 @@ fn functionals_and_shifts_after_refining_from_afar() {
 fn functionals_of_a_drift_linear_in_time_between_pixels() {
     let experiment = given(&BETWEEN, &[0; 5]);
     check_all_functionals(both(experiment.with_lamp(Lamp::Linear(TIMES.to_vec()))));
+}
+
+/// With the noise of a dark: at whole pixels, and jointly between pixels, with free fluxes and refined
+/// shifts.
+fn with_dark() -> Vec<Experiment> {
+    let std = [[0.0; 2], [3e-4; 2], [1e-4, 3e-4], [3e-4; 2], [2e-4; 2]];
+    let fractions = noisy(SMALL, &BETWEEN).with_flux(&DRIFT).turned(&TURNED);
+    let mut cases: Vec<Experiment> = [[0; 5], TURNED].map(|turns| given(&CROSS, &turns)).into();
+    cases.push(fractions.experiment());
+    cases.push(fractions.experiment().with_lamp(Lamp::Free));
+    cases.push(refined(&std, &[0; 5]));
+    cases.push(considered());
+    let dark = cases.into_iter().map(Experiment::with_dark);
+    dark.flat_map(both).collect()
+}
+
+#[test]
+fn functionals_and_shifts_with_the_noise_of_a_dark() {
+    for experiment in with_dark() {
+        let case = Case::new(experiment);
+        case.check_functionals(&case.functionals());
+        if case.answer.refined {
+            case.check_shifts();
+        }
+    }
+}
+
+#[test]
+fn maps_with_the_noise_of_a_dark() {
+    for experiment in with_dark().into_iter().step_by(2) {
+        Case::new(experiment).check_map();
+    }
+}
+
+#[test]
+fn the_noise_of_a_dark_adds_to_the_misfit() {
+    for experiment in with_dark() {
+        let case = Case::new(experiment);
+        let found = misfit_by_dark(&case.experiment, &case.answer, 1).unwrap();
+        let [mean, scatter] = case.covariance.misfit;
+        let standard_error = (scatter / DRAWS_OF_MISFIT).sqrt();
+        // Little need not be exact. Of more, a search may lack a share of what the beam follows, which
+        // is at most as large as the rest.
+        let negligible = NEGLIGIBLE * case.known().count() as f64;
+        let inexact = if mean <= negligible { negligible } else { LACK * mean };
+        assert!((found - mean).abs() <= 4.0 * standard_error + inexact, "{found} {mean}");
+    }
+}
+
+#[test]
+fn a_dark_is_no_noise_of_a_fit_with_offsets() {
+    let experiment = noisy(SMALL, &BETWEEN).at_two_levels().experiment();
+    let plain = Case::new(experiment.clone());
+    let found = Case::new(experiment.with_dark());
+    let [a, b] = [&plain, &found]
+        .map(|case| variances(&case.experiment, &case.answer, &plain.functionals(), 1).unwrap());
+    assert_eq!(a, b);
+    assert_eq!(misfit_by_dark(&found.experiment, &found.answer, 1).unwrap(), 0.0);
 }
 
 #[test]

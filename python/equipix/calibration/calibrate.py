@@ -9,11 +9,24 @@ import numpy as np
 
 from equipix import _native
 from equipix.calibration import verdicts
-from equipix.calibration.error_bars import dark_std, error_bars
+from equipix.calibration.coverage import with_coverage
+from equipix.calibration.error_bars import (
+    standard_deviations,
+    with_dark_misfit,
+    with_hidden_tilt,
+)
+from equipix.calibration.false_pixels import without_false_pixels
+from equipix.calibration.input_verdicts import on_input
+from equipix.calibration.lamp_drift import lamp_drift
+from equipix.calibration.misfit import misfit
 from equipix.calibration.options import Options, is_to_be_fitted
+from equipix.calibration.orientation import orientation_test
 from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.priors import widened
+from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
-from equipix.calibration.sign import shift_sign
+from equipix.calibration.sample_variances import steadied
+from equipix.calibration.unchanged import sampled_arrays
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
 from equipix.exposures.options import FitOptions
@@ -45,6 +58,7 @@ def calibrate(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     dark: Literal["subtracted", "fit"] = "subtracted",
+    dark_variance: ArrayLike | None = None,
     robust: bool = False,
     method: Method = "multiscale",
     tolerance: float = 1e-6,
@@ -60,7 +74,8 @@ def calibrate(
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
         `FrameStatistics` contain their noise: the weights come from a noise model fitted over all
-        pixels, not from each pixel's own sample variance. A mean with saturated samples is left
+        pixels, not from each pixel's own sample variance; single frames show no noise, and without
+        `variance` all their weights are 1. A mean with saturated samples is left
         out of its exposure, and the pixel is flagged ``SATURATED``; it keeps the sensitivity that
         the other exposures determine. Dead, hot and noisy pixels are masked and flagged, the hot
         ones where `equipix.average` was given the dark frames as `FrameStatistics`.
@@ -78,7 +93,7 @@ def calibrate(
         True = do not use.
     saturation : float, optional
         Level, in the units of frames given as arrays: a value at or above it counts as masked, and
-        its pixel is flagged.
+        its pixel is flagged. By default the largest value of a dtype of whole numbers.
     flux : array_like, shape (n,), "fit" or "linear", optional
         Known relative flux of each exposure, 1 unless given; or what is to be found: a flux for
         each exposure, or ln c linear in `time`.
@@ -97,6 +112,12 @@ def calibrate(
     dark : {"subtracted", "fit"}
         Whether the dark is already subtracted, or to be found as an offset of each pixel: for
         exposures at two or more levels of the lamp, whose ratio is `flux`, without a dark frame.
+    dark_variance : float or array_like, shape (rows, cols), optional
+        Variance of the dark mean that was subtracted from all frames, in the units of the frames
+        squared: that of a dark frame over the number of dark frames. Its error is common to all
+        exposures, so `variance` must be without it. It enters the error bars and `reduced_chi2`,
+        not the weights. `FrameStatistics` with a dark contain it, unless `variance` is given as
+        numbers.
     robust : bool
         Whether to leave out measurements that disagree with the others, such as a particle or a
         reflection in one exposure only. Left out is what is more than five standard deviations
@@ -143,18 +164,28 @@ def calibrate(
     ShiftRoundingWarning
         If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if free
-        fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly degenerate
-        with the sensitivity.
+        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
+        than half of the pixels that are not masked are determined (`Calibration.is_partial`); if
+        free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly
+        degenerate with the sensitivity.
     ConvergenceWarning
         If the tolerance was not reached.
+    DriftWarning
+        If the data contradict the fluxes given: the lamp has drifted, which hides a tilt.
     MisfitWarning
-        If residuals are more than twice as large as the variances predict.
+        If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
+        neighbouring pixels are correlated. The message names the likely cause.
+    SaturationWarning
+        If many values are exactly at the highest one, and no saturation level is given or a higher
+        one.
     ShiftSignWarning
-        If the data contradict the sign of the shifts.
+        If the data contradict the orientation of the shifts: a sign, or the order of the axes.
 
     Notes
     -----
+    The arrays given are viewed, not copied, where their dtype and order allow it: they must not
+    change during the call, nor as long as `Calibration.std_of` is asked.
+
     Minimises :math:`F = \sum_k \sum_p w_k(p) [y_k(p) - c_k L(u_k(p)) M(p)]^2` over the sensitivity
     M and the beam L, with weights w = 1/variance, fluxes c and the position u of pixel p in the
     beam [1]_. F does not change when M is multiplied and L divided by one number: the gauge is
@@ -166,12 +197,15 @@ def calibrate(
     cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
     Gauss-Newton steps in which M is eliminated by its closed form.
 
-    The sign of the shifts is tested with at most twelve exposures and with the central pixels: four
-    times as many along each axis as the largest shift, or fewer where that is more than 80. They
-    are fitted with the shifts as given and with all of them reversed, fluxes free in both. The
-    lower F must be lower by 6·√(2/dof) of itself, in two thirds of all places. The sign is not
-    tested, and undetermined, with fewer than three exposures or a thousand degrees of freedom,
-    with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
+    The orientation of the shifts is tested with at most twelve exposures, as far apart as possible,
+    and with the central pixels: four times as many along each axis as the largest shift, or fewer
+    where that is more than 80. They are fitted with both signs along each axis and with the axes
+    exchanged, where exposures are turned also with the opposite turns; fluxes are free in all. An
+    orientation is excluded if its F is higher than the lowest by 6·√(2/dof) of itself, in two
+    thirds of all places, and by a misfit of more than 0.5 % of the signal; and only if the
+    residuals of the lowest F are white, or the misfit is 30 times what correlates in them. Nothing
+    is tested, and all undetermined, with fewer than three exposures or a thousand degrees of
+    freedom, with ``dark="fit"``, without shifts, and where the middle of the sensor has no light.
 
     References
     ----------
@@ -205,8 +239,10 @@ def calibrate(
         rotation=rotation,
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
-        whole=method == "coordinate-descent",
+        dark_variance=dark_variance,
     )
+    if fit_options.whole_shifts:
+        exposures = exposures.whole()
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 
@@ -217,27 +253,40 @@ def calibrated(
     start: Fit | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from exposures: weights, fit, sign, flags, verdicts, error bars.
+    """Calibrate from exposures: weights, fit, orientation, flags, error bars, verdicts.
 
     The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    advice = verdicts.on_plan(exposures)
+    advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
     verdicts.say(advice)
-    weighted = weighted_fit(exposures, options, start)
-    test = shift_sign(weighted.exposures, weighted.fit, options.fit)
+    weighted, frames = steadied(exposures, weighted_fit(exposures, options, start), options)
+    weighted = without_false_pixels(weighted, options)
+    weighted, widths = widened(weighted, options)
+    weighted = with_dark_misfit(weighted, options.fit)
+    weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))
+    test = orientation_test(weighted.exposures, weighted.fit, options.fit)
     flags = pixel_flags(weighted, options.fit)
-    dark = dark_std(weighted, options.fit)
-    found = verdicts.on_fit(weighted, options, test, dark)
+    residuals = sampled(weighted, workers=options.fit.workers)
+    drift = lamp_drift(weighted, residuals)
+    found = verdicts.on_fit(weighted, options, test, drift, misfit(weighted, residuals))
+    found += verdicts.on_noise(frames, widths)
+    found = with_coverage(found, weighted, flags)
+    # Before the error bars, which may be refused or interrupted.
     verdicts.say(found)
-    wanted = options.uncertainty and all(verdict.kind != "uncertainty" for verdict in found)
-    bars = error_bars(weighted, flags, options.fit) if wanted else None
+    wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
+    bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
+    if bars is not None and drift is not None:
+        bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
+    last = verdicts.on_standard_deviations(weighted, options, bars, dark)
+    verdicts.say(last)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,
         flags=flags,
-        sign=test.sign,
-        verdicts=(*advice, *found),
+        orientation=test,
+        drift=drift,
+        verdicts=(*advice, *found, *last),
         bars=bars,
         metadata=metadata | (provenance or {}),
     )
@@ -251,7 +300,7 @@ def _metadata(
     bars: ErrorBars | None,
 ) -> dict[str, Any]:
     """Versions, options and times, as JSON values."""
-    exposures, fit, rejected = weighted
+    exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
     chosen: dict[str, Any] = {
         "method": options.fit.method,
         "tolerance": options.fit.tolerance,

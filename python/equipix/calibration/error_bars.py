@@ -7,17 +7,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
-from equipix.errors import InputError
-from equipix.flags import determined, usable
-from equipix.maps import tilt_weights
+from equipix.errors import ConvergenceWarning, InputError, warn
+from equipix.maps import slope_pixels, tilt_weights
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from equipix._native import Fit
+    from equipix._native import Fit, Uncertainty
     from equipix._types import Array, Bools, Floats, Progress
+    from equipix.calibration.lamp_drift import Drift
     from equipix.calibration.weights import Weighted
     from equipix.exposures.options import FitOptions
+
+
+_NOT_FOUND = 0.1
+"""Largest estimated error of M for which noise determines the residuals."""
 
 
 class ErrorBars(NamedTuple):
@@ -47,51 +51,80 @@ class DarkStd(NamedTuple):
     of_a_pixel: float | None
 
 
-def error_bars(weighted: Weighted, flags: Array, options: FitOptions) -> ErrorBars:
-    """Standard deviations of sensitivity, tilt and shifts, in one set-up of the linear problem."""
-    exposures, fit, _ = weighted
+def standard_deviations(
+    weighted: Weighted, flags: Array, options: FitOptions, *, wanted: bool
+) -> tuple[ErrorBars | None, DarkStd | None]:
+    """Standard deviations of sensitivity, tilt and shifts if `wanted`, and of a fitted dark.
+
+    That of a dark which was fitted together with fluxes is always given: a verdict needs it. All
+    are questions of one call, which sets up the linear problem once.
+    """
+    exposures, fit = weighted.exposures, weighted.fit
+    asks_dark = exposures.offset and exposures.flux.kind != "known"
+    if asks_dark and not wanted and not np.isfinite(weighted.noise_variance):
+        return None, DarkStd(None, None)
+    if not (wanted or asks_dark):
+        return None, None
     scale = noise_scale(weighted)
-    weights = tilt_weights(usable(flags) & determined(fit.sensitivity, flags))
-    asks_tilt = not fit.leaves_tilt and bool(np.isfinite(weights).all())
+    weights = tilt_weights(slope_pixels(fit.sensitivity, flags))
+    asks_tilt = wanted and not fit.leaves_tilt and bool(np.isfinite(weights).all())
     refined = fit.refinement == "refined"
-    with naming_memory("the error map"):
+    with naming_memory("the error map" if wanted else "the standard deviation of the dark"):
         answer = fit.uncertainty(
-            error_map=True,
+            error_map=wanted,
             functionals=of_logarithm(weights, fit) if asks_tilt else None,
-            shifts=refined,
-            offset=False,
+            shifts=wanted and refined,
+            offset=asks_dark,
             workers=options.workers,
-            progress=options.progress,
+            progress=options.progress if wanted else None,
+            dark_variance=_relative(exposures.dark_variance, scale),
         )
+    dark = _of_dark(weighted, answer, scale) if asks_dark else None
+    return _error_bars(weighted, answer, scale) if wanted else None, dark
+
+
+def _error_bars(weighted: Weighted, answer: Uncertainty, scale: float) -> ErrorBars:
+    """Standard deviations of sensitivity, tilt and shifts from the answers for unit weights."""
+    exposures, fit = weighted.exposures, weighted.fit
     std = scale * cast("Floats", answer.std)
-    tilt = _std(scale, answer.variances) if asks_tilt else None
-    shifts = _std(scale, answer.shift_variances) if refined else exposures.positions.std
+    unknown = np.full(2, np.inf if fit.leaves_tilt else np.nan)
+    refined = answer.shift_variances is not None
     return ErrorBars(
         sensitivity=np.asarray(std, exposures.values.dtype),
-        tilt=np.full(2, np.inf if fit.leaves_tilt else np.nan) if tilt is None else tilt,
-        shifts=shifts,
-        exactness={"draws": answer.draws, "relative_standard_error": answer.exactness},
+        tilt=unknown if answer.variances is None else _std(scale, answer.variances),
+        shifts=_std(scale, answer.shift_variances) if refined else exposures.positions.std,
+        exactness={
+            "draws": answer.draws,
+            "relative_standard_error": answer.exactness,
+            "incomplete_searches": answer.incomplete,
+        },
     )
 
 
-def dark_std(weighted: Weighted, options: FitOptions) -> DarkStd | None:
-    """Uncertainty of a dark that was fitted together with fluxes; None for any other."""
-    exposures, fit, _ = weighted
-    if not exposures.offset or exposures.flux.kind == "known":
-        return None
-    if not np.isfinite(weighted.noise_variance):
-        return DarkStd(None, None)
-    with naming_memory("the standard deviation of the dark"):
+def _of_dark(weighted: Weighted, answer: Uncertainty, scale: float) -> DarkStd:
+    """Uncertainty of a fitted dark from the answers for unit weights."""
+    along, alone = _std(scale, answer.offset_variances).tolist()
+    return DarkStd(along if weighted.fit.ended == "converged" else None, alone)
+
+
+def with_dark_misfit(weighted: Weighted, options: FitOptions) -> Weighted:
+    """Add what the noise of the dark adds to F, unless the fit is too far from its minimum."""
+    exposures, fit = weighted.exposures, weighted.fit
+    found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= _NOT_FOUND
+    if exposures.dark_variance is None or not found:
+        return weighted
+    with naming_memory("the misfit of the dark"):
         answer = fit.uncertainty(
             error_map=False,
             functionals=None,
             shifts=False,
-            offset=True,
+            offset=False,
             workers=options.workers,
             progress=None,
+            dark_variance=exposures.dark_variance,
+            dark_misfit=True,
         )
-    along, alone = _std(noise_scale(weighted), answer.offset_variances).tolist()
-    return DarkStd(along if fit.ended == "converged" else None, alone)
+    return weighted._replace(dark_misfit=cast("float", answer.dark_misfit))
 
 
 def noise_scale(weighted: Weighted) -> float:
@@ -111,10 +144,24 @@ def noise_scale(weighted: Weighted) -> float:
     return float(np.sqrt(variance))
 
 
+def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
+    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
+    if not drift.is_added:
+        return bars
+    hidden = response * np.sqrt(drift.variance_map(response))
+    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
+    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
+
+
 def of_logarithm(weights: Floats, fit: Fit) -> Floats:
     """Weights g of M whose sums vary as those of ln M with `weights`: g = w/M."""
     none = np.zeros(weights.shape)
     return np.asarray(np.divide(weights, fit.sensitivity, where=weights != 0, out=none))
+
+
+def _relative(dark_variance: Floats | None, scale: float) -> Floats | None:
+    """Variance of the dark in units of that of a value of weight 1."""
+    return None if dark_variance is None else dark_variance / scale**2
 
 
 def _std(scale: float, variances: ArrayLike | None) -> Floats:
@@ -125,6 +172,7 @@ def _std(scale: float, variances: ArrayLike | None) -> Floats:
 def functional_std(
     weighted: Weighted,
     weights: Floats,
+    drift: Drift | None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -132,7 +180,7 @@ def functional_std(
     """Standard deviation of the sum of weights · ln M, for each of a stack (m, rows, cols).
 
     With g = weights/M the variance is gᵀ S⁻¹ g, in the gauge mean(M) = 1: the solution of one
-    linear problem, to 1e-4 of the variance.
+    linear problem, to 1e-4 of the variance. The noise of a dark adds its own.
     """
     scale = noise_scale(weighted)
     with naming_memory("the standard deviation"):
@@ -143,30 +191,27 @@ def functional_std(
             offset=False,
             workers=positive_workers(workers),
             progress=progress,
+            dark_variance=_relative(weighted.exposures.dark_variance, scale),
         )
-    return _std(scale, answer.variances)
+    if answer.incomplete:
+        warn(incomplete_searches(answer.incomplete), ConvergenceWarning)
+    std = _std(scale, answer.variances)
+    if drift is not None and drift.is_added:
+        std = np.hypot(std, np.sqrt(drift.variance_of(weights, weighted.fit.sensitivity)))
+    return std
+
+
+def incomplete_searches(count: int) -> str:
+    """Message on searches that ended before their variance was found."""
+    return (
+        f"{count} of the searches for standard deviations ended early: the measurements barely "
+        "constrain some pattern of the sensitivity, and standard deviations that it is part of are "
+        "too small: choose less regular shifts, or give a smaller 'shift_std'"
+    )
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:
-    """Weights of a functional as (m, rows, cols), 0 wherever ln M is undetermined.
-
-    Parameters
-    ----------
-    weights : array_like, shape (rows, cols) or (m, rows, cols)
-        Weights of the pixels.
-    determined : ndarray of bool, shape (rows, cols)
-        Where ln M is known.
-
-    Returns
-    -------
-    ndarray, shape (m, rows, cols), float64
-        The weights.
-
-    Raises
-    ------
-    InputError
-        If they do not fit the sensor, or are not finite, or not 0 in such a pixel.
-    """
+    """Weights of functionals as (m, rows, cols), which must be 0 where ln M is undetermined."""
     array = as_array("weights", weights, ndim=(2, 3)).astype(np.float64, copy=False)
     if array.shape[-2:] != determined.shape:
         raise InputError(f"'weights' has shape {array.shape}, the sensor {determined.shape}")

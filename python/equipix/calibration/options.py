@@ -41,10 +41,15 @@ class Options:
 
     def check(self, exposures: Exposures) -> None:
         """Refuse options that these exposures exclude."""
-        if exposures.offset and (self.robust or exposures.noise):
+        if exposures.offset and exposures.noise:
             raise InputError(
-                "'dark' is 'fit', but 'robust' and noise models expect the signal alone: subtract "
-                "a dark, or give variances as numbers and leave 'robust' out"
+                "'dark' is 'fit', but the noise model, that of averages or of 'variance', expects "
+                "the signal alone: subtract a dark, or give 'variance' as numbers"
+            )
+        if exposures.offset and self.robust:
+            raise InputError(
+                "'dark' is 'fit', but 'robust' expects the signal alone: subtract a dark, or leave "
+                "'robust' out"
             )
         if self.robust and len(exposures) < _FEWEST_FOR_REJECTION:
             raise InputError(
@@ -55,6 +60,8 @@ class Options:
 
 def is_to_be_fitted(dark: object) -> bool:
     """Whether the dark is an unknown of the fit; refuses other values."""
+    if dark is None or isinstance(dark, bool):
+        raise InputError(f"'dark' is {dark!r}, expected 'subtracted' or 'fit'")
     if not isinstance(dark, str):
         raise InputError(
             "'dark' holds values: subtract it from the frames, or give it to equipix.average"

@@ -8,21 +8,22 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix._check import check_count, check_progress, per_exposure
+from equipix._check import check_count, check_progress
 from equipix._native import Beam
+from equipix._readonly import ReadOnly
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
-from equipix.calibration.saved import read_fields, save_fields
-from equipix.calibration.verdicts import Verdict
+from equipix.calibration.prediction import places_of, signal_at, subtract_signals
+from equipix.calibration.saved import save_fields
+from equipix.calibration.unchanged import check_unchanged
 from equipix.correction.apply import apply_gain
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
-from equipix.exposures.positions import Positions
-from equipix.flags import determined, usable
-from equipix.maps import tilt
+from equipix.flags import determined
+from equipix.maps import slope_pixels, tilt
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from os import PathLike
     from typing import Self
 
@@ -30,14 +31,17 @@ if TYPE_CHECKING:
 
     from equipix._types import Flagged, Progress, ShiftSign
     from equipix.calibration.error_bars import ErrorBars
+    from equipix.calibration.lamp_drift import Drift
+    from equipix.calibration.orientation import OrientationTest
+    from equipix.calibration.verdicts import Verdict
     from equipix.calibration.weights import Weighted
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration:
-    """Calibrated sensor: the result of `calibrate`.
+class Calibration(ReadOnly):
+    """Calibrated sensor, the result of `calibrate`; its arrays are read-only.
 
     Attributes
     ----------
@@ -70,8 +74,9 @@ class Calibration:
     objective : float
         Objective F at the end.
     reduced_chi2 : float
-        F over the degrees of freedom: 1 on average where the variances given are right, and the
-        variance of one value where none were given. NaN without any degree of freedom.
+        F over its expectation, the degrees of freedom and what the noise of the dark adds: 1 on
+        average where the variances given are right. Where none were given, the variance of one
+        value. NaN without any degree of freedom.
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
         A pixel that does not respond connects no parts; nor does one whose measurements have
@@ -117,8 +122,17 @@ class Calibration:
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
-        Whether the data confirm the sign of the shifts, contradict it, or do neither, as those
-        of a Gaussian beam, whatever its width; see `calibrate`.
+        Whether the data confirm the signs and the order of the shifts' axes, contradict them, or do
+        neither, as those of a Gaussian beam, whatever its width; see `calibrate`.
+    orientation : OrientationTest or None
+        The same for each axis, with the best orientation and, in ``words``, what to do; None if
+        read from a file of an older version.
+    drift : Drift or None
+        What the data say of fluxes that were given: the size of the lamp's drift about them, its
+        standard error, the degrees of freedom, and the tilt that it hides, which is part of
+        `sensitivity_std`, `tilt_std` and `std_of` where the data show a drift. Errors of the tilt
+        over `tilt_std` then follow Student's t with so many degrees of freedom. None where fluxes
+        were fitted or have a prior, and where no combination of them leaves a residual.
     """
 
     sensitivity: NDArray[Any]
@@ -147,6 +161,8 @@ class Calibration:
     weighted: Weighted | None = field(default=None, compare=False)
     rejected: NDArray[np.bool_] | None = None
     shift_sign: ShiftSign = "undetermined"
+    orientation: OrientationTest | None = None
+    drift: Drift | None = None
     verdicts: tuple[Verdict, ...] = ()
 
     @classmethod
@@ -155,14 +171,14 @@ class Calibration:
         weighted: Weighted,
         *,
         flags: NDArray[Any],
-        sign: ShiftSign,
+        orientation: OrientationTest,
         verdicts: tuple[Verdict, ...],
+        drift: Drift | None,
         bars: ErrorBars | None,
         metadata: dict[str, Any],
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
-        exposures, fit, rejected = weighted
-        dtype = exposures.values.dtype
+        exposures, fit, dtype = weighted.exposures, weighted.fit, weighted.exposures.values.dtype
         return cls(
             sensitivity=fit.sensitivity.astype(dtype, copy=False),
             beam=fit.beam.values,
@@ -188,8 +204,10 @@ class Calibration:
             tilt_std=None if bars is None else bars.tilt,
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
-            rejected=rejected,
-            shift_sign=sign,
+            rejected=weighted.rejected,
+            shift_sign=orientation.sign,
+            orientation=orientation,
+            drift=drift,
             verdicts=verdicts,
         )
 
@@ -198,6 +216,14 @@ class Calibration:
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.sensitivity.shape
         return rows, cols
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether less than half of the pixels that are not masked are determined.
+
+        The verdict of kind ``"partial"`` contains the cause.
+        """
+        return any(verdict.kind == "partial" for verdict in self.verdicts)
 
     def __repr__(self) -> str:
         """Short form: sizes and how far the solver came."""
@@ -211,16 +237,16 @@ class Calibration:
 
     @property
     def tilt(self) -> NDArray[Any]:
-        """Least-squares slope of ln M over valid pixels, edge to edge (row, col).
+        """Least-squares slope of ln M, edge to edge (row, col); NaN where it is undetermined.
 
-        Valid are pixels without ``DO_NOT_USE``; NaN where they determine no slope.
+        Pixels count whose M is determined, from half to twice the mean of such, and not flagged
+        ``UNRELIABLE_FLAT``. Where free fluxes leave the tilt undetermined it is 0.
         """
-        valid = usable(self.flags) & determined(self.sensitivity, self.flags)
-        return tilt(self.sensitivity, valid)
+        return tilt(self.sensitivity, slope_pixels(self.sensitivity, self.flags))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the compiled fit, which cannot be pickled."""
-        return {**vars(self), "weighted": None}
+        return vars(self) | {"weighted": None}
 
     def __copy__(self) -> Self:
         """Return a copy that keeps the fit."""
@@ -255,7 +281,8 @@ class Calibration:
         ------
         InputError
             If this calibration was read from a file, which holds no measurements; if the weights
-            do not fit; or if no variance was given and the residuals do not determine it.
+            do not fit; if no variance was given and the residuals do not determine it; or if an
+            array that was calibrated has changed.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 
@@ -263,8 +290,9 @@ class Calibration:
         -----
         Errors of pixels are correlated: the variance of a mean over many cannot be had from
         `sensitivity_std`. With w the weights and g = w/M it is gᵀ S⁻¹ g, S being the reduced normal
-        matrix: one linear problem, about as much work as the calibration. Changes made since to the
-        arrays that were calibrated go unnoticed.
+        matrix: one linear problem, about as much work as the calibration. It reads the arrays that
+        were calibrated again, which must not have changed: 4096 values of each are compared, so a
+        change of few values is not noticed.
 
         Examples
         --------
@@ -287,8 +315,9 @@ class Calibration:
                 "measurements: call std_of on the result of calibrate or Experiment.run"
             )
         check_progress(progress)
+        check_unchanged(self.weighted.exposures, self.weighted.sampled)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
-        std = functional_std(self.weighted, stack, workers=workers, progress=progress)
+        std = functional_std(self.weighted, stack, self.drift, workers=workers, progress=progress)
         return float(std[0]) if np.ndim(weights) == 2 else std
 
     def correct(
@@ -387,8 +416,8 @@ class Calibration:
         """
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
-        (place,) = self._places(np.reshape(shift, (1, 2)), [rotation], [flux])
-        return self._signal(*place)
+        (place,) = places_of(np.reshape(shift, (1, 2)), [rotation], [flux])
+        return signal_at(place, self._beam, self.sensitivity)
 
     def residuals(
         self,
@@ -409,8 +438,7 @@ class Calibration:
         variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
             Variance of the values given, as for `calibrate`.
         shifts, rotation, flux : array_like, optional
-            Where and how bright the exposures were taken, as for `calibrate`; by default those
-            of the calibration.
+            Of the exposures, as for `calibrate`; by default those of the calibration.
 
         Returns
         -------
@@ -436,40 +464,21 @@ class Calibration:
             raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
         if shifts is None:
             check_count("frames", len(values), len(self.shifts))
-        places = self._places(
+        places = places_of(
             self.shifts if shifts is None else shifts,
             self.rotation if shifts is None and rotation is None else rotation,
             self.flux if shifts is None and flux is None else flux,
         )
         check_count("shifts", len(places), len(values))
         residuals = np.full(values.shape, np.nan, np.result_type(values, self.sensitivity))
-        for k, place in enumerate(places):
-            signal = self._signal(*place)
-            np.subtract(values[k], signal, out=residuals[k], where=np.isfinite(values[k]))
-            if self.dark_is_fitted:
-                residuals[k] -= self.dark
-            variance = measured.variance_of(k, signal)
-            if variance is not None:
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    residuals[k] /= np.sqrt(variance)
+        signals = (signal_at(place, self._beam, self.sensitivity) for place in places)
+        subtract_signals(measured, signals, self.dark if self.dark_is_fitted else None, residuals)
         return residuals
 
-    def _places(
-        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None
-    ) -> list[tuple[list[float], int, float]]:
-        """Shift, rotation and flux of each exposure, checked."""
-        positions = Positions.of(shifts, rotation=rotation)
-        fluxes = per_exposure("flux", flux, len(positions), default=1)
-        rows = zip(positions.shifts, positions.rotation, fluxes, strict=True)
-        return [(shift.tolist(), int(turn), float(c)) for shift, turn, c in rows]
-
-    def _signal(self, shift: list[float], rotation: int, flux: float) -> NDArray[Any]:
-        """Frame c · L(u) · M(p) from a position, in the dtype of the sensitivity."""
-        row, col = shift
+    @property
+    def _beam(self) -> Beam:
         tilt = self.beam_tilt.tolist()
-        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
-        light = beam.light(self.shape, (row, col), rotation, workers=None)
-        return np.asarray(flux * light * self.sensitivity, self.sensitivity.dtype)
+        return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.
@@ -489,12 +498,3 @@ class Calibration:
             If the suffix is unknown.
         """
         save_fields(path, vars(self), force=force)
-
-
-def read_calibration(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
-) -> Calibration:
-    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
-    fields = read_fields(path, pages, content)
-    verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
-    return Calibration(**{**fields, "history": History(**fields["history"]), "verdicts": verdicts})

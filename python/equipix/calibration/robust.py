@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.calibration.residual_tests import ROBUST
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from equipix._native import Fit
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
     from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 
@@ -26,9 +28,6 @@ m spreads 1/(m − 1) of its own deviation over each of the others: at most a ha
 
 _TESTABLE = 1e-6
 """Least share of its variance that a residual must keep: less is rounding."""
-
-_ROBUST = 1.4826
-"""Standard deviation over median absolute deviation, for normal noise."""
 
 
 def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions) -> Bools:
@@ -58,13 +57,15 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions)
     that no longer deviates is used again, and so are those of a pixel that would have no M.
     """
     new, old = deviations(exposures, fit, before, options)
-    leading = np.where(before, 0, np.nan_to_num(new))
+    result = before & ~(old <= _NEAR)
+    del old
+    leading = np.nan_to_num(new, copy=False)
+    leading[before] = 0
     by_pixel = leading.max(axis=0)
     by_cell = np.zeros(fit.beam.values.shape, leading.dtype)
     for k, each in enumerate(leading):
         seen = exposures.cells(by_cell, fit, k)
         np.maximum(seen, each, out=seen)
-    result = before & ~(old <= _NEAR)
     # A pixel may lose its connections by mistake while larger deviations mask the false values:
     # then all its measurements are used again.
     result[:, np.isnan(fit.sensitivity)] = False
@@ -72,7 +73,7 @@ def rejected(exposures: Exposures, fit: Fit, before: Bools, options: FitOptions)
         rival = _LEADING * np.maximum(by_pixel, exposures.cells(by_cell, fit, k))
         suspect = (leading[k] > _NEAR) & (leading[k] >= rival)
         result[k] |= suspect & (leading[k] > _BEYOND)
-        result[k] |= suspect & (_box(result[k]) > 0)
+        result[k] |= suspect & (box_sums(result[k]) > 0)
     return result
 
 
@@ -111,42 +112,54 @@ def deviations(
     """
     shape, flux = exposures.shape, fit.flux
     response = np.nan_to_num(fit.sensitivity).astype(np.float64)
-    usable = exposures.usable()
-    on_pixels, on_cells = np.zeros(shape), np.zeros(fit.beam.values.shape)
-    seen = [np.nan_to_num(exposures.light(fit, k, options.workers)) for k in range(len(exposures))]
-    weights = [
-        _weights(exposures.variance, k, usable[k] & (seen[k] * response != 0))
-        for k in range(len(exposures))
-    ]
-    for k, light in enumerate(seen):
-        weight = np.where(left_out[k], 0, weights[k])
-        on_pixels += weight * light**2
+    on_pixels = fit.information(workers=options.workers)
+    on_cells = np.zeros(fit.beam.values.shape)
+    # Light and weights are computed twice: of all exposures they are four times the data.
+    for k in range(len(exposures)):
+        light, weight = _seen(exposures, fit, k, response, options.workers)
+        weight[left_out[k]] = 0
         exposures.cells(on_cells, fit, k)[:] += weight * (flux[k] * response) ** 2
     new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
-    for k, light in enumerate(seen):
-        shares = (
-            _share(weights[k] * light**2, on_pixels),
-            _share(weights[k] * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
+    for k in range(len(exposures)):
+        light, weight = _seen(exposures, fit, k, response, options.workers)
+        spread = _spread(
+            _share(weight * light**2, on_pixels),
+            _share(weight * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
+            left_out[k],
         )
-        sign = np.where(left_out[k], 1, -1)
-        spread = (1 + sign * shares[0]) * (1 + sign * shares[1])
-        known = (weights[k] > 0) & (spread > _TESTABLE)  # NaN is not
-        expected = light * response
+        known = (weight > 0) & (spread > _TESTABLE)  # NaN is not
+        light *= response
+        root = np.sqrt(weight, out=weight)
         residual = np.full(shape, np.nan)
-        root = np.sqrt(weights[k])
-        scaled = (root * (exposures.values[k] - expected))[known] / np.sqrt(spread[known])
+        scaled = (root * (exposures.values[k] - light))[known] / np.sqrt(spread[known])
         residual[known] = scaled
         used = known & ~left_out[k]
-        least = options.tolerance * _median(root * expected, known)
-        residual /= max(_ROBUST * _median(residual, used), least, np.finfo(float).tiny)
+        least = options.tolerance * _median(root * light, known)
+        residual /= max(ROBUST * _median(residual, used), least, np.finfo(float).tiny)
+        del light, weight, root, spread, scaled
         new[k], old[k] = _conspicuous(residual, used, known)
     return new, old
+
+
+def _seen(
+    exposures: Exposures, fit: Fit, exposure: int, response: Floats, workers: int | None
+) -> tuple[Floats, Floats]:
+    """Light on each pixel in an exposure, and the weights of what may be used there."""
+    light = np.nan_to_num(exposures.light(fit, exposure, workers), copy=False)
+    used = exposures.usable(exposure) & (light * response != 0)
+    return light, _weights(exposures.variance, exposure, used)
+
+
+def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
+    """Variances of residuals in σ², from the shares of their noise that M and L take."""
+    sign = np.where(left_out, 1, -1)
+    return np.asarray((1 + sign * of_pixel) * (1 + sign * of_cell))
 
 
 def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
     """Deviations alone or of the 3×3 means around, of what was used and of what was left out."""
     own = np.abs(residual)
-    quiet = _box(used & (own > _BEYOND)) == 0
+    quiet = box_sums(used & (own > _BEYOND)) == 0
     new = np.fmax(own, np.where(known & quiet, np.abs(_around(residual, used)), np.nan))
     old = np.fmax(own, np.abs(_around(np.clip(residual, -_BEYOND, _BEYOND), known)))
     new[~known] = old[~known] = np.nan
@@ -155,8 +168,8 @@ def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Arr
 
 def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     """Mean of the 3×3 residuals around each pixel, in standard deviations by their own scale."""
-    mean = _box(np.where(where, residual, 0)) / np.sqrt(np.maximum(_box(where), 1))
-    scaled: NDArray[Any] = mean / max(1.0, _ROBUST * _median(mean, where))
+    mean = box_sums(np.where(where, residual, 0)) / np.sqrt(np.maximum(box_sums(where), 1))
+    scaled: NDArray[Any] = mean / max(1.0, ROBUST * _median(mean, where))
     return scaled
 
 
@@ -175,10 +188,10 @@ def _share(own: NDArray[Any], total: NDArray[Any]) -> NDArray[Any]:
 
 def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
     chosen = np.abs(values[where])
-    return float(np.median(chosen)) if chosen.size else 0.0
+    return float(np.median(chosen, overwrite_input=True)) if chosen.size else 0.0
 
 
-def _box(image: NDArray[Any]) -> NDArray[Any]:
+def box_sums(image: NDArray[Any]) -> NDArray[Any]:
     """Sum of the 3×3 pixels around each, those beyond the border counting 0."""
     padded = np.pad(image.astype(np.float32), 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]

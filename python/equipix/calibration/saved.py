@@ -43,24 +43,7 @@ _OPTIONAL = _MAYBE | _SPLINE
 
 
 def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
-    """Write the fields of a `Calibration` to a file that `read_fields` reads.
-
-    Parameters
-    ----------
-    path : path
-        The file; its suffix names the format.
-    fields : mapping
-        The attributes of a `Calibration` by name.
-    force : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    FileError
-        If the file exists and `force` is not set, or it cannot be written.
-    InputError
-        If the suffix is unknown.
-    """
+    """Write the attributes of a `Calibration` to a file; see `Calibration.save`."""
     content = {
         "format": FORMAT,
         "kind": KIND,
@@ -73,21 +56,9 @@ def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: 
 def read_fields(
     path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
 ) -> dict[str, Any]:
-    """Make the fields of a `Calibration` of what `save_fields` wrote.
+    """Make the attributes of a `Calibration` of the arrays and metadata that `save_fields` wrote.
 
-    Parameters
-    ----------
-    path : path
-        The file they are from.
-    pages : mapping of str to ndarray
-        Its arrays by name.
-    content : dict
-        Its metadata.
-
-    Returns
-    -------
-    dict
-        The attributes of a `Calibration` by name; ``history`` holds those of a `History`.
+    ``history`` holds the attributes of a `History`.
 
     Raises
     ------
@@ -123,6 +94,8 @@ def read_fields(
         "verdicts": numbers["verdicts"],
         "reduced_chi2": float("nan") if chi2 is None else chi2,
         "shift_sign": numbers.get("shift_sign", "undetermined"),
+        "orientation": numbers.get("orientation"),
+        "drift": numbers.get("drift"),
         "history": _history(numbers["history"]),
         "rejected": None if rejected is None else rejected.astype(bool),
         "metadata": content["metadata"],
@@ -155,7 +128,9 @@ def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Collect the rest as JSON values, which have neither NaN nor infinity."""
     chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
-    history = fields["history"]
+    history, orientation, drift = (fields[name] for name in ("history", "orientation", "drift"))
+    if orientation is not None:
+        orientation = {**vars(orientation), "best": vars(orientation.best)}
     return {
         "beam_origin": list(fields["beam_origin"]),
         "shifts": fields["shifts"].tolist(),
@@ -166,6 +141,8 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
         "reduced_chi2": chi2 if np.isfinite(chi2) else None,
         "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
         "shift_sign": fields["shift_sign"],
+        "orientation": orientation,
+        "drift": None if drift is None else _lists(vars(drift)),
         "tilt_std": None
         if tilt_std is None
         else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],
@@ -175,6 +152,14 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
             "objective": history.objective.tolist(),
             "error_estimate": history.error_estimate.tolist(),
         },
+    }
+
+
+def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace arrays by lists."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in fields.items()
     }
 
 

@@ -7,12 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.drift import trend_told
+from equipix.calibration import sample_variances
+from equipix.calibration.error_bars import incomplete_searches
+from equipix.calibration.lamp_drift import WARNED
+from equipix.drift import distinct_trend
 from equipix.errors import (
     ConvergenceWarning,
+    DriftWarning,
     EquipixWarning,
     IdentifiabilityWarning,
     MisfitWarning,
+    MissingDarkWarning,
+    SaturationWarning,
+    ShiftRoundingWarning,
     ShiftSignWarning,
     warn,
 )
@@ -21,18 +28,18 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from equipix._native import Fit
-    from equipix.calibration.error_bars import DarkStd
+    from equipix.calibration.error_bars import DarkStd, ErrorBars
+    from equipix.calibration.lamp_drift import Drift
+    from equipix.calibration.misfit import Misfit
     from equipix.calibration.options import Options
-    from equipix.calibration.sign import SignTest
+    from equipix.calibration.orientation import OrientationTest
+    from equipix.calibration.priors import Contradiction
     from equipix.calibration.weights import Weighted
     from equipix.exposures.exposures import Exposures
 
 _UNDETERMINED = 1e-4
 """A Ritz value this small belongs to a pattern that the measurements do not determine: its noise is
 100 times that of others."""
-
-_MISFIT = 4.0
-"""A reduced χ² above this is not caused by slightly wrong variances."""
 
 _NOT_FOUND = 0.1
 """Largest estimated error of M of a joint fit for which noise determines the errors."""
@@ -41,13 +48,22 @@ _DEGENERATE = 0.1
 """Share of the variance of a drift below which the error of its size is over three times larger."""
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
+    "rounding": ShiftRoundingWarning,
     "order": IdentifiabilityWarning,
+    "saturation": SaturationWarning,
+    "unit": IdentifiabilityWarning,
+    "raw": MissingDarkWarning,
+    "repeated": MisfitWarning,
+    "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
     "components": IdentifiabilityWarning,
     "pattern": IdentifiabilityWarning,
     "tilt": IdentifiabilityWarning,
     "dark": IdentifiabilityWarning,
     "misfit": MisfitWarning,
+    "drift": DriftWarning,
+    "prior": MisfitWarning,
+    "variance": MisfitWarning,
     "convergence": ConvergenceWarning,
     "uncertainty": ConvergenceWarning,
 }
@@ -76,29 +92,69 @@ class Verdict:
 
 
 def say(verdicts: Iterable[Verdict]) -> None:
-    """Raise the warning of each; no other function warns of a result."""
+    """Raise the warning of each; no other function warns of a calibration."""
     for verdict in verdicts:
         warn(verdict.message, _CATEGORIES[verdict.kind])
 
 
 def on_plan(exposures: Exposures) -> list[Verdict]:
-    """Verdicts before any fit: whether a drift in time is degenerate with a tilt."""
+    """Verdicts before any fit."""
+    found = [_on_rounding(exposures), _on_order(exposures)]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def on_noise(frames: float | None, contradictions: Iterable[Contradiction]) -> list[Verdict]:
+    """Verdicts on variances and priors that the data contradict.
+
+    `frames` is the number of frames whose sample variances were given.
+    """
+    found = [] if frames is None else [Verdict("variance", sample_variances.words(frames))]
+    return [*found, *(Verdict("prior", each.words) for each in contradictions)]
+
+
+def on_standard_deviations(
+    weighted: Weighted, options: Options, bars: ErrorBars | None, dark: DarkStd | None
+) -> list[Verdict]:
+    """Verdicts that need standard deviations: on a fitted dark, and on the error bars."""
+    found = [_on_dark(weighted.fit, options, dark), _on_searches(bars)]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def _on_searches(bars: ErrorBars | None) -> Verdict | None:
+    count = 0 if bars is None else bars.exactness["incomplete_searches"]
+    return Verdict("uncertainty", incomplete_searches(count)) if count else None
+
+
+def _on_rounding(exposures: Exposures) -> Verdict | None:
+    rounding = exposures.positions.rounding
+    if rounding is None:
+        return None
+    remedy = "use method='multiscale', or move the sensor by whole pixels"
+    return Verdict("rounding", f"{rounding.words}: {remedy}")
+
+
+def _on_order(exposures: Exposures) -> Verdict | None:
+    """Verdict on an order in which a drift in time is degenerate with a tilt."""
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
-        return []
-    share = trend_told(positions.shifts, times)
+        return None
+    share = distinct_trend(positions.shifts, times)
     if share >= _DEGENERATE:
-        return []
-    text = (
+        return None
+    return Verdict(
+        "order",
         f"in this order of exposures only {share:.1%} of the variance of a drift linear in time is "
         f"distinguishable from a tilt of the sensitivity (limit {_DEGENERATE:.0%}): take the "
-        "exposures in another order, see equipix.plan.advise_order"
+        "exposures in another order, see equipix.plan.advise_order",
     )
-    return [Verdict("order", text)]
 
 
 def on_fit(
-    weighted: Weighted, options: Options, test: SignTest, dark: DarkStd | None
+    weighted: Weighted,
+    options: Options,
+    test: OrientationTest,
+    drift: Drift | None,
+    misfit: Misfit | None,
 ) -> list[Verdict]:
     """Verdicts on a fit, the most important first."""
     found = [
@@ -106,19 +162,23 @@ def on_fit(
         _on_components(weighted.fit),
         _on_patterns(weighted.fit),
         _on_tilt(weighted.fit),
-        _on_dark(weighted.fit, options, dark),
-        _on_misfit(weighted),
+        *_on_residuals(drift, misfit),
         _on_convergence(weighted.fit, options),
         _on_uncertainty(weighted.fit, options),
     ]
     return [verdict for verdict in found if verdict is not None]
 
 
+def is_too_far(fit: Fit) -> bool:
+    """Whether a fit is too far from its minimum for standard deviations."""
+    return fit.is_joint and not float(fit.error_estimate[-1]) <= _NOT_FOUND
+
+
 def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
     """Verdict on a fit that is too far from its minimum for standard deviations."""
-    error = float(fit.error_estimate[-1])
-    if not options.uncertainty or not fit.is_joint or error <= _NOT_FOUND:
+    if not (options.uncertainty and is_too_far(fit)):
         return None
+    error = float(fit.error_estimate[-1])
     return Verdict(
         "uncertainty",
         "no standard deviations: the fit is too far from its minimum (estimated error "
@@ -126,15 +186,14 @@ def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
     )
 
 
-def _on_sign(test: SignTest) -> Verdict | None:
+def _on_sign(test: OrientationTest) -> Verdict | None:
     if test.sign != "contradicted":
         return None
     return Verdict(
         "sign",
-        "the data contradict the sign of the shifts: with all shifts reversed and free fluxes the "
-        f"squared residuals are {test.reversed / test.given:.2g} times as large. A shift grows "
-        "when the sensor moves towards larger rows and columns: give 'shifts' with the other "
-        "sign, or exchange the aperture images before and after the moves",
+        f"{test.words}; as given and with free fluxes the squared residuals are {test.ratio:.2g} "
+        "times as large. A shift grows when the sensor moves towards larger rows and columns: "
+        "give 'shifts' so, or exchange the aperture images before and after the moves",
     )
 
 
@@ -190,17 +249,13 @@ def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None
     )
 
 
-def _on_misfit(weighted: Weighted) -> Verdict | None:
-    chi2 = weighted.reduced_chi2
-    known = weighted.exposures.variance is not None and weighted.fit.ended == "converged"
-    if not (known and chi2 > _MISFIT):
-        return None
-    return Verdict(
-        "misfit",
-        f"the residuals are {chi2**0.5:.1f} times as large as the variances predict (limit "
-        f"{_MISFIT**0.5:g}): check the shifts and their sign; if the lamp drifts use flux='fit', "
-        "if there is dust use robust=True",
-    )
+def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
+    """Verdicts on fluxes and residuals; a misfit that wrong fluxes cause is said once."""
+    drifts = drift is not None and drift.probability < WARNED
+    found = [Verdict("drift", drift.words)] if drift is not None and drifts else []
+    if misfit is not None and not (drifts and misfit.cause == "flux"):
+        found.append(Verdict("misfit", misfit.words))
+    return found
 
 
 def _on_convergence(fit: Fit, options: Options) -> Verdict | None:

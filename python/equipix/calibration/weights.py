@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix.calibration.fallen_dust import without_fallen_dust
 from equipix.calibration.robust import rejected
+from equipix.exposures.front import union
 from equipix.noise import modelled_variances
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
@@ -27,17 +30,31 @@ _MOST_ROUNDS = 20
 
 
 class Weighted(NamedTuple):
-    """Exposures with their final weights, their fit, and the measurements left out."""
+    """Exposures with their final weights, their fit, and the measurements left out.
+
+    `dark_misfit` is what the noise of the dark adds to F on average, `sampled` what the arrays held
+    that later questions read again.
+    """
 
     exposures: Exposures
     fit: Fit
     rejected: Bools | None
+    dark_misfit: float = 0.0
+    sampled: Mapping[str, Array] = MappingProxyType({})
 
     @property
     def reduced_chi2(self) -> float:
-        """F over the degrees of freedom; NaN without any."""
+        """F over its expectation, or the variance of a value of weight 1; NaN where undetermined.
+
+        The expectation of F is the degrees of freedom and what the noise of the dark adds.
+        """
         freedom = self.fit.degrees_of_freedom
-        return self.fit.misfit / freedom if freedom > 0 else float("nan")
+        if freedom <= 0:
+            return float("nan")
+        if self.exposures.variance is not None:
+            return self.fit.misfit / (freedom + self.dark_misfit)
+        left = self.fit.misfit - self.dark_misfit
+        return left / freedom if left > 0 or self.dark_misfit == 0 else float("nan")
 
     @property
     def noise_variance(self) -> float:
@@ -60,18 +77,22 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
         at_medians = (c * middle for c in exposures.flux.values)
         start = modelled(exposures, at_medians).fit(rough, start)
         exposures = modelled(exposures, expected(exposures, start, middle, options.fit.workers))
+    fit = exposures.fit(options.fit, start)
+    # With the rough fit go the variances that it refers to.
+    del start
     if options.robust:
-        return _robust_fit(exposures, options.fit, start, middle)
-    return Weighted(exposures, exposures.fit(options.fit, start), None)
+        return _robust_fit(exposures, options.fit, fit, middle)
+    return Weighted(exposures, fit, None)
 
 
 def _robust_fit(
-    exposures: Exposures, options: FitOptions, start: Fit | None, middle: Floats | None
+    exposures: Exposures, options: FitOptions, fit: Fit, middle: Floats | None
 ) -> Weighted:
-    """Fit and leave out outliers, until nothing changes."""
+    """Leave out outliers and fit again, until nothing changes."""
+    given = exposures.usable()
+    exposures, fit = without_fallen_dust(exposures, fit, options)
     usable = exposures.usable()
     out = np.zeros_like(usable)
-    fit = exposures.fit(options, start)
     kept = exposures
     for _ in range(_MOST_ROUNDS):
         former, out = out, rejected(exposures, fit, out, options)
@@ -79,9 +100,17 @@ def _robust_fit(
             break
         if middle is not None:
             exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
-        kept = exposures.without(~usable | out)
+        kept = contradictory_found(exposures.without(~usable | out), given)
         fit = kept.fit(options, fit)
-    return Weighted(kept, fit, out)
+    return Weighted(kept, fit, out | (given & ~usable))
+
+
+def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
+    """Exposures with a finding for each pixel most of whose given measurements are left out."""
+    contradictory = given.sum(axis=0) > 2 * kept.usable().sum(axis=0)
+    found = union(kept.findings.contradictory, contradictory)
+    findings = dataclasses.replace(kept.findings, contradictory=found)
+    return dataclasses.replace(kept, findings=findings)
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:

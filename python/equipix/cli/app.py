@@ -16,7 +16,7 @@ from equipix.errors import EquipixError, EquipixWarning
 
 COMMANDS = {
     "calibrate": ("calibrate", "Calibrate a sensor from the images of an experiment."),
-    "inspect": ("calibrate", "Show what a calibration file holds."),
+    "inspect": ("calibrate", "Show what a calibration file, or a file of averaged frames, holds."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Divide frames by the sensitivity, their dark level subtracted."),

@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
 from equipix._types import FluxModel, Method
-from equipix.calibration.result import Calibration
 from equipix.cli.options import (
     Force,
     Json,
+    Mask,
     MaxSweeps,
     Picture,
     Tolerance,
     Uncertainty,
     Workers,
+    naming_mask,
 )
+from equipix.cli.summary import of_calibration, summary
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.comparison import compare as compare_calibrations
-from equipix.correction.protocol import Correction
+from equipix.errors import EquipixError
 from equipix.experiment.run import Experiment
-from equipix.flags import Flag
-from equipix.io import SUFFIXES, refuse_inputs
-from equipix.loading import load, load_calibration
+from equipix.io import SUFFIXES, read_mask, refuse_inputs
+from equipix.loading import load_any, load_calibration
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
+
+if TYPE_CHECKING:
+    from equipix.calibration.result import Calibration
 
 commands = typer.Typer()
 
@@ -46,9 +51,16 @@ def calibrate(
         FluxModel | None,
         typer.Option(help="Fluxes to find: one an exposure, or linear in the file's times."),
     ] = None,
+    mask: Mask = None,
     tolerance: Tolerance = 1e-6,
     max_sweeps: MaxSweeps = None,
     uncertainty: Uncertainty = False,
+    partial: Annotated[
+        bool,
+        typer.Option(
+            "--partial", help="Save a result that determines less than half of the pixels."
+        ),
+    ] = False,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
@@ -56,10 +68,14 @@ def calibrate(
     """Calibrate a sensor from the images of an experiment."""
     check_output(output, force=force, suffixes=SUFFIXES)
     loaded = Experiment.load(experiment)
-    refuse_inputs([output], [experiment, *loaded.files()])
-    with progress_bars() as progress:
+    refuse_inputs([output], [experiment, *loaded.files(), *([mask] if mask else [])])
+    if not partial:
+        # `_refuse_partial` says the same as an error.
+        warnings.filterwarnings("ignore", "the exposures determine only|the fit ended far from")
+    with progress_bars() as progress, naming_mask(mask):
         calibration = loaded.run(
             flux=flux,
+            mask=None if mask is None else read_mask(mask),
             robust=robust,
             method=method,
             tolerance=tolerance,
@@ -68,77 +84,35 @@ def calibrate(
             workers=workers,
             progress=progress,
         )
+    if not partial:
+        _refuse_partial(calibration, output)
     calibration.save(output, force=force)
-    show_result({"output": str(output), **_summary(calibration)}, as_json=as_json)
+    result = {"output": str(output), **of_calibration(calibration)}
+    if not as_json:  # their messages are on stderr, as warnings
+        result["verdicts"] = ", ".join(each.kind for each in calibration.verdicts) or "none"
+    show_result(result, as_json=as_json)
+
+
+def _refuse_partial(calibration: Calibration, output: Path) -> None:
+    """Refuse a result that determines less than half of the unmasked pixels, or none."""
+    for verdict in calibration.verdicts:
+        if verdict.kind == "partial":
+            raise EquipixError(
+                f"'{output}' is not written (--partial writes it): {verdict.message}"
+            )
 
 
 @commands.command(epilog="Example: equipix inspect cal.tif")
 def inspect(
-    file: Annotated[Path, typer.Argument(help="A calibration: .tif or .npz.")],
+    file: Annotated[Path, typer.Argument(help="A calibration or an average: .tif or .npz.")],
     as_json: Json = False,
 ) -> None:
-    """Show what a calibration file holds."""
-    correction = load(file)
-    result: dict[str, Any] = {"file": str(file)}
-    if isinstance(correction, Calibration):
-        result |= _summary(correction)
-    else:
-        result |= {
-            "shape": list(correction.shape),
-            "order": len(correction.coefficients) - 1,
-            "flagged_pixels": _flagged(correction),
-        }
-    if as_json:
-        result["metadata"] = correction.metadata
+    """Show what a calibration file, or a file of averaged frames, holds."""
+    content = load_any(file)
+    result = {"file": str(file), **summary(content)}
+    if as_json and hasattr(content, "metadata"):
+        result["metadata"] = content.metadata
     show_result(result, as_json=as_json)
-
-
-def _flagged(correction: Correction) -> dict[str, int]:
-    """Count the pixels that have each flag."""
-    return {
-        flag.name or "": int(np.count_nonzero(correction.flags & flag))
-        for flag in Flag
-        if (correction.flags & flag).any()
-    }
-
-
-def _summary(calibration: Calibration) -> dict[str, Any]:
-    """Collect the main figures of a calibration."""
-    sensitivity = calibration.sensitivity
-    options = calibration.metadata.get("options", {})
-    return {
-        "shape": list(calibration.shape),
-        "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
-        "spread": float(np.nanstd(sensitivity, dtype=np.float64)),
-        **_uncertainty(calibration),
-        "converged": calibration.converged,
-        "error_estimate": calibration.error_estimate,
-        "sweeps": calibration.sweeps,
-        _misfit_name(options): calibration.reduced_chi2,
-        "components": calibration.components,
-        "shift_sign": calibration.shift_sign,
-        "fluxes": options.get("flux", "known"),
-        "flagged_pixels": _flagged(calibration),
-    }
-
-
-def _misfit_name(options: dict[str, Any]) -> str:
-    """Name of the mean square residual: without variances it is a variance in DN²."""
-    return "variance_of_a_value" if options.get("weights") == "equal" else "reduced_chi2"
-
-
-def _uncertainty(calibration: Calibration) -> dict[str, Any]:
-    """Standard deviations by noise, if they were computed, and their exactness."""
-    std, tilt_std = calibration.sensitivity_std, calibration.tilt_std
-    if std is None or tilt_std is None:
-        return {}
-    exactness = calibration.metadata["uncertainty"]["relative_standard_error"]
-    return {
-        "sensitivity_std": float(np.nanmedian(std)),
-        "sensitivity_std_is_exact_to": exactness,
-        "tilt": dict(zip(("rows", "cols"), calibration.tilt.tolist(), strict=True)),
-        "tilt_std": dict(zip(("rows", "cols"), tilt_std.tolist(), strict=True)),
-    }
 
 
 @commands.command(epilog="Example: equipix compare first.tif second.tif -o agreement.png")
@@ -165,6 +139,7 @@ def compare(
             "rms": float(result.rms[k]),
             "block_rms": float(result.block_rms[k]),
             "largest": float(result.largest[k]),
+            "tilt_compared": not result.open_tilt[k],
             "predicted_rms": None
             if result.predicted_rms is None
             else float(result.predicted_rms[k]),
@@ -176,7 +151,13 @@ def compare(
         show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
     else:
         _show_pairs(pairs)
-        show_result({"pixels compared": pixels, "picture": str(output or "none")}, as_json=False)
+        words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
+        if result.open_tilt.any():
+            left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}
+            words["tilt"] = "left out: free fluxes leave it undetermined in one or more of " + (
+                ", ".join(sorted(map(str, left_out)))
+            )
+        show_result(words, as_json=False)
 
 
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -18,6 +24,23 @@ Uncertainty = Annotated[
 Saturation = Annotated[
     float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
 ]
+Mask = Annotated[
+    Path | None,
+    typer.Option(help="An image or .npy: pixels that are not 0 in it are not used."),
+]
+
+
+@contextmanager
+def naming_mask(file: Path | None) -> Iterator[None]:
+    """Name the file in messages on the mask that was read from it."""
+    try:
+        yield
+    except InputError as error:
+        if file is None or not str(error).startswith("'mask'"):
+            raise
+        raise InputError(f"{file}: {error}") from error
+
+
 Picture = Annotated[
     Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from equipix.cli.options import Force, Json, Picture, Seed
@@ -11,7 +12,7 @@ from equipix.cli.terminal import check_output, progress_bars, show_result, show_
 from equipix.errors import InputError
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
-from equipix.plan import ErrorBudget, advise_order, error_budget, identify, suggest, trend_told
+from equipix.plan import ErrorBudget, advise_order, distinct_trend, error_budget, identify, suggest
 
 commands = typer.Typer()
 
@@ -31,7 +32,7 @@ def plan(
     ] = None,
     exposures: Annotated[
         int | None,
-        typer.Option(min=2, help="Exposures of the patterns to find; the fewest unless given."),
+        typer.Option(min=2, help="Exposures of the patterns to find; five unless given."),
     ] = None,
     noise: Annotated[float, typer.Option(help="Noise of an exposure, over its signal.")] = 1e-3,
     drift: Annotated[
@@ -92,12 +93,13 @@ def _pairs(text: str) -> list[list[float]]:
 
 def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
     """Collect the figures of a pattern."""
-    found = identify(budget.shape, budget.shifts)
+    # Rounded: equations and unknowns are the same between pixels, and the budget has the parts.
+    found = identify(budget.shape, np.rint(budget.shifts))
     order = advise_order(budget.shifts)
     return {
         "shifts": budget.shifts.tolist(),
-        "components": found.components,
-        "largest": found.largest,
+        "components": budget.components,
+        "largest": found.largest if budget.components == found.components else found.labels.size,
         "equations": found.equations,
         "unknowns": found.unknowns,
         "rms": budget.rms,
@@ -105,9 +107,9 @@ def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
         "tilt_by_cause": {name: list(tilt) for name, tilt in budget.tilt_by_cause.items()},
         "worst_wave": list(budget.spectrum.worst),
         "smallest_eigenvalue": budget.spectrum.smallest,
-        "trend_told": budget.trend_told,
+        "distinct_trend": budget.distinct_trend,
         "order": order.tolist(),
-        "trend_told_in_order": trend_told(budget.shifts[order]),
+        "distinct_trend_in_order": distinct_trend(budget.shifts[order]),
     }
 
 
@@ -122,8 +124,8 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
         "equations / unknowns": lambda p: f"{p['equations']} / {p['unknowns']}",
         "worst wave, cycles per pixel": lambda p: "({:.3f}, {:.3f})".format(*p["worst_wave"]),
         "λ of it": lambda p: f"{p['smallest_eigenvalue']:.3f}",
-        "linear trend distinct from tilt": lambda p: f"{p['trend_told']:.1%}",
-        "  in the order advised": lambda p: f"{p['trend_told_in_order']:.1%}",
+        "linear trend distinct from tilt": lambda p: f"{p['distinct_trend']:.1%}",
+        "  in the order advised": lambda p: f"{p['distinct_trend_in_order']:.1%}",
     }
     patterns = [f"pattern {k + 1}" for k in range(len(plans))]
     show_table(

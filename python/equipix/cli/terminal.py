@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     Report = Callable[[int, int, str], None]
 
+_WHOLE = 1e9
+"""Whole numbers below this are printed with all digits, as saturation levels are."""
+
 
 @contextmanager
 def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
@@ -80,7 +83,8 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
         return
     width = max(map(len, result))
     for name, value in result.items():
-        print(f"{name.replace('_', ' '):<{width}}  {_words(value)}")  # noqa: T201
+        words = _words(value).replace("\n", "\n" + " " * (width + 2))
+        print(f"{name.replace('_', ' '):<{width}}  {words}")  # noqa: T201
 
 
 def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
@@ -130,14 +134,18 @@ def _json_value(value: Any) -> Any:
     return value
 
 
-def _words(value: object) -> str:
+def _words(value: Any) -> str:
     match value:
         case bool():
             return "yes" if value else "no"
         case float():
-            return f"{value:.4g}"
+            return f"{value:.0f}" if value.is_integer() and abs(value) < _WHOLE else f"{value:.4g}"
         case dict():
             return ", ".join(f"{name} {_words(item)}" for name, item in value.items()) or "none"
+        case []:
+            return "none"
+        case [dict(), *_]:
+            return "\n".join(": ".join(map(str, each.values())) for each in value)
         case list() | tuple():
             return " × ".join(str(item) for item in value)
     return str(value)

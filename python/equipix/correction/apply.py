@@ -10,7 +10,7 @@ from equipix._check import as_array
 from equipix._types import Flagged
 from equipix.errors import InputError
 from equipix.flags import Flag
-from equipix.frames import FrameStatistics
+from equipix.frames import FrameStatistics, refuse_subtracted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,6 +83,7 @@ def apply_gain(
     The parameters are those of `equipix.Calibration.correct`.
     """
     if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
         dark = dark.mean
     offset = np.zeros((), np.float32) if dark is None else as_array("dark", dark, ndim=2)
     if dark is not None and offset.shape != gain.shape:

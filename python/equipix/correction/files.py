@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix._types import Flagged, Progress
-from equipix.errors import AlreadyCorrectedWarning, FileError, InputError
-from equipix.frames import average, load_statistics
+from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
+from equipix.frames import average, refuse_subtracted
 from equipix.io import (
     description,
     find_files,
     folder_beside,
     frame_format,
     refuse_inputs,
+    refuse_saved,
     stream_frames,
     write_frames,
     write_whole,
@@ -136,16 +136,16 @@ def _warn_of_corrected(files: list[Path]) -> None:
     floats = [file for file in files if frame_format(file)[1].kind == "f"]
     if corrected := [file for file in floats if description(file) == _MARK]:
         others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
-        warnings.warn(
+        warn(
             f"{corrected[0]}{others}: corrected already; a second correction divides by the "
             "sensitivity twice: give the raw frames",
             AlreadyCorrectedWarning,
-            stacklevel=3,
         )
 
 
 def _count(file: Path, correction: Correction) -> int:
-    """Count the frames of a file; they must be of the sensor's shape."""
+    """Count the frames of a file; they must be raw, and of the sensor's shape."""
+    refuse_saved(file)
     (count, *shape), _ = frame_format(file)
     if tuple(shape) != correction.shape:
         raise InputError(
@@ -172,8 +172,6 @@ def _takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
 
 def _dark_frame(source: str) -> NDArray[Any]:
     """Read the mean of dark frames, averaged already or not."""
-    try:
-        mean = load_statistics(source).mean
-    except (FileError, InputError):  # not averaged yet
-        mean = average(source).mean
-    return mean.astype(np.float32)
+    dark = average(source)
+    refuse_subtracted(dark, source)
+    return dark.mean.astype(np.float32)

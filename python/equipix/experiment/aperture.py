@@ -11,14 +11,15 @@ from equipix.errors import InputError
 from equipix.experiment.manifest import find_files
 from equipix.exposures.positions import in_beam, variance_in_beam
 from equipix.flags import usable
-from equipix.io import read_frames
-from equipix.shifts import measure_shift
+from equipix.io import read_frames, refuse_saved
+from equipix.mending import hot_places, mended
+from equipix.shifts import measure_shift, saturation_level
 
 if TYPE_CHECKING:
     from pathlib import Path
     from typing import Self
 
-    from equipix._types import Array, Floats
+    from equipix._types import Array, Bools, Floats
     from equipix.calibration.weights import Weighted
     from equipix.experiment.manifest import Exposure, Manifest
     from equipix.shifts import ShiftMeasurement, Spot
@@ -43,7 +44,8 @@ class Equalisation:
         The dark frame, in DN.
     variance : ndarray, shape (rows, cols)
         Relative variance of the sensitivity by noise, the beam being known: 1/(M² Σ w c²L²), times
-        n/(n − 2) since a pixel's n measurements determine the beam too. NaN where unknown.
+        n/(n − 2) since a pixel's n measurements determine the beam too; with two, which determine
+        no noise, times 2. NaN where unknown.
     """
 
     gain: Array
@@ -53,7 +55,7 @@ class Equalisation:
     @classmethod
     def of(cls, weighted: Weighted, flags: Array, workers: int | None = None) -> Self:
         """Take it from the fit of exposures whose dark is known."""
-        exposures, fit, _ = weighted
+        exposures, fit = weighted.exposures, weighted.fit
         if exposures.dark is None:
             raise InputError(
                 "'calibration' holds no dark frame: give one that Experiment.run has made"
@@ -88,9 +90,16 @@ class Equalisation:
 
 
 def measured_shifts(
-    path: Path, manifest: Manifest, equalisation: Equalisation | None = None
+    path: Path,
+    manifest: Manifest,
+    equalisation: Equalisation | None = None,
+    *,
+    hot: Bools | None = None,
 ) -> tuple[Floats, Floats]:
-    """Shift of each exposure and its standard error; see `Experiment.measure_shifts`."""
+    """Shift of each exposure and its standard error; see `Experiment.measure_shifts`.
+
+    `hot` are the pixels that the dark frames show to be hot.
+    """
     shifts, variances = [np.zeros(2)], [np.zeros(2)]
     first, *others = manifest.exposure
     if first.shift is not None:
@@ -101,7 +110,7 @@ def measured_shifts(
             shifts.append(np.array(new.shift))
             variances.append(np.square(new.shift_std or [0.0, 0.0]))
             continue
-        spots, shape = _spots(path, manifest, new, equalisation)
+        spots, shape = _spots(path, manifest, new, equalisation, hot)
         ends = ((spots.before, old.rotation), (spots.after, new.rotation))
         before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
         shifts.append(shifts[-1] + before - after)
@@ -115,20 +124,42 @@ def measured_shifts(
 
 
 def _spots(
-    path: Path, manifest: Manifest, exposure: Exposure, equalisation: Equalisation | None
+    path: Path,
+    manifest: Manifest,
+    exposure: Exposure,
+    equalisation: Equalisation | None,
+    hot: Bools | None,
 ) -> tuple[ShiftMeasurement, tuple[int, int]]:
     """Find the spots of the move to `exposure`, and the shape of the sensor."""
     before, after = (
-        read_frames(find_files(path, entry))
+        _images(find_files(path, entry))
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )
     try:
         level = manifest.sensor.saturation_level
         if equalisation is not None:
+            before, after = (
+                _equalised(images, saturation_level(images, level), equalisation, hot)
+                for images in (before, after)
+            )
             # In other units; the first measurement has checked that nothing saturates.
-            before, after = equalisation.apply(before), equalisation.apply(after)
-            level = None
-        return measure_shift(before, after, saturation=level), before.shape[-2:]
+            level, hot = None, None
+        return measure_shift(before, after, saturation=level, hot=hot), before.shape[-2:]
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
+
+
+def _images(files: list[Path]) -> Array:
+    """Images of the aperture, as the camera gave them."""
+    for file in files:
+        refuse_saved(file)
+    return read_frames(files)
+
+
+def _equalised(
+    images: Array, level: float | None, equalisation: Equalisation, hot: Bools | None
+) -> Array:
+    """Images as equal pixels would have given them; isolated hot ones as their neighbours show."""
+    places = hot_places(images, level, hot)
+    return mended(equalisation.apply(images), places)

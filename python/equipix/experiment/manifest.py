@@ -21,13 +21,20 @@ _WANTED = {
     "bit_depth": "a whole number from 1 to 16",
     "saturation": "a positive number (DN)",
     "gain_dn_per_e": "a positive number (DN per electron)",
+    "mask": "an image file",
+    "region": "tables [[sensor.region]]",
+    "rows": "[first, end], two whole numbers from 0 on, the first below the end",
+    "cols": "[first, end], two whole numbers from 0 on, the first below the end",
+    "centre": "[row, col] in pixels",
+    "radius": "a positive number of pixels",
+    "outside": "true or false",
     "dark": "a table",
     "exposure": "two or more tables [[exposure]]",
     "name": "a text",
     "frames": "a file, a glob or a list of them",
     "aperture_before": "a file, a glob or a list of them",
     "aperture_after": "a file, a glob or a list of them",
-    "shift": "[row, col] in pixels",
+    "shift": "[row, col] in pixels, without a unit: divide micrometres by the pixel pitch",
     "shift_std": "[row, col] in pixels, not negative",
     "flux": "a positive number",
     "flux_std": "a positive number, relative to the flux",
@@ -38,19 +45,57 @@ _WANTED = {
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Text = Annotated[str, Field(min_length=1)]
 Files = Text | Annotated[list[Text], Field(min_length=1)]
+Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+class Region(_Table):
+    """One ``[[sensor.region]]``: a rectangle or a circle of pixels that must not be used."""
+
+    rows: Span | None = None
+    cols: Span | None = None
+    centre: Pair | None = None
+    radius: Positive | None = None
+    outside: bool = False
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        if (self.centre is None) != (self.radius is None):
+            raise _problem("give both 'centre' and 'radius'")
+        spans = [span for span in (self.rows, self.cols) if span is not None]
+        if bool(spans) == (self.centre is not None):
+            raise _problem("give 'rows', 'cols' or both, or 'centre' and 'radius'")
+        for first, end in spans:
+            if first >= end:
+                raise _problem(f"{[first, end]} holds no pixel: the first must be below the end")
+        return self
+
+
 class Sensor(_Table):
-    """Table ``[sensor]``: levels in DN."""
+    """Table ``[sensor]``: levels in DN, and pixels that must not be used."""
 
     name: str = ""
     bit_depth: Annotated[int, Field(ge=1, le=16)] | None = None
     saturation: Positive | None = None
     gain_dn_per_e: Positive | None = None
+    mask: Text | None = None
+    region: Annotated[list[Region], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _level_within_depth(self) -> Self:
+        if self.saturation is None or self.bit_depth is None:
+            return self
+        largest = 2**self.bit_depth - 1
+        if self.saturation > largest:
+            raise _problem(
+                f"'saturation' in [sensor] is {self.saturation:g}, above {largest}, the largest "
+                f"value that 'bit_depth' = {self.bit_depth} holds: no value would reach it"
+            )
+        return self
 
     @property
     def saturation_level(self) -> float | None:
@@ -58,6 +103,11 @@ class Sensor(_Table):
         if self.saturation is None and self.bit_depth is not None:
             return float(2**self.bit_depth - 1)
         return self.saturation
+
+    @property
+    def saturation_key(self) -> str:
+        """The key that gives `saturation_level`."""
+        return "bit_depth" if self.saturation is None and self.bit_depth else "saturation"
 
 
 class Dark(_Table):
@@ -73,7 +123,7 @@ class Exposure(_Table):
     frames: Files
     aperture_before: Files | None = None
     aperture_after: Files | None = None
-    shift: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    shift: Pair | None = None
     shift_std: (
         Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
         | None
@@ -130,7 +180,7 @@ class Manifest(_Table):
 def read_manifest(path: Path) -> Manifest:
     """Read and check the file `path`."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -163,7 +213,8 @@ def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]
         exposure = next((part for part in location if isinstance(part, int)), None)
         names = [part for part in location if isinstance(part, str)]
         kinds = {"manifest": detail["msg"], "extra_forbidden": "unknown", "missing": "missing"}
-        mistake = (kinds.get(detail["type"], "value"), *names[:2])
+        depth = 3 if names[:2] == ["sensor", "region"] else 2
+        mistake = (kinds.get(detail["type"], "value"), *names[:depth])
         found.setdefault(mistake, {}).setdefault(exposure, _sentence(detail, content))
     sentences = [list(alike.values()) for alike in found.values()]
     return [
@@ -178,6 +229,8 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     match location:
         case ["exposure", int(index), *_]:
             place = f" in exposure {index}{_name(content['exposure'][index])}"
+        case ["sensor", "region", int(index), *_]:
+            place = f" in [[sensor.region]] {index + 1}"
         case [table, _, *_]:
             place = f" in [{table}]"
         case _:
@@ -185,11 +238,16 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     if detail["type"] == "manifest":
         return detail["msg"] + place
     if detail["type"] == "extra_forbidden":
-        return f"unknown key '{location[-1]}'{place}"
+        hint = ""
+        if str(location[-1]).startswith(("shift", "position")):
+            hint = ": 'shift' is in pixels: divide micrometres by the pixel pitch"
+        return f"unknown key '{location[-1]}'{place}{hint}"
     if detail["type"] == "missing":
         return f"key '{location[-1]}' is missing{place}"
     key = next(key for key in reversed(location) if key in _WANTED)
     value = detail["input"]
+    if key == "exposure" and isinstance(value, dict):
+        return "[exposure] is one table: write [[exposure]], with two brackets, for each exposure"
     return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"
 
 

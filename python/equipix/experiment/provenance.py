@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from equipix._types import Floats
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 def provenance(
     path: Path,
     manifest: Manifest,
-    files: list[Path],
+    hashes: Mapping[Path, str],
     shifts: Floats,
     std: Floats,
     noise: NoiseModel | None,
@@ -32,8 +33,13 @@ def provenance(
         "measured_shifts": shifts.tolist(),
         "measured_shift_std": std.tolist(),
         "noise": None if noise is None else asdict(noise),
-        "inputs": {os.path.relpath(file, folder): _sha256(file) for file in [path, *files]},
+        "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
     }
+
+
+def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
+    """Hashes of the content of files."""
+    return {file: _sha256(file) for file in files}
 
 
 def _sha256(path: Path) -> str:

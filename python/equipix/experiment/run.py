@@ -12,25 +12,27 @@ from equipix.calibration.calibrate import calibrated
 from equipix.calibration.options import Options
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.weights import weighted_fit
-from equipix.errors import FileError, InputError
+from equipix.defects import hot_pixels
+from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.manifest import find_files, read_manifest
-from equipix.experiment.provenance import provenance
+from equipix.experiment.mask import excluded_pixels
+from equipix.experiment.provenance import provenance, sha256_of
+from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged
-from equipix.exposures.front import exposures_of
+from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
-from equipix.frames import average
+from equipix.frames import average, refuse_subtracted, saved_shape
 from equipix.io import as_path, frame_format
-from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from os import PathLike
     from pathlib import Path
     from typing import Any
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
-    from equipix._types import Floats, FluxModel, Method, Progress
+    from equipix._types import Bools, Floats, FluxModel, Method, Progress
     from equipix.calibration.result import Calibration
     from equipix.experiment.manifest import Manifest
     from equipix.exposures.exposures import Exposures
@@ -59,7 +61,9 @@ class Experiment:
     Notes
     -----
     Frames, dark frames and aperture images are named relative to the file: one file (a
-    multi-page TIFF holds many frames), a glob or a list. The position of an exposure is either
+    multi-page TIFF holds many frames; a saved average stands for the frames that it was made of), a
+    glob or a list. ``[sensor]`` may exclude pixels by a mask
+    file and by regions. The position of an exposure is either
     ``shift = [row, col]`` in pixels, or computed from the position before it and from images of
     a small aperture in the beam, taken before and after the move.
     """
@@ -85,15 +89,22 @@ class Experiment:
         ------
         FileError
             If the file cannot be read, has an unknown key or a wrong value, or names a file that
-            does not exist.
+            does not exist, or one file for two measurements.
         """
         file = as_path("path", path)
         experiment = cls(file, read_manifest(file))
         experiment.files()
+        refuse_repeats(file, experiment.manifest)
         return experiment
 
     def files(self) -> list[Path]:
         """All image files of the experiment, each once."""
+        mask = self.manifest.sensor.mask
+        masks = [] if mask is None else find_files(self.path, mask)
+        return list(dict.fromkeys([*self._images(), *masks]))
+
+    def _images(self) -> list[Path]:
+        """The files of frames and of images of the aperture, each once."""
         entries: list[str | list[str] | None] = [self.manifest.dark.frames]
         for exposure in self.manifest.exposure:
             entries += [exposure.frames, exposure.aperture_before, exposure.aperture_after]
@@ -108,14 +119,15 @@ class Experiment:
         FileError
             If a file cannot be read or differs from the first dark frames.
         """
-        first, *others = self.files()
-        wanted, wanted_dtype = frame_format(first)
+        first, *others = self._images()
+        wanted, wanted_dtype = _format(first)
         for file in others:
-            shape, dtype = frame_format(file)
-            if shape[1:] != wanted[1:] or dtype != wanted_dtype:
+            shape, dtype = _format(file)
+            wanted_dtype = wanted_dtype or dtype
+            if shape != wanted or dtype not in (None, wanted_dtype):
                 raise FileError(
-                    f"{file}: holds {dtype} frames of shape {shape[1:]}, expected {wanted_dtype} "
-                    f"of shape {wanted[1:]} as in {first}"
+                    f"{file}: holds {dtype or 'averaged'} frames of shape {shape}, expected "
+                    f"{wanted_dtype or 'averaged'} of shape {wanted} as in {first}"
                 )
 
     def measure_shifts(
@@ -161,12 +173,29 @@ class Experiment:
                     "give the result of Experiment.run"
                 )
             equalisation = Equalisation.of(calibration.weighted, calibration.flags)
-        return measured_shifts(self.path, self.manifest, equalisation)
+        hot = self._hot(FitOptions()) if self._is_moved() else None
+        return measured_shifts(self.path, self.manifest, equalisation, hot=hot)
+
+    def _is_moved(self) -> bool:
+        """Whether a move is measured from images of the aperture."""
+        return any(exposure.shift is None for exposure in self.manifest.exposure[1:])
+
+    def _hot(self, options: FitOptions) -> Bools:
+        """Pixels that the dark frames show to be hot."""
+        return hot_pixels(self._dark(options), None)
+
+    def _dark(self, options: FitOptions) -> FrameStatistics:
+        frames = self.manifest.dark.frames
+        dark = self._statistics("dark", frames, None, options)
+        files = ", ".join(map(str, find_files(self.path, frames)))
+        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
+        return dark
 
     def run(
         self,
         *,
         flux: FluxModel | None = None,
+        mask: ArrayLike | None = None,
         robust: bool = False,
         method: Method = "multiscale",
         tolerance: float = 1e-6,
@@ -182,6 +211,8 @@ class Experiment:
         flux : {"fit", "linear"}, optional
             Fluxes to find: one for each exposure, or linear in the file's ``time``. Unless given
             they are those of the file, as known or, with ``flux_std``, as a prior.
+        mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+            True = do not use, besides the pixels that the file excludes.
         robust : bool
             Whether to leave out measurements that disagree with the others.
         method : {"multiscale", "coordinate-descent"}
@@ -206,11 +237,17 @@ class Experiment:
         Raises
         ------
         FileError
-            If a file cannot be read, or the images differ in size or depth.
+            If a file cannot be read, the images differ in size or depth, or two files have the same
+            content.
         InputError
             If an option is out of range, or the exposures do not make a calibration.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
+
+        Warns
+        -----
+        UnusedInputWarning
+            If the file has ``flux`` or ``time`` that `flux` leaves without use.
 
         Notes
         -----
@@ -220,48 +257,95 @@ class Experiment:
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
+        self._warn_of_unused(flux)
+        if flux == "linear" and self._column("time") is None:
+            raise InputError(
+                f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
+                "[[exposure]]"
+            )
         self.check_formats()
-        shifts, std = self.measure_shifts()
-        exposures, noise = self._exposures(shifts, std, flux, fit_options)
+        excluded = self._excluded(mask)
+        hashes = sha256_of([self.path, *self.files()])
+        refuse_repeats(self.path, self.manifest, hashes)
+        dark = self._dark(fit_options)
+        hot = hot_pixels(dark, None)
+        shifts, std = measured_shifts(self.path, self.manifest, hot=hot)
+        exposures, noise = self._exposures(dark, shifts, std, flux, excluded, fit_options)
         start = None
-        moved = any(exposure.shift is None for exposure in self.manifest.exposure[1:])
-        if moved and method == "multiscale":
+        if self._is_moved() and not fit_options.whole_shifts:
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
-            shifts, std = measured_shifts(self.path, self.manifest, equalisation)
+            shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
-        origin = provenance(self.path, self.manifest, self.files(), shifts, std, noise)
+        origin = provenance(self.path, self.manifest, hashes, shifts, std, noise)
         return calibrated(exposures, options, start=start, provenance=origin)
 
+    def _warn_of_unused(self, flux: FluxModel | None) -> None:
+        """Warn of values in the file that the fluxes to find leave without use."""
+        if flux is not None and self._column("flux") is not None:
+            warn(
+                f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
+                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
+                UnusedInputWarning,
+            )
+        if flux != "linear" and self._column("time") is not None:
+            warn(
+                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
+                UnusedInputWarning,
+            )
+
+    def _excluded(self, mask: ArrayLike | None) -> Bools | None:
+        """Pixels that the file or the caller excludes."""
+        shape, _ = _format(self._images()[0])
+        given = None
+        if mask is not None:
+            given = as_mask(mask, (len(self.manifest.exposure), *shape))
+        return union(given, excluded_pixels(self.path, self.manifest, shape))
+
     def _exposures(
-        self, shifts: Floats, std: Floats, flux: FluxModel | None, options: FitOptions
+        self,
+        dark: FrameStatistics,
+        shifts: Floats,
+        std: Floats,
+        flux: FluxModel | None,
+        mask: Bools | None,
+        options: FitOptions,
     ) -> tuple[Exposures, NoiseModel | None]:
         """The exposures from averaged frames and the file, and the noise model of one frame."""
-        whole = options.method == "coordinate-descent"
-        averaged = self._average(options)
+        refined = std.any() and not options.whole_shifts
+        averaged = self._average(dark, options)
         exposures = exposures_of(
             averaged,
-            round_shifts(shifts, std) if whole else shifts,
-            shift_std=std if std.any() and not whole else None,
+            shifts,
+            mask=mask,
+            shift_std=std if refined else None,
             flux=self._column("flux") if flux is None else flux,
             flux_std=self._column("flux_std") if flux is None else None,
             time=self._column("time") if flux == "linear" else None,
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
-            whole=whole,
         )
-        return exposures, averaged.noise
+        return exposures.whole(std) if options.whole_shifts else exposures, averaged.noise
 
-    def _average(self, options: FitOptions) -> Averaged:
+    def _average(self, dark: FrameStatistics, options: FitOptions) -> Averaged:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""
         exposures = self.manifest.exposure
         with naming_memory("averaging"):
-            dark = self._statistics("dark", self.manifest.dark.frames, None, options)
-            gain = self.manifest.sensor.gain_dn_per_e
-            averaged = Averaged(len(exposures), dtype=np.float32, gain=gain)
+            sensor = self.manifest.sensor
+            averaged = Averaged(
+                len(exposures),
+                dtype=np.float32,
+                gain=sensor.gain_dn_per_e,
+                saturation=sensor.saturation_level,
+                saturation_key=sensor.saturation_key,
+            )
             for each in exposures:
-                averaged.add(self._statistics(each.name, each.frames, dark, options))
+                statistics = self._statistics(each.name, each.frames, dark, options)
+                try:
+                    averaged.add(statistics, each.name)
+                except InputError as error:
+                    raise FileError(f"{self.path}: {error}") from error
         return averaged
 
     def _statistics(
@@ -277,18 +361,18 @@ class Experiment:
 
         level = self.manifest.sensor.saturation_level
         files = find_files(self.path, entry)
-        frames = average(
-            files, dark=dark, saturation=level, workers=options.workers, progress=report
-        )
-        if (frames.saturated > 0).all():
-            reached = "the largest value" if level is None else f"{level:g} DN"
-            raise FileError(
-                f"{self.path}: every pixel of '{name}' reaches the saturation level, {reached}: "
-                "correct 'bit_depth' or 'saturation' in [sensor], or expose less"
-            )
-        return frames
+        return average(files, dark=dark, saturation=level, workers=options.workers, progress=report)
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""
         values = [getattr(exposure, key) for exposure in self.manifest.exposure]
         return [value for value in values if value is not None] or None
+
+
+def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
+    """Rows, columns and dtype of the frames of a file; no dtype of frames averaged before."""
+    saved = saved_shape(file)
+    if saved is not None:
+        return saved, None
+    (_, rows, cols), dtype = frame_format(file)
+    return (rows, cols), dtype

@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.defects import Findings, dead_pixels, hot_pixels, noisy_pixels
+from equipix.defects import (
+    Findings,
+    dead_pixels,
+    hot_pixels,
+    noisy_pixels,
+    refuse_saturated,
+)
 from equipix.errors import InputError
+from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
+from equipix.frames import same_statistics
 from equipix.noise import NoiseModel, photon_transfer
 
 if TYPE_CHECKING:
@@ -17,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import DTypeLike
 
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
     from equipix.frames import FrameStatistics
 
 
@@ -32,25 +40,38 @@ class Averaged:
         Of the mean frames that are kept.
     gain : float, optional
         Gain of the camera where it is known, in DN per electron.
+    saturation : float, optional
+        Level that was averaged with, in DN, where it is known; for messages.
 
     Attributes
     ----------
     values : ndarray, shape (n, rows, cols)
         Mean frames, the dark subtracted; NaN where a sample saturates, which is left out of that
         exposure alone.
+    raw : bool
+        Whether no dark was subtracted from averages of whole numbers.
     dark : FrameStatistics or None
         The dark frames that were subtracted.
     """
 
     def __init__(
-        self, count: int, *, dtype: DTypeLike = np.float64, gain: float | None = None
+        self,
+        count: int,
+        *,
+        dtype: DTypeLike = np.float64,
+        gain: float | None = None,
+        saturation: float | None = None,
+        saturation_key: str = "saturation",
     ) -> None:
-        self.count, self.gain = count, gain
+        self.count, self.gain, self.saturation = count, gain, saturation
+        self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
         self._of_dark: list[float] = []
         self._points: list[Array] = []
+        self._clipped: list[Clipping | None] = []
+        self.raw = True
 
     @classmethod
     def of(cls, frames: Sequence[FrameStatistics]) -> Self:
@@ -60,16 +81,19 @@ class Averaged:
             averaged.add(each)
         return averaged
 
-    def add(self, frames: FrameStatistics) -> None:
-        """Add the next exposure.
+    def add(self, frames: FrameStatistics, name: str = "") -> None:
+        """Add the next exposure, which may have a name.
 
         Raises
         ------
         InputError
-            If it has another shape than the first, another dark, or saturates in every pixel.
+            If it has another shape than the first, another dark, or no finite value that does not
+            saturate; with the first exposure, if its dark has none.
         """
         exposure, shape = len(self._frames), frames.mean.shape
         if exposure == 0:
+            if frames.dark is not None:
+                self._refuse_saturated("'dark'", frames.dark)
             self.values = np.empty((self.count, *shape), self._dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
@@ -78,17 +102,18 @@ class Averaged:
             raise InputError(
                 f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
             )
-        if not _same(frames.dark, self.dark):
+        if not same_statistics(frames.dark, self.dark):
             raise InputError(
                 f"'frames': exposure {exposure} has another dark than the first: average all with "
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        if saturates.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {exposure} saturates: expose less, or correct "
-                "the 'saturation' that they were averaged with"
-            )
+        which = f"'frames': exposure {exposure}{f' ({name!r})' if name else ''}"
+        _refuse_no_variance(which, frames)
+        self._refuse_saturated(which, frames)
+        clipped = clipping_of(frames)
+        self._clipped.append(clipped)
+        self.raw &= frames.raw
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
@@ -96,7 +121,9 @@ class Averaged:
         self._frames.append(count)
         if self.dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
-        self._points.append(photon_transfer(frames.mean, frames.variance, ~saturates, count))
+        # Clipped samples scatter less: their bins would have most of the weight in the noise model.
+        free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
+        self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
     @cached_property
     def noise(self) -> NoiseModel | None:
@@ -108,13 +135,24 @@ class Averaged:
             known |= self.gain is not None and len(points[-1]) > 0
         return NoiseModel.fit(np.concatenate(points), gain=self.gain) if known else None
 
+    @property
+    def clipped(self) -> Clipping | None:
+        """A saturation level that was not given, if the values show one."""
+        return highest(self._clipped)
+
     def models(self, noise: NoiseModel) -> list[NoiseModel]:
-        """Noise model of each mean frame, from that of one frame."""
-        of_dark = self._of_dark
+        """Noise model of each mean frame without that of the dark, from that of one frame."""
+        return [noise.of_mean(frames) for frames in self._frames]
+
+    def dark_variance(self, noise: NoiseModel) -> Floats | None:
+        """Variance of the dark that was subtracted from all, from the noise of one frame.
+
+        Of a dark that is not kept it is what the averages state; None without any.
+        """
         if self.dark is not None:
-            of_dark = [float(noise.variance(0.0)) / int(self.dark.count.max())] * self.count
-        pairs = zip(self._frames, of_dark, strict=True)
-        return [noise.of_mean(frames, dark_variance=variance) for frames, variance in pairs]
+            return np.asarray(noise.variance(0.0) / np.maximum(self.dark.count, 1))
+        stated = float(np.mean(self._of_dark))
+        return np.full(self.saturated.shape, stated) if stated > 0 else None
 
     def findings(self, noise: NoiseModel | None) -> Findings:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
@@ -129,20 +167,33 @@ class Averaged:
             dead = self._dead(noise) & ~hot
         return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
+    def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
+        saturates = frames.saturated > 0
+        refuse_saturated(which, frames.mean, saturates, self.saturation, self._saturation_key)
+
     def _dead(self, noise: NoiseModel | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""
-        models = None if noise is None else self.models(noise)
+        models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
         dead: Bools = dead_pixels(self.values, models) & measured
         return dead
 
+    def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
+        """Noise model of each mean frame less the dark, for one exposure by itself."""
+        of_dark = self.dark_variance(noise)
+        variance = 0.0 if of_dark is None else float(np.median(of_dark))
+        return [noise.of_mean(frames, dark_variance=variance) for frames in self._frames]
 
-def _same(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
-    """Whether two darks are the same measurement: one object, or equal to the last bit."""
-    if one is None or other is None or one is other:
-        return one is other
-    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:
+    """Refuse averages of several samples without a finite variance that is not negative."""
+    several = (frames.count > 1) & np.isfinite(frames.mean)
+    wrong = several & ~(np.isfinite(frames.variance) & (frames.variance >= 0))
+    if wrong.any():
+        raise InputError(
+            f"{which}: 'variance' holds {frames.variance[wrong][0]:g}, expected finite numbers not "
+            "below 0 where 'count' is above 1"
+        )
 
 
 def _added_by_dark(frames: FrameStatistics, count: int) -> float:

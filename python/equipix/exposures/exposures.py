@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import naming_memory
+from equipix._readonly import ReadOnly
 from equipix.defects import Findings
 
 if TYPE_CHECKING:
@@ -19,8 +20,10 @@ if TYPE_CHECKING:
 
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
+    from equipix.exposures.clipping import Clipping
     from equipix.exposures.flux import Flux
     from equipix.exposures.options import FitOptions
+    from equipix.exposures.orientation import Orientation
     from equipix.exposures.positions import Positions
     from equipix.noise import NoiseModel
 
@@ -29,8 +32,8 @@ _BLOCK = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Exposures:
-    """Exposures of one beam.
+class Exposures(ReadOnly):
+    """Exposures of one beam, as read-only arrays.
 
     Attributes
     ----------
@@ -50,9 +53,16 @@ class Exposures:
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
     findings : Findings
-        Bad pixels found before any fit.
+        Bad pixels found before the last fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
+    dark_variance : ndarray, shape (rows, cols), float64, or None
+        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are
+        without it. None where it is unknown, or where an offset is sought, which takes all of it.
+    clipped : Clipping or None
+        A saturation level that was not given, if the values show one.
+    raw : bool
+        Whether the values are averages of whole numbers from which no dark was subtracted.
     """
 
     values: Array
@@ -64,6 +74,9 @@ class Exposures:
     offset: bool = False
     findings: Findings = field(default_factory=Findings)
     dark: Array | None = None
+    dark_variance: Floats | None = None
+    clipped: Clipping | None = None
+    raw: bool = False
 
     def __len__(self) -> int:
         """Return the number of exposures."""
@@ -75,11 +88,11 @@ class Exposures:
         rows, cols = self.values.shape[1:]
         return rows, cols
 
-    def usable(self) -> Bools:
-        """Return which measurements may be used, shape (n, rows, cols)."""
-        usable: Bools = np.isfinite(self.values)
+    def usable(self, exposure: int | slice = slice(None)) -> Bools:
+        """Return which measurements may be used, of all exposures or of one."""
+        usable: Bools = np.isfinite(self.values[exposure])
         if self.mask is not None:
-            usable &= ~self.mask
+            usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
         return usable
 
     def weighted(self, variance: Array | None) -> Self:
@@ -89,6 +102,10 @@ class Exposures:
     def without(self, mask: Bools) -> Self:
         """Return the exposures without some measurements, besides those masked before."""
         return dataclasses.replace(self, mask=mask if self.mask is None else mask | self.mask)
+
+    def whole(self, std: Floats | None = None) -> Self:
+        """Return the exposures at the nearest whole shifts; `std` are errors of the shifts."""
+        return dataclasses.replace(self, positions=self.positions.whole(std))
 
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the exposures."""
@@ -121,11 +138,12 @@ class Exposures:
             mask=None if mask is None else np.ascontiguousarray(mask[part]),
             findings=Findings(),
             dark=None,
+            dark_variance=None,
         )
 
-    def reversed(self) -> Self:
-        """Return the exposures with all shifts of the other sign."""
-        return dataclasses.replace(self, positions=self.positions.reversed())
+    def oriented(self, orientation: Orientation) -> Self:
+        """Return the exposures with shifts and rotations in another orientation."""
+        return dataclasses.replace(self, positions=self.positions.oriented(orientation))
 
     def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
         """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
@@ -158,11 +176,23 @@ class Exposures:
     def residuals(self, fit: Fit, workers: int | None) -> Floats:
         """Return y − c · L(u) · M(p) − O(p), (n, rows, cols); NaN where nothing is predicted."""
         residuals = np.empty(self.values.shape)
-        for k, residual in enumerate(residuals):
-            np.subtract(self.values[k], self.light(fit, k, workers) * fit.sensitivity, out=residual)
-            if fit.offset is not None:
-                residual -= fit.offset
+        for k in range(len(self)):
+            residuals[k] = self.residual(fit, k, workers)
         return residuals
+
+    def residual(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
+        """Return y − c · L(u) · M(p) − O(p) of one exposure; NaN where nothing is predicted."""
+        residual = self.light(fit, exposure, workers)
+        residual *= fit.sensitivity
+        np.subtract(self.values[exposure], residual, out=residual)
+        if fit.offset is not None:
+            residual -= fit.offset
+        return residual
+
+    def deviation(self, exposure: int) -> Floats:
+        """Return the standard deviation of the values of an exposure; 1 where weights are equal."""
+        variance = 1.0 if self.variance is None else self.variance[exposure]
+        return np.asarray(np.sqrt(variance, dtype=np.float64))
 
     def weighted_squares(self, squares: Array) -> Floats:
         """Return squares over variances; NaN where nothing is measured."""
@@ -195,6 +225,7 @@ class Exposures:
             offset=self.offset,
             variance=self.variance,
             mask=self.mask,
+            unreliable=self.findings.contradictory,
             workers=options.workers,
             progress=options.progress,
         )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix._check import as_array, check_count, per_exposure
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Flux:
+class Flux(ReadOnly):
     """Relative flux c of each exposure.
 
     Attributes

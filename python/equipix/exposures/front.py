@@ -7,23 +7,25 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from equipix._check import as_array, as_floats, check_count, naming_memory, number
-from equipix.defects import Findings
+from equipix._check import as_array, as_floats, as_level, check_count, naming_memory
+from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged
+from equipix.exposures.clipping import Clipping, clipping, highest
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
+from equipix.exposures.nothing import refuse_nothing
 from equipix.exposures.positions import Positions
+from equipix.exposures.reach import check_reach
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
-from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array, Bools, FluxModel
+    from equipix._types import Array, Bools, Floats, FluxModel
 
 
 def exposures_of(
@@ -39,24 +41,19 @@ def exposures_of(
     rotation: ArrayLike | None = None,
     shift_std: ArrayLike | None = None,
     offset: bool = False,
-    whole: bool = False,
+    dark_variance: ArrayLike | None = None,
 ) -> Exposures:
-    """Check what the caller gave; the arguments are those of `equipix.calibrate`.
-
-    With `whole` the shifts are rounded to whole pixels, with a warning where that matters.
-    """
+    """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
         measured = measured_of(frames, variance, saturation)
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
-        return Exposures(
+        positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
+        rows, cols = measured.values.shape[1:]
+        check_reach(shifts, positions, (rows, cols))
+        exposures = Exposures(
             values=measured.values,
-            positions=Positions.of(
-                round_shifts(shifts) if whole else shifts,
-                rotation=rotation,
-                std=shift_std,
-                count=count,
-            ),
+            positions=positions,
             flux=Flux.of(flux, flux_std, time, count),
             mask=union(given, measured.mask),
             variance=measured.variance,
@@ -64,7 +61,35 @@ def exposures_of(
             offset=offset,
             findings=measured.findings,
             dark=measured.dark,
+            dark_variance=_of_dark(dark_variance, measured, offset=offset),
+            clipped=measured.clipped,
+            raw=measured.raw and not offset,
         )
+        refuse_nothing(exposures, given)
+        return exposures
+
+
+def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
+    """Variance of the dark that was subtracted from all, given or that of the averages."""
+    if given is not None and offset:
+        raise InputError(
+            "'dark_variance' is that of a dark that was subtracted, but 'dark' is 'fit': give one "
+            "of the two"
+        )
+    if offset:
+        return None
+    if given is None:
+        return measured.dark_variance
+    shape = measured.values.shape[1:]
+    variance = as_array("dark_variance", given, ndim=(0, 2)).astype(np.float64)
+    if variance.shape not in ((1,), shape):  # as_array makes one number an array of one
+        raise InputError(
+            f"'dark_variance' has shape {variance.shape}, expected {shape} or one number"
+        )
+    wrong = variance[~(np.isfinite(variance) & (variance >= 0))]
+    if wrong.size:
+        raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")
+    return np.array(np.broadcast_to(variance, shape))
 
 
 class Measured(NamedTuple):
@@ -76,6 +101,9 @@ class Measured(NamedTuple):
     models: Sequence[NoiseModel]
     findings: Findings
     dark: Array | None = None
+    dark_variance: Floats | None = None
+    clipped: Clipping | None = None
+    raw: bool = False
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -93,11 +121,6 @@ def measured_of(
     averaged = frames if isinstance(frames, Averaged) else _averaged(frames)
     if averaged is None:
         return _of_arrays(cast("ArrayLike", frames), variance, saturation)
-    if averaged is not frames and variance is None and averaged.noise is None:
-        raise InputError(
-            "'frames' are single frames, from which no noise can be estimated: give 'variance', or "
-            "the means alone for unit weights"
-        )
     return _of_averaged(averaged, variance, saturation)
 
 
@@ -119,7 +142,8 @@ def _of_averaged(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), averaged.values)
-    findings = averaged.findings(noise if isinstance(noise, NoiseModel) else None)
+    model = noise if isinstance(noise, NoiseModel) else None
+    findings = averaged.findings(model)
     dark = averaged.dark
     return Measured(
         averaged.values,
@@ -128,6 +152,9 @@ def _of_averaged(
         models,
         findings,
         None if dark is None else dark.mean.astype(averaged.values.dtype),
+        None if model is None else averaged.dark_variance(model),
+        averaged.clipped,
+        averaged.raw,
     )
 
 
@@ -146,11 +173,24 @@ def _of_arrays(
     variances = None
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), values)
-    if saturation is None:
-        return Measured(values, None, variances, models, Findings())
-    saturated = _saturated(values, saturation)
+    level = _largest(frames) if saturation is None else as_level(saturation)
+    if level is None:
+        clipped = highest(clipping(each) for each in values)
+        return Measured(values, None, variances, models, Findings(), clipped=clipped)
+    saturated = _saturated(values, level)
+    clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
+    if saturation is None and not saturated.any():
+        return Measured(values, None, variances, models, Findings(), clipped=clipped)
     findings = Findings(saturated=np.any(saturated, axis=0))
-    return Measured(values, saturated, variances, models, findings)
+    return Measured(values, saturated, variances, models, findings, clipped=clipped)
+
+
+def _largest(frames: ArrayLike) -> float | None:
+    """Largest value of arrays of whole numbers, which counts as saturated unless given."""
+    arrays = frames if isinstance(frames, list | tuple) else [frames]
+    dtypes = {getattr(each, "dtype", None) for each in arrays}
+    dtype = dtypes.pop() if len(dtypes) == 1 else None
+    return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
 
 
 def _averaged(frames: object) -> Averaged | None:
@@ -177,29 +217,25 @@ def as_models(variance: object, count: int) -> list[NoiseModel]:
     return models
 
 
-def _saturated(values: Array, saturation: float) -> Bools:
-    """Which values reach the level `saturation`."""
-    level = number("saturation", saturation)
-    if not level > 0:
-        raise InputError(f"'saturation' is {saturation!r}, expected a level above 0")
+def _saturated(values: Array, level: float) -> Bools:
+    """Which values reach the saturation level."""
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
-        if each.all():
-            raise InputError(
-                f"'frames': every pixel of exposure {k} reaches the 'saturation' level {level:g}: "
-                "expose less, or correct the level"
-            )
+        refuse_saturated(f"'frames': exposure {k}", values[k], each, level)
     return saturated
 
 
 def as_variances(variance: ArrayLike, values: Array) -> Array:
     """Variances in the shape and dtype that the solver takes."""
-    variances = as_array("variance", variance, ndim=(1, 3))
-    if variances.ndim == 1:
+    variances = as_array("variance", variance, ndim=(0, 1, 2, 3))
+    shape = np.shape(variance)  # as_array makes one number an array of one
+    if len(shape) == 1:
         check_count("variance", len(variances), len(values))
         return variances.astype(np.float64)
-    if variances.shape != values.shape:
-        raise InputError(f"'variance' has shape {variances.shape}, expected {values.shape}")
+    if shape != values.shape:
+        raise InputError(
+            f"'variance' has shape {shape}, expected {(len(values),)} or {values.shape}"
+        )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return variances.astype(values.dtype, copy=False)
 
@@ -214,7 +250,9 @@ def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
     """Mask of one exposure or of all, of frames of that shape."""
     array = as_array("mask", mask, ndim=(2, 3))
     if array.dtype != np.bool_:
-        raise InputError(f"'mask' has dtype {array.dtype}, expected bool: True = do not use")
+        raise InputError(
+            f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+        )
     if array.shape not in (shape[1:], shape):
         raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
     return array

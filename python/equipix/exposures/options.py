@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, get_args
 
+from equipix import _native
 from equipix._check import as_tolerance, check_progress, positive_count, positive_workers
 from equipix._types import Method
 from equipix.errors import InputError
@@ -38,6 +39,11 @@ class FitOptions:
     max_sweeps: int | None = None
     workers: int | None = None
     progress: Progress | None = None
+
+    @property
+    def whole_shifts(self) -> bool:
+        """Whether the method takes whole shifts alone, as the core decides."""
+        return _native.needs_whole_shifts(self.method)
 
     @classmethod
     def of(

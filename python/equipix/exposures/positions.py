@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, as_shifts, check_count, per_exposure
+from equipix._readonly import ReadOnly
 from equipix.errors import InputError
+from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from equipix._types import Array, Floats
+    from equipix.exposures.orientation import Orientation
+    from equipix.shifts import Rounding
 
 _TURNS = {
     0: ((1, 0), (0, 1)),
@@ -27,7 +31,7 @@ _TURNS = {
 }
 """A of each rotation, in degrees: the exposure is ``numpy.rot90(window, rotation / 90)``."""
 
-_WIDEST = 0.3
+WIDEST = 0.3
 """Largest prior standard deviation of a shift, in pixels: a fit moves it by less than a pixel."""
 
 _ROUNDING = 1e-6
@@ -38,7 +42,7 @@ _BEYOND = 2**31
 
 
 @dataclass(frozen=True, eq=False)
-class Positions:
+class Positions(ReadOnly):
     """Positions of the sensor in the beam: pixel p is at u = A p + t + d.
 
     Attributes
@@ -49,11 +53,14 @@ class Positions:
         How far the sensor is turned, in degrees: 0, 90, 180 or 270. It determines A and t.
     std : ndarray, shape (n, 2), float64, or None
         Prior standard deviations of the shifts, in pixels; None: the shifts are exact.
+    rounding : Rounding or None
+        The largest noticeable rounding, where the shifts were rounded to whole pixels.
     """
 
     shifts: Floats
     rotation: NDArray[np.int64]
     std: Floats | None = None
+    rounding: Rounding | None = None
 
     @classmethod
     def of(
@@ -78,9 +85,20 @@ class Positions:
         """Return the number of exposures."""
         return len(self.shifts)
 
-    def reversed(self) -> Self:
-        """Return the positions with all shifts of the other sign."""
-        return dataclasses.replace(self, shifts=-self.shifts)
+    def oriented(self, orientation: Orientation) -> Self:
+        """Return the positions with shifts and rotations in another orientation."""
+        std = self.std
+        return dataclasses.replace(
+            self,
+            shifts=orientation.shifts(self.shifts),
+            rotation=orientation.rotation(self.rotation),
+            std=std if std is None or not orientation.exchanged else std[:, ::-1],
+        )
+
+    def whole(self, std: ArrayLike | None = None) -> Self:
+        """Return the positions at the nearest whole shifts; `std` are errors of the shifts."""
+        shifts, rounding = round_shifts(self.shifts, std)
+        return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
         """Return the same exposures at other shifts, measured with standard deviations `std`."""
@@ -98,11 +116,13 @@ class Positions:
 
         The smallest corner is the origin, so that the padded grid of the part is small.
         """
-        corners = np.array(
-            [in_beam(first, turn, shape) - _offset(turn, sizes) for turn in self.rotation.tolist()]
-        )
-        shifts = self.shifts + corners
+        shifts = self.shifts + self.corners(first, sizes, shape)
         return dataclasses.replace(self, shifts=shifts - np.floor(shifts.min(axis=0)))
+
+    def corners(self, first: ArrayLike, sizes: ArrayLike, shape: tuple[int, int]) -> Floats:
+        """Return (n, 2): how far the shift of a part of the sensor is from that of the whole."""
+        turns = self.rotation.tolist()
+        return np.array([in_beam(first, turn, shape) - _offset(turn, sizes) for turn in turns])
 
 
 def in_beam(pixel: ArrayLike, rotation: int, shape: tuple[int, int]) -> Array:
@@ -142,9 +162,9 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> Floats:
     std = np.array(np.broadcast_to(array, (count, 2)), dtype=np.float64)
     if not (np.isfinite(std).all() and (std >= 0).all() and std.any()):
         raise InputError(f"'shift_std' is {std.tolist()}, expected pixels, not negative, not all 0")
-    if std.max() > _WIDEST:
+    if std.max() > WIDEST:
         raise InputError(
-            f"'shift_std' holds {std.max():g}, expected at most {_WIDEST}: shifts are refined "
+            f"'shift_std' holds {std.max():g}, expected at most {WIDEST}: shifts are refined "
             "within a pixel of where they were measured: measure them more accurately"
         )
     return std

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix.errors import FileError, InputError
 from equipix.io import tiff
+from equipix.io.images import frame_format
 from equipix.io.names import as_path
 from equipix.io.reading import reading
 from equipix.io.whole import write_whole
@@ -89,7 +91,9 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     path = as_path("path", path)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise InputError(f"'path' is {str(path)!r}, expected the suffix .tif or .npz")
+        raise InputError(
+            f"{path}: ends in '{path.suffix}', expected a .tif or .npz file that equipix has saved"
+        )
     with reading(path):
         pages, description = read(path)
     try:
@@ -99,6 +103,52 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
             f"{path}: holds neither a calibration nor frame statistics: equipix did not write it"
         ) from error
     return pages, metadata
+
+
+def kind_of(path: Path) -> str | None:
+    """Kind of content in a file that `save_pages` wrote, of which no array is read; else None.
+
+    Raises
+    ------
+    FileError
+        If the file is not readable.
+    """
+    read = _DESCRIPTIONS.get(path.suffix.lower())
+    if read is None:
+        return None
+    with reading(path):
+        description = read(path)
+    try:
+        content = json.loads(description)
+    except ValueError:
+        return None
+    kind = content.get("kind") if isinstance(content, dict) else None
+    return kind if isinstance(kind, str) else None
+
+
+def saved_kind(path: Path) -> str | None:
+    """Kind of content in a file that stands in the place of frames; None of other files.
+
+    Files of whole numbers, which cameras write, are not searched.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES or (suffix != ".npz" and frame_format(path)[1].kind != "f"):
+        return None
+    return kind_of(path)
+
+
+def refuse_saved(path: Path) -> None:
+    """Refuse a file that `save_pages` wrote where images are expected.
+
+    Raises
+    ------
+    FileError
+        With what the file holds.
+    """
+    kind = saved_kind(path)
+    if kind is not None:
+        article = "" if kind.endswith("s") else "a "
+        raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
 
 
 def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:
@@ -166,10 +216,23 @@ def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) 
         np.savez(file, allow_pickle=False, metadata=np.array(description), **pages)
 
 
+def _check_npz(path: Path) -> None:
+    """Refuse another kind of file before NumPy takes it for pickled objects."""
+    if not zipfile.is_zipfile(path):
+        raise FileError(f"{path}: is no .npz file, whatever its name says")
+
+
 def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    _check_npz(path)
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         pages = {name: file[name] for name in file.files}
     return pages, str(pages.pop("metadata", ""))
+
+
+def _description_of_npz(path: Path) -> str:
+    _check_npz(path)
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        return str(file["metadata"]) if "metadata" in file.files else ""
 
 
 SUFFIXES = (".tif", ".tiff", ".npz")
@@ -177,3 +240,8 @@ SUFFIXES = (".tif", ".tiff", ".npz")
 
 _WRITERS = {".tif": tiff.write_pages, ".tiff": tiff.write_pages, ".npz": _write_npz}
 _READERS = {".tif": tiff.read_pages, ".tiff": tiff.read_pages, ".npz": _read_npz}
+_DESCRIPTIONS = {
+    ".tif": tiff.description,
+    ".tiff": tiff.description,
+    ".npz": _description_of_npz,
+}

@@ -2,7 +2,7 @@
 
 from equipix.plan.budget import ErrorBudget, error_budget
 from equipix.plan.identifiability import Identifiability, identify
-from equipix.plan.order import advise_order, trend_told
+from equipix.plan.order import advise_order, distinct_trend
 from equipix.plan.search import Suggestion, suggest
 from equipix.plan.spectrum import Spectrum
 
@@ -12,8 +12,8 @@ __all__ = [
     "Spectrum",
     "Suggestion",
     "advise_order",
+    "distinct_trend",
     "error_budget",
     "identify",
     "suggest",
-    "trend_told",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,12 +10,12 @@ import numpy as np
 
 from equipix._check import as_shifts, check_shape, number, per_exposure
 from equipix.drift import tilt_rms, tilt_std
-from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError
+from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError, warn
 from equipix.plan.identifiability import identify, is_connected
 from equipix.plan.noise import factor, local_variance
-from equipix.plan.order import trend_told
+from equipix.plan.order import distinct_trend
 from equipix.plan.shift_errors import shift_error_effect
-from equipix.plan.spectrum import Spectrum, spectrum
+from equipix.plan.spectrum import Spectrum, smallest_near, spectrum
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,6 +23,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from equipix._types import Floats
+
+_WHOLE = 0.02
+"""Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
+
+_UNDETERMINED = 1e-4
+"""λ of a wave that shifts between pixels do not determine, as in a calibration's verdict."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,7 +53,7 @@ class ErrorBudget:
         ``"shift_error"``. That of noise is far smaller.
     spectrum : Spectrum
         λ(q) and its worst wave.
-    trend_told : float
+    distinct_trend : float
         Share of the variance of a linear trend of the lamp, with the exposures in this order,
         that is distinct from a tilt: see `advise_order`.
     components : int
@@ -61,7 +66,7 @@ class ErrorBudget:
     rms_by_cause: dict[str, float]
     tilt_by_cause: dict[str, tuple[float, float]]
     spectrum: Spectrum
-    trend_told: float
+    distinct_trend: float
     components: int
     _noise: _Noise
 
@@ -123,6 +128,8 @@ def error_budget(
         Rows and columns of the sensor.
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels; at least two.
+        Fractions of a pixel count for drift, errors of shifts and the spectrum; noise is that of
+        the nearest whole shifts, which a calibration between pixels has too.
     noise : float
         Standard deviation of the random noise of an exposure's mean, the same in every pixel, as
         a share of the signal in the middle of the beam at flux 1.
@@ -153,7 +160,8 @@ def error_budget(
     DriftWarning
         If the tilt that drift leaves exceeds the error from noise.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor uncompared.
+        If the shifts leave parts of the sensor uncompared, or, between pixels, do not constrain a
+        wave.
 
     Notes
     -----
@@ -182,7 +190,8 @@ def error_budget(
     if not (np.isfinite(powers).all() and (powers > 0).all()):
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
     positions = np.rint(exact - exact[0]).astype(np.int64) + np.rint(exact[0]).astype(np.int64)
-    components = _components(sizes, positions)
+    waves = spectrum(exact, powers)
+    components = _components(sizes, positions, _between_pixels(exact, waves))
     scale = noise**2 * factor(sizes, positions, powers)
     predicted = _Noise(sizes, positions, powers, beam_width, scale)
     drift_tilt = tilt_std(sizes, exact, drift)
@@ -204,8 +213,8 @@ def error_budget(
             "drift": (float(drift_tilt[0]), float(drift_tilt[1])),
             "shift_error": moved[1],
         },
-        spectrum=spectrum(exact, powers),
-        trend_told=trend_told(exact),
+        spectrum=waves,
+        distinct_trend=distinct_trend(exact),
         components=components,
         _noise=predicted,
     )
@@ -240,30 +249,48 @@ def _positive(name: str, value: float, *, zero: bool = False) -> None:
         raise InputError(f"'{name}' is {value!r}, expected a number above 0{' or 0' * zero}")
 
 
-def _components(shape: tuple[int, int], positions: NDArray[np.int64]) -> int:
+def _between_pixels(shifts: Floats, waves: Spectrum) -> bool:
+    """Whether shifts lie between pixels; warns if a wave is periodic in all of them.
+
+    Such shifts compare each pixel with parts of several cells, so no part of the sensor is
+    unconnected; but a wave of the same phase in all exposures is undetermined.
+    """
+    moves = shifts - shifts[0]
+    if np.abs(moves - np.rint(moves)).max() <= _WHOLE:
+        return False
+    if np.isfinite(waves.worst).all() and smallest_near(waves, shifts) < _UNDETERMINED:
+        row, col = waves.worst
+        warn(
+            f"the shifts do not constrain a wave of ({row:.3f}, {col:.3f}) cycles per pixel, which "
+            "has the same phase in all exposures: choose less regular shifts "
+            "(equipix.plan.suggest)",
+            IdentifiabilityWarning,
+        )
+    return True
+
+
+def _components(shape: tuple[int, int], positions: NDArray[np.int64], between: bool) -> int:
     """Count the components, and warn of more than one."""
     fits = np.all(np.abs(positions) < shape)
-    components = (
-        1 if fits and is_connected(shape, positions) else identify(shape, positions).components
-    )
-    if components > 1:
-        warnings.warn(
+    components = 1
+    if not (fits and (between or is_connected(shape, positions))):
+        components = identify(shape, positions).components
+    if components > 1 and not between:
+        warn(
             f"the shifts leave {components} parts of the sensor unconnected: the errors are those "
             "within a part: choose other shifts (equipix.plan.suggest)",
             IdentifiabilityWarning,
-            stacklevel=3,
         )
     return components
 
 
-def warn_of_drift(causes: dict[str, float]) -> None:
-    """Warn of a tilt from drift that exceeds the noise; shown where `error_budget` was called."""
+def warn_of_drift(causes: dict[str, float], place: str = "") -> None:
+    """Warn of a tilt from drift that exceeds the noise, of the pattern that `place` names."""
     if causes["drift"] > causes["noise"] > 0:
-        warnings.warn(
-            f"lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
+        warn(
+            f"{place}lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
             f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
             "residual: measure the flux, turn one exposure, or use larger shifts "
             "(equipix.plan.suggest)",
             DriftWarning,
-            stacklevel=3,
         )

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix import _native
-from equipix._check import as_shifts, check_shape, naming_memory, per_exposure
-from equipix.errors import InputError
+from equipix._check import as_shifts, check_shape, naming_memory
+from equipix.errors import InputError, ShiftRoundingWarning, warn
 from equipix.exposures.front import as_mask
+from equipix.exposures.positions import as_rotation
 from equipix.shifts import round_shifts
 
 if TYPE_CHECKING:
@@ -108,14 +109,19 @@ def identify(
     if len(exact) < 2:
         raise InputError(f"'shifts' holds {len(exact)} exposures, expected at least two")
     # A part of a pixel that all shifts have in common moves the grid of the beam along.
-    whole = round_shifts(exact - (exact[0] - np.rint(exact[0])))
+    whole, rounding = round_shifts(exact - (exact[0] - np.rint(exact[0])))
+    if rounding is not None:
+        given = rounding._replace(shift=exact[rounding.exposure].tolist())
+        first = np.round(exact[0], 3).tolist()
+        warn(
+            f"{given.words}, the first is {first}: choose shifts that differ by whole pixels",
+            ShiftRoundingWarning,
+        )
     masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
-    turns = per_exposure("rotation", rotation, len(whole), default=0)
-    if not np.all(np.isin(turns, (0, 90, 180, 270))):
-        raise InputError(f"'rotation' is {turns.tolist()}, expected 0, 90, 180 or 270 degrees")
+    turns = as_rotation(rotation, len(whole))
     with naming_memory("identifying"):
         labels, counts, seen = _native.planned_components(
-            sizes, whole, rotation=turns.astype(int).tolist(), mask=masked
+            sizes, whole, rotation=turns.tolist(), mask=masked
         )
     return Identifiability(
         components=len(counts),

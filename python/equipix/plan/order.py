@@ -22,7 +22,7 @@ _TIE = 12
 """Decimals beyond which shares of a trend differ by rounding only."""
 
 
-def trend_told(shifts: ArrayLike) -> float:
+def distinct_trend(shifts: ArrayLike) -> float:
     """Share of the variance of a linear trend of the lamp that is distinct from a tilt.
 
     Parameters
@@ -44,11 +44,11 @@ def trend_told(shifts: ArrayLike) -> float:
     Examples
     --------
     >>> from equipix import cross_pattern, plan
-    >>> print(f"{plan.trend_told(cross_pattern(11, 19)):.3f}")
+    >>> print(f"{plan.distinct_trend(cross_pattern(11, 19)):.3f}")
     0.035
     """
     positions = as_shifts(shifts)
-    return drift.trend_told(positions, np.arange(len(positions)))
+    return drift.distinct_trend(positions, np.arange(len(positions)))
 
 
 def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
@@ -77,7 +77,7 @@ def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
     >>> order = plan.advise_order(cross)
     >>> cross[order].tolist()
     [[0, 11], [19, 0], [0, 0], [0, 19], [11, 0]]
-    >>> print(f"{plan.trend_told(cross[order]):.3f}")
+    >>> print(f"{plan.distinct_trend(cross[order]):.3f}")
     0.996
     """
     positions = as_shifts(shifts)

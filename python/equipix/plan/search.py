@@ -33,6 +33,18 @@ _NEAR, _FAR, _TRIED = 32, 16, 4
 _GAIN = 1e-3
 """Least relative gain of a move."""
 
+_USUAL = 5
+"""Exposures of a pattern unless given: fewer leave no residual that shows a wrong one."""
+
+_NEAR_DISTANCES = np.array([(0, 0), (0, 11), (19, 0), (7, 5), (3, 17)])
+"""Positions a few pixels apart, at different distances."""
+
+_PERIODS = 8
+"""Waves of this many periods within the travel, and fewer, must be constrained."""
+
+_PERIODIC = 0.02
+"""λ of such a wave at which the predicted variance by noise counts twice."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Suggestion:
@@ -77,14 +89,13 @@ def suggest(
     shape : tuple of int
         Rows and columns of the sensor.
     exposures : int or None
-        How many exposures; None: as few as determine every pixel.
+        How many exposures; None: five, or fewer where the travel has fewer positions.
     max_shift : int or array_like of two
         Travel of the stage, in pixels, along both axes or (row, col): shifts are 0 to that. It is
         cut where the sensor is smaller.
     noise, drift, shift_error, beam_width : float
         As for `error_budget`, whose `rms` is what makes a pattern good. Unless given, drift is a
-        tenth of the noise, of which nothing warns; for the order of the patterns only such ratios
-        matter.
+        tenth of the noise; for the order of the patterns only such ratios matter.
     patterns : int
         How many patterns to return, at most.
     rng : numpy.random.Generator or int
@@ -105,14 +116,16 @@ def suggest(
     Warns
     -----
     DriftWarning
-        If even with the best pattern the tilt from the drift given exceeds the error from noise.
+        For each pattern of which the tilt from drift exceeds the error from noise.
 
     Notes
     -----
     The variance from noise falls with the mean of 1/λ(q) and rises with the number of beam cells;
-    the tilt from drift falls with the spread of the shifts: so good patterns have their positions
-    near the corners of the travel, but not so regularly that waves are nearly periodic in them.
-    From several starts, positions are moved one by one to where the predicted error is least.
+    the tilt from drift falls with the spread of the shifts. With all positions at the corners of
+    the travel, though, waves are nearly periodic in them and barely constrained, which counts as
+    noise too. So good patterns have some positions a few pixels apart, at different distances, and
+    others as far away as the travel allows. From several starts of this kind, positions are moved
+    one by one to where the predicted error is least.
 
     Examples
     --------
@@ -132,7 +145,8 @@ def suggest(
     lamp = noise / 10 if drift is None else drift
     score = _Score(sizes, travel, noise, lamp)
     if exposures is None:
-        counts = range(2, 6)
+        fewest = min(_USUAL, int(np.prod(travel + 1)))
+        counts = range(fewest, 1, -1)
     elif positive_count("exposures", exposures) == 1:
         raise InputError("'exposures' is 1, expected two or more: one compares no pixels")
     else:
@@ -172,8 +186,8 @@ def suggest(
             suggestions.append(Suggestion(shifts, budget))
             report(done, len(finalists), "judging patterns")
     suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
-    if drift is not None:
-        warn_of_drift(suggestions[0].budget.rms_by_cause)
+    for number, suggestion in enumerate(suggestions[:wanted], start=1):
+        warn_of_drift(suggestion.budget.rms_by_cause, f"pattern {number}: ")
     return suggestions[:wanted]
 
 
@@ -204,6 +218,7 @@ class _Score:
         # Points of a Kronecker sequence cover the half plane of waves evenly.
         steps = np.arange(1, _WAVES + 1)[:, None] * np.array([0.7548776662, 0.5698402910])
         waves = (steps % 1 - [0, 0.5]) * [np.pi, 2 * np.pi]
+        waves = np.concatenate([waves, _periods(travel)])
         self._phases = [
             np.exp(1j * np.outer(q, np.arange(most + 1))).astype(np.complex64)
             for q, most in zip(waves.T, travel, strict=True)
@@ -216,7 +231,11 @@ class _Score:
         patterns = np.concatenate([kept, places[:, None]], axis=1)
         spans = np.ptp(patterns, axis=1)
         rest = count / (count - self._cells(spans, count))
-        noise = self._noise**2 * self._mean_of_inverse(others, places) * (1 - 1 / count) * rest
+        visible = self._visible(others, places)
+        inverse = np.mean(1 / visible[:_WAVES], axis=0, dtype=np.float64)
+        if len(visible) > _WAVES:
+            inverse *= 1 + _PERIODIC / visible[_WAVES:].min(axis=0)
+        noise = self._noise**2 * inverse * (1 - 1 / count) * rest
         drift = tilt_rms(tilt_std(self._shape, patterns, self._drift))
         return np.asarray(np.sqrt(noise + drift**2))
 
@@ -225,24 +244,39 @@ class _Score:
         cells = np.prod((np.array(self._shape) + spans) / self._shape, axis=1)
         return np.asarray(np.minimum(cells, count * (1 - 1e-3)))
 
-    def _mean_of_inverse(self, others: Points, places: Points) -> Floats:
-        """Mean of 1/λ over the waves."""
+    def _visible(self, others: Points, places: Points) -> Floats:
+        """Return λ of the waves, of each pattern."""
         count = len(others) + 1
         sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
         visible = count - (sums.real**2 + sums.imag**2) / count
-        return np.asarray(np.mean(1 / np.maximum(visible, 1e-3), axis=0, dtype=np.float64))
+        return np.asarray(np.maximum(visible, 1e-3), dtype=np.float64)
 
     def _waves(self, places: Points) -> NDArray[np.complex64]:
         down, right = self._phases
         return np.asarray(down[:, places[:, 0]] * right[:, places[:, 1]])
 
 
+def _periods(travel: Points) -> Floats:
+    """Waves of a few periods within the travel, along and across it, that few positions repeat."""
+    largest = np.where(travel >= 4 * _PERIODS, _PERIODS, 0)
+    rows, cols = np.mgrid[0 : largest[0] + 1, -largest[1] : largest[1] + 1]
+    numbers = np.stack([rows.ravel(), cols.ravel()], axis=1)
+    numbers = numbers[(numbers[:, 0] > 0) | (numbers[:, 1] > 0)]
+    return np.asarray(2 * np.pi * numbers / np.maximum(travel, 1))
+
+
 def _starts(count: int, travel: Points, rng: np.random.Generator) -> list[Points]:
-    """Patterns to begin with: near the corners of the travel, and one that is surely connected."""
+    """Patterns to begin with: surely connected, a few pixels apart and far, near the corners."""
     nearest = np.array([(0, 0), (0, 1), (1, 0)])[:count]
     far = rng.integers(0, travel, (max(count - 3, 0), 2), endpoint=True)
     starts = [np.minimum(np.concatenate([nearest, far]), travel)]
-    for _ in range(_STARTS - 1):
+    for _ in range(_STARTS // 2):
+        near = _NEAR_DISTANCES[: max(count - 3, 3)][:count]
+        corners = rng.permutation([(1, 0), (0, 1), (1, 1)]) * travel
+        others = np.resize(corners, (max(count - len(near), 0), 2))
+        others = others - rng.integers(0, travel // 8 + 1, others.shape) * (others > 0)
+        starts.append(np.clip(np.concatenate([near, others]), 0, travel))
+    while len(starts) < _STARTS:
         corners = rng.permutation(count)[:, None] >> np.array([0, 1]) & 1
         inwards = np.abs(rng.normal(0, 0.08, (count, 2)))
         places = np.where(corners, 1 - inwards, inwards) * travel

@@ -10,6 +10,9 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+_FINER = 64
+"""Steps within one of the grid of frequencies, to each side, that the smallest λ is refined by."""
+
 _FREQUENCIES = 512
 """Between 0 and half a cycle per pixel: finer than the dips of patterns up to this many pixels."""
 
@@ -70,3 +73,17 @@ def spectrum(shifts: NDArray[Any], powers: NDArray[np.float64]) -> Spectrum:
         return Spectrum(rows, cols, values, (np.nan, np.nan), np.nan)
     worst = float(rows[row]), float(cols[col])
     return Spectrum(rows, cols, values, worst, float(values[row, col]))
+
+
+def smallest_near(found: Spectrum, shifts: NDArray[Any]) -> float:
+    """Refine the smallest λ between the frequencies of the spectrum, for fluxes of 1.
+
+    Shifts between pixels may make a wave periodic whose frequency is none of the grid's.
+    """
+    steps = np.linspace(-1, 1, 2 * _FINER + 1) / (2 * _FREQUENCIES)
+    down, right = (
+        np.exp(2j * np.pi * np.outer(steps + middle, along))
+        for middle, along in zip(found.worst, shifts.T, strict=True)
+    )
+    count = len(shifts)
+    return float((count - np.abs(down @ right.T) ** 2 / count).min())

@@ -1,6 +1,6 @@
 """Centroid of a spot in its plainest form: NumPy, whole arrays, no speed.
 
-The method is told in the docs of the compiled core's module ``centroid``; the steps here bear the
+The docs of the compiled core's module ``centroid`` describe the method; the steps here bear the
 same names and stand in the same order.
 """
 
@@ -57,6 +57,7 @@ def locate(frames: ArrayLike, *, saturation: float | None = None) -> Spot:
         saturation = np.iinfo(raw.dtype).max if raw.dtype.kind in "iu" else np.inf
     stack = raw.astype(np.float64)
     stack = stack[np.newaxis] if stack.ndim == 2 else stack
+    stack = without_hot(stack, saturation, whole=raw.dtype.kind in "iu")
     mean = stack.sum(axis=0) / len(stack)
     window, level, departure = find_window(mean)
     patch = widen(window, max(3, 3 * min(window[1] - window[0], window[3] - window[2]) // 8))
@@ -81,6 +82,44 @@ def locate(frames: ArrayLike, *, saturation: float | None = None) -> Spot:
     centroid, std = moments(rows, cols, basis, signal, variance, inside, ring)
     centre = np.array([window[0] + window[1] - 1, window[2] + window[3] - 1]) / 2
     return Spot(centre + centroid, std)
+
+
+def without_hot(stack: Image, level: float, *, whole: bool) -> Image:
+    """Isolated pixels that saturate in every frame, darker light around them, replaced."""
+    ever, mean = np.any(stack >= level, axis=0), stack.mean(axis=0)
+    base = np.median(mean)
+    hot = []
+    for row, col in np.argwhere(ever).tolist():
+        inside = 2 <= row < ever.shape[0] - 2 and 2 <= col < ever.shape[1] - 2
+        if not inside or ever[row - 1 : row + 2, col - 1 : col + 2].sum() > 1 or base >= level:
+            continue
+        light = base + light_around(mean - base, row, col, 0.01 * (level - base))
+        if light < 0.9 * level and np.all(stack[:, row, col] >= level):
+            hot.append((row, col))
+    result = stack.copy()
+    for image, values in zip(result, stack, strict=True):
+        good = np.ones(values.shape, dtype=bool)
+        for place in hot:
+            good[place] = False
+        floor = 0.01 * float(np.ptp(values[good])) + float(np.finfo(np.float32).tiny)
+        for row, col in hot:
+            light = np.median(values) + light_around(values - np.median(values), row, col, floor)
+            image[row, col] = np.rint(light) if whole else light
+    return result
+
+
+def light_around(signal: Image, row: int, col: int, floor: float) -> float:
+    """Cubic interpolation along the direction in which ln of the light changes least."""
+    found = []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        far, near, after, beyond = (signal[row + k * down, col + k * right] for k in (-2, -1, 1, 2))
+        logs = np.log(np.maximum([far, near, after, beyond], floor))
+        change = abs(logs[2] - logs[1]) + abs(logs[3] - logs[0])
+        value = (4 * (near + after) - (far + beyond)) / 6
+        if min(far, near, after, beyond) > 2 * floor:
+            value = np.exp((4 * (logs[1] + logs[2]) - (logs[0] + logs[3])) / 6)
+        found.append((change, value))
+    return float(min(found, key=lambda each: each[0])[1])
 
 
 def moments(

@@ -36,7 +36,7 @@ class JointSolution:
     dark : ndarray, shape (rows, cols)
         The offset O; 0 unless it was sought.
     beam : ndarray, shape of the grid
-        L at the cells; NaN where it is not told.
+        L at the cells; NaN where it is undetermined.
     beam_origin : tuple of int
         Cell that pixel (0, 0) of the unrotated sensor sees at shift 0.
     flux : ndarray, shape (n,)
@@ -165,11 +165,11 @@ def joint(
         matrix[len(root) + len(rough) :, ends[2] :] = priors
         wanted = [root * residual, -rough @ beam, -priors @ x[ends[2] :]]
         history.append(sum(float(part @ part) for part in wanted))
-        told = np.any(matrix != 0, axis=0)
-        change = np.linalg.lstsq(matrix[:, told], np.concatenate(wanted), rcond=1e-12)[0]
-        x[told] += change
-        # Of M alone: cells that hardly anything tells go on by rounding.
-        if np.abs(change[: np.sum(told[:pixels])]).max() < 1e-12 * np.abs(x[:pixels]).max():
+        determined = np.any(matrix != 0, axis=0)
+        change = np.linalg.lstsq(matrix[:, determined], np.concatenate(wanted), rcond=1e-12)[0]
+        x[determined] += change
+        # Of M alone: cells that hardly anything determines go on by rounding.
+        if np.abs(change[: np.sum(determined[:pixels])]).max() < 1e-12 * np.abs(x[:pixels]).max():
             break
 
     sensitivity, offset, beam, theta, zeta = np.split(x, ends[:-1])
@@ -189,7 +189,7 @@ def joint(
     # Measurements and priors scatter by 1 in these units; so does the penalty, which leaves open
     # what it alone decides.
     response = np.zeros(matrix.T.shape)
-    response[told] = np.linalg.pinv(matrix[:, told], rcond=1e-12)
+    response[determined] = np.linalg.pinv(matrix[:, determined], rcond=1e-12)
     of_gain, of_dark, _, _, of_zeta = np.split(response, ends[:-1])
     if open_ways.size:
         # The gauge takes the slope out of a change of ln M.
@@ -233,7 +233,7 @@ def _flux_columns(
     """T of ln c = ln c₀ + T·θ, and in which directions a tilt of ln M hides what T leaves out.
 
     M → M·exp(b·p), L → L·exp(−b·u) and ln c → ln c + b·d changes no measurement, unless exposures
-    are turned against each other: then only a factor between L and c is not told.
+    are turned against each other: then only a factor between L and c is undetermined.
     """
     count = len(shifts)
     if flux_std is not None:
@@ -247,8 +247,8 @@ def _flux_columns(
         return left[:, np.sum(sizes > 1e-9 * sizes[0]) :], open_ways
     if isinstance(flux, str):
         times = np.asarray(time, float)
-        told = times - hidden @ np.linalg.lstsq(hidden, times)[0]
-        if np.linalg.norm(told) > 1e-9 * np.linalg.norm(times):
+        distinct = times - hidden @ np.linalg.lstsq(hidden, times)[0]
+        if np.linalg.norm(distinct) > 1e-9 * np.linalg.norm(times):
             return (times - times.mean())[:, None] / np.ptp(times), np.empty((0, 2))
         growth = np.linalg.lstsq(shifts - shifts.mean(axis=0), times)[0]
         return np.empty((count, 0)), (growth / np.linalg.norm(growth))[None]

@@ -55,7 +55,7 @@ mod surface;
 use self::detect::{BLOCKS, Detection, RIM};
 use self::patch::Patch;
 use self::region::Region;
-use self::surface::{Point, Surface, Terms, dot, solve, terms};
+use self::surface::{Point, Surface, Terms, dot, solve_by_elimination, terms};
 use crate::control::Control;
 use crate::error::{Error, Result, SpotProblem};
 use crate::frames::{Sample, Shape, Stack};
@@ -236,7 +236,7 @@ impl Aperture {
             sum += arm * arm * variance[index];
             lever.iter_mut().zip(self.pixels[index].terms).for_each(|(h, term)| *h += arm * term);
         }
-        let through = solve(&self.surface.normal, lever);
+        let through = solve_by_elimination(&self.surface.normal, lever);
         for (index, _) in ring.zip(&self.surface.kept).filter(|(_, kept)| **kept) {
             sum += dot(&through, &self.pixels[index].terms).powi(2) * variance[index];
         }

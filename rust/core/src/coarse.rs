@@ -14,8 +14,16 @@
 
 mod hats;
 mod matrix;
+mod modulated;
+mod modulated_kernel;
+mod modulated_matrix;
 mod spacing;
+mod spectrum;
 
 pub(crate) use hats::Hats;
-pub(crate) use matrix::{Arm, Coarse};
-pub(crate) use spacing::{DAMPING, bytes_needed, spacing};
+pub(crate) use matrix::{Coarse, Entry};
+pub(crate) use modulated::Modulated;
+pub(crate) use modulated_kernel::Value;
+pub(crate) use modulated_matrix::{SeenWave, Spot};
+pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
+pub(crate) use spectrum::{Complex, MOST_WAVES, Symbol, barely_constrained, times};

@@ -6,6 +6,7 @@
 //! sees, so it has no edge and joins nothing; nor has a pixel in the dark.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use crate::control::Control;
 use crate::error::Result;
@@ -241,6 +242,67 @@ impl Edges {
         let sizes: Vec<usize> = order.iter().map(|&root| sizes[root] as usize).collect();
         let seen = sizes.iter().sum();
         Ok(Components { pixels: labels, cells, sizes, seen })
+    }
+}
+
+/// Stretches of rows whose pixels, or cells, are known to be of one component: one a row, so that most
+/// measurements of rows that hang together are seen at once.
+pub(crate) struct Stretches {
+    sensor: Shape,
+    beam: Shape,
+    pixels: Vec<Option<Range<usize>>>,
+    cells: Vec<Option<Range<usize>>>,
+}
+
+impl Stretches {
+    /// None yet.
+    pub(crate) fn new(sensor: Shape, beam: Shape) -> Self {
+        Self { sensor, beam, pixels: vec![None; sensor.rows], cells: vec![None; beam.rows] }
+    }
+
+    /// Makes one component of pixels side by side in a row and of cells side by side in some rows.
+    pub(crate) fn join(
+        &mut self,
+        edges: &mut Edges,
+        row: usize,
+        pixels: Range<usize>,
+        rows: Range<usize>,
+        cells: Range<usize>,
+    ) {
+        let first = row * self.sensor.cols;
+        let pixel = first + pixels.start;
+        join_stretch(edges, &mut self.pixels[row], first, pixels);
+        for row in rows {
+            let first = edges.pixels + row * self.beam.cols;
+            let cell = first + cells.start;
+            join_stretch(edges, &mut self.cells[row], first, cells.clone());
+            edges.sets.union(pixel, cell);
+        }
+    }
+}
+
+/// Joins the nodes of a row, which begins at `first`, in these columns; `known` are joined already.
+fn join_stretch(
+    edges: &mut Edges,
+    known: &mut Option<Range<usize>>,
+    first: usize,
+    columns: Range<usize>,
+) {
+    let meets = |known: &&mut Range<usize>| columns.start < known.end && known.start < columns.end;
+    let met = known.as_mut().filter(meets);
+    let inside = met.as_deref().map_or(columns.start..columns.start, Range::clone);
+    for col in (columns.start..inside.start).chain(inside.end..columns.end) {
+        edges.sets.union(first + columns.start, first + col);
+        edges.used[first + col] = true;
+    }
+    match met {
+        Some(known) => {
+            edges.sets.union(first + columns.start, first + known.start);
+            *known = known.start.min(columns.start)..known.end.max(columns.end);
+        }
+        None => {
+            known.get_or_insert(columns);
+        }
     }
 }
 

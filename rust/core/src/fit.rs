@@ -5,13 +5,14 @@ use crate::connectivity::Components;
 use crate::control::Control;
 use crate::convergence::History;
 use crate::error::{Error, Result};
-use crate::exposures::{Exposures, Stretch};
+use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::Rotation;
+use crate::information;
 use crate::parallel::Workers;
 
 /// What became of shifts that were to be refined.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Refinement {
     /// They were not to be.
     None,
@@ -19,8 +20,27 @@ pub enum Refinement {
     NotTried,
     /// The beam has too little structure to determine them: they are as given.
     Undetermined,
+    /// They are refined along this direction (row, column) of length 1 alone.
+    Along([f64; 2]),
     /// They are refined.
     Done,
+}
+
+impl Refinement {
+    /// Whether they are refined, if along one direction alone.
+    #[must_use]
+    pub const fn is_done(self) -> bool {
+        matches!(self, Self::Along(_) | Self::Done)
+    }
+
+    /// The direction along which alone they are refined.
+    #[must_use]
+    pub const fn along(self) -> Option<[f64; 2]> {
+        match self {
+            Self::Along(direction) => Some(direction),
+            _ => None,
+        }
+    }
 }
 
 /// A calibrated sensor.
@@ -63,10 +83,11 @@ impl Fit {
     pub fn solution(&self) -> Solution<'_> {
         Solution {
             sensitivity: &self.sensitivity,
+            flags: &self.flags,
             beam: self.beam.view(),
             flux: &self.flux,
             shifts: &self.shifts,
-            refined: self.refinement == Refinement::Done,
+            refinement: self.refinement,
             joint: self.is_joint(),
             unit: self.unit(),
         }
@@ -131,14 +152,16 @@ impl Fit {
 pub struct Solution<'s> {
     /// M in the gauge mean(M) = 1, row by row; NaN where undetermined.
     pub sensitivity: &'s [f64],
+    /// Bits of [`flag`](crate::frames::flag) for each pixel.
+    pub flags: &'s [u32],
     /// The beam L.
     pub beam: Beam<&'s [f64]>,
     /// The flux c of each exposure.
     pub flux: &'s [f64],
     /// The shifts as found.
     pub shifts: &'s [[f64; 2]],
-    /// Whether they were refined.
-    pub refined: bool,
+    /// What became of those that were to be refined.
+    pub refinement: Refinement,
     /// Whether it is that of a joint fit.
     pub joint: bool,
     /// The variance of a measurement of weight 1.
@@ -152,6 +175,7 @@ impl Solution<'_> {
         if self.flux.len() == count
             && self.shifts.len() == count
             && self.sensitivity.len() == pixels
+            && self.flags.len() == pixels
         {
             return Ok(());
         }
@@ -175,40 +199,8 @@ impl Solution<'_> {
         control: &Control,
     ) -> Result<Vec<f64>> {
         self.check(exposures)?;
-        let (sensor, cols) = (exposures.sensor(), exposures.sensor().cols);
-        let mut information = workers.filled(sensor.len(), 0.0, control);
-        for (k, rotation) in exposures.positions().rotations.iter().enumerate() {
-            control.check()?;
-            let light = self.beam.light(self.shifts[k], *rotation, sensor, workers);
-            workers.map_blocks(&mut information, cols, |row, sums| {
-                let light = &light[row * cols..][..cols];
-                add_information(exposures, k, [row, 0], self.flux[k], light, sums);
-            });
-        }
-        control.check()?;
-        Ok(information)
-    }
-}
-
-/// Adds w c² L² of the measurements of exposure `k` from a pixel on along its row, of light L.
-pub(crate) fn add_information<T: Real>(
-    exposures: &Exposures<'_, T>,
-    k: usize,
-    [row, col]: [usize; 2],
-    flux: f64,
-    light: &[f64],
-    sums: &mut [f64],
-) {
-    let mut scratch = vec![0.0; light.len()];
-    let weight = match exposures.stretch(k, row, col..col + light.len(), &mut scratch) {
-        Stretch::Uniform(_, weight) => Some(weight),
-        Stretch::Weighted(..) => None,
-    };
-    for (i, (sum, light)) in sums.iter_mut().zip(light).enumerate() {
-        let (weight, light) = (weight.unwrap_or(scratch[i]), flux * light);
-        // Light that is not known has no number, and a measurement that is not used no weight.
-        if weight > 0.0 && light.is_finite() {
-            *sum += weight * light * light;
-        }
+        let (sensor, rotations) = (exposures.sensor(), &exposures.positions().rotations);
+        let light = |k: usize| self.beam.light(self.shifts[k], rotations[k], sensor, workers);
+        information::of_sensor(exposures, self.flux, light, workers, control)
     }
 }

@@ -5,15 +5,20 @@
 //! M → M·exp(α·p),   L → L·exp(β·u),   ln c_k → ln c_k − β·d_k,   β = −A α   with free fluxes
 //! ```
 //!
-//! The mean of M is 1 in each component, the mean of ln c is 0, and the least-squares slope of ln M is
-//! 0 along the directions in the beam that free fluxes leave open.
+//! The mean of M is 1 in each component, the mean of ln c is 0, and the least-squares slope of ln M over
+//! [`slope_pixels`] is 0 along the directions in the beam that free fluxes leave open.
 
 use crate::connectivity::Components;
 use crate::fit::Fit;
-use crate::frames::Shape;
+use crate::frames::{Shape, flag};
 use crate::geometry::Rotation;
 use crate::linalg::inverse;
 use crate::parallel::Workers;
+
+/// Upper limit on rounds of selecting the pixels of the slope and removing it. Few pixels are close to a
+/// limit of the range, so two or three rounds are usual. Pixels that a tilt moves to and fro across a limit
+/// may leave no set that is its own result: then a slope of their size remains.
+const MOST_ROUNDS: usize = 20;
 
 /// Brings M to mean 1, each component for itself, and M to NaN outside the largest, L to NaN outside
 /// all. The pixels `left_out` are not in the means unless nothing else is there.
@@ -40,31 +45,56 @@ pub(crate) fn fix_means(fit: &mut Fit, left_out: &[usize], workers: &Workers) {
     }
 }
 
-/// Gives L the slope `drift` that a lamp's drift has in the beam, brings the mean of ln c to 0, and the
-/// slope of ln M, least squares over the ordinary pixels of the largest component, along the
-/// directions in the beam that the fluxes leave `open`.
-pub(crate) fn fix_fluxes(
-    fit: &mut Fit,
-    drift: [f64; 2],
-    open: &[[f64; 2]],
-    rotation: Rotation,
-    sensor: Shape,
-) {
-    untilt(fit, rotation.in_sensor(drift), rotation, sensor);
+/// What fitted fluxes leave to the gauge.
+pub(crate) struct FluxGauge {
+    /// The slope of ln L that a lamp's drift has in the beam.
+    pub(crate) drift: [f64; 2],
+    /// The directions in the beam along which a tilt is left undetermined.
+    pub(crate) open: Vec<[f64; 2]>,
+    /// How the sensor was turned in the first exposure.
+    pub(crate) rotation: Rotation,
+    pub(crate) sensor: Shape,
+}
+
+/// Gives L the slope of the drift, brings the mean of ln c to 0, and the slope of ln M to 0 along the open
+/// directions; needs the flags.
+pub(crate) fn fix_fluxes(fit: &mut Fit, gauge: &FluxGauge) {
+    let FluxGauge { drift, open, rotation, sensor } = gauge;
+    untilt(fit, rotation.in_sensor(*drift), *rotation, *sensor);
     if !open.is_empty() {
-        let slope = slopes(&fit.sensitivity, &fit.components.pixels, sensor).map(|weights| {
-            let pixels = weights.iter().zip(&fit.sensitivity).filter(|(w, _)| **w != 0.0);
-            pixels.map(|(weight, m)| weight * m.ln()).sum::<f64>()
-        });
-        for direction in open.iter().map(|direction| rotation.in_sensor(*direction)) {
-            let along = direction[0] * slope[0] + direction[1] * slope[1];
-            untilt(fit, direction.map(|part| along * part), rotation, sensor);
-        }
+        level(fit, gauge);
     }
     let mean = fit.flux.iter().map(|c| c.ln()).sum::<f64>() / fit.flux.len() as f64;
     fit.flux.iter_mut().for_each(|c| *c /= mean.exp());
     let coefficients = fit.beam.coefficients.iter_mut().flatten();
     fit.beam.values.iter_mut().chain(coefficients).for_each(|value| *value *= mean.exp());
+}
+
+/// Brings the slope of ln M to 0 along the open directions. Removing it changes which pixels are within the
+/// range of [`slope_pixels`], so both are repeated until the pixels are those of the result.
+fn level(fit: &mut Fit, gauge: &FluxGauge) {
+    let FluxGauge { open, rotation, sensor, .. } = gauge;
+    let mut before = Vec::new();
+    for _ in 0..MOST_ROUNDS {
+        let counted = slope_pixels(&fit.sensitivity, &fit.flags);
+        if counted == before {
+            return;
+        }
+        let slope = slope(&fit.sensitivity, &counted, *sensor);
+        for direction in open.iter().map(|direction| rotation.in_sensor(*direction)) {
+            let along = direction[0] * slope[0] + direction[1] * slope[1];
+            untilt(fit, direction.map(|part| along * part), *rotation, *sensor);
+        }
+        before = counted;
+    }
+}
+
+/// The least-squares slope of ln M along rows and columns, a pixel, over the pixels that are `counted`.
+fn slope(sensitivity: &[f64], counted: &[bool], sensor: Shape) -> [f64; 2] {
+    slopes(counted, sensor).map(|weights| {
+        let pixels = weights.iter().zip(sensitivity).filter(|(w, _)| **w != 0.0);
+        pixels.map(|(weight, m)| weight * m.ln()).sum()
+    })
 }
 
 /// M → M·exp(−slope·p) and all that goes with it.
@@ -100,16 +130,25 @@ fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
     }
 }
 
-/// Weights whose sums with ln M are its least-squares slopes along rows and columns, a pixel, over
-/// the pixels of label 0 from half to twice the mean: the logarithm of a dead one would weigh more
-/// than all others of its row.
-pub(crate) fn slopes(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [Vec<f64>; 2] {
-    let counted = || sensitivity.iter().zip(labels).filter(|(_, label)| **label == 0);
+/// Which pixels count for the slope of ln M: M is determined, its measurements carry weight, and it is
+/// from half to twice the mean of such: the logarithm of a dead one would weigh more than all others of
+/// its row.
+#[must_use]
+pub fn slope_pixels(sensitivity: &[f64], flags: &[u32]) -> Vec<bool> {
+    let unreliable = flag::NO_FLAT_FIELD | flag::UNRELIABLE_FLAT;
+    let pixels = || sensitivity.iter().zip(flags);
+    let reliable = |(m, flags): &(&f64, &u32)| m.is_finite() && **flags & unreliable == 0;
+    let counted = || pixels().filter(reliable);
     let mean = counted().map(|(m, _)| m).sum::<f64>() / counted().count() as f64;
     let ordinary = 0.5 * mean..2.0 * mean;
-    let counts = |pixel: usize| labels[pixel] == 0 && ordinary.contains(&sensitivity[pixel]);
+    pixels().map(|pixel| reliable(&pixel) && ordinary.contains(pixel.0)).collect()
+}
+
+/// Weights whose sums with ln M are its least-squares slopes along rows and columns, a pixel, over the
+/// pixels that are `counted`.
+pub(crate) fn slopes(counted: &[bool], sensor: Shape) -> [Vec<f64>; 2] {
     let place = |pixel: usize| [(pixel / sensor.cols) as f64, (pixel % sensor.cols) as f64];
-    let pixels = || (0..sensitivity.len()).filter(|&pixel| counts(pixel)).map(place);
+    let pixels = || (0..counted.len()).filter(|&pixel| counted[pixel]).map(place);
     let sum = pixels().fold([0.0; 3], |s, [row, col]| [s[0] + row, s[1] + col, s[2] + 1.0]);
     let mean = [sum[0] / sum[2], sum[1] / sum[2]];
     let from_mean = |[row, col]: [f64; 2]| [row - mean[0], col - mean[1]];
@@ -119,9 +158,9 @@ pub(crate) fn slopes(sensitivity: &[f64], labels: &[i32], sensor: Shape) -> [Vec
     let inverse = inverse([rr, rc, cc]);
     let weight = |pixel: usize, [of_row, of_col]: [f64; 2]| {
         let [r, c] = from_mean(place(pixel));
-        if counts(pixel) { of_row * r + of_col * c } else { 0.0 }
+        if counted[pixel] { of_row * r + of_col * c } else { 0.0 }
     };
-    inverse.map(|axis| (0..sensitivity.len()).map(|pixel| weight(pixel, axis)).collect())
+    inverse.map(|axis| (0..counted.len()).map(|pixel| weight(pixel, axis)).collect())
 }
 
 /// Replaces each value by `scaled(value, label)`.

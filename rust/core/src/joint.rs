@@ -8,41 +8,48 @@
 //! L is a spline of coefficients a where shifts are no whole numbers (`layout.rs`), so its part of the
 //! normal matrix is banded while that of M stays diagonal. Hence M is eliminated, not L as in `reduced`,
 //! and Gauss-Newton steps are taken in (a, ln c, d) (`system.rs`), by conjugate gradients in double
-//! precision (`search.rs`) with a preconditioner on two scales (`preconditioner.rs`). The penalty
+//! precision (`conjugate_gradients.rs`) with a preconditioner on two scales (`preconditioner.rs`). The penalty
 //! (`penalty.rs`) is slight: τ is 1e-5 of the mean weight of a cell. A product is one pass over the
 //! pixels (`pass.rs`).
 
 mod bands;
+mod conjugate_gradients;
 mod first_beam;
 mod flux;
 mod freedom;
+mod fused;
+mod fused_kernel;
 mod kernel;
 mod layout;
 mod memory;
 mod outcome;
 mod pass;
 mod penalty;
+mod pixels;
 mod preconditioner;
 mod rim;
-mod room;
-mod search;
+mod shift_information;
 mod survey;
 mod system;
 #[cfg(test)]
 mod tests;
+mod tiles;
 mod unknowns;
+mod waves;
 mod wide;
+mod workspace;
 
+pub(crate) use conjugate_gradients::ConjugateGradients;
 pub(crate) use first_beam::{Source, first_beam};
 pub(crate) use flux::Fluxes;
-pub(crate) use kernel::{Follow, Row};
+pub(crate) use kernel::{Propagate, Row};
 pub(crate) use layout::Grid;
 pub(crate) use memory::{bytes_needed, bytes_needed_by_covariance};
 pub(crate) use outcome::{coefficients, components, freedom, unknowns, values_at_cells};
 pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
-pub(crate) use room::Room;
-pub(crate) use search::Search;
+pub(crate) use shift_information::Directions;
 pub(crate) use system::System;
 pub(crate) use unknowns::{ShiftPrior, State};
+pub(crate) use workspace::Workspace;

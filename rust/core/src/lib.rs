@@ -126,6 +126,7 @@
 //! ritz            the smallest Ritz value, from conjugate gradients
 //! beam            the light that a sensor sees of the beam from any position
 //! connectivity    what the measurements can compare; connected pixels
+//! information     the information D = Σ w c² L² of each pixel on M: its inverse variance with a known beam
 //! exposures       measurements, weights, positions, fluxes; the one check of their values
 //! padded          images as rows of one width, with zeros around
 //! geometry        shifts, rotations, the padded grid of the beam, the taps of its spline
@@ -187,6 +188,7 @@ pub mod fit;
 pub mod frames;
 mod gauge;
 pub mod geometry;
+mod information;
 #[cfg(feature = "io")]
 pub mod io;
 mod joint;
@@ -204,6 +206,8 @@ mod ritz;
 pub mod solve;
 pub mod statistics;
 pub mod sweep;
+#[cfg(test)]
+mod testing;
 pub mod uncertainty;
 
 pub use beam::Beam;
@@ -213,6 +217,7 @@ pub use error::{Error, Result};
 pub use exposures::{Checked, Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
 pub use fit::{Fit, Refinement, Solution};
 pub use frames::{Real, Shape, Stack};
+pub use gauge::slope_pixels;
 pub use geometry::Rotation;
 pub use joint::SMOOTHING;
 pub use parallel::Workers;

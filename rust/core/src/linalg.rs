@@ -25,8 +25,8 @@ impl Cholesky {
         Some(Self { factor })
     }
 
-    /// Replaces the right-hand side by the solution.
-    pub(crate) fn solve(&self, right: &mut [f64]) {
+    /// Replaces the right-hand side by the solution: forward and back substitution.
+    pub(crate) fn substitute(&self, right: &mut [f64]) {
         self.factor.solve_in_place(ColMut::from_slice_mut(right));
     }
 }
@@ -59,7 +59,7 @@ mod tests {
         let entries: Vec<_> = diagonal.chain(coupling).collect();
         let mut x = vec![0.0; order as usize];
         x[order as usize - 1] = 1.0;
-        Cholesky::new(order as usize, &entries).unwrap().solve(&mut x);
+        Cholesky::new(order as usize, &entries).unwrap().substitute(&mut x);
         // The condition is some order², so as many roundings.
         for (index, x) in x.iter().enumerate() {
             assert!((x - (index + 1) as f64).abs() < 2500.0 * 50.0 * f64::EPSILON);

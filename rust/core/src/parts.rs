@@ -21,7 +21,7 @@ pub struct Parts<'m, 'a, T> {
 }
 
 impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
-    /// Room for it.
+    /// Its buffers.
     pub fn new(exposures: &'m Exposures<'a, T>, workers: &'m Workers) -> Self {
         let control = Control::new();
         let reduced = Reduced::new(exposures, workers, &control);

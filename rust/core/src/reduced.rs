@@ -18,15 +18,17 @@
 //! makes good what the one before left by rounding (iterative refinement).
 
 mod blocks;
+mod conjugate_gradients;
+mod dark;
+mod dark_noise;
 mod kernel;
 mod noise;
 mod operator;
-mod search;
 mod smallest;
 mod two_level;
 mod two_level_kernel;
 
-pub(crate) use operator::{Reduced, Scale};
-pub(crate) use search::{Search, bytes_needed};
+pub(crate) use conjugate_gradients::{ConjugateGradients, bytes_needed};
+pub(crate) use operator::{Draw, Reduced, Scale};
 pub(crate) use smallest::Smallest;
 pub(crate) use two_level::TwoLevel;

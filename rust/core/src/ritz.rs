@@ -52,9 +52,57 @@ impl Ritz {
     }
 }
 
+/// The smallest Ritz value of all searches so far, after each of their iterations.
+#[derive(Clone, Debug)]
+pub(crate) struct Lowest {
+    values: Vec<f64>,
+}
+
+impl Default for Lowest {
+    fn default() -> Self {
+        Self::new(1.0)
+    }
+}
+
+impl Lowest {
+    /// Before any iteration, with an eigenvalue that is known.
+    pub(crate) fn new(known: f64) -> Self {
+        Self { values: vec![known] }
+    }
+
+    pub(crate) fn push(&mut self, value: f64) {
+        self.values.push(self.found().min(value));
+    }
+
+    /// The smallest so far.
+    pub(crate) fn found(&self) -> f64 {
+        self.values[self.values.len() - 1]
+    }
+
+    /// Where it is going: as far below as it has fallen over the last half of the iterations. A value
+    /// that falls no longer is found; one among many eigenvalues near 0 falls like 1/iterations² until
+    /// then.
+    pub(crate) fn expected(&self) -> f64 {
+        self.found().powi(2) / self.values[self.values.len() / 2]
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_value_that_still_falls_is_expected_to_fall_on() {
+        let mut lowest = Lowest::new(0.25);
+        for value in [1.0, 0.2, 0.3, 0.1, 0.1] {
+            lowest.push(value);
+        }
+        assert!((lowest.expected() - 0.1 * 0.1 / 0.2).abs() < 1e-12);
+        for _ in 0..6 {
+            lowest.push(0.4);
+        }
+        assert!((lowest.found() - 0.1).abs() < 1e-12 && (lowest.expected() - 0.1).abs() < 1e-12);
+    }
 
     #[test]
     fn the_smallest_ritz_value_of_a_chain_is_known() {

@@ -11,6 +11,7 @@
 //! ```
 
 mod calibrate;
+mod course;
 mod descent;
 mod found;
 mod joint;

@@ -239,7 +239,7 @@ impl<T: Summable> Accumulator<T> {
     ///
     /// # Errors
     /// [`Error::Value`] if `saturation` is NaN; [`Error::Shape`] if a frame has no pixel;
-    /// [`Error::Memory`] if there is no room for the sums and what comes of them.
+    /// [`Error::Memory`] if there is no memory for the sums and what comes of them.
     pub fn new(shape: Shape, saturation: Option<f64>) -> Result<Self> {
         Stack::<T>::new("frames", &[], 0, shape)?;
         let saturation = saturation.or(T::FULL_SCALE).unwrap_or(f64::INFINITY);

@@ -6,10 +6,12 @@
 
 mod ask;
 mod joint;
+mod joint_dark;
 mod joint_gauge;
 mod joint_pulls;
 mod reduced;
 mod sampling;
+mod smoothed;
 
 pub use ask::Uncertainty;
 pub use sampling::ErrorMap;

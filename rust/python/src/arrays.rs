@@ -10,7 +10,7 @@
 
 use equipix_core::{Error, Mask, Measurements, Real, Result, Rotation, Shape, Stack, Variance};
 use numpy::{
-    Element, IntoPyArray, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    Element, IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyReadonlyArray3, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyTypeError;
@@ -142,13 +142,22 @@ pub(crate) fn rotation(degrees: i64) -> Result<Rotation> {
     })
 }
 
-/// Values as an array (rows, cols), without a copy.
+/// Values as an array (rows, cols), without a copy, that nobody may write to.
 pub(crate) fn image<T: Element>(
     py: Python<'_>,
     values: Vec<T>,
     shape: Shape,
 ) -> PyResult<Py<PyArray2<T>>> {
-    Ok(values.into_pyarray(py).reshape([shape.rows, shape.cols])?.unbind())
+    let values = read_only(py, values)?;
+    Ok(values.bind(py).reshape([shape.rows, shape.cols])?.unbind())
+}
+
+/// Values as an array, without a copy, that nobody may write to: several results share it, and a fit is
+/// asked again later.
+pub(crate) fn read_only<T: Element>(py: Python<'_>, values: Vec<T>) -> PyResult<Py<PyArray1<T>>> {
+    let array = values.into_pyarray(py);
+    drop(array.try_readwrite()?.make_nonwriteable());
+    Ok(array.unbind())
 }
 
 /// The sizes of an array (rows, cols).

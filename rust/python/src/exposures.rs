@@ -26,7 +26,7 @@ impl PyExposures {
     /// Checks the exposures of an experiment.
     #[new]
     #[pyo3(signature = (frames, shifts, *, shift_std, rotation, flux, flux_model, offset, variance,
-                        mask, workers, progress))]
+                        mask, unreliable, workers, progress))]
     #[expect(clippy::too_many_arguments, reason = "all that is known of exposures")]
     fn new(
         py: Python<'_>,
@@ -39,6 +39,7 @@ impl PyExposures {
         offset: bool,
         variance: Option<Py<PyAny>>,
         mask: Option<Py<PyAny>>,
+        unreliable: Option<PyReadonlyArray2<'_, bool>>,
         workers: Option<NonZeroUsize>,
         progress: Option<Bound<'_, PyAny>>,
     ) -> PyResult<Self> {
@@ -46,12 +47,16 @@ impl PyExposures {
         let (shifts, std) = (pairs(&shifts)?, shift_std.as_ref().map(pairs).transpose()?);
         let borrowed = arrays.borrow(py)?;
         let measurements = borrowed.view()?;
+        let unreliable = unreliable.as_ref().map(PyReadonlyArray2::as_slice).transpose()?;
         let checked = run::interruptible(py, progress.as_ref(), |control| {
             let positions = Positions { shifts, rotations: rotations(&rotation)?, std };
             let flux = Flux { values: flux, kind: flux_kind(flux_model)? };
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
-                let exposures = Exposures::new(m, positions, flux, offset, &workers, control)?;
+                let mut exposures = Exposures::new(m, positions, flux, offset, &workers, control)?;
+                if let Some(unreliable) = unreliable {
+                    exposures = exposures.with_unreliable(unreliable)?;
+                }
                 Ok(exposures.checked().clone())
             })
         })?;
@@ -84,8 +89,15 @@ impl PyExposures {
                 calibrate(&exposures, &options, start.as_ref(), &workers, control)
             })
         })?;
-        PyFit::new(slf.as_any(), Arc::clone(data), fit)
+        PyFit::new(py, Arc::clone(data), fit)
     }
+}
+
+/// Whether a method takes whole shifts alone.
+#[pyfunction]
+pub(crate) fn needs_whole_shifts(py: Python<'_>, method: &str) -> PyResult<bool> {
+    let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
+    Ok(method.needs_whole_shifts())
 }
 
 fn method_named(name: &str) -> Result<Method> {

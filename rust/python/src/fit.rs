@@ -1,11 +1,12 @@
 //! `Fit`, `Beam` and `Uncertainty`: what a calibration found, and what can be asked of it.
 //!
-//! Large arrays move into NumPy without a copy; a question views them again.
+//! Large arrays move into NumPy without a copy, read-only; a question views them again.
 //!
 //! | argument | dtype and rank | here | how |
 //! |---|---|---|---|
 //! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
-//! | functionals | float64, 3 | `&[f64]` | view |
+//! | functionals, dark_variance | float64, 3 and 2 | `&[f64]` | view |
+//! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view |
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;
@@ -14,10 +15,10 @@ use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
     Uncertainty, Workers,
 };
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 
-use crate::arrays::{either, image, rotation, shape_of};
+use crate::arrays::{either, image, read_only, rotation, shape_of};
 use crate::data::Data;
 use crate::run;
 
@@ -101,8 +102,6 @@ impl BorrowedBeam<'_> {
 pub(crate) struct PyFit {
     data: Arc<Data>,
     #[pyo3(get)]
-    exposures: Py<PyAny>,
-    #[pyo3(get)]
     sensitivity: Py<PyArray2<f64>>,
     #[pyo3(get)]
     beam: Py<PyBeam>,
@@ -136,14 +135,19 @@ pub(crate) struct PyFit {
     smallest_ritz: Option<f64>,
     #[pyo3(get)]
     leaves_tilt: bool,
-    #[pyo3(get)]
-    refinement: &'static str,
+    refinement: Refinement,
     #[pyo3(get)]
     is_joint: bool,
 }
 
 #[pymethods]
 impl PyFit {
+    /// What became of shifts that were to be refined.
+    #[getter]
+    const fn refinement(&self) -> &'static str {
+        refinement_code(self.refinement)
+    }
+
     /// D = Σ w c² L² of each pixel.
     #[pyo3(signature = (*, workers))]
     fn information(
@@ -164,7 +168,8 @@ impl PyFit {
     }
 
     /// Answers what is asked of it, from one linear problem.
-    #[pyo3(signature = (*, error_map, functionals, shifts, offset, workers, progress))]
+    #[pyo3(signature = (*, error_map, functionals, shifts, offset, workers, progress,
+                        dark_variance=None, dark_misfit=false))]
     #[expect(clippy::too_many_arguments, reason = "the questions that there are")]
     fn uncertainty(
         &self,
@@ -175,9 +180,12 @@ impl PyFit {
         offset: bool,
         workers: Option<NonZeroUsize>,
         progress: Option<Bound<'_, PyAny>>,
+        dark_variance: Option<PyReadonlyArray2<'_, f64>>,
+        dark_misfit: bool,
     ) -> PyResult<PyUncertainty> {
         let functionals = functionals.as_ref().map(|stack| stack.as_slice()).transpose()?;
-        let questions = Questions { error_map, functionals, shifts, offset };
+        let dark = dark_variance.as_ref().map(|image| image.as_slice()).transpose()?;
+        let questions = Questions { error_map, functionals, shifts, offset, dark, dark_misfit };
         let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
         let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
         let checked = &self.data.checked;
@@ -192,16 +200,15 @@ impl PyFit {
 }
 
 impl PyFit {
-    /// The result of a fit of `exposures`.
-    pub(crate) fn new(exposures: &Bound<'_, PyAny>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
-        let (py, sensor) = (exposures.py(), data.checked.sensor());
+    /// The result of a fit of the exposures of these arrays.
+    pub(crate) fn new(py: Python<'_>, data: Arc<Data>, fit: Fit) -> PyResult<Self> {
+        let sensor = data.checked.sensor();
         let (unit, is_joint) = (fit.unit(), fit.is_joint());
         let History { looks, ended } = fit.history;
         let column = |value: fn(&Look) -> f64| looks.iter().map(value).collect::<Vec<_>>();
         let sweeps: Vec<_> = looks.iter().map(|look| look.sweep).collect();
         Ok(Self {
             data,
-            exposures: exposures.clone().unbind(),
             sensitivity: image(py, fit.sensitivity, sensor)?,
             beam: Py::new(py, PyBeam::of(py, fit.beam)?)?,
             flags: image(py, fit.flags, sensor)?,
@@ -210,24 +217,29 @@ impl PyFit {
             flux: fit.flux,
             shifts: fit.shifts,
             offset: fit.offset.map(|offset| image(py, offset, sensor)).transpose()?,
-            sweeps: sweeps.into_pyarray(py).unbind(),
-            objective: column(|look| look.objective).into_pyarray(py).unbind(),
-            error_estimate: column(|look| look.error).into_pyarray(py).unbind(),
+            sweeps: read_only(py, sweeps)?,
+            objective: read_only(py, column(|look| look.objective))?,
+            error_estimate: read_only(py, column(|look| look.error))?,
             ended: ended_code(ended),
             misfit: fit.misfit,
             degrees_of_freedom: fit.degrees_of_freedom,
             unit,
             smallest_ritz: fit.smallest_ritz,
             leaves_tilt: fit.leaves_tilt,
-            refinement: refinement_code(fit.refinement),
+            refinement: fit.refinement,
             is_joint,
         })
     }
 
     /// The arrays of the solution, borrowed.
     pub(crate) fn borrow<'py>(&'py self, py: Python<'py>) -> BorrowedFit<'py> {
-        let sensitivity = self.sensitivity.bind(py).readonly();
-        BorrowedFit { fit: self, sensitivity, beam: self.beam.get().borrow(py) }
+        let (sensitivity, flags) = (self.sensitivity.bind(py), self.flags.bind(py));
+        BorrowedFit {
+            fit: self,
+            sensitivity: sensitivity.readonly(),
+            flags: flags.readonly(),
+            beam: self.beam.get().borrow(py),
+        }
     }
 }
 
@@ -235,6 +247,7 @@ impl PyFit {
 pub(crate) struct BorrowedFit<'py> {
     fit: &'py PyFit,
     sensitivity: PyReadonlyArray2<'py, f64>,
+    flags: PyReadonlyArray2<'py, u32>,
     beam: BorrowedBeam<'py>,
 }
 
@@ -242,14 +255,25 @@ impl BorrowedFit<'_> {
     pub(crate) fn solution(&self) -> PyResult<Solution<'_>> {
         Ok(Solution {
             sensitivity: self.sensitivity.as_slice()?,
+            flags: self.flags.as_slice()?,
             beam: self.beam.view()?,
             flux: &self.fit.flux,
             shifts: &self.fit.shifts,
-            refined: self.fit.refinement == refinement_code(Refinement::Done),
+            refinement: self.fit.refinement,
             joint: self.fit.is_joint,
             unit: self.fit.unit,
         })
     }
+}
+
+/// Which pixels count for the slope of ln M.
+#[pyfunction]
+pub(crate) fn slope_pixels(
+    sensitivity: PyReadonlyArray2<'_, f64>,
+    flags: PyReadonlyArray2<'_, u32>,
+) -> PyResult<Py<PyArray2<bool>>> {
+    let counted = equipix_core::slope_pixels(sensitivity.as_slice()?, flags.as_slice()?);
+    image(sensitivity.py(), counted, shape_of(&sensitivity))
 }
 
 /// Answers, in units of the variance of a value of weight 1; `None` for what was not asked.
@@ -261,6 +285,8 @@ pub(crate) struct PyUncertainty {
     variances: Option<Py<PyArray1<f64>>>,
     shift_variances: Option<Vec<[f64; 2]>>,
     offset_variances: Option<(f64, f64)>,
+    dark_misfit: Option<f64>,
+    incomplete: u64,
 }
 
 impl PyUncertainty {
@@ -271,9 +297,11 @@ impl PyUncertainty {
             std: answers.map.map(|map| image(py, map.std, sensor)).transpose()?,
             draws,
             exactness,
-            variances: answers.variances.map(|values| values.into_pyarray(py).unbind()),
+            variances: answers.variances.map(|values| read_only(py, values)).transpose()?,
             shift_variances: answers.shifts,
             offset_variances: answers.offset.map(Into::into),
+            dark_misfit: answers.dark_misfit,
+            incomplete: answers.incomplete,
         })
     }
 }
@@ -285,6 +313,9 @@ struct Questions<'a> {
     functionals: Option<&'a [f64]>,
     shifts: bool,
     offset: bool,
+    /// The variance by pixel of a dark that was subtracted from all exposures.
+    dark: Option<&'a [f64]>,
+    dark_misfit: bool,
 }
 
 struct Answers {
@@ -292,6 +323,8 @@ struct Answers {
     variances: Option<Vec<f64>>,
     shifts: Option<Vec<[f64; 2]>>,
     offset: Option<[f64; 2]>,
+    dark_misfit: Option<f64>,
+    incomplete: u64,
 }
 
 impl Questions<'_> {
@@ -303,12 +336,18 @@ impl Questions<'_> {
         control: &Control,
     ) -> Result<Answers> {
         let mut bars = Uncertainty::new(exposures, solution, workers, control)?;
-        Ok(Answers {
+        if let Some(variance) = self.dark {
+            bars = bars.with_dark(variance)?;
+        }
+        let answers = Answers {
             map: self.error_map.then(|| bars.error_map()).transpose()?,
             variances: self.functionals.map(|stack| bars.variances(stack)).transpose()?,
             shifts: if self.shifts { bars.shift_variances()? } else { None },
             offset: if self.offset { bars.offset_variances()? } else { None },
-        })
+            dark_misfit: self.dark_misfit.then(|| bars.misfit_by_dark()).transpose()?,
+            incomplete: 0,
+        };
+        Ok(Answers { incomplete: bars.incomplete(), ..answers })
     }
 }
 
@@ -325,6 +364,6 @@ const fn refinement_code(refinement: Refinement) -> &'static str {
         Refinement::None => "none",
         Refinement::NotTried => "not tried",
         Refinement::Undetermined => "undetermined",
-        Refinement::Done => "refined",
+        Refinement::Along(_) | Refinement::Done => "refined",
     }
 }

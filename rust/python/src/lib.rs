@@ -33,9 +33,9 @@ mod _native {
     #[pymodule_export]
     use crate::centroid::locate_spots;
     #[pymodule_export]
-    use crate::exposures::PyExposures;
+    use crate::exposures::{PyExposures, needs_whole_shifts};
     #[pymodule_export]
-    use crate::fit::{PyBeam, PyFit, PyUncertainty};
+    use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
     #[pymodule_export]
     use crate::plan::planned_components;
     #[pymodule_export]

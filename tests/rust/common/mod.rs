@@ -57,6 +57,8 @@ pub(crate) struct Experiment {
     pub(crate) mask: Vec<bool>,
     /// Whether an offset of each pixel is sought.
     pub(crate) offset: bool,
+    /// The variance, by pixel, of a dark that was subtracted from all exposures; empty if there is none.
+    pub(crate) dark: Vec<f64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -93,6 +95,8 @@ pub(crate) struct Look {
 pub(crate) struct Answer {
     /// M; NaN where undetermined.
     pub(crate) sensitivity: Vec<f64>,
+    /// Bits that say what is wrong with a pixel.
+    pub(crate) flags: Vec<u32>,
     /// O, if it was sought.
     pub(crate) offset: Option<Vec<f64>>,
     /// L at the cells of its grid; NaN where unobserved.
@@ -106,6 +110,7 @@ pub(crate) struct Answer {
     pub(crate) shifts: Vec<[f64; 2]>,
     /// Whether shifts were refined.
     pub(crate) refined: bool,
+    pub(crate) refinement: Refinement,
     pub(crate) leaves_tilt: bool,
     /// The component of each pixel and of each cell, the largest one being 0; −1 for none.
     pub(crate) labels: [Vec<i32>; 2],
@@ -195,6 +200,15 @@ pub(crate) fn offset_variances(
     Ok(found.unwrap_or_default().map(|variance| variance * unit))
 }
 
+/// What the noise of the dark adds to F on average.
+pub(crate) fn misfit_by_dark(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+) -> Result<f64> {
+    ask(experiment, answer, workers, |bars| bars.misfit_by_dark())
+}
+
 /// The variance of a measurement of weight 1: 1 where variances are given, else reduced χ².
 fn variance_of_weight_1(experiment: &Experiment, answer: &Answer) -> f64 {
     match experiment.noise {
@@ -262,6 +276,7 @@ fn ask<R>(
     let [rows, cols] = answer.beam_shape;
     let solution = Solution {
         sensitivity: &answer.sensitivity,
+        flags: &answer.flags,
         beam: Beam {
             values: &answer.beam,
             coefficients: answer.coefficients.as_deref(),
@@ -271,12 +286,18 @@ fn ask<R>(
         },
         flux: &answer.flux,
         shifts: &answer.shifts,
-        refined: answer.refined,
+        refinement: answer.refinement,
         joint: answer.is_joint(),
         unit: variance_of_weight_1(experiment, answer),
     };
     with_exposures(experiment, &workers, |exposures| {
-        question(&mut Uncertainty::new(exposures, &solution, &workers, &control)?)
+        let bars = Uncertainty::new(exposures, &solution, &workers, &control)?;
+        if experiment.dark.is_empty() {
+            return question(&mut { bars });
+        }
+        let unit = variance_of_weight_1(experiment, answer);
+        let relative: Vec<f64> = experiment.dark.iter().map(|variance| variance / unit).collect();
+        question(&mut bars.with_dark(&relative)?)
     })
 }
 
@@ -296,7 +317,8 @@ fn answer(fit: Fit) -> Answer {
         beam_shape: [fit.beam.shape.rows, fit.beam.shape.cols],
         origin: fit.beam.origin,
         beam: fit.beam.values,
-        refined: fit.refinement == Refinement::Done,
+        refined: fit.refinement.is_done(),
+        refinement: fit.refinement,
         leaves_tilt: fit.leaves_tilt,
         labels: [fit.components.pixels, fit.components.cells],
         misfit: fit.misfit,
@@ -304,6 +326,7 @@ fn answer(fit: Fit) -> Answer {
         converged: fit.history.ended == Ended::Converged,
         history: looks.map(look).collect(),
         sensitivity: fit.sensitivity,
+        flags: fit.flags,
         offset: fit.offset,
         flux: fit.flux,
         shifts: fit.shifts,

@@ -14,6 +14,11 @@ pub(crate) struct Covariance {
     pub(crate) of_gain: Vec<f64>,
     /// The part of it that a map of errors samples.
     pub(crate) drawn: Vec<f64>,
+    /// The part of that which is known nevertheless, since M follows the dark at once.
+    pub(crate) followed: Vec<f64>,
+    /// What the noise of the dark adds to F: the mean of eᵀ A e, and its variance where the elements of e
+    /// are as large as their standard deviation and only their signs are random.
+    pub(crate) misfit: [f64; 2],
     /// The variances of the shifts (row, column) that were refined, less their mean.
     pub(crate) of_shifts: Vec<[f64; 2]>,
     /// The variance of b, the least-squares part b M of the offsets' errors.
@@ -53,11 +58,23 @@ impl Covariance {
             add(1.0, &wrong, &mut drawn);
         }
         of_gain.iter_mut().chain(&mut drawn).for_each(|value| *value *= unit);
+        let mut of_shifts = of_shifts(&dense, &factor);
+        let dark = Dark::of(&dense, &factor, &x);
+        let mut followed = vec![0.0; pixels * pixels];
+        if let Some(dark) = &dark {
+            let of_dark = dark.of_gain(&gauge);
+            add(1.0, &of_dark, &mut of_gain);
+            add(1.0, &of_dark, &mut drawn);
+            followed = gauge.on_both_sides(&dark.followed(&normal.matrix));
+            dark.add_to_shifts(&dense, &mut of_shifts);
+        }
         Some(Self {
             pixels,
             of_gain,
             drawn,
-            of_shifts: of_shifts(&dense, &factor),
+            followed,
+            misfit: dark.map_or([0.0; 2], |dark| dark.misfit()),
+            of_shifts,
             along: along(&dense, &factor, &x),
             alone: mean_of_offsets_alone(&dense, &normal.matrix),
         })
@@ -71,6 +88,73 @@ impl Covariance {
 
     pub(crate) fn std(&self, pixel: usize) -> f64 {
         self.of_gain[pixel * (self.pixels + 1)].sqrt()
+    }
+}
+
+/// The noise of a dark that was subtracted from all exposures.
+struct Dark<'e> {
+    variance: &'e [f64],
+    /// Jᵀ w 1 of each pixel, what it moves, and the sums of the weights.
+    pulls: Vec<Vec<f64>>,
+    moves: Vec<Vec<f64>>,
+    weights: Vec<f64>,
+}
+
+impl<'e> Dark<'e> {
+    fn of(dense: &Dense<'e>, factor: &Factorised, x: &[f64]) -> Option<Self> {
+        let variance = &dense.experiment.dark[..];
+        let (pulls, weights) = dense.pulls_in_common(x);
+        let moves = pulls.iter().map(|pull| factor.solve(pull)).collect();
+        (!variance.is_empty()).then_some(Self { variance, pulls, moves, weights })
+    }
+
+    /// What it adds to the covariance of M.
+    fn of_gain(&self, gauge: &Gauge) -> Vec<f64> {
+        let pixels = self.variance.len();
+        let mut found = vec![0.0; pixels * pixels];
+        for (moved, variance) in self.moves.iter().zip(self.variance) {
+            let moved = gauge.apply(&moved[..pixels]);
+            for (row, a) in found.chunks_exact_mut(pixels).zip(&moved) {
+                row.iter_mut().zip(&moved).for_each(|(sum, b)| *sum += variance * a * b);
+            }
+        }
+        found
+    }
+
+    /// The variances that M has by it at the beam that there is.
+    fn followed(&self, normal: &Symmetric) -> Vec<f64> {
+        let pixels = self.variance.len();
+        let mut found = vec![0.0; pixels * pixels];
+        for pixel in (0..pixels).filter(|&pixel| normal.at(pixel, pixel) > 0.0) {
+            let a = self.pulls[pixel][pixel] / normal.at(pixel, pixel);
+            found[pixel * (pixels + 1)] = self.variance[pixel] * a * a;
+        }
+        found
+    }
+
+    fn add_to_shifts(&self, dense: &Dense<'_>, of_shifts: &mut [[f64; 2]]) {
+        for (index, found) in of_shifts.as_flattened_mut().iter_mut().enumerate() {
+            let functional = dense.moves(index / 2, index % 2);
+            for (moved, variance) in self.moves.iter().zip(self.variance) {
+                let shift: f64 = functional.iter().map(|&(at, z)| z * moved[at]).sum();
+                *found += variance * shift * shift;
+            }
+        }
+    }
+
+    /// With A = 1ᵀ w 1 − 1ᵀ w J N⁻¹ Jᵀ w 1.
+    fn misfit(&self) -> [f64; 2] {
+        let [mut mean, mut scatter] = [0.0; 2];
+        for (p, (pull, v)) in self.pulls.iter().zip(self.variance).enumerate() {
+            for (q, (moved, u)) in self.moves.iter().zip(self.variance).enumerate() {
+                if p == q {
+                    mean += v * (self.weights[p] - dot(pull, moved));
+                } else {
+                    scatter += 2.0 * v * u * dot(pull, moved).powi(2);
+                }
+            }
+        }
+        [mean, scatter]
     }
 }
 

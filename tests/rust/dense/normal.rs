@@ -64,6 +64,21 @@ impl Dense<'_> {
         normal
     }
 
+    /// What a change of all measurements of a pixel alike pulls at the unknowns, by pixel, and their
+    /// weights.
+    pub(crate) fn pulls_in_common(&self, x: &[f64]) -> (Vec<Vec<f64>>, Vec<f64>) {
+        let (mut pulls, mut weights) =
+            (vec![vec![0.0; x.len()]; self.pixels()], vec![0.0; self.pixels()]);
+        let flux = self.flux(x);
+        for at in &self.measurements {
+            weights[at.pixel] += at.weight;
+            for (unknown, slope) in self.row(at, x, flux[at.exposure], self.shift(at.exposure, x)) {
+                pulls[at.pixel][unknown] += at.weight * slope;
+            }
+        }
+        (pulls, weights)
+    }
+
     /// The slopes of c·L·M + O along the unknowns; that along M, which is the light c·L, stands first.
     fn row(&self, at: &Measurement, x: &[f64], c: f64, shift: [f64; 2]) -> Vec<(usize, f64)> {
         let (k, m) = (at.exposure, x[at.pixel]);

@@ -129,6 +129,7 @@ impl Simulation {
             noise: Noise::Exposures(vec![variance; self.shifts.len()]),
             mask: Vec::new(),
             offset: self.offset > 0.0,
+            dark: Vec::new(),
         }
     }
 
@@ -152,6 +153,15 @@ impl Experiment {
             (0..2).for_each(|axis| shift[axis] += 0.5 * std[axis] * random(92, 2 * k + axis));
         }
         self.shift_std = Some(std.to_vec());
+        self
+    }
+
+    /// The same where a dark was subtracted whose variance is some four times that of an exposure.
+    pub(crate) fn with_dark(mut self) -> Self {
+        let Noise::Exposures(variance) = &self.noise else { return self };
+        let pixels = self.shape[0] * self.shape[1];
+        let of_pixel = |pixel| 4.0 * variance[0] * (1.0 + 0.5 * random(93, pixel));
+        self.dark = (0..pixels).map(of_pixel).collect();
         self
     }
 

@@ -102,13 +102,13 @@ impl Surface {
                 }
             }
         }
-        let step = solve(&self.normal, right);
+        let step = solve_by_elimination(&self.normal, right);
         self.coefficients.iter_mut().zip(step).for_each(|(value, step)| *value += step);
     }
 }
 
 /// Solves a symmetric positive definite system by Gaussian elimination.
-pub(super) fn solve(matrix: &[Terms; TERMS], right: Terms) -> Terms {
+pub(super) fn solve_by_elimination(matrix: &[Terms; TERMS], right: Terms) -> Terms {
     let mut rows = *matrix;
     let mut x = right;
     for pivot in 0..TERMS {

@@ -10,15 +10,15 @@ use crate::linalg::Cholesky;
 
 /// Hats further apart than this, in rows or columns of the coarse grid, meet only where exposures
 /// are turned against each other.
-const REACH: usize = 2;
+pub(super) const REACH: usize = 2;
 /// Places of a matrix element's row behind its column: the same coarse row, and those below.
-const STENCIL: usize = (REACH + 1) * (2 * REACH + 1);
+pub(super) const STENCIL: usize = (REACH + 1) * (2 * REACH + 1);
 
 /// What is added to the diagonal, as a share of it: less than the eigenvalues of parts that hang
 /// together weakly.
-const RIDGE: f64 = 1e-6;
+pub(super) const RIDGE: f64 = 1e-6;
 /// A share of the diagonal that rounding alone leaves of an eigenvalue.
-const NOTHING: f64 = 1e-10;
+pub(super) const NOTHING: f64 = 1e-10;
 /// What is added if there are such eigenvalues, besides those of constants in a part, divided by the
 /// square of the nodes along a side: a tenth of the smallest eigenvalue of a sensor that hangs
 /// together. Single precision leaves errors in those directions, which must not be magnified.
@@ -38,18 +38,18 @@ pub(crate) struct Coarse {
 impl Coarse {
     /// The matrix of the hats and other unknowns, whose own diagonal elements are `others`, summed
     /// over blocks: what each exposure sees of them there.
-    pub(crate) fn of_stars(
+    pub(crate) fn of_blocks(
         hats: &Hats,
         others: &[f64],
-        stars: impl Iterator<Item = Vec<Arm>>,
+        blocks: impl Iterator<Item = Vec<Entry>>,
         control: &Control,
     ) -> Result<Self> {
         let mut matrix = Matrix::new(hats, others.len());
-        for (block, star) in stars.enumerate() {
-            if block % CHECK_EVERY == 0 {
+        for (index, entries) in blocks.enumerate() {
+            if index % CHECK_EVERY == 0 {
                 control.check()?;
             }
-            matrix.add_star(&star);
+            matrix.add_block(&entries);
         }
         for (index, &value) in others.iter().enumerate() {
             let place = hats.count() + index;
@@ -97,7 +97,7 @@ impl Coarse {
             for (hat, height) in heights.iter_mut().enumerate() {
                 *height *= matrix.diagonal(hat);
             }
-            self.solve(&mut heights, 1.0);
+            self.correct(&mut heights, 1.0);
             let scale: f64 = (0..heights.len())
                 .map(|hat| matrix.diagonal(hat) * heights[hat] * heights[hat])
                 .sum::<f64>()
@@ -110,12 +110,13 @@ impl Coarse {
         quotient < NOTHING
     }
 
-    /// Replaces a right-hand side, one value a hat, by the heights of the hats, times `factor`.
+    /// The coarse correction: replaces a right-hand side, one value a hat, by the heights of the hats,
+    /// times `factor`.
     ///
     /// Constants in a part are left out on either side: they are no error, and what there is of
     /// them is rounding. If rounding in a nearly singular matrix left no factor, the heights are 0
     /// and the first level is left alone.
-    pub(crate) fn solve(&self, values: &mut [f64], factor: f64) {
+    pub(crate) fn correct(&self, values: &mut [f64], factor: f64) {
         let Some(cholesky) = &self.factor else { return values.fill(0.0) };
         for part in &self.parts {
             let (sum, area) = part
@@ -123,7 +124,7 @@ impl Coarse {
                 .fold((0.0, 0.0), |(sum, area), &(hat, share)| (sum + values[hat], area + share));
             part.iter().for_each(|&(hat, share)| values[hat] -= share * sum / area);
         }
-        cholesky.solve(values);
+        cholesky.substitute(values);
         for part in &self.parts {
             let (sum, area) = part.iter().fold((0.0, 0.0), |(sum, area), &(hat, share)| {
                 (sum + share * values[hat], area + share)
@@ -134,14 +135,14 @@ impl Coarse {
 }
 
 /// One exposure's part in a block: its weight there, and what it sees of the unknowns.
-pub(crate) struct Arm {
+pub(crate) struct Entry {
     pub(crate) weight: f64,
     pub(crate) hats: [(usize, f64); 4],
     /// Behind the hats.
     pub(crate) others: Vec<(usize, f64)>,
 }
 
-impl Arm {
+impl Entry {
     fn heights(&self) -> impl Iterator<Item = (usize, f64)> {
         self.hats.iter().chain(&self.others).copied()
     }
@@ -169,29 +170,29 @@ impl Matrix {
     }
 
     /// Adds Σ_k Ω_k (φ_k − φ̄)(φ_k − φ̄)ᵀ, φ̄ the weighted mean.
-    fn add_star(&mut self, star: &[Arm]) {
-        let total: f64 = star.iter().map(|arm| arm.weight).sum();
+    fn add_block(&mut self, entries: &[Entry]) {
+        let total: f64 = entries.iter().map(|entry| entry.weight).sum();
         let mut nodes: Vec<usize> =
-            star.iter().flat_map(|arm| arm.heights().map(|hat| hat.0)).collect();
+            entries.iter().flat_map(|entry| entry.heights().map(|hat| hat.0)).collect();
         nodes.sort_unstable();
         nodes.dedup();
         let mut mean = vec![0.0; nodes.len()];
-        let mut heights = vec![0.0; star.len() * nodes.len()];
-        for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
-            for (hat, height) in arm.heights() {
-                self.masses[hat] += arm.weight * height * height;
+        let mut heights = vec![0.0; entries.len() * nodes.len()];
+        for (entry, heights) in entries.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
+            for (hat, height) in entry.heights() {
+                self.masses[hat] += entry.weight * height * height;
                 let at = nodes.partition_point(|&node| node < hat);
                 heights[at] += height;
-                mean[at] += arm.weight / total * height;
+                mean[at] += entry.weight / total * height;
             }
         }
-        for (arm, heights) in star.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
+        for (entry, heights) in entries.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
             for (height, mean) in heights.iter_mut().zip(&mean) {
                 *height -= mean;
             }
             for (a, &upper) in nodes.iter().enumerate() {
                 for (b, &lower) in nodes.iter().enumerate().skip(a) {
-                    self.add(upper, lower, arm.weight * heights[a] * heights[b]);
+                    self.add(upper, lower, entry.weight * heights[a] * heights[b]);
                 }
             }
         }

@@ -1,6 +1,7 @@
 //! How far apart hats stand, how much they count, and the memory that their matrix takes.
 
 use super::hats::Hats;
+use super::spectrum::MOST_WAVES;
 use crate::geometry::{Geometry, Placement};
 
 /// The factor γ of the second level. Errors that both levels see would count twice with γ = 1, and
@@ -18,12 +19,25 @@ const MOST_HATS: usize = 20_000;
 /// Most hats where exposures are turned against each other: hats far apart meet then, and the factor
 /// of their matrix is nearly full.
 const MOST_HATS_TURNED: usize = 1000;
+/// Upper limit on the heights of all waves together.
+const MOST_HEIGHTS: usize = 30_000;
 
 /// What the matrix of the hats and its factor take in bytes: as measured for 28 000 and 51 000 hats,
-/// or those of a full triangle, twice, where exposures are turned against each other.
-pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
+/// or those of a full triangle, twice, where exposures are turned against each other. Those of a wave have
+/// two heights for each hat.
+pub(crate) fn bytes_needed(geometry: &Geometry, waves: usize) -> u64 {
     let hats = Hats::new(geometry.sensor, spacing(geometry)).count() as u64;
-    if geometry.views.len() > 1 { 8 * hats * hats } else { 2700 * hats }
+    if geometry.views.len() > 1 {
+        return 8 * hats * hats;
+    }
+    let of_wave = Hats::new(geometry.sensor, spacing_of_waves(geometry));
+    2700 * hats + 8000 * (waves * of_wave.count()) as u64
+}
+
+/// How far apart the hats of a wave stand: as all others, unless they would be too many.
+pub(crate) fn spacing_of_waves(geometry: &Geometry) -> [usize; 2] {
+    let area = (2 * MOST_WAVES * geometry.sensor.len() / MOST_HEIGHTS).isqrt();
+    spacing(geometry).map(|spacing| spacing.max(area))
 }
 
 /// How far apart hats stand, along rows and columns of the sensor.

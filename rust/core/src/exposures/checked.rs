@@ -34,6 +34,7 @@ pub struct Checked {
     offset: bool,
     geometry: Geometry,
     tallies: Vec<Tally>,
+    unreliable: Vec<usize>,
 }
 
 impl Checked {
@@ -71,8 +72,24 @@ impl<'a, T: Real> Exposures<'a, T> {
         let tallies = (0..count).map(|exposure| tally(&measurements, exposure, workers, control));
         let tallies = tallies.collect::<Result<Vec<_>>>()?;
         check_light(&tallies)?;
-        let checked = Checked { positions, flux, offset, geometry, tallies };
+        let unreliable = Vec::new();
+        let checked = Checked { positions, flux, offset, geometry, tallies, unreliable };
         Ok(Self { measurements, checked })
+    }
+
+    /// The same exposures, with pixels whose measurements contradict each other: M is fitted there, flagged,
+    /// and counts neither for the mean of M nor for its slope.
+    ///
+    /// # Errors
+    /// [`Error::Shape`](crate::Error::Shape) if `unreliable` has not a value for each pixel.
+    pub fn with_unreliable(mut self, unreliable: &[bool]) -> Result<Self> {
+        let pixels = self.sensor().len();
+        if unreliable.len() != pixels {
+            let (got, wanted) = (unreliable.len().to_string(), pixels.to_string());
+            return Err(Error::Shape { argument: "unreliable", got, wanted });
+        }
+        self.checked.unreliable = (0..pixels).filter(|&pixel| unreliable[pixel]).collect();
+        Ok(self)
     }
 
     /// Views exposures again that were checked before: the same values, unchanged.
@@ -146,6 +163,11 @@ impl<'a, T: Real> Exposures<'a, T> {
         self.checked.offset
     }
 
+    /// The pixels whose measurements contradict each other, by rising index.
+    pub(crate) fn unreliable(&self) -> &[usize] {
+        &self.checked.unreliable
+    }
+
     /// Whether all shifts are whole and exact, and nothing is sought besides M and L.
     pub(crate) fn are_whole(&self) -> bool {
         self.checked.positions.are_whole() && !self.seek_more()
@@ -212,19 +234,36 @@ impl<'a, T: Real> Exposures<'a, T> {
         control: &Control,
         mut visit: impl FnMut(usize, usize, usize),
     ) -> Result<()> {
+        self.for_each_stretch(control, |exposure, row, cols| {
+            cols.for_each(|col| visit(exposure, row, col));
+        })
+    }
+
+    /// Calls `visit(exposure, row, columns)` for the used measurements that stand side by side.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] if `control` asks to stop.
+    pub(crate) fn for_each_stretch(
+        &self,
+        control: &Control,
+        mut visit: impl FnMut(usize, usize, Range<usize>),
+    ) -> Result<()> {
         let Shape { rows, cols } = self.sensor();
         let mut scratch = vec![0.0; cols];
         for exposure in 0..self.count() {
             for row in 0..rows {
                 control.check()?;
-                let stretch = self.stretch(exposure, row, 0..cols, &mut scratch);
-                for col in 0..cols {
-                    let used = match &stretch {
-                        Stretch::Uniform(..) => true,
-                        Stretch::Weighted(_, weights) => weights[col] > 0.0,
-                    };
-                    if used {
-                        visit(exposure, row, col);
+                match self.stretch(exposure, row, 0..cols, &mut scratch) {
+                    Stretch::Uniform(..) => visit(exposure, row, 0..cols),
+                    Stretch::Weighted(_, weights) => {
+                        let mut first = 0;
+                        for alike in weights.chunk_by(|a, b| (*a > 0.0) == (*b > 0.0)) {
+                            let end = first + alike.len();
+                            if alike[0] > 0.0 {
+                                visit(exposure, row, first..end);
+                            }
+                            first = end;
+                        }
                     }
                 }
             }
@@ -232,7 +271,7 @@ impl<'a, T: Real> Exposures<'a, T> {
         Ok(())
     }
 
-    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` has room for them.
+    /// The measurements of `exposure` in columns `cols` of `row`; `scratch` is a buffer for them.
     pub(crate) fn stretch<'s>(
         &self,
         exposure: usize,

@@ -47,7 +47,7 @@ impl<T: Real> pulp::NullaryFnOnce for Weigh<'_, T> {
     }
 }
 
-/// The values of `exposure` in columns `cols` of `row` with their weights; `scratch` has room for these.
+/// The values of `exposure` in columns `cols` of `row` with their weights; `scratch` is a buffer for these.
 pub(super) fn weigh<'a, 's, T: Real>(
     measurements: &Measurements<'a, T>,
     exposure: usize,

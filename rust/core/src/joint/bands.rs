@@ -3,8 +3,6 @@
 use super::layout::Window;
 use crate::geometry::View;
 
-/// Rows of pixels in a band, at least: a band adds to as many rows of cells and those that shifts reach.
-const FEWEST_ROWS: usize = 32;
 /// How the sensor is cut into bands, and where their sums lie.
 #[derive(Default)]
 pub(crate) struct Bands {
@@ -27,7 +25,8 @@ pub(crate) struct Strip {
 }
 
 impl Bands {
-    pub(crate) fn new(windows: &[Window], views: &[View], width: usize) -> Self {
+    /// Bands of `fewest` rows at least: a band adds to as many rows of cells and those that shifts reach.
+    pub(crate) fn new(windows: &[Window], views: &[View], width: usize, fewest: usize) -> Self {
         let reach = |view: usize| {
             let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);
             let first = rows.clone().min().unwrap_or(0);
@@ -35,7 +34,7 @@ impl Bands {
         };
         let reaches: Vec<_> = (0..views.len()).map(reach).collect();
         let furthest = reaches.iter().map(|reach| reach.1).max().unwrap_or(0);
-        let height = FEWEST_ROWS.max(furthest);
+        let height = fewest.max(furthest);
         let mut length = 0;
         let strips = views.iter().zip(reaches).map(|(view, (first, reach))| {
             let (rows, cols, start) = (height + reach + width - 1, view.shape.cols, length);
@@ -52,12 +51,12 @@ impl Bands {
     }
 
     /// The bands that see a row of a view, each with that row of its sums.
-    pub(crate) fn seeing<'s>(
+    pub(crate) fn seeing<'s, N>(
         &self,
-        sums: &'s [f64],
+        sums: &'s [N],
         view: usize,
         row: usize,
-    ) -> impl Iterator<Item = &'s [f64]> + use<'s> {
+    ) -> impl Iterator<Item = &'s [N]> + use<'s, N> {
         let (height, length, strip) = (self.height, self.length, self.strips[view]);
         let before = (row + height).saturating_sub(strip.first + strip.rows) / height;
         let bands = before..sums.len() / length;

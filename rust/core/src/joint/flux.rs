@@ -4,7 +4,7 @@
 //! ln c_k → ln c_k + α·d_k nothing that is measured changes, unless exposures are turned against each
 //! other. So free fluxes are sought where ln c has no part that is affine in the shifts, and what
 //! remains undetermined is left to the gauge. With a prior of weights π the same is done with
-//! Σ π a b in place of Σ a b: then the best of the parts that no measurement tells is the given one.
+//! Σ π a b in place of Σ a b: then the best of the parts that no measurement determines is the given one.
 
 use crate::exposures::FluxKind;
 use crate::geometry::Rotation;
@@ -65,14 +65,16 @@ impl Fluxes {
                 (free, Vec::new(), open)
             }
             FluxKind::Linear(times) => {
-                // What of the times is affine in the shifts no measurement tells from a tilt: it
-                // follows from the rest.
-                let told = complement(&hidden(turned), std::iter::once(times.clone()), &weights);
-                if let (Some(told), false) = (told.first(), turned) {
-                    slope = affine_part(times, told, shifts).map(|part| -part);
+                // What of the times is affine in the shifts is degenerate with a tilt: it follows from the
+                // rest.
+                let distinct =
+                    complement(&hidden(turned), std::iter::once(times.clone()), &weights);
+                if let (Some(distinct), false) = (distinct.first(), turned) {
+                    slope = affine_part(times, distinct, shifts).map(|part| -part);
                 }
-                let open = if told.is_empty() { vec![growth(times, shifts)] } else { Vec::new() };
-                (told, Vec::new(), open)
+                let open =
+                    if distinct.is_empty() { vec![growth(times, shifts)] } else { Vec::new() };
+                (distinct, Vec::new(), open)
             }
             FluxKind::Prior(_) => {
                 let free = complement(&hidden(turned), (0..count).map(unit), &weights);
@@ -99,7 +101,7 @@ impl Fluxes {
         let logs: Vec<f64> = flux.iter().zip(&self.values).map(|(c, c0)| (c / c0).ln()).collect();
         let theta = self.sought(&logs);
         let rest: Vec<f64> =
-            logs.iter().zip(self.spread(&theta)).map(|(log, told)| log - told).collect();
+            logs.iter().zip(self.spread(&theta)).map(|(log, sought)| log - sought).collect();
         let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / logs.len() as f64;
         let level = mean(&mut rest.iter().copied());
         let centre = [0, 1].map(|axis| mean(&mut shifts.iter().map(|d| d[axis])));
@@ -160,10 +162,10 @@ fn growth(times: &[f64], shifts: &[[f64; 2]]) -> [f64; 2] {
     slope.map(|part| part / length)
 }
 
-/// γ of t/|t·told| = told + c + γ·d, for d along which the times change at all.
-fn affine_part(times: &[f64], told: &[f64], shifts: &[[f64; 2]]) -> [f64; 2] {
+/// γ of t/|t·distinct| = distinct + c + γ·d, for d along which the times change at all.
+fn affine_part(times: &[f64], distinct: &[f64], shifts: &[[f64; 2]]) -> [f64; 2] {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let scale = dot(times, told);
+    let scale = dot(times, distinct);
     let basis = [0, 1].map(|axis| shifts.iter().map(|d| d[axis]).collect::<Vec<f64>>());
     let constant = vec![1.0; times.len()];
     // Against the constant, then the second axis against the first too.
@@ -230,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_exposure_tells_all_but_the_mean() {
+    fn a_turned_exposure_determines_all_but_the_mean() {
         let mut rotations = [Rotation::None; 5];
         rotations[4] = Rotation::Half;
         let fluxes = Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &rotations);
@@ -239,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_drift_that_is_linear_along_the_shifts_cannot_be_told() {
+    fn a_drift_that_is_linear_along_the_shifts_is_not_determined() {
         let line = [[0.0, 0.0], [0.0, 3.0], [0.0, 6.0], [0.0, 9.0]];
         let times = |scale: f64| FluxKind::Linear((0..4).map(|k| scale * f64::from(k)).collect());
         let fluxes = Fluxes::new(&[1.0; 4], &times(60.0), &line, &[Rotation::None; 4]);
@@ -254,14 +256,14 @@ mod tests {
     }
 
     #[test]
-    fn a_linear_drift_is_what_is_told_and_its_affine_part() {
+    fn a_linear_drift_is_its_distinct_and_its_affine_part() {
         let times = [3.0, 10.0, 21.0, 30.0, 47.0];
         let flux = FluxKind::Linear(times.to_vec());
         let fluxes = Fluxes::new(&[1.0; 5], &flux, &CROSS, &[Rotation::None; 5]);
-        let told = &fluxes.columns[0];
+        let distinct = &fluxes.columns[0];
         let [row, col] = fluxes.slope;
         let whole: Vec<f64> =
-            told.iter().zip(&CROSS).map(|(t, d)| t - row * d[0] - col * d[1]).collect();
+            distinct.iter().zip(&CROSS).map(|(t, d)| t - row * d[0] - col * d[1]).collect();
         // Linear in time: the same slope between all pairs, to rounding of sums of some ten terms.
         let slope = (whole[1] - whole[0]) / (times[1] - times[0]);
         for k in 2..5 {

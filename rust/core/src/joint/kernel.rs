@@ -19,8 +19,8 @@ pub(crate) struct Combine<'s> {
     pub(crate) rows: [&'s [f64]; TAPS],
     pub(crate) along_rows: [f64; TAPS],
     pub(crate) along_cols: [f64; TAPS],
-    /// Room for a row of values.
-    pub(crate) room: &'s mut [f64],
+    /// The row of values between.
+    pub(crate) line: &'s mut [f64],
     pub(crate) sums: &'s mut [f64],
 }
 
@@ -37,12 +37,12 @@ impl pulp::NullaryFnOnce for Combine<'_> {
     fn call(self) {
         let [s, t, u, v] = self.along_rows;
         let [a, b, c, d] = self.rows;
-        for ((((room, a), b), c), d) in self.room.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *room = s * a + t * b + u * c + v * d;
+        for ((((value, a), b), c), d) in self.line.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *value = s * a + t * b + u * c + v * d;
         }
         let [s, t, u, v] = self.along_cols;
         let cols = self.sums.len();
-        let [a, b, c, d] = [0, 1, 2, 3].map(|from| &self.room[from..from + cols]);
+        let [a, b, c, d] = [0, 1, 2, 3].map(|from| &self.line[from..from + cols]);
         for ((((sum, a), b), c), d) in self.sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
             *sum += s * a + t * b + u * c + v * d;
         }
@@ -100,6 +100,18 @@ impl<'s> Row<'s> {
         (exposures + if with_offset { 6 } else { 3 }) * cols
     }
 
+    /// The same row for a shorter time.
+    pub(crate) fn again(&mut self) -> Row<'_> {
+        let [offset, i12, i22] = &mut self.offset;
+        Row {
+            light: self.light,
+            sensitivity: self.sensitivity,
+            inverse: self.inverse,
+            change: self.change,
+            offset: [offset, i12, i22],
+        }
+    }
+
     pub(crate) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
         let (light, rest) = values.split_at_mut(exposures * cols);
         let mut parts = rest.chunks_exact_mut(cols);
@@ -123,19 +135,19 @@ impl<'s> Row<'s> {
 /// ```
 ///
 /// Without an offset O = 0 and M = Σ w e y / Σ w e².
-pub(crate) struct Solve<'s> {
+pub(crate) struct Eliminate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
     /// y, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Σ w e y, Σ w e, Σ w and Σ w y: room for four rows.
+    /// Σ w e y, Σ w e, Σ w and Σ w y: buffers for four rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
     pub(crate) singular: f64,
 }
 
-impl pulp::NullaryFnOnce for Solve<'_> {
+impl pulp::NullaryFnOnce for Eliminate<'_> {
     type Output = f64;
 
     #[inline(always)]
@@ -214,19 +226,19 @@ fn sum(values: &[f64]) -> f64 {
 /// What a change of the light pulls at the beam once M and O have followed it: v → c M w (u − α e − β)
 /// with u = c M v, and the change −α of M; returns the largest size of that less a share of the change
 /// before.
-pub(crate) struct Follow<'s> {
+pub(crate) struct Propagate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
     pub(crate) weights: &'s [f64],
     /// v, then the pull.
     pub(crate) values: &'s mut Lines,
-    /// Room for rows.
+    /// Buffers for rows.
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// The share of the change before.
     pub(crate) share: f64,
 }
 
-impl pulp::NullaryFnOnce for Follow<'_> {
+impl pulp::NullaryFnOnce for Propagate<'_> {
     type Output = f64;
 
     #[inline(always)]

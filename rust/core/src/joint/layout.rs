@@ -116,10 +116,12 @@ mod tests {
         let rotations =
             [Rotation::None, Rotation::Quarter, Rotation::Half, Rotation::ThreeQuarters];
         let shifts = [[0.25, -1.5], [1.0, 0.125], [-2.75, 0.5], [0.5, 3.0]];
-        for fitted in [false, true] {
+        // Fitted shifts may come as far from those that the grid was made for.
+        for (fitted, moved) in [(false, 0.0), (true, 0.0), (true, 0.99), (true, -0.99)] {
             let grid = Grid::new(sensor, &shifts, &rotations, fitted).unwrap();
             let origin = grid.geometry.origin.map(|o| o as f64);
             let beam = grid.geometry.beam;
+            let shifts = shifts.map(|d| d.map(|d| d + moved));
             for (k, window) in grid.windows(&shifts).iter().enumerate() {
                 let view = grid.geometry.views[window.view];
                 for (row, col) in (0..5).flat_map(|r| (0..7).map(move |c| (r, c))) {

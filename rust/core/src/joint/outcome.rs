@@ -1,14 +1,15 @@
 //! What a state of the joint problem says besides its unknowns: components, values of the beam at its
 //! cells, and how many numbers the measurements determine.
 
-use super::freedom::told;
+use super::freedom::determined_share;
 use super::layout::Grid;
 use super::penalty::SMOOTHING;
 use super::system::System;
-use crate::connectivity::{Components, Edges};
+use crate::connectivity::{Components, Edges, Stretches};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
+use crate::geometry::{Rotation, View};
 
 /// Measurements less unknowns.
 pub(crate) fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
@@ -22,11 +23,9 @@ pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     if !system.pass.grid.is_spline() {
         return seen + params;
     }
-    let weights = system.pass.exposures.exposure_weights();
-    let total: f64 = weights.iter().sum();
-    let shares: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
+    let shares = system.shares_of_exposures();
     let windows = system.pass.grid.windows(&system.state.shifts);
-    (told(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
+    (determined_share(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
 }
 
 /// The components of pixels and cells. Along an axis where all shifts differ by whole numbers of pixels,
@@ -44,14 +43,24 @@ pub(crate) fn components<T: Real>(
     });
     let windows = system.pass.grid.windows(shifts);
     let mut edges = Edges::new(sensor.len(), geometry.beam.len());
-    system.pass.exposures.for_each_measurement(control, |exposure, row, col| {
+    let mut stretches = Stretches::new(*sensor, geometry.beam);
+    system.pass.exposures.for_each_stretch(control, |exposure, row, cols| {
         let window = &windows[exposure];
-        let cells = geometry.views[window.view].cells;
+        let View { cells, rotation, .. } = geometry.views[window.view];
         let [down, along] = if window.swaps_axes { [whole[1], whole[0]] } else { whole };
-        for i in window.along_rows.around(down) {
-            for j in window.along_cols.around(along) {
-                let cell = cells.at(row + window.row + i, col + window.col + j);
-                edges.add(row * sensor.cols + col, cell);
+        let (down, along) = (window.along_rows.around(down), window.along_cols.around(along));
+        if rotation == Rotation::None && along.len() > 1 {
+            // Pixels side by side see a cell in common.
+            let seen = cols.start + window.col + along.start..cols.end + window.col + along.end - 1;
+            let rows = row + window.row + down.start..row + window.row + down.end;
+            return stretches.join(&mut edges, row, cols, rows, seen);
+        }
+        for col in cols {
+            for i in down.clone() {
+                for j in along.clone() {
+                    let cell = cells.at(row + window.row + i, col + window.col + j);
+                    edges.add(row * sensor.cols + col, cell);
+                }
             }
         }
     })?;

@@ -11,7 +11,7 @@ use std::borrow::Cow;
 use super::bands::Bands;
 use super::kernel::{AROUND, Combine, Lines, Row};
 use super::layout::{Grid, Window};
-use super::room::{Room, Sums};
+use super::workspace::{Sums, Workspace};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
@@ -20,6 +20,8 @@ use crate::geometry::{Rotation, TAPS, Taps, View};
 use crate::parallel::dot;
 use crate::parallel::{Add, Workers};
 
+/// Rows of pixels in a band, at least.
+const FEWEST_ROWS: usize = 32;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 16;
 
@@ -39,7 +41,7 @@ pub(crate) struct Pass<'m, 'a, T> {
     /// Whether slopes of the shifts are gathered.
     pub(crate) with_shifts: bool,
     /// [`Row`] by row.
-    rows: Vec<f64>,
+    pub(super) rows: Vec<f64>,
     /// What cells get of the pixels' pulls, by band.
     sums: Vec<f64>,
     /// Passes made.
@@ -80,7 +82,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     pub(crate) fn place(&mut self, shifts: &[[f64; 2]], control: &Control) {
         let Grid { geometry, width, sensor, .. } = &self.grid;
         self.windows = self.grid.windows(shifts);
-        self.bands = Bands::new(&self.windows, &geometry.views, *width);
+        self.bands = Bands::new(&self.windows, &geometry.views, *width, FEWEST_ROWS);
         let size = self.bands.size(sensor.rows);
         if self.sums.len() != size {
             self.sums = Vec::new();
@@ -88,13 +90,13 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         }
     }
 
-    /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the room's values,
+    /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the workspace's values,
     /// and the slopes of the beam if shifts are sought; finds what `cells` get of them.
     pub(crate) fn run(
         &mut self,
         cells: &mut [f64],
         control: &Control,
-        work: impl Fn(&Self, usize, Row<'_>, &mut Room, &mut Sums) + Sync,
+        work: impl Fn(&Self, usize, Row<'_>, &mut Workspace, &mut Sums) + Sync,
     ) -> Result<Sums> {
         let (sensor, count) = (self.exposures.sensor(), self.exposures.count());
         let length = Row::length(count, sensor.cols, self.with_offset);
@@ -103,7 +105,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         let (pass, height) = (&*self, self.bands.height);
         let sizes = [height * length, self.bands.length];
         let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
-            let mut room = pass.room();
+            let mut workspace = pass.workspace();
             let mut found = pass.no_sums();
             strips.fill(0.0);
             let rows = rows.chunks_exact_mut(length);
@@ -112,16 +114,16 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 if control.is_cancelled() {
                     break;
                 }
-                room.lines.rotate_left(1);
+                workspace.lines.rotate_left(1);
                 let parts = Row::of(row, count, sensor.cols);
-                work(pass, band * height + index, parts, &mut room, &mut found);
-                pass.gather(row, &mut room, &mut found);
-                pass.spread(index, &mut room, strips);
+                work(pass, band * height + index, parts, &mut workspace, &mut found);
+                pass.gather(row, &mut workspace, &mut found);
+                pass.spread(index, &mut workspace, strips);
             }
             for index in last..last + pass.grid.width - 1 {
-                room.lines.rotate_left(1);
-                room.values().clear();
-                pass.spread(index, &mut room, strips);
+                workspace.lines.rotate_left(1);
+                workspace.values().clear();
+                pass.spread(index, &mut workspace, strips);
             }
             found
         });
@@ -148,15 +150,15 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     }
 
     /// The pulls of a row at fluxes and shifts.
-    fn gather(&self, row: &[f64], room: &mut Room, found: &mut Sums) {
+    fn gather(&self, row: &[f64], workspace: &mut Workspace, found: &mut Sums) {
         let cols = self.exposures.sensor().cols;
         for (k, flux) in self.flux.iter().enumerate() {
-            let pull = room.lines[TAPS - 1].of(k);
+            let pull = workspace.lines[TAPS - 1].of(k);
             if self.with_flux {
                 found.flux[k] += dot(&row[k * cols..][..cols], pull) / flux;
             }
             if let Some(found) = found.shifts.get_mut(k) {
-                for (found, slopes) in found.iter_mut().zip(&room.slopes) {
+                for (found, slopes) in found.iter_mut().zip(&workspace.slopes) {
                     *found += dot(&slopes[k * cols..][..cols], pull);
                 }
             }
@@ -165,23 +167,23 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
 
     /// Adds to a band's sums what the pulls of the last rows make of the row of cells that the first
     /// factors lead to.
-    fn spread(&self, index: usize, room: &mut Room, strips: &mut [f64]) {
+    fn spread(&self, index: usize, workspace: &mut Workspace, strips: &mut [f64]) {
         let wide = self.exposures.sensor().cols + self.grid.width - 1;
         for (k, window) in self.windows.iter().enumerate() {
             let strip = &self.bands.strips[window.view];
             let at = strip.start + (index + window.row - strip.first) * strip.cols + window.col;
             let sums = &mut strips[at..][..wide];
             if !self.grid.is_spline() {
-                Add { factor: 1.0, values: room.lines[TAPS - 1].of(k), sums }.dispatch();
+                Add { factor: 1.0, values: workspace.lines[TAPS - 1].of(k), sums }.dispatch();
                 continue;
             }
-            let rows = room.lines.each_ref().map(|lines| lines.padded(k));
+            let rows = workspace.lines.each_ref().map(|lines| lines.padded(k));
             let [along_rows, along_cols] = [&window.along_rows, &window.along_cols].map(|taps| {
                 let [s, t, u, v] = taps.values;
                 [v, u, t, s]
             });
-            let room = &mut room.line[..wide + AROUND];
-            Combine { rows, along_rows, along_cols, room, sums }.dispatch();
+            let line = &mut workspace.line[..wide + AROUND];
+            Combine { rows, along_rows, along_cols, line, sums }.dispatch();
         }
     }
 
@@ -256,36 +258,36 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
             return Add { factor: along_rows[0] * along_cols[0], values: of(0), sums: seen }
                 .dispatch();
         }
-        let (rows, room) = (std::array::from_fn(of), &mut line[..wide]);
-        Combine { rows, along_rows, along_cols, room, sums: seen }.dispatch();
+        let (rows, line) = (std::array::from_fn(of), &mut line[..wide]);
+        Combine { rows, along_rows, along_cols, line, sums: seen }.dispatch();
     }
 
-    /// What the pixels of a row see of values on cells, added to the room's values.
-    pub(crate) fn see(&self, views: &Views<'_>, row: usize, room: &mut Room) {
+    /// What the pixels of a row see of values on cells, added to the workspace's values.
+    pub(crate) fn see(&self, views: &Views<'_>, row: usize, workspace: &mut Workspace) {
         for (k, window) in self.windows.iter().enumerate() {
             let taps = [window.along_rows.values, window.along_cols.values];
-            let Room { lines: [.., values], line, .. } = room;
+            let Workspace { lines: [.., values], line, .. } = workspace;
             self.interpolate(views, window, row, taps, line, values.of_mut(k));
         }
     }
 
-    /// The slopes along both axes of the beam that the pixels of a row see, left in the room, where shifts
+    /// The slopes along both axes of the beam that the pixels of a row see, left in the workspace, where shifts
     /// are sought.
-    pub(crate) fn see_slopes(&self, views: &Views<'_>, row: usize, room: &mut Room) {
+    pub(crate) fn see_slopes(&self, views: &Views<'_>, row: usize, workspace: &mut Workspace) {
         let cols = self.exposures.sensor().cols;
-        for (axis, slopes) in room.slopes.iter_mut().enumerate() {
+        for (axis, slopes) in workspace.slopes.iter_mut().enumerate() {
             slopes.fill(0.0);
             for (window, slopes) in self.windows.iter().zip(slopes.chunks_exact_mut(cols)) {
                 let taps = slopes_along(window, axis);
-                self.interpolate(views, window, row, taps, &mut room.line, slopes);
+                self.interpolate(views, window, row, taps, &mut workspace.line, slopes);
             }
         }
     }
 
     /// The weights and values of one row of each exposure.
-    pub(crate) fn measure(&self, row: usize, room: &mut Room) {
+    pub(crate) fn measure(&self, row: usize, workspace: &mut Workspace) {
         let cols = self.exposures.sensor().cols;
-        let Room { weights, lines: [.., values], .. } = room;
+        let Workspace { weights, lines: [.., values], .. } = workspace;
         for (k, weights) in weights.chunks_exact_mut(cols).enumerate() {
             let values = values.of_mut(k);
             match self.exposures.stretch(k, row, 0..cols, weights) {
@@ -301,21 +303,21 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         }
     }
 
-    /// The weights of one row of each exposure; those that are all the same stand in the room.
-    pub(crate) fn weigh_row(&self, row: usize, room: &mut Room) {
+    /// The weights of one row of each exposure; those that are all the same stand in the workspace.
+    pub(crate) fn weigh_row(&self, row: usize, workspace: &mut Workspace) {
         let cols = self.exposures.sensor().cols;
-        for (k, weights) in room.weights.chunks_exact_mut(cols).enumerate() {
+        for (k, weights) in workspace.weights.chunks_exact_mut(cols).enumerate() {
             if self.exposures.uniform_weight(k).is_none() {
                 let _ = self.exposures.stretch(k, row, 0..cols, weights);
             }
         }
     }
 
-    pub(crate) fn room(&self) -> Room {
+    pub(crate) fn workspace(&self) -> Workspace {
         let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
         let moved = if self.with_shifts { count * cols } else { 0 };
         let weight = |k| self.exposures.uniform_weight(k).unwrap_or(0.0);
-        Room {
+        Workspace {
             weights: (0..count).flat_map(|k| std::iter::repeat_n(weight(k), cols)).collect(),
             lines: [(); TAPS].map(|()| Lines::new(count, cols)),
             line: vec![0.0; cols + 2 * AROUND],

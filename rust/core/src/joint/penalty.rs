@@ -5,6 +5,7 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
+use crate::coarse::Value;
 use crate::control::Control;
 use crate::frames::Shape;
 use crate::parallel::Workers;
@@ -15,16 +16,21 @@ const FOURTH: [f64; 5] = [1.0, -4.0, 6.0, -4.0, 1.0];
 /// Rows that a thread takes at a time.
 const BAND: usize = 32;
 
+/// The symbol of GᵀG along one axis.
+pub(super) fn bent(q: f64) -> f64 {
+    (2.0 * (q / 2.0).sin()).powi(8)
+}
+
 pub(crate) struct Penalty {
     shape: Shape,
     pub(crate) tau: f64,
     /// 1 where the five cells from here on count, down a column and along a row; else 0.
-    counted: [Vec<f64>; 2],
+    counted: [Vec<f32>; 2],
     /// D a and aᵀ D a.
-    pull: Vec<f64>,
+    pub(super) pull: Vec<f64>,
     norm: f64,
     /// GᵀG a and ‖G a‖².
-    bent: Vec<f64>,
+    pub(super) bent: Vec<f64>,
     energy: f64,
 }
 
@@ -40,7 +46,7 @@ impl Penalty {
         let Shape { rows, cols } = shape;
         let zeros = || workers.filled(shape.len(), 0.0, control);
         let count = |width: usize, height: usize, step: usize| {
-            let mut counted = zeros();
+            let mut counted = workers.filled(shape.len(), 0.0, control);
             workers.map_blocks(&mut counted, cols, |row, counted| {
                 if row >= height || width == 0 {
                     return;
@@ -54,6 +60,25 @@ impl Penalty {
             [count(cols, rows.saturating_sub(4), cols), count(cols.saturating_sub(4), rows, 1)];
         let (pull, bent) = (zeros(), zeros());
         Self { shape, tau, counted, pull, norm: 0.0, bent, energy: 0.0 }
+    }
+
+    /// Counts also where another penalty does; returns whether it now counts where the other one does not.
+    pub(crate) fn count_where(&mut self, other: &Self) -> bool {
+        let mut grows = false;
+        for (own, other) in self.counted.iter_mut().zip(&other.counted) {
+            for (own, other) in own.iter_mut().zip(other) {
+                grows |= *own > *other;
+                *own = own.max(*other);
+            }
+        }
+        grows
+    }
+
+    /// Whether it has a part in a cell.
+    pub(super) fn concerns(&self, cell: usize) -> bool {
+        let mut found = false;
+        self.for_row(cell, |_, _| found = true);
+        found
     }
 
     /// Takes the beam a of weights D that its multiples are free of.
@@ -80,11 +105,18 @@ impl Penalty {
 
     /// Adds τ Pᵀ GᵀG P x to `sums`.
     pub(crate) fn add_product(&self, x: &[f64], sums: &mut [f64], workers: &Workers) {
-        let scale = workers.dot(&self.pull, x) / self.norm;
-        let back = (workers.dot(&self.bent, x) - scale * self.energy) / self.norm;
+        let [bent, pull] = self.multiples(workers.dot(&self.pull, x), workers.dot(&self.bent, x));
         self.add_curvature(x, self.tau, sums, workers);
-        workers.add_multiple(sums, -scale * self.tau, &self.bent);
-        workers.add_multiple(sums, -back * self.tau, &self.pull);
+        workers.add_multiple(sums, -bent, &self.bent);
+        workers.add_multiple(sums, -pull, &self.pull);
+    }
+
+    /// The multiples of GᵀG a and of D a that P takes off τ GᵀG x, for the products of x with D a and with
+    /// GᵀG a.
+    pub(super) fn multiples(&self, pull: f64, bent: f64) -> [f64; 2] {
+        let scale = pull / self.norm;
+        let back = (bent - scale * self.energy) / self.norm;
+        [scale * self.tau, back * self.tau]
     }
 
     /// Adds √τ Pᵀ Gᵀ s, whose covariance is that of the penalty, for signs s.
@@ -126,44 +158,48 @@ impl Penalty {
 
     /// Adds `factor` GᵀG x to `sums`.
     fn add_curvature(&self, x: &[f64], factor: f64, sums: &mut [f64], workers: &Workers) {
+        workers.map_blocks(sums, BAND * self.shape.cols, |band, part| {
+            self.bend_rows(x, factor, band * BAND, part);
+        });
+    }
+
+    /// Adds `factor` GᵀG x to rows of sums from `first` on.
+    pub(super) fn bend_rows<N: Value>(&self, x: &[N], factor: N, first: usize, sums: &mut [N]) {
         let Shape { rows, cols } = self.shape;
         let [down, along] = &self.counted;
-        workers.map_blocks(sums, BAND * cols, |band, part| {
-            // Differences that begin in this row and the four before; along it with zeros around.
-            let mut differences = [(); 5].map(|()| vec![0.0; cols]);
-            let mut beside = vec![0.0; cols + 4];
-            let first = band * BAND;
-            for row in first.saturating_sub(4)..first + part.len() / cols {
-                differences.rotate_left(1);
-                let line = |i: usize| &x[(row + i) * cols..][..cols];
-                let sums = &mut differences[4][..];
-                if row + 4 < rows {
-                    let (values, counted) = (std::array::from_fn(line), &down[row * cols..]);
-                    pulp::Arch::new().dispatch(Differ { values, counted, sums });
-                } else {
-                    sums.fill(0.0);
-                }
-                let Some(own) = row.checked_sub(first) else { continue };
-                let part = &mut part[own * cols..][..cols];
-                let values = [4, 3, 2, 1, 0].map(|i| &differences[i][..]);
-                pulp::Arch::new().dispatch(Bend { values, factor, sums: &mut *part });
-                if cols > 4 {
-                    let (line, counted) = (line(0), &along[row * cols..]);
-                    let (values, sums) =
-                        (std::array::from_fn(|i| &line[i..cols - 4 + i]), &mut beside[4..cols]);
-                    pulp::Arch::new().dispatch(Differ { values, counted, sums });
-                    let values = [4, 3, 2, 1, 0].map(|i| &beside[i..cols + i]);
-                    pulp::Arch::new().dispatch(Bend { values, factor, sums: part });
-                }
+        // Differences that begin in this row and the four before; along it with zeros around.
+        let mut differences = [(); 5].map(|()| vec![N::default(); cols]);
+        let mut beside = vec![N::default(); cols + 4];
+        for row in first.saturating_sub(4)..first + sums.len() / cols {
+            differences.rotate_left(1);
+            let line = |i: usize| &x[(row + i) * cols..][..cols];
+            let found = &mut differences[4][..];
+            if row + 4 < rows {
+                let (values, counted) = (std::array::from_fn(line), &down[row * cols..]);
+                pulp::Arch::new().dispatch(Differ { values, counted, sums: found });
+            } else {
+                found.fill(N::default());
             }
-        });
+            let Some(own) = row.checked_sub(first) else { continue };
+            let part = &mut sums[own * cols..][..cols];
+            let values = [4, 3, 2, 1, 0].map(|i| &differences[i][..]);
+            pulp::Arch::new().dispatch(Bend { values, factor, sums: &mut *part });
+            if cols > 4 {
+                let (line, counted) = (line(0), &along[row * cols..]);
+                let (values, sums) =
+                    (std::array::from_fn(|i| &line[i..cols - 4 + i]), &mut beside[4..cols]);
+                pulp::Arch::new().dispatch(Differ { values, counted, sums });
+                let values = [4, 3, 2, 1, 0].map(|i| &beside[i..cols + i]);
+                pulp::Arch::new().dispatch(Bend { values, factor, sums: part });
+            }
+        }
     }
 }
 
 /// Whether all five weights are above 0.
 struct Count<'s> {
     weights: [&'s [f64]; 5],
-    counted: &'s mut [f64],
+    counted: &'s mut [f32],
 }
 
 impl pulp::NullaryFnOnce for Count<'_> {
@@ -181,13 +217,13 @@ impl pulp::NullaryFnOnce for Count<'_> {
 }
 
 /// Fourth differences, where they count.
-struct Differ<'s> {
-    values: [&'s [f64]; 5],
-    counted: &'s [f64],
-    sums: &'s mut [f64],
+struct Differ<'s, N> {
+    values: [&'s [N]; 5],
+    counted: &'s [f32],
+    sums: &'s mut [N],
 }
 
-impl pulp::NullaryFnOnce for Differ<'_> {
+impl<N: Value> pulp::NullaryFnOnce for Differ<'_, N> {
     type Output = ();
 
     #[inline(always)]
@@ -195,19 +231,20 @@ impl pulp::NullaryFnOnce for Differ<'_> {
         let [a, b, c, d, e] = self.values;
         let inputs = a.iter().zip(b).zip(c).zip(d).zip(e).zip(self.counted);
         for (sum, (((((a, b), c), d), e), counted)) in self.sums.iter_mut().zip(inputs) {
-            *sum = counted * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
+            let [four, six] = [4.0, 6.0].map(N::of);
+            *sum = N::of(f64::from(*counted)) * (*a - four * *b + six * *c - four * *d + *e);
         }
     }
 }
 
 /// Adds a multiple of fourth differences.
-struct Bend<'s> {
-    values: [&'s [f64]; 5],
-    factor: f64,
-    sums: &'s mut [f64],
+struct Bend<'s, N> {
+    values: [&'s [N]; 5],
+    factor: N,
+    sums: &'s mut [N],
 }
 
-impl pulp::NullaryFnOnce for Bend<'_> {
+impl<N: Value> pulp::NullaryFnOnce for Bend<'_, N> {
     type Output = ();
 
     #[inline(always)]
@@ -215,7 +252,8 @@ impl pulp::NullaryFnOnce for Bend<'_> {
         let [a, b, c, d, e] = self.values;
         let inputs = a.iter().zip(b).zip(c).zip(d).zip(e);
         for (sum, ((((a, b), c), d), e)) in self.sums.iter_mut().zip(inputs) {
-            *sum += self.factor * (a - 4.0 * b + 6.0 * c - 4.0 * d + e);
+            let [four, six] = [4.0, 6.0].map(N::of);
+            *sum += self.factor * (*a - four * *b + six * *c - four * *d + *e);
         }
     }
 }
@@ -223,6 +261,20 @@ impl pulp::NullaryFnOnce for Bend<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn cells_out_of_sight_stay_in_it() {
+        let (shape, workers) = (Shape::new(9, 11), Workers::new(None).unwrap());
+        let seen = |rows: usize| -> Vec<f64> {
+            (0..99).map(|cell| f64::from(u8::from(cell / 11 < rows))).collect()
+        };
+        let of = |rows| Penalty::new(shape, &seen(rows), 1.0, &workers, &Control::default());
+        let (eight, nine) = (of(8), of(9));
+        let (first_of_row_9, mut less, mut more) = (8 * 11, of(8), of(9));
+        assert!(!eight.concerns(first_of_row_9) && nine.concerns(first_of_row_9));
+        assert!(!less.count_where(&nine) && less.counted == nine.counted);
+        assert!(more.count_where(&eight) && more.counted == nine.counted);
+    }
 
     #[test]
     fn a_multiple_of_the_beam_and_a_cubic_cost_nothing() {

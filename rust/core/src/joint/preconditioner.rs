@@ -9,13 +9,14 @@
 //! values. χ is 1 but at the rim of the beam, where R takes over (`joint/rim.rs`). The third part is that of
 //! [`coarse`](crate::coarse), with the columns of Φ hats times the beam
 //! (`joint/wide.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
-//! that they could explain is told from theirs by large scales alone.
+//! that they could explain is distinguished from theirs by large scales alone.
 
 use super::rim::Rim;
 use super::survey::Block;
 use super::system::System;
+use super::waves::Waves;
 use super::wide::Wide;
-use crate::coarse::{Arm, Coarse, DAMPING, Hats, spacing};
+use crate::coarse::{Coarse, DAMPING, Entry, Hats, spacing};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -32,6 +33,7 @@ const FILTER: [f64; 5] = [0.08, -0.445, 1.73, -0.445, 0.08];
 
 pub(crate) struct Preconditioner {
     wide: Wide,
+    waves: Waves,
     /// 1/D of cells that are not of the rim, else 0.
     inverse: Vec<f64>,
     rim: Rim,
@@ -55,15 +57,18 @@ impl Preconditioner {
         let (sensor, count) = (system.pass.exposures.sensor(), system.pass.exposures.count());
         let params = system.fluxes.columns.len();
         let across = sensor.cols.div_ceil(size[1]);
-        let arm = |index: usize, k: usize, block: &Block| {
+        // The cell that the middle of a block sees.
+        let seen = |index: usize, k: usize| {
             let corner = [index / across * size[0], index % across * size[1]];
             let centre = |axis: usize, side: usize| {
                 let end = (corner[axis] + size[axis]).min(side) - 1;
                 (corner[axis] + end) as f64 / 2.0
             };
             let place = system.pass.grid.place(k, [centre(0, sensor.rows), centre(1, sensor.cols)]);
-            let [row, col] =
-                [0, 1].map(|axis| place[axis] + system.state.shifts[k][axis] + origin[axis] as f64);
+            [0, 1].map(|axis| place[axis] + system.state.shifts[k][axis] + origin[axis] as f64)
+        };
+        let entry = |index: usize, k: usize, block: &Block| {
+            let [row, col] = seen(index, k);
             let columns = system.fluxes.columns.iter().enumerate();
             let mut others: Vec<_> =
                 columns.map(|(index, column)| (hats.count() + index, column[k])).collect();
@@ -71,11 +76,11 @@ impl Preconditioner {
                 let first = hats.count() + params + 2 * k;
                 others.extend([0, 1].map(|axis| (first + axis, block.slope[axis] / block.weight)));
             }
-            Arm { weight: block.weight, hats: hats.over(row, col), others }
+            Entry { weight: block.weight, hats: hats.over(row, col), others }
         };
-        let stars = blocks.chunks_exact(count).enumerate().map(|(index, blocks)| {
+        let entries = blocks.chunks_exact(count).enumerate().map(|(index, blocks)| {
             let lit = blocks.iter().enumerate().filter(|(_, block)| block.weight > 0.0);
-            lit.map(|(k, block)| arm(index, k, block)).collect()
+            lit.map(|(k, block)| entry(index, k, block)).collect()
         });
         // What a block's mean slope leaves of its mean square is the parameter's own.
         let mut own = system.precisions();
@@ -93,18 +98,20 @@ impl Preconditioner {
                 }
             }
         }
-        let coarse = Coarse::of_stars(&hats, &own, stars, control)?;
+        let coarse = Coarse::of_blocks(&hats, &own, entries, control)?;
+        control.check()?;
+        let waves = Waves::new(system, &blocks, seen);
         let rim = Rim::new(system, control)?;
         let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
         let weights = &system.weights;
         let least = FAINTEST * weights.iter().sum::<f64>() / weights.len() as f64;
-        let told = |&d: &f64| if d > least { 1.0 / d } else { 0.0 };
-        let mut inverse: Vec<f64> = weights.iter().map(told).collect();
+        let invert_seen = |&d: &f64| if d > least { 1.0 / d } else { 0.0 };
+        let mut inverse: Vec<f64> = weights.iter().map(invert_seen).collect();
         rim.cells().for_each(|cell| inverse[cell] = 0.0);
         let params = whole.into_iter().map(invert).collect();
         let (wide, filters) = (Wide::new(hats, system, control), system.pass.grid.is_spline());
         let cols = system.pass.grid.geometry.beam.cols;
-        Ok(Self { wide, inverse, rim, params, coarse, cols, filters })
+        Ok(Self { wide, waves, inverse, rim, params, coarse, cols, filters })
     }
 
     /// Whether the coarse matrix has a factor.
@@ -118,7 +125,8 @@ impl Preconditioner {
         let (of_cells, of_params) = r.split_at(self.inverse.len());
         let mut heights = self.wide.gather(of_cells, workers);
         heights.extend_from_slice(of_params);
-        self.coarse.solve(&mut heights, DAMPING);
+        self.coarse.correct(&mut heights, DAMPING);
+        let lines = self.waves.correct(&self.wide, of_cells, workers);
         z.resize(of_cells.len(), 0.0);
         workers.map_blocks(z, BAND * cols, |band, part| {
             let first = band * BAND;
@@ -129,6 +137,7 @@ impl Preconditioner {
                 part.iter_mut().zip(own).for_each(|(z, (r, inverse))| *z = r * inverse);
             }
             self.wide.spread(&heights, first, part);
+            self.waves.spread(&self.wide, &lines, first, part);
         });
         self.rim.add(of_cells, z, workers);
         let coarse = &heights[self.wide.hats.count()..];
@@ -140,6 +149,15 @@ impl Preconditioner {
         let shifts = &mut z[self.inverse.len() + system.fluxes.columns.len()..];
         let moves = system.centred(shifts);
         shifts.copy_from_slice(moves.as_flattened());
+    }
+
+    /// The part of waves of P⁻¹ r.
+    #[cfg(test)]
+    pub(super) fn waves_of<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64]) -> Vec<f64> {
+        let lines = self.waves.correct(&self.wide, r, system.pass.workers);
+        let mut found = vec![0.0; r.len()];
+        self.waves.spread(&self.wide, &lines, 0, &mut found);
+        found
     }
 
     /// χ K D⁻¹ K χ r on rows of cells from `first` on.
@@ -155,8 +173,8 @@ impl Preconditioner {
             match inside((first + step).checked_sub(2 * around)).map(of) {
                 Some(row) => {
                     let input = r[row.clone()].iter().zip(&self.inverse[row]);
-                    let told = |(r, d): (&f64, &f64)| if *d > 0.0 { *r } else { 0.0 };
-                    line.iter_mut().zip(input).for_each(|(line, input)| *line = told(input));
+                    let seen = |(r, d): (&f64, &f64)| if *d > 0.0 { *r } else { 0.0 };
+                    line.iter_mut().zip(input).for_each(|(line, input)| *line = seen(input));
                 }
                 None => line.fill(0.0),
             }
@@ -193,7 +211,7 @@ impl FilterRows {
         Self { rows, line: vec![0.0; cols + FILTER.len() - 1] }
     }
 
-    /// Room for the row that comes in; the first one goes.
+    /// A buffer for the row that comes in; the first one goes.
     fn next(&mut self) -> &mut [f64] {
         self.rows.rotate_left(1);
         &mut self.rows[FILTER.len() - 1]

@@ -7,26 +7,26 @@
 
 use super::layout::Window;
 use super::system::System;
+use super::tiles::{Tile, Tiles};
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
 use crate::geometry::TAPS;
 use crate::linalg::Cholesky;
 use crate::parallel::Workers;
 
 /// A cell is of the rim if one so near has less than this share of its weight: the outermost factor of a
-/// spline is at most a sixth.
-const NEAR: usize = 2;
+/// spline is at most a sixth. Where exposures are turned against each other a third cell saves next to nothing,
+/// and on a grid of which the rim is the larger part it costs iterations.
+const NEAR: usize = 3;
+pub(super) const NEAR_OF_TURNED: usize = 2;
 const SHARE: f64 = 1.0 / 6.0;
 /// A rim of more cells than these of each row and column fills the image: then its diagonal has to do.
-pub(crate) const WIDEST: usize = 12;
+pub(crate) const WIDEST: usize = 16;
 /// What is added to the diagonal, as a share of it, for cells that rounding alone determines.
 const RIDGE: f64 = 1e-10;
 /// Cells that lie within a spline's reach of each other, along one axis.
 const REACH: usize = 2 * TAPS - 1;
-/// The rim is factorised in tiles of the grid so many cells wide, which are almost independent:
-/// each in some hundredths of a second, which nothing interrupts.
-const TILE: usize = 512;
 
 pub(crate) struct Rim {
     parts: Vec<Part>,
@@ -34,7 +34,8 @@ pub(crate) struct Rim {
 
 /// The rim in one tile.
 struct Part {
-    cells: Vec<u32>,
+    /// Its cells, each with its share.
+    cells: Vec<(u32, f64)>,
     factor: Option<Cholesky>,
     /// 1/(N + τ GᵀG), of the diagonal, where there is no factor.
     inverse: Vec<f64>,
@@ -42,50 +43,39 @@ struct Part {
 
 impl Rim {
     pub(crate) fn new<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Self> {
-        let mut cells = if system.pass.grid.is_spline() { cells(system) } else { Vec::new() };
-        let (length, cols) = (system.state.beam.len(), system.pass.grid.geometry.beam.cols);
-        let fits = cells.len() <= WIDEST * (length / cols + cols);
-        let tile = |&cell: &u32| (cell as usize / cols / TILE, cell as usize % cols / TILE);
-        cells.sort_by_key(tile);
-        let parts: Vec<&[u32]> = cells.chunk_by(|a, b| tile(a) == tile(b)).collect();
-        let mut numbers = system.pass.workers.filled(length, u32::MAX, control);
-        for part in &parts {
-            part.iter().zip(0..).for_each(|(&cell, number)| numbers[cell as usize] = number);
-        }
-        let parts = system.pass.workers.map(parts.len(), |index| {
+        let cells = if system.pass.grid.is_spline() { cells(system) } else { Vec::new() };
+        let Shape { rows, cols } = system.pass.grid.geometry.beam;
+        let fits = cells.len() <= WIDEST * (rows + cols);
+        let tiles = Tiles::new(Shape::new(rows, cols), &cells);
+        let parts = system.pass.workers.map(tiles.parts.len(), |index| {
             control.check()?;
-            Ok(Part::new(system, parts[index], &numbers, fits))
+            Ok(Part::new(system, &tiles.parts[index], fits))
         });
         Ok(Self { parts: parts.into_iter().collect::<Result<_>>()? })
     }
 
+    /// The cells of the rim, those in several tiles several times.
     pub(crate) fn cells(&self) -> impl Iterator<Item = usize> {
-        self.parts.iter().flat_map(|part| &part.cells).map(|&cell| cell as usize)
+        self.parts.iter().flat_map(|part| &part.cells).map(|&(cell, _)| cell as usize)
     }
 
     /// Adds (N + τ GᵀG)⁻¹ r on the rim.
     pub(crate) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
-        let found = workers.map(self.parts.len(), |index| self.parts[index].solve(r));
+        let found = workers.map(self.parts.len(), |index| self.parts[index].apply(r));
         self.cells().zip(found.into_iter().flatten()).for_each(|(cell, value)| z[cell] += value);
     }
 }
 
 impl Part {
-    /// The part of these cells, by the number that each cell has among those of its part.
-    fn new<T: Real>(
-        system: &System<'_, '_, T>,
-        cells: &[u32],
-        numbers: &[u32],
-        fits: bool,
-    ) -> Self {
+    fn new<T: Real>(system: &System<'_, '_, T>, tile: &Tile, fits: bool) -> Self {
         let (mut entries, mut inverse) = (Vec::new(), Vec::new());
-        for (&cell, number) in cells.iter().zip(0..) {
+        let numbers = tile.numbers();
+        for (&(cell, _), number) in tile.cells.iter().zip(0..) {
             let mut row: Vec<(u32, f64)> = Vec::new();
             system.for_neighbours(cell as usize, |other, value| {
-                let other_number = numbers[other];
-                let is_own = cells.get(other_number as usize) == Some(&(other as u32));
-                if is_own && other_number <= number {
-                    row.push((other_number, value));
+                let other = tile.place(other).map_or(u32::MAX, |place| numbers[place]);
+                if other <= number {
+                    row.push((other, value));
                 }
             });
             row.sort_by_key(|&(other, _)| other);
@@ -99,37 +89,43 @@ impl Part {
                 entries.clear();
             }
         }
-        let factor = fits.then(|| Cholesky::new(cells.len(), &entries)).flatten();
-        Self { cells: cells.to_vec(), factor, inverse }
+        let factor = fits.then(|| Cholesky::new(tile.cells.len(), &entries)).flatten();
+        Self { cells: tile.cells.clone(), factor, inverse }
     }
 
-    fn solve(&self, r: &[f64]) -> Vec<f64> {
-        let mut values: Vec<f64> = self.cells.iter().map(|&cell| r[cell as usize]).collect();
+    /// (N + τ GᵀG)⁻¹ r, times the shares on either side.
+    fn apply(&self, r: &[f64]) -> Vec<f64> {
+        let own = self.cells.iter().map(|&(cell, share)| share * r[cell as usize]);
+        let mut values: Vec<f64> = own.collect();
         match &self.factor {
-            Some(factor) => factor.solve(&mut values),
+            Some(factor) => factor.substitute(&mut values),
             None => values.iter_mut().zip(&self.inverse).for_each(|(value, i)| *value *= i),
         }
+        values.iter_mut().zip(&self.cells).for_each(|(value, (_, share))| *value *= share);
         values
     }
 }
 
 /// The cells of the rim.
 fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
+    let is_turned = system.pass.grid.geometry.views.len() > 1;
+    let near = if is_turned { NEAR_OF_TURNED } else { NEAR };
     let (weights, shape) = (&system.weights, system.pass.grid.geometry.beam);
+    let penalty = system.penalty.as_ref();
     let rows = system.pass.workers.map(shape.rows, |row| {
         let mut found = Vec::new();
         for col in 0..shape.cols {
             let cell = row * shape.cols + col;
             let least = SHARE * weights[cell];
-            let inside = row >= NEAR
-                && col >= NEAR
-                && row + NEAR < shape.rows
-                && col + NEAR < shape.cols
-                && (row - NEAR..=row + NEAR).all(|row| {
-                    let around = &weights[row * shape.cols + col - NEAR..][..=2 * NEAR];
+            let inside = row >= near
+                && col >= near
+                && row + near < shape.rows
+                && col + near < shape.cols
+                && (row - near..=row + near).all(|row| {
+                    let around = &weights[row * shape.cols + col - near..][..=2 * near];
                     around.iter().all(|&weight| weight >= least)
                 });
-            if weights[cell] > 0.0 && !inside {
+            if !inside && (weights[cell] > 0.0 || penalty.is_some_and(|p| p.concerns(cell))) {
                 found.push(cell as u32);
             }
         }

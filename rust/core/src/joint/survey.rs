@@ -1,14 +1,9 @@
-//! What the exposures show of the beam, in sums: over blocks of pixels, and of its structure.
+//! What the exposures show of the beam, in sums over blocks of pixels.
 
 use super::system::System;
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::{Real, Shape};
-
-/// Cells between slopes that are compared.
-const APART: usize = 8;
-/// Binomial factors of standard deviation 1.
-const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
+use crate::frames::Real;
 
 /// What one exposure shows in a block of pixels, with the light e = c L: Σ w (M e)², and with its
 /// slopes along the shift Σ w M² e ∂e and Σ w M² (∂e)².
@@ -27,21 +22,22 @@ impl<T: Real> System<'_, '_, T> {
         let (down, across) = (sensor.rows.div_ceil(size[0]), sensor.cols.div_ceil(size[1]));
         let beams = self.pass.views_of(&self.state.beam);
         let found = self.pass.workers.map(down, |block_row| {
-            let mut room = self.pass.room();
+            let mut workspace = self.pass.workspace();
             let mut found = vec![Block::default(); across * count];
             for row_index in block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]) {
                 control.check()?;
                 let row = self.pass.row(row_index);
                 let (light, rest) = row.split_at(count * sensor.cols);
-                self.pass.weigh_row(row_index, &mut room);
-                self.pass.see_slopes(&beams, row_index, &mut room);
+                self.pass.weigh_row(row_index, &mut workspace);
+                self.pass.see_slopes(&beams, row_index, &mut workspace);
                 for k in 0..count {
                     for col in 0..sensor.cols {
                         let at = k * sensor.cols + col;
                         let block = &mut found[col / size[1] * count + k];
-                        let (weight, light) = (room.weights[at] * rest[col].powi(2), light[at]);
+                        let (weight, light) =
+                            (workspace.weights[at] * rest[col].powi(2), light[at]);
                         block.weight += weight * light * light;
-                        for (axis, slopes) in room.slopes.iter().enumerate() {
+                        for (axis, slopes) in workspace.slopes.iter().enumerate() {
                             let Some(slope) = slopes.get(at) else { continue };
                             let slope = self.pass.flux[k] * slope;
                             block.slope[axis] += weight * light * slope;
@@ -54,39 +50,5 @@ impl<T: Real> System<'_, '_, T> {
         });
         let found: Result<Vec<Vec<Block>>> = found.into_iter().collect();
         Ok(found?.concat())
-    }
-
-    /// How much the beam's slopes change from place to place, over those of noise: the mean square of
-    /// the smoothed slopes' second differences over [`APART`] cells, by that of what smoothing took
-    /// away. A beam without structure, such as a Gaussian, has slopes of its own too, but by those
-    /// shifts are nearly degenerate with a bend of M.
-    pub(crate) fn structure(&self) -> f64 {
-        let Shape { rows, cols } = self.pass.grid.geometry.beam;
-        let beam = &self.state.beam;
-        let seen = |cell: usize| self.weights.get(cell).is_some_and(|&weight| weight > 0.0);
-        let [mut kept, mut lost] = [0.0, 0.0];
-        for (step, length) in [(1, cols), (cols, rows)] {
-            let slope = |cell: usize| beam[cell + step] - beam[cell - step];
-            let smooth = |cell: usize| {
-                let terms = SMOOTH.iter().enumerate();
-                terms.map(|(i, t)| t * slope(cell + i * step - 2 * step)).sum::<f64>()
-            };
-            for cell in 0..beam.len() {
-                let place = cell / step % length;
-                let ends = 3..length.saturating_sub(3 + 2 * APART);
-                if !ends.contains(&place) {
-                    continue;
-                }
-                let places = [cell, cell + APART * step, cell + 2 * APART * step];
-                let known =
-                    |cell: usize| seen(cell - 3 * step) && seen(cell) && seen(cell + 3 * step);
-                if places.into_iter().all(known) {
-                    let [first, middle, last] = places.map(smooth);
-                    kept += (first - 2.0 * middle + last).powi(2) / 6.0;
-                    lost += (slope(cell) - first).powi(2);
-                }
-            }
-        }
-        kept / lost
     }
 }

@@ -15,12 +15,13 @@
 use std::ops::Range;
 
 use super::flux::Fluxes;
-use super::kernel::{Follow, Solve};
+use super::fused::Fused;
+use super::kernel::{Eliminate, Propagate};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
-use super::room::Sums;
 use super::unknowns::{ShiftPrior, State};
+use super::workspace::Sums;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -50,6 +51,16 @@ pub(crate) struct System<'m, 'a, T> {
     /// D a/(aᵀD a) with these weights D and the coefficients a.
     scale: Vec<f64>,
     pub(crate) penalty: Option<Penalty>,
+    /// A faster product where it serves, and whether it is of the state last linearised.
+    fused: Option<Fused>,
+    is_fused_anew: bool,
+    /// Whether products may be made in single precision: where no later step makes good what they leave,
+    /// they may not.
+    pub(crate) allows_single: bool,
+    /// Whether the weights and τ are of the state last linearised.
+    is_weighed_anew: bool,
+    /// Whether the penalty counts more cells than at the state linearised before.
+    pub(crate) sees_more: bool,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -73,6 +84,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             weights: Vec::new(),
             scale: Vec::new(),
             penalty: None,
+            fused: None,
+            is_fused_anew: false,
+            allows_single: true,
+            is_weighed_anew: false,
+            sees_more: false,
             state,
         }
     }
@@ -81,6 +97,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     pub(crate) fn seek_shifts(&mut self, prior: Option<ShiftPrior>) -> Option<ShiftPrior> {
         self.pass.with_shifts = prior.is_some();
         std::mem::replace(&mut self.shift_prior, prior)
+    }
+
+    /// The share of each exposure in all weights.
+    pub(super) fn shares_of_exposures(&self) -> Vec<f64> {
+        let weights = self.pass.exposures.exposure_weights();
+        let total: f64 = weights.iter().sum();
+        weights.iter().map(|weight| weight / total).collect()
     }
 
     /// Whether shifts are sought.
@@ -130,10 +153,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         self.pass.place(&self.state.shifts, control);
+        // Its bands are those of the shifts.
+        self.fused.take_if(|_| self.shift_prior.is_some());
+        (self.is_fused_anew, self.is_weighed_anew) = (false, false);
         self.pass.flux = self.fluxes.at(&self.state.theta);
         let beam = std::mem::take(&mut self.state.beam);
         let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
-        let found = self.solve_pixels(&beam, &mut pull, control);
+        let found = self.eliminate_pixels(&beam, &mut pull, control);
         self.state.beam = beam;
         let found = found?;
         self.append(&found, &mut pull);
@@ -149,27 +175,37 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// What [`linearise`](Self::linearise) gives, at weights D and a weight of the penalty of the state
     /// there.
     pub(crate) fn renew(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.penalty = None;
-        self.weigh(control)?;
+        if !self.is_weighed_anew {
+            self.penalty = None;
+            self.weigh(control)?;
+        }
         self.whole(control)
     }
 
     /// M and O at their closed forms, and what they leave pulls at the cells.
-    fn solve_pixels(&mut self, beam: &[f64], pull: &mut [f64], control: &Control) -> Result<Sums> {
+    fn eliminate_pixels(
+        &mut self,
+        beam: &[f64],
+        pull: &mut [f64],
+        control: &Control,
+    ) -> Result<Sums> {
         let views = self.pass.views_of(beam);
-        self.pass.run(pull, control, |pass, row_index, row, room, found| {
-            room.values().clear();
-            pass.see(&views, row_index, room);
+        self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
+            workspace.values().clear();
+            pass.see(&views, row_index, workspace);
             let lights = row.light.chunks_exact_mut(pass.exposures.sensor().cols);
             for (k, (light, flux)) in lights.zip(&pass.flux).enumerate() {
-                light.iter_mut().zip(room.values().of(k)).for_each(|(e, seen)| *e = flux * seen);
+                light
+                    .iter_mut()
+                    .zip(workspace.values().of(k))
+                    .for_each(|(e, seen)| *e = flux * seen);
             }
-            pass.measure(row_index, room);
-            pass.see_slopes(&views, row_index, room);
-            let (weights, values, sums) = room.parts();
+            pass.measure(row_index, workspace);
+            pass.see_slopes(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
-            let solve = Solve { row, fluxes, weights, values, sums, singular };
-            found.objective += pulp::Arch::new().dispatch(solve);
+            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular };
+            found.objective += pulp::Arch::new().dispatch(eliminate);
         })
     }
 
@@ -224,14 +260,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             objective += self.unit * precision * theta * theta;
         }
         if let Some(prior) = &self.shift_prior {
-            let known = prior.measured.as_flattened().iter().zip(prior.precisions.as_flattened());
-            let found = self.state.shifts.as_flattened();
-            let of_shifts = slope[cells + params..].iter_mut().zip(found).zip(known);
-            for ((slope, found), (measured, precision)) in of_shifts {
-                let deviation = found - measured;
-                *slope -= self.unit * precision * deviation;
+            let found = self.state.shifts.iter().zip(&prior.measured);
+            let deviations: Vec<[f64; 2]> =
+                found.map(|(d, measured)| [d[0] - measured[0], d[1] - measured[1]]).collect();
+            let known = deviations.as_flattened().iter().zip(prior.precisions.as_flattened());
+            for (deviation, precision) in known {
                 objective += self.unit * precision * deviation * deviation;
             }
+            let pulls = prior.pull(&deviations);
+            let of_shifts = slope[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(slope, pull)| *slope -= self.unit * pull);
         }
         objective
     }
@@ -246,16 +284,16 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// The pixels whose measurements do not distinguish an offset from a gain, where one is sought.
     pub(crate) fn without_offset(&self) -> Vec<usize> {
-        let (mut untold, mut first) = (Vec::new(), 0);
+        let (mut undetermined, mut first) = (Vec::new(), 0);
         if self.pass.with_offset {
             self.pass.for_rows(|[_, gain, _, _, beside, _]| {
                 let pixels = gain.iter().zip(beside).enumerate();
-                let told = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
-                untold.extend(told.map(|(col, _)| first + col));
+                let alone = pixels.filter(|(_, (gain, offset))| **gain > 0.0 && **offset == 0.0);
+                undetermined.extend(alone.map(|(col, _)| first + col));
                 first += gain.len();
             });
         }
-        untold
+        undetermined
     }
 
     /// S x, and the change of M that goes with x in each [`Row`]; returns the largest size of that less
@@ -267,26 +305,69 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
+        if self.is_single() {
+            return self.multiply_single(x, product, share, control);
+        }
+        self.multiply_double(x, product, share, control)
+    }
+
+    /// [`multiply`](Self::multiply) in double precision.
+    pub(super) fn multiply_double(
+        &mut self,
+        x: &[f64],
+        product: &mut Vec<f64>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
         let cells = self.state.beam.len();
         let params = self.fluxes.columns.len();
         let moves = self.centred(&x[cells + params..]);
         let beam = std::mem::take(&mut self.state.beam);
         product.resize(cells, 0.0);
-        let sums = self.follow(&beam, x, &moves, product, share, control);
+        let sums = self.propagate(&beam, x, &moves, product, share, control);
         self.state.beam = beam;
         let sums = sums?;
         self.append(&sums, product);
         if let Some(penalty) = &self.penalty {
             penalty.add_product(&x[..cells], &mut product[..cells], self.pass.workers);
         }
-        let found = x[cells..cells + params].iter().chain(moves.as_flattened());
-        let priors = product[cells..].iter_mut().zip(found).zip(self.precisions());
-        priors.for_each(|((product, x), precision)| *product += precision * x);
+        let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
+        for ((product, x), precision) in of_flux.zip(&self.fluxes.precisions) {
+            *product += self.unit * precision * x;
+        }
+        if let Some(prior) = &self.shift_prior {
+            let pulls = prior.pull(&moves);
+            let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(product, pull)| *product += self.unit * pull);
+        }
         Ok(sums.largest)
     }
 
+    /// [`multiply`](Self::multiply) in single precision.
+    fn multiply_single(
+        &mut self,
+        x: &[f64],
+        product: &mut Vec<f64>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
+        let Some(penalty) = &self.penalty else { return Ok(f64::INFINITY) };
+        let fused = self.fused.get_or_insert_with(|| Fused::new(&self.pass, control));
+        if !self.is_fused_anew {
+            fused.renew(&self.pass);
+            self.is_fused_anew = true;
+        }
+        product.resize(x.len(), 0.0);
+        fused.multiply(&mut self.pass, penalty, x, share, product, control)
+    }
+
+    /// Whether products are made in single precision.
+    pub(crate) fn is_single(&self) -> bool {
+        self.allows_single && Fused::serves(&self.pass)
+    }
+
     /// What a step pulls at the cells once M and O have followed it.
-    fn follow(
+    fn propagate(
         &mut self,
         beam: &[f64],
         x: &[f64],
@@ -295,21 +376,63 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<Sums> {
-        let (cells, params) = (beam.len(), self.fluxes.columns.len());
-        let logs = self.fluxes.spread(&x[cells..cells + params]);
-        let shares: Vec<f64> =
-            logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect();
+        let cells = beam.len();
+        let shares = self.shares(&x[cells..]);
         let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(beam));
-        self.pass.run(pull, control, |pass, row_index, row, room, found| {
-            pass.weigh_row(row_index, room);
-            pass.see_slopes(&beams, row_index, room);
-            room.begin(row.light, &shares, moves);
-            pass.see(&views, row_index, room);
-            let (weights, values, sums) = room.parts();
+        self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
+            pass.weigh_row(row_index, workspace);
+            pass.see_slopes(&beams, row_index, workspace);
+            workspace.begin(row.light, &shares, moves);
+            pass.see(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
             let fluxes = &pass.flux[..];
-            let follow = Follow { row, fluxes, weights, values, sums, share };
-            found.largest = found.largest.max(pulp::Arch::new().dispatch(follow));
+            let propagate = Propagate { row, fluxes, weights, values, sums, share };
+            found.largest = found.largest.max(pulp::Arch::new().dispatch(propagate));
         })
+    }
+
+    /// Changes of ln c, divided by c, of changes of θ and what stands behind them.
+    fn shares(&self, x: &[f64]) -> Vec<f64> {
+        let logs = self.fluxes.spread(&x[..self.fluxes.columns.len()]);
+        logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect()
+    }
+
+    /// 1ᵀ w Q J x of each pixel: what a change of all its measurements alike does to the slope along x.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn propagate_common(&mut self, x: &[f64], control: &Control) -> Result<Vec<f64>> {
+        let cells = self.state.beam.len();
+        let shares = self.shares(&x[cells..]);
+        let moves = self.centred(&x[cells + self.fluxes.columns.len()..]);
+        let beam = std::mem::take(&mut self.state.beam);
+        let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(&beam));
+        let mut pull = vec![0.0; cells];
+        let done = self.pass.run(&mut pull, control, |pass, row_index, mut row, workspace, _| {
+            pass.weigh_row(row_index, workspace);
+            pass.see_slopes(&beams, row_index, workspace);
+            workspace.begin(row.light, &shares, &moves);
+            pass.see(&views, row_index, workspace);
+            let (weights, values, sums) = workspace.parts();
+            let fluxes = &pass.flux[..];
+            let propagate =
+                Propagate { row: row.again(), fluxes, weights, values, sums, share: 0.0 };
+            pulp::Arch::new().dispatch(propagate);
+            row.change.fill(0.0);
+            for (k, flux) in pass.flux.iter().enumerate() {
+                let pulls = values.of(k).iter().zip(&*row.sensitivity);
+                for (sum, (pull, m)) in row.change.iter_mut().zip(pulls) {
+                    // A pixel without response pulls at nothing.
+                    *sum += if *m == 0.0 { 0.0 } else { pull / (flux * m) };
+                }
+            }
+        });
+        drop((views, beams));
+        self.state.beam = beam;
+        done?;
+        let mut common = Vec::new();
+        self.pass.for_rows(|[_, _, sums, ..]| common.extend_from_slice(sums));
+        Ok(common)
     }
 
     /// The priors' weights of the parameters.
@@ -321,10 +444,10 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
     fn weigh(&mut self, control: &Control) -> Result<()> {
         let mut weights = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
-        self.pass.run(&mut weights, control, |pass, row_index, row, room, _| {
+        self.pass.run(&mut weights, control, |pass, row_index, row, workspace, _| {
             let cols = pass.exposures.sensor().cols;
-            pass.weigh_row(row_index, room);
-            let (weights, values, _) = room.parts();
+            pass.weigh_row(row_index, workspace);
+            let (weights, values, _) = workspace.parts();
             for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let pixels = weights.iter().zip(&*row.sensitivity);
                 for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
@@ -333,14 +456,18 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             }
         })?;
         self.weights = weights;
+        self.is_weighed_anew = self.penalty.is_none();
         if self.pass.grid.is_spline() {
             let total: f64 = self.weights.iter().sum();
             let typical = self.pass.workers.dot(&self.weights, &self.weights) / total;
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(SMOOTHING * typical, |penalty| penalty.tau);
             let shape = self.pass.grid.geometry.beam;
-            self.penalty =
-                Some(Penalty::new(shape, &self.weights, tau, self.pass.workers, control));
+            let mut penalty = Penalty::new(shape, &self.weights, tau, self.pass.workers, control);
+            // Nor would it be one if cells left it that come out of sight.
+            let last = self.penalty.take();
+            self.sees_more = last.is_some_and(|last| penalty.count_where(&last));
+            self.penalty = Some(penalty);
         }
         control.check()
     }
@@ -362,29 +489,5 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             *weight *= (self.pass.flux[exposure] * m).powi(2);
         }
         weights
-    }
-
-    /// M and O at the state, row by row.
-    pub(crate) fn pixels(&self) -> [Vec<f64>; 2] {
-        let mut found = [Vec::new(), Vec::new()];
-        self.pass.for_rows(|[sensitivity, _, _, offset, ..]| {
-            found[0].extend_from_slice(sensitivity);
-            found[1].extend_from_slice(offset);
-        });
-        found
-    }
-
-    /// The mean M of the pixels with measurements.
-    fn mean_sensitivity(&self) -> f64 {
-        let (mut sum, mut count) = (0.0, 0);
-        self.pass.for_rows(|[sensitivity, inverse, ..]| {
-            for (m, inverse) in sensitivity.iter().zip(inverse) {
-                if *inverse > 0.0 {
-                    sum += m;
-                    count += 1;
-                }
-            }
-        });
-        sum / f64::from(count.max(1))
     }
 }

@@ -1,24 +1,27 @@
-//! The rim against dense algebra.
+//! The rim against dense algebra, and products in single precision against those in double.
 
 use super::flux::Fluxes;
 use super::layout::Grid;
-use super::rim::Rim;
+use super::preconditioner::Preconditioner;
+use super::rim::{NEAR_OF_TURNED as NEAR, Rim};
 use super::system::System;
 use super::unknowns::State;
+use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::exposures::{Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
 use crate::frames::{Shape, Stack};
 use crate::geometry::Rotation;
 use crate::parallel::Workers;
+use crate::testing::{self, SENSOR, random_number};
 
-const SENSOR: Shape = Shape::new(9, 11);
 const ROTATIONS: [Rotation; 4] =
     [Rotation::None, Rotation::Quarter, Rotation::Half, Rotation::ThreeQuarters];
-const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [0.3, 2.2], [-1.6, 0.7], [2.4, 1.5]];
+const FLUX: [f64; 4] = [1.0, 1.1, 0.9, 1.2];
+const SHIFTS: &[[f64; 2]] = testing::SHIFTS.split_at(4).0;
 
 /// A number from 0 to 1 that looks random.
 fn random(index: usize) -> f64 {
-    ((index as f64 * 12.9898).sin() * 43758.5453).rem_euclid(1.0)
+    0.5 + 0.5 * random_number(index)
 }
 
 /// Variances, and what is masked.
@@ -28,29 +31,43 @@ fn uneven() -> (Vec<f64>, Vec<bool>) {
 }
 
 /// Calls `visit` with the linear problem of a sensor that is turned every way, and its dense N.
-fn with_system(visit: impl FnOnce(&System<'_, '_, f64>, &[Vec<f64>])) {
+fn with_turned(visit: impl FnOnce(&System<'_, '_, f64>, &[Vec<f64>])) {
     let (variance, mask) = uneven();
-    let frames: Vec<f64> = (0..mask.len()).map(|i| 1.0 + 0.1 * random(i + 5000)).collect();
-    let flux = [1.0, 1.1, 0.9, 1.2];
+    with_system(&ROTATIONS, &each(&variance), &Mask::Measurements(&mask), |system| {
+        visit(system, &dense(system, &FLUX, &variance, &mask));
+    });
+}
+
+fn stack(values: &[f64]) -> Stack<'_, f64> {
+    Stack::new("frames", values, ROTATIONS.len(), SENSOR).unwrap()
+}
+
+fn each(variance: &[f64]) -> Variance<'_, f64> {
+    Variance::Measurements(stack(variance))
+}
+
+/// Calls `visit` with the linear problem of exposures that are turned so.
+fn with_system(
+    rotations: &[Rotation; 4],
+    variance: &Variance<'_, f64>,
+    mask: &Mask<'_>,
+    visit: impl FnOnce(&mut System<'_, '_, f64>),
+) {
+    let frames: Vec<f64> =
+        (0..ROTATIONS.len() * SENSOR.len()).map(|i| 1.0 + 0.1 * random(i + 5000)).collect();
     let (workers, control) = (Workers::new(None).unwrap(), Control::new());
-    let stack = |values| Stack::new("frames", values, ROTATIONS.len(), SENSOR).unwrap();
-    let measurements = Measurements {
-        frames: stack(&frames),
-        variance: Variance::Measurements(stack(&variance)),
-        mask: Mask::Measurements(&mask),
-    };
-    let positions = Positions { shifts: SHIFTS.to_vec(), rotations: ROTATIONS.to_vec(), std: None };
-    let lamp = Flux { values: flux.to_vec(), kind: FluxKind::Known };
+    let measurements = Measurements { frames: stack(&frames), variance: *variance, mask: *mask };
+    let positions = Positions { shifts: SHIFTS.to_vec(), rotations: rotations.to_vec(), std: None };
+    let lamp = Flux { values: FLUX.to_vec(), kind: FluxKind::Known };
     let exposures =
         Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
-    let grid = Grid::new(SENSOR, &SHIFTS, &ROTATIONS, false).unwrap();
-    let fluxes = Fluxes::new(&flux, &FluxKind::Known, &SHIFTS, &ROTATIONS);
+    let grid = Grid::new(SENSOR, SHIFTS, rotations, false).unwrap();
+    let fluxes = Fluxes::new(&FLUX, &FluxKind::Known, SHIFTS, rotations);
     let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
     let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
     let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control);
     system.linearise(&control).unwrap();
-    let normal = dense(&system, &flux, &variance, &mask);
-    visit(&system, &normal);
+    visit(&mut system);
 }
 
 /// N: the sum of w c² M² B_i B_j over the measurements.
@@ -101,14 +118,15 @@ fn taps(system: &System<'_, '_, f64>, exposure: usize, pixel: usize) -> Vec<(usi
 
 #[test]
 fn the_rim_is_where_a_cell_near_has_less_than_a_sixth() {
-    with_system(|system, normal| {
+    with_turned(|system, normal| {
         let Shape { rows, cols } = system.pass.grid.geometry.beam;
         // D = Σ w c² M² B, the sum of a row of N, since all B of a pixel sum to 1.
         let weight = |row: usize, col: usize| normal[row * cols + col].iter().sum::<f64>();
         let is_rim = |cell: usize| {
             let (row, col) = (cell / cols, cell % cols);
-            let near = |at: usize, size: usize| (at + 1).saturating_sub(3)..(at + 3).min(size);
-            let inside = row >= 2 && col >= 2 && row + 2 < rows && col + 2 < cols;
+            let near = |at: usize, size: usize| at.saturating_sub(NEAR)..(at + NEAR + 1).min(size);
+            let end = |at: usize, size: usize| at < NEAR || at + NEAR >= size;
+            let inside = !end(row, rows) && !end(col, cols);
             let mut around = near(row, rows).flat_map(|r| near(col, cols).map(move |c| (r, c)));
             let own = weight(row, col);
             own > 0.0 && (!inside || around.any(|(r, c)| weight(r, c) < own / 6.0))
@@ -122,7 +140,7 @@ fn the_rim_is_where_a_cell_near_has_less_than_a_sixth() {
 
 #[test]
 fn on_the_rim_the_normal_matrix_is_inverted() {
-    with_system(|system, normal| {
+    with_turned(|system, normal| {
         let rim = Rim::new(system, &Control::new()).unwrap();
         let cells: Vec<usize> = rim.cells().collect();
         let right: Vec<f64> = (0..normal.len()).map(|cell| random(cell + 77) - 0.5).collect();
@@ -140,4 +158,65 @@ fn on_the_rim_the_normal_matrix_is_inverted() {
         let outside = (0..normal.len()).filter(|cell| !cells.contains(cell));
         assert!(outside.into_iter().all(|cell| found[cell] == 0.0));
     });
+}
+
+/// Of pixels that see waves of period 7 nearly alike, S and the matrix of hats times those waves agree.
+#[test]
+fn the_matrix_of_waves_is_that_of_the_product() {
+    let sensor = Shape::new(84, 98);
+    let shifts = [[0.0, 0.0], [0.3, 7.2], [7.1, -0.4]];
+    let frames = vec![1.0; 3 * sensor.len()];
+    let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+    let frames = Stack::new("frames", &frames, 3, sensor).unwrap();
+    let positions = Positions::of_shifts(&shifts);
+    let exposures =
+        Exposures::new(frames.into(), positions, Flux::steady(3), false, &workers, &control);
+    let exposures = exposures.unwrap();
+    let grid = Grid::new(sensor, &shifts, &[Rotation::None; 3], false).unwrap();
+    let fluxes = Fluxes::new(&[1.0; 3], &FluxKind::Known, &shifts, &[Rotation::None; 3]);
+    let state = State {
+        beam: vec![1.0; grid.geometry.beam.len()],
+        theta: Vec::new(),
+        shifts: shifts.to_vec(),
+    };
+    let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control);
+    system.linearise(&control).unwrap();
+    let preconditioner = Preconditioner::new(&mut system, &control).unwrap();
+    // A wave packet, then what the waves make of what it pulls.
+    let white: Vec<f64> = (0..system.size()).map(|cell| random(cell + 13) - 0.5).collect();
+    let packet = preconditioner.waves_of(&system, &white);
+    let mut pulls = Vec::new();
+    system.multiply_double(&packet, &mut pulls, 0.0, &control).unwrap();
+    let found = preconditioner.waves_of(&system, &pulls);
+    let square = |values: &[f64]| values.iter().map(|value| value * value).sum::<f64>();
+    let off: Vec<f64> = found.iter().zip(&packet).map(|(f, p)| f - DAMPING * p).collect();
+    let share = (square(&off) / square(&found)).sqrt();
+    // Hats of 24 cells hold some three periods, and a rim of 10 of 100 cells is seen by fewer exposures.
+    assert!(square(&packet) > 0.0 && share < 0.3, "{share}");
+}
+
+#[test]
+fn a_product_in_single_precision_is_that_in_double() {
+    let (variance, mask) = uneven();
+    let even = (Variance::Exposures(&[1.0, 2.0, 0.5, 3.0]), Mask::None);
+    for (variance, mask) in [(each(&variance), Mask::Measurements(&mask)), even] {
+        with_system(&[Rotation::None; 4], &variance, &mask, |system| {
+            assert!(system.is_single());
+            let control = Control::new();
+            let x: Vec<f64> = (0..system.size()).map(|cell| random(cell + 31) - 0.5).collect();
+            let (mut single, mut double) = (Vec::new(), Vec::new());
+            let sizes = [
+                system.multiply(&x, &mut single, 0.5, &control).unwrap(),
+                system.multiply_double(&x, &mut double, 0.5, &control).unwrap(),
+            ];
+            // An element is a sum of some 4 · 16 · 4 products, the largest of the size of the largest one.
+            let rounding = 256.0 * f64::from(f32::EPSILON);
+            // The change of the first, less half of itself.
+            assert!((sizes[1] / sizes[0] - 0.5).abs() < rounding);
+            let size = double.iter().fold(0.0_f64, |top, value| top.max(value.abs()));
+            for (one, other) in single.iter().zip(&double) {
+                assert!((one - other).abs() < rounding * size, "{one} {other}");
+            }
+        });
+    }
 }

@@ -22,6 +22,8 @@ pub(crate) struct State {
 pub(crate) struct ShiftPrior {
     pub(crate) measured: Vec<[f64; 2]>,
     pub(crate) precisions: Vec<[f64; 2]>,
+    /// The direction, of length 1, along which alone shifts are sought, if not along both axes.
+    pub(crate) along: Option<[f64; 2]>,
 }
 
 impl ShiftPrior {
@@ -31,7 +33,22 @@ impl ShiftPrior {
         positions.std.as_ref().map(|std| Self {
             measured: positions.shifts.clone(),
             precisions: std.iter().map(precision).collect(),
+            along: None,
         })
+    }
+
+    /// The part of shifts along the direction in which they are sought.
+    fn projected(&self, shifts: &[[f64; 2]]) -> Vec<[f64; 2]> {
+        let Some([e, f]) = self.along else { return shifts.to_vec() };
+        shifts.iter().map(|[row, col]| [e, f].map(|part| part * (e * row + f * col))).collect()
+    }
+
+    /// What this prior pulls at deviations of shifts, in units of the noise.
+    pub(crate) fn pull(&self, deviations: &[[f64; 2]]) -> Vec<[f64; 2]> {
+        let weighted = deviations.iter().zip(&self.precisions);
+        let pulls: Vec<[f64; 2]> = weighted.map(|(d, p)| [p[0] * d[0], p[1] * d[1]]).collect();
+        // Along both axes what pulls at deviations less their mean has none.
+        if self.along.is_some() { self.centred_pulls(&pulls) } else { pulls }
     }
 
     /// Brings shifts back to where the grid reaches.
@@ -48,26 +65,30 @@ impl ShiftPrior {
     /// As Σ_j π_j (d_k − d_j)/Σ π: where one shift is all but exact, it is all but the mean, and what
     /// rounding leaves of their difference would pull at it with all its weight.
     pub(crate) fn centred(&self, shifts: &[[f64; 2]]) -> Vec<[f64; 2]> {
-        let shares = self.shares();
+        let (shares, shifts) = (self.shares(), &self.projected(shifts));
         let from_mean = |shift: &[f64; 2], axis: usize| -> f64 {
             let others = shares.iter().zip(shifts);
             others
                 .map(|(share, other): (_, &[f64; 2])| share[axis] * (shift[axis] - other[axis]))
                 .sum()
         };
-        shifts.iter().map(|shift| [0, 1].map(|axis| from_mean(shift, axis))).collect()
+        let found: Vec<[f64; 2]> =
+            shifts.iter().map(|shift| [0, 1].map(|axis| from_mean(shift, axis))).collect();
+        self.projected(&found)
     }
 
     /// What pulls at shifts pulls at them less their mean: the transpose of [`centred`](Self::centred).
     pub(crate) fn centred_pulls(&self, pulls: &[[f64; 2]]) -> Vec<[f64; 2]> {
-        let shares = self.shares();
+        let (shares, pulls) = (self.shares(), &self.projected(pulls));
         let left = |k: usize, axis: usize| -> f64 {
             let others = (0..pulls.len()).filter(|&j| j != k);
             others
                 .map(|j| shares[j][axis] * pulls[k][axis] - shares[k][axis] * pulls[j][axis])
                 .sum()
         };
-        (0..pulls.len()).map(|k| [0, 1].map(|axis| left(k, axis))).collect()
+        let found: Vec<[f64; 2]> =
+            (0..pulls.len()).map(|k| [0, 1].map(|axis| left(k, axis))).collect();
+        self.projected(&found)
     }
 
     /// The share of each shift in their mean.

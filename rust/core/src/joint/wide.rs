@@ -18,7 +18,7 @@ pub(crate) struct Wide {
     cols: usize,
     /// a, and ∂a/3 along rows and columns where the beam is a spline, in single precision; 0 for cells
     /// that are not seen.
-    beam: Vec<f32>,
+    pub(super) beam: Vec<f32>,
     slopes: [Vec<f32>; 2],
 }
 

@@ -1,33 +1,94 @@
-//! The coarse matrix of S, summed over blocks of beam cells.
+//! The coarse spaces of S, with their matrices summed over blocks of beam cells.
 
 use super::operator::Reduced;
-use crate::coarse::{Arm, Coarse, Hats};
+use crate::coarse::{
+    Coarse, Complex, Entry, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
+    spacing_of_waves, times,
+};
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Geometry, Placement, Walk};
 use crate::parallel::Workers;
 
 /// Blocks of cells along the distance of two hats.
 const BLOCKS: usize = 3;
-/// The coarse matrix of S, factorised.
+/// The hats with the coarse matrix of S, factorised, and those times waves that exposures barely constrain.
 ///
 /// # Errors
 /// [`Error::Cancelled`](crate::Error::Cancelled).
-pub(super) fn coarse_matrix<T: Real>(
+pub(super) fn coarse_spaces<T: Real>(
     hats: &Hats,
     geometry: &Geometry,
     reduced: &Reduced<'_, '_, T>,
     workers: &Workers,
     control: &Control,
-) -> Result<Coarse> {
+) -> Result<(Coarse, Modulated<f32>)> {
     let blocks = Blocks::new(hats, geometry);
     let weights = blocks.weights(geometry, reduced, workers, control)?;
-    let stars = weights
+    let entries = weights
         .chunks_exact(geometry.placements.len())
         .enumerate()
-        .map(|(block, weights)| blocks.star(block, weights, hats, geometry));
-    Coarse::of_stars(hats, &[], stars, control)
+        .map(|(block, weights)| blocks.entries(block, weights, hats, geometry));
+    let coarse = Coarse::of_blocks(hats, &[], entries, control)?;
+    control.check()?;
+    let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
+    let seen = seen(reduced.exposures, &finer);
+    let spots: Vec<Vec<Spot>> = match &seen[..] {
+        [] => Vec::new(),
+        _ => weights
+            .chunks_exact(geometry.placements.len())
+            .enumerate()
+            .map(|(block, weights)| blocks.spots(block, weights, &finer, geometry))
+            .collect(),
+    };
+    let waves = Modulated::new(finer, geometry.sensor.rows, &seen, &spots, workers);
+    Ok((coarse, waves))
+}
+
+/// How many waves the coarse space of these exposures has.
+pub(super) fn count_waves<T: Real>(exposures: &Exposures<'_, T>) -> usize {
+    let geometry = exposures.geometry();
+    seen(exposures, &Hats::new(geometry.sensor, spacing_of_waves(geometry))).len()
+}
+
+/// The waves that the exposures barely constrain, as a cell sees them: e^{−iq·d} of the pixel that sees it.
+/// Where exposures are turned against each other no wave is seen as one.
+fn seen<T: Real>(exposures: &Exposures<'_, T>, hats: &Hats) -> Vec<SeenWave> {
+    if exposures.geometry().views.len() > 1 {
+        return Vec::new();
+    }
+    let places = Places(&exposures.geometry().placements);
+    let weights = exposures.exposure_weights();
+    let weighed = weights.iter().zip(exposures.flux()).map(|(weight, c)| weight * c * c);
+    let total: f64 = weighed.clone().sum();
+    let shares: Vec<f64> = weighed.map(|weight| weight / total).collect();
+    let reach = [0, 1].map(|axis| {
+        let along = places.0.iter().map(|place| [place.row, place.col][axis]);
+        along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
+    });
+    let waves = barely_constrained(&places, &shares, reach, [hats.rows.spacing, hats.cols.spacing]);
+    let seen = waves.into_iter().map(|wave| {
+        let [q, p] = wave.vector;
+        let factor = |k: usize| times(places.along(0, k, q), places.along(1, k, p));
+        SeenWave { wave, factors: (0..places.0.len()).map(factor).collect(), penalty: 0.0 }
+    });
+    seen.collect()
+}
+
+struct Places<'p>(&'p [Placement]);
+
+impl Symbol for Places<'_> {
+    fn along(&self, axis: usize, exposure: usize, q: f64) -> Complex {
+        let place = &self.0[exposure];
+        let (sin, cos) = (q * [place.row, place.col][axis] as f64).sin_cos();
+        [cos, -sin]
+    }
+
+    fn penalty(&self, _: f64) -> f64 {
+        0.0
+    }
 }
 
 /// The blocks of cells, numbered row by row of the beam grid.
@@ -92,19 +153,31 @@ impl Blocks {
         Ok(weights)
     }
 
-    /// What one block adds: the weight of each exposure and the hats at the pixel that sees the
-    /// block's centre.
-    fn star(&self, block: usize, weights: &[f32], hats: &Hats, geometry: &Geometry) -> Vec<Arm> {
+    /// What one block adds.
+    fn entries(
+        &self,
+        block: usize,
+        weights: &[f32],
+        hats: &Hats,
+        geometry: &Geometry,
+    ) -> Vec<Entry> {
+        let spots = self.spots(block, weights, hats, geometry).into_iter();
+        spots.map(|Spot { weight, hats, .. }| Entry { weight, hats, others: Vec::new() }).collect()
+    }
+
+    /// The weight of each exposure in a block and the hats at the pixel that sees its centre.
+    fn spots(&self, block: usize, weights: &[f32], hats: &Hats, geometry: &Geometry) -> Vec<Spot> {
         let (i, j) = (block / self.shape().cols, block % self.shape().cols);
         let centre = |edges: &[usize], at: usize| (edges[at] + edges[at + 1] - 1) as f64 / 2.0;
         let centre = [centre(&self.rows, i), centre(&self.cols, j)];
-        let seeing = geometry.placements.iter().zip(weights).filter(|(_, weight)| **weight > 0.0);
+        let exposures = geometry.placements.iter().zip(weights).enumerate();
+        let seeing = exposures.filter(|(_, (_, weight))| **weight > 0.0);
         seeing
-            .map(|(place, &weight)| {
+            .map(|(exposure, (place, &weight))| {
                 let rotation = geometry.views[place.view].rotation;
                 let [row, col] = rotation.to_view(centre, geometry.beam);
                 let hats = hats.over(row - place.row as f64, col - place.col as f64);
-                Arm { weight: f64::from(weight), hats, others: Vec::new() }
+                Spot { exposure, weight: f64::from(weight), hats }
             })
             .collect()
     }

@@ -175,7 +175,8 @@ impl pulp::NullaryFnOnce for Sign<'_, '_> {
 }
 
 /// The right-hand side that noise e makes: b = Σ w c² L (e − M h), from lines of L² and h. The sign
-/// of L is lost: it turns all noise of one cell, which is as likely either way.
+/// of L is lost: it turns all noise of one cell, which is as likely either way. Returns
+/// Σ w c² e (e − M h).
 pub(super) struct NoiseSlope<'l, 's> {
     pub(super) lines: &'l [Line<'s>],
     pub(super) noise: &'l [&'s [f32]],
@@ -184,10 +185,11 @@ pub(super) struct NoiseSlope<'l, 's> {
 }
 
 impl pulp::NullaryFnOnce for NoiseSlope<'_, '_> {
-    type Output = ();
+    type Output = f64;
 
     #[inline(always)]
-    fn call(self) {
+    fn call(self) -> f64 {
+        let mut total = [0.0; LANES];
         for (index, slope) in self.slope.as_chunks_mut().0.iter_mut().enumerate() {
             let m = chunk(self.sensitivity, index);
             let mut sum = [0.0; LANES];
@@ -195,10 +197,43 @@ impl pulp::NullaryFnOnce for NoiseSlope<'_, '_> {
                 let (w, light) = (line.weight.chunk(index), chunk(line.first, index));
                 let (h, e) = (chunk(line.second, index), chunk(noise, index));
                 for i in 0..LANES {
-                    sum[i] += w[i] * light[i].sqrt() * (e[i] - m[i] * h[i]);
+                    let left = w[i] * (e[i] - m[i] * h[i]);
+                    sum[i] += left * light[i].sqrt();
+                    total[i] += left * e[i];
                 }
             }
             *slope = sum;
+        }
+        total.iter().map(|&sum| f64::from(sum)).sum()
+    }
+}
+
+/// Σ w c L (x − M h), from lines of L² and h, and 1/c of each exposure: what a change of all
+/// measurements of a pixel alike does to x · b.
+pub(super) struct Common<'l, 's> {
+    pub(super) lines: &'l [Line<'s>],
+    pub(super) factors: &'l [f32],
+    pub(super) sensitivity: &'l [f32],
+    pub(super) x: &'l [f32],
+    pub(super) sums: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Common<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (index, sums) in self.sums.as_chunks_mut().0.iter_mut().enumerate() {
+            let (x, m) = (chunk(self.x, index), chunk(self.sensitivity, index));
+            let mut sum = [0.0; LANES];
+            for (line, factor) in self.lines.iter().zip(self.factors) {
+                let (w, light) = (line.weight.chunk(index), chunk(line.first, index));
+                let h = chunk(line.second, index);
+                for i in 0..LANES {
+                    sum[i] += w[i] * factor * light[i].sqrt() * (x[i] - m[i] * h[i]);
+                }
+            }
+            *sums = sum;
         }
     }
 }

@@ -1,5 +1,6 @@
 //! The operator S: products, its diagonal, and the pixels that leave it.
 
+use super::dark::Dark;
 use super::kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
 use crate::control::Control;
 use crate::error::Result;
@@ -37,9 +38,11 @@ pub(crate) struct Reduced<'m, 'a, T> {
     pub(crate) mean: f64,
     left_out: Vec<LeftOut>,
     /// (L/scale)² in each view; 0 where unobserved.
-    light: Vec<Vec<f32>>,
-    /// h in each view: room for the first half of a product.
-    hidden: Vec<Vec<f32>>,
+    pub(super) light: Vec<Vec<f32>>,
+    /// h in each view: a buffer for the first half of a product.
+    eliminated: Vec<Vec<f32>>,
+    /// The noise of a dark that was subtracted from all exposures, where it is known.
+    pub(super) dark: Option<Dark>,
 }
 
 /// A pixel that its measurements leave almost no weight.
@@ -80,6 +83,11 @@ impl Scale {
         1.0 / (self.weight * self.light * self.light)
     }
 
+    /// What a standard deviation of measurements is multiplied by to become one of the noise there.
+    pub(super) fn noise(&self) -> f64 {
+        self.weight.sqrt()
+    }
+
     /// The standard deviation of an M where that of the linear problem is 1.
     pub(crate) fn deviation(&self) -> f64 {
         self.slope().sqrt()
@@ -87,7 +95,7 @@ impl Scale {
 }
 
 impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
-    /// Room for the operator of `model`.
+    /// Buffers for the operator of `model`.
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
         workers: &'m Workers,
@@ -108,7 +116,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             mean: 1.0,
             left_out: Vec::new(),
             light: of_views(),
-            hidden: of_views(),
+            eliminated: of_views(),
+            dark: None,
         }
     }
 
@@ -144,7 +153,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         product: &mut [f32],
         control: &Control,
     ) -> Result<f64> {
-        self.hide(Shown::Step(x), control);
+        self.eliminate(Input::Step(x), control);
         let (padding, rows) = (self.padding, self.exposures.sensor().rows);
         let bands = self.workers.map_blocks(
             padding.body_mut(product),
@@ -171,37 +180,37 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         Ok(bands.into_iter().sum())
     }
 
-    /// The first half of a product: h, in each view, of what the pixels show.
-    pub(super) fn hide(&mut self, shown: Shown<'_>, control: &Control) {
-        let mut hidden = std::mem::take(&mut self.hidden);
+    /// The first half of a product: h, in each view, of an input.
+    pub(super) fn eliminate(&mut self, input: Input<'_>, control: &Control) {
+        let mut eliminated = std::mem::take(&mut self.eliminated);
         let padding = self.padding;
-        if let [hidden] = &mut hidden[..] {
+        if let [eliminated] = &mut eliminated[..] {
             let size = BAND * padding.width;
-            self.workers.map_blocks(padding.body_mut(hidden), size, |band, signals| {
+            self.workers.map_blocks(padding.body_mut(eliminated), size, |band, signals| {
                 let mut scratch = self.scratch();
                 let mut weight = vec![0.0; padding.width];
                 for (index, signal) in signals.chunks_exact_mut(padding.width).enumerate() {
                     if control.is_cancelled() {
                         return;
                     }
-                    let lines = self.cell_lines(0, band * BAND + index, shown, &mut scratch);
+                    let lines = self.cell_lines(0, band * BAND + index, input, &mut scratch);
                     let arch = pulp::Arch::new();
                     arch.dispatch(Gather { lines: &lines, signal, weight: &mut weight });
-                    if let Shown::Weight = shown {
+                    if let Input::Weight = input {
                         signal.fill(1.0);
                     }
                     arch.dispatch(Divide { signal, weight: &weight });
                 }
             });
         } else {
-            self.hide_turned(shown, &mut hidden, control);
+            self.eliminate_turned(input, &mut eliminated, control);
         }
-        self.hidden = hidden;
+        self.eliminated = eliminated;
     }
 
     /// h where exposures are turned against each other: the sums of each view are brought together
     /// on the beam grid and turned into each view.
-    fn hide_turned(&self, shown: Shown<'_>, hidden: &mut [Vec<f32>], control: &Control) {
+    fn eliminate_turned(&self, input: Input<'_>, eliminated: &mut [Vec<f32>], control: &Control) {
         let (padding, views) = (self.padding, &self.exposures.geometry().views);
         let gathered = |(index, view): (usize, &View)| {
             let mut signal = padding.zeros(view.shape.rows, self.workers, control);
@@ -216,7 +225,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                     if control.is_cancelled() {
                         return;
                     }
-                    let lines = self.cell_lines(index, band * BAND + row, shown, &mut scratch);
+                    let lines = self.cell_lines(index, band * BAND + row, input, &mut scratch);
                     pulp::Arch::new().dispatch(Gather { lines: &lines, signal, weight });
                 }
             });
@@ -224,8 +233,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         };
         let sums: Vec<_> = views.iter().enumerate().map(gathered).collect();
         let beam_cols = self.exposures.geometry().beam.cols;
-        for (view, hidden) in views.iter().zip(hidden) {
-            let body = padding.body_mut(hidden);
+        for (view, eliminated) in views.iter().zip(eliminated) {
+            let body = padding.body_mut(eliminated);
             self.workers.map_blocks(body, padding.width, |row, cells| {
                 for (col, cell) in cells[..view.shape.cols].iter_mut().enumerate() {
                     let place = view.cells.at(row, col);
@@ -236,7 +245,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                         signal += padding.row(&sums.0, row)[col];
                         weight += padding.row(&sums.1, row)[col];
                     }
-                    if let Shown::Weight = shown {
+                    if let Input::Weight = input {
                         signal = 1.0;
                     }
                     *cell = if weight > 0.0 { signal / weight } else { 0.0 };
@@ -350,7 +359,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         &'s self,
         view: usize,
         row: usize,
-        shown: Shown<'s>,
+        input: Input<'s>,
         scratch: &'s mut Scratch,
     ) -> Vec<Line<'s>> {
         let places = self.exposures.geometry().placements.iter().enumerate();
@@ -362,13 +371,13 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                 let ExposureScratch { weight, noise } = scratch;
                 let weight = self.weight(exposure, pixel_row, weight);
                 let first = self.padding.row_before(&self.sensitivity, pixel_row, place.col);
-                let second = match shown {
-                    Shown::Step(x) => self.padding.row_before(x, pixel_row, place.col),
-                    Shown::Noise(draw) => {
-                        let row = self.noise([draw, exposure as u64], pixel_row, weight, noise);
+                let second = match input {
+                    Input::Step(x) => self.padding.row_before(x, pixel_row, place.col),
+                    Input::Noise(noise_of) => {
+                        let row = self.noise(noise_of, exposure, pixel_row, weight, noise);
                         &row[self.padding.lead - place.col..][..self.padding.width]
                     }
-                    Shown::Weight => first,
+                    Input::Weight => first,
                 };
                 Some(Line { weight: weight.before(&self.padding, place.col), first, second })
             })
@@ -385,7 +394,11 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
                 Line {
                     weight: self.weight(exposure, row, &mut scratch.weight).at(&self.padding),
                     first: self.padding.row_from(&self.light[place.view], view_row, place.col),
-                    second: self.padding.row_from(&self.hidden[place.view], view_row, place.col),
+                    second: self.padding.row_from(
+                        &self.eliminated[place.view],
+                        view_row,
+                        place.col,
+                    ),
                 }
             })
             .collect()
@@ -418,7 +431,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
     }
 }
 
-/// Room for the weights of one row of each exposure.
+/// Buffers for the weights of one row of each exposure.
 pub(crate) struct Scratch {
     pub(super) of_exposures: Vec<ExposureScratch>,
 }
@@ -435,13 +448,22 @@ pub(super) struct WeightScratch {
     padded: Vec<f32>,
 }
 
-/// What the pixels of each exposure show to the cells that they see.
+/// A draw of noise, by its number.
 #[derive(Clone, Copy)]
-pub(super) enum Shown<'x> {
+pub(crate) enum Draw {
+    /// Of each measurement by itself.
+    Measurements(u64),
+    /// Of the dark, less what M follows of it (`dark_noise.rs`).
+    Dark(u64),
+}
+
+/// What each exposure brings into the elimination of the beam.
+#[derive(Clone, Copy)]
+pub(super) enum Input<'x> {
     /// The step x.
     Step(&'x [f32]),
     /// The noise of a draw, in place of M h.
-    Noise(u64),
+    Noise(Draw),
     /// Nothing: in place of h stands 1/Σ w c² M².
     Weight,
 }

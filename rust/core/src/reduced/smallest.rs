@@ -1,15 +1,16 @@
 //! The smallest Ritz value of all searches so far, and the error of M that it implies.
 
-use super::search::Search;
+use super::conjugate_gradients::ConjugateGradients;
 use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
+use crate::ritz::Lowest;
 
 /// The smallest Ritz value found so far, and in how many iterations.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Smallest {
-    value: f64,
+    lowest: Lowest,
     pub(crate) iterations: u64,
     /// Whether the last search found no direction to go at once: nothing is left but rounding, or
     /// else rounding has spoilt the problem.
@@ -20,7 +21,7 @@ pub(crate) struct Smallest {
 impl Default for Smallest {
     /// The eigenvalue of smooth errors, known beforehand.
     fn default() -> Self {
-        Self { value: DAMPING, iterations: 0, settled: false, stuck: false }
+        Self { lowest: Lowest::new(DAMPING), iterations: 0, settled: false, stuck: false }
     }
 }
 
@@ -28,13 +29,13 @@ impl Smallest {
     /// One more iteration of `search`; `false` if there was none to make.
     pub(crate) fn iterate<T: Real>(
         &mut self,
-        search: &mut Search<'_, '_, T>,
+        search: &mut ConjugateGradients<'_, '_, T>,
         control: &Control,
     ) -> Result<bool> {
         let went = search.iterate(control)?;
         if went {
             self.iterations += 1;
-            self.value = self.value.min(search.ritz.smallest());
+            self.lowest.push(search.ritz.smallest());
         } else {
             self.settled = search.is_settled();
             self.stuck = search.ritz.is_empty() && !self.settled;
@@ -43,19 +44,19 @@ impl Smallest {
     }
 
     /// The largest error, before the step that `search` has found is made.
-    pub(crate) fn error<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
+    pub(crate) fn error<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
         search.found() + self.left(search)
     }
 
     /// The share of b · S⁻¹ b that x · b lacks, at most: what is left is e · S e with e = S⁻¹ r, no more
     /// than r · P⁻¹ r over the smallest eigenvalue of P⁻¹S.
-    pub(crate) fn lack<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
-        let left = search.square() / self.value;
+    pub(crate) fn lack<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
+        let left = search.square() / self.lowest.expected();
         left / (search.energy + left)
     }
 
     /// What is left of the error once the step that `search` has found is made.
-    pub(crate) fn left<T: Real>(&self, search: &Search<'_, '_, T>) -> f64 {
-        search.largest() / self.value
+    pub(crate) fn left<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
+        search.largest() / self.lowest.expected()
     }
 }

@@ -21,10 +21,10 @@
 //! A slight ridge makes it definite: what it is not definite in, by constants in pieces that do not
 //! hang together or by shifts along one line only, is no error that S can see.
 
-use super::blocks::coarse_matrix;
+use super::blocks::coarse_spaces;
 use super::operator::Reduced;
-use super::two_level_kernel::{Descend, Direction};
-use crate::coarse::{Coarse, DAMPING, Hats, spacing};
+use super::two_level_kernel::{Descend, Direction, Level};
+use crate::coarse::{Coarse, DAMPING, Hats, Modulated, spacing};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -44,6 +44,9 @@ pub(crate) struct TwoLevel<'m> {
     heights: Vec<f64>,
     /// Those heights along the rows of the coarse grid, at every column of the sensor.
     spread: Vec<f32>,
+    /// Hats times waves, and likewise their heights.
+    waves: Option<Modulated<f32>>,
+    lines: Vec<f32>,
 }
 
 impl<'m> TwoLevel<'m> {
@@ -57,7 +60,8 @@ impl<'m> TwoLevel<'m> {
         let hats = Hats::new(exposures.sensor(), spacing(geometry));
         let spread = vec![0.0; hats.rows.nodes * padding.width];
         let heights = vec![0.0; hats.count()];
-        Self { workers, geometry, padding, hats, coarse: None, heights, spread }
+        let (coarse, waves, lines) = (None, None, Vec::new());
+        Self { workers, geometry, padding, hats, coarse, heights, spread, waves, lines }
     }
 
     /// Sums and factorises the coarse matrix, unless that has been done at other weights: it need
@@ -72,7 +76,9 @@ impl<'m> TwoLevel<'m> {
     ) -> Result<()> {
         if self.coarse.is_none() {
             let Self { hats, geometry, workers, .. } = self;
-            self.coarse = Some(coarse_matrix(hats, geometry, reduced, workers, control)?);
+            let (coarse, waves) = coarse_spaces(hats, geometry, reduced, workers, control)?;
+            self.coarse = Some(coarse);
+            self.waves = Some(waves).filter(|waves| !waves.is_empty());
         }
         Ok(())
     }
@@ -111,13 +117,17 @@ impl<'m> TwoLevel<'m> {
                         below,
                     });
                 }
-                (total, sums.finish())
+                (total, sums.finish(), self.sum_waves(reduced, band, rows))
             },
         );
         self.heights.fill(0.0);
         let mut by_diagonal = 0.0;
-        for (total, sums) in bands {
+        let mut of_waves = vec![0.0; self.waves.as_ref().map_or(0, Modulated::size)];
+        for (total, sums, waves) in bands {
             by_diagonal += total;
+            for (first, sums) in waves {
+                of_waves[first..].iter_mut().zip(sums).for_each(|(sum, found)| *sum += found);
+            }
             for (first, sums) in sums {
                 for (height, sum) in self.heights[first..].iter_mut().zip(sums) {
                     *height += sum;
@@ -126,11 +136,40 @@ impl<'m> TwoLevel<'m> {
         }
         let right = self.heights.clone();
         match &self.coarse {
-            Some(coarse) => coarse.solve(&mut self.heights, DAMPING),
+            Some(coarse) => coarse.correct(&mut self.heights, DAMPING),
             None => self.heights.fill(0.0),
         }
         self.spread();
+        by_diagonal += self.solve_waves(of_waves);
         by_diagonal + right.iter().zip(&self.heights).map(|(b, y)| b * y).sum::<f64>()
+    }
+
+    /// Ψᵀ r over rows of a band.
+    fn sum_waves<T: Real>(
+        &self,
+        reduced: &Reduced<'_, '_, T>,
+        band: usize,
+        residual: &[f32],
+    ) -> Vec<(usize, Vec<f64>)> {
+        let (Some(waves), padding) = (&self.waves, self.padding) else { return Vec::new() };
+        let mut values = vec![0.0; residual.len()];
+        let rows = values.chunks_exact_mut(padding.width);
+        for (index, (values, residual)) in
+            rows.zip(residual.chunks_exact(padding.width)).enumerate()
+        {
+            let sensitivity = padding.row(&reduced.sensitivity, band * SUMMED + index);
+            pulp::Arch::new().dispatch(Level { residual, sensitivity, values });
+        }
+        waves.gather(band * SUMMED, &values, padding.width)
+    }
+
+    /// Finds the heights of waves from Ψᵀ r; returns the product of the two.
+    fn solve_waves(&mut self, right: Vec<f64>) -> f64 {
+        let Some(waves) = &self.waves else { return 0.0 };
+        let mut heights = right.clone();
+        waves.correct(&mut heights, self.workers);
+        self.lines = waves.open(&heights, self.padding.width, self.workers);
+        right.iter().zip(&heights).map(|(b, y)| b * y).sum()
     }
 
     /// The heights of the hats along the rows of the coarse grid.
@@ -158,6 +197,10 @@ impl<'m> TwoLevel<'m> {
         let (x, direction) = (padding.body_mut(x), padding.body_mut(direction));
         let size = BAND * padding.width;
         let bands = self.workers.map_pairs(x, direction, [size; 2], |band, x, direction| {
+            let mut modulated = vec![0.0; x.len()];
+            if let Some(waves) = &self.waves {
+                waves.spread(&self.lines, band * BAND, &mut modulated, padding.width);
+            }
             let rows = x.chunks_exact_mut(padding.width);
             let rows = rows.zip(direction.chunks_exact_mut(padding.width)).enumerate();
             let by_row = rows.map(|(index, (x, direction))| {
@@ -175,6 +218,7 @@ impl<'m> TwoLevel<'m> {
                     height: height as f32,
                     above: &spread[..padding.width],
                     below: &spread[padding.width..][..padding.width],
+                    modulated: &modulated[index * padding.width..][..padding.width],
                 })
             });
             by_row.fold(0.0, f32::max)

@@ -53,6 +53,8 @@ pub(super) struct Direction<'l> {
     pub(super) height: f32,
     pub(super) above: &'l [f32],
     pub(super) below: &'l [f32],
+    /// What the hats times waves have of y.
+    pub(super) modulated: &'l [f32],
 }
 
 impl pulp::NullaryFnOnce for Direction<'_> {
@@ -67,8 +69,9 @@ impl pulp::NullaryFnOnce for Direction<'_> {
             let (r, d) = (chunk(self.residual, index), chunk(self.inverse_diagonal, index));
             let m = chunk(self.sensitivity, index);
             let (above, below) = (chunk(self.above, index), chunk(self.below, index));
+            let modulated = chunk(self.modulated, index);
             for i in 0..LANES {
-                let smooth = above[i] + self.height * (below[i] - above[i]);
+                let smooth = modulated[i] + above[i] + self.height * (below[i] - above[i]);
                 let z = if d[i] > 0.0 { r[i] * d[i] + m[i] * smooth } else { 0.0 };
                 x[i] += self.step * direction[i];
                 direction[i] = z + self.keep * direction[i];
@@ -76,5 +79,22 @@ impl pulp::NullaryFnOnce for Direction<'_> {
             }
         }
         largest.iter().copied().fold(0.0, f32::max)
+    }
+}
+
+/// M r.
+pub(super) struct Level<'l> {
+    pub(super) residual: &'l [f32],
+    pub(super) sensitivity: &'l [f32],
+    pub(super) values: &'l mut [f32],
+}
+
+impl pulp::NullaryFnOnce for Level<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let products = self.residual.iter().zip(self.sensitivity).map(|(r, m)| r * m);
+        self.values.iter_mut().zip(products).for_each(|(value, product)| *value = product);
     }
 }

@@ -12,9 +12,9 @@ use crate::parallel::Workers;
 /// Minimises F, and gives M in the gauge mean(M) = 1 over the pixels of each component.
 ///
 /// Whole shifts and known fluxes leave M and L alone to be found, by the method asked for; everything
-/// else is fitted jointly. Pixels that their measurements leave almost no weight are flagged and not in
-/// the mean. A `start` saves passes over the data; it must be of the same sensor, with as many
-/// exposures.
+/// else is fitted jointly. Pixels that their measurements leave almost no weight, or whose measurements
+/// contradict each other, are flagged and not in the mean. A `start` saves passes over the data; it must be of
+/// the same sensor, with as many exposures.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for options that make no sense, and for what does not go
@@ -36,5 +36,5 @@ pub fn calibrate<T: Real>(
     } else {
         joint::minimise(exposures, options, start, workers, control)?
     };
-    Ok(found.into_fit(workers))
+    Ok(found.into_fit(exposures.unreliable(), workers))
 }

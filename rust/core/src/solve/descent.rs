@@ -8,7 +8,7 @@ use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
-use crate::reduced::{Scale, Search, Smallest};
+use crate::reduced::{ConjugateGradients, Scale, Smallest};
 use crate::sweep::Estimate;
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
@@ -37,7 +37,8 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     if let Some(start) = start {
         estimate = estimate.at(start.sensitivity);
     }
-    let (scale, mut search) = (Scale::of(exposures), Search::new(exposures, workers, control));
+    let (scale, mut search) =
+        (Scale::of(exposures), ConjugateGradients::new(exposures, workers, control));
     let mut looks: Vec<Look> = Vec::new();
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
@@ -73,7 +74,7 @@ pub(super) fn minimise<'m, 'a, T: Real>(
 fn look<T: Real>(
     estimate: &mut Estimate<'_, '_, T>,
     scale: Scale,
-    search: &mut Search<'_, '_, T>,
+    search: &mut ConjugateGradients<'_, '_, T>,
     control: &Control,
 ) -> Result<(f64, f64)> {
     let misfit = estimate.slopes(scale.slope(), &mut search.residual, control)?;

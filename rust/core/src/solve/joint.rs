@@ -1,5 +1,6 @@
 //! The joint fit: Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated.
 
+use super::course::Course;
 use super::found::Found;
 use super::options::Options;
 use super::start;
@@ -13,8 +14,8 @@ use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
 use crate::fit::{Fit, Refinement, Solution};
 use crate::frames::Real;
-use crate::gauge;
-use crate::joint::{self, Preconditioner, Search, ShiftPrior, System};
+use crate::gauge::FluxGauge;
+use crate::joint::{self, ConjugateGradients, Directions, Preconditioner, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
 
@@ -22,13 +23,17 @@ use crate::parallel::Workers;
 const MOST_PRODUCTS: u64 = 5000;
 /// The estimated error of M at which shifts begin to be refined.
 const BEFORE_SHIFTS: f64 = 1e-3;
-/// A beam whose structure is so much larger than noise determines shifts; by the slopes of noise steps
-/// would lead nowhere.
-const TOLD: f64 = 10.0;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
 /// What linearising adds counts as this share of a step at most, and at least.
 const CURVED: [f64; 2] = [1e-8, 0.03];
+/// What a step leaves of the error where shifts are sought, whose second derivatives the linear problem does
+/// not know.
+const BY_SHIFTS: f64 = 0.1;
+/// Passes without progress after which a fit has stalled where shifts are sought: the steps are short.
+const PATIENCE_BY_SHIFTS: u64 = 150;
+/// The most that one step reduces the error by where products are made in single precision.
+const PRECISION: f64 = 1e-5;
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
 /// measurement, where it is not known, count as found.
 const SETTLING: usize = 3;
@@ -65,7 +70,7 @@ pub(super) fn minimise<T: Real>(
 /// Steps towards the minimum.
 struct Steps<'m, 'a, T> {
     system: System<'m, 'a, T>,
-    search: Search,
+    search: ConjugateGradients,
     options: &'m Options,
     /// The most passes.
     limit: u64,
@@ -81,6 +86,8 @@ struct Steps<'m, 'a, T> {
     /// What is known of shifts that are refined later.
     shift_prior: Option<ShiftPrior>,
     refinement: Refinement,
+    /// The last step, where shifts are sought.
+    course: Option<Course>,
 }
 
 impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
@@ -97,13 +104,16 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let mut refinement =
             shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
         // Shifts are refined from a beam that is nearly found: that of a start that has refined them.
-        if start.is_some_and(|start| start.refined) && shift_prior.is_some() {
-            system.seek_shifts(shift_prior.take());
-            refinement = Refinement::Done;
+        if let Some(start) = start.filter(|start| start.refinement.is_done())
+            && let Some(mut prior) = shift_prior.take()
+        {
+            refinement = start.refinement;
+            prior.along = refinement.along();
+            system.seek_shifts(Some(prior));
         }
         Ok(Self {
             system,
-            search: Search::default(),
+            search: ConjugateGradients::default(),
             options,
             limit,
             swept,
@@ -114,6 +124,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             preconditioner: None,
             shift_prior,
             refinement,
+            course: None,
         })
     }
 
@@ -121,8 +132,15 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn next(&mut self, control: &Control) -> Result<Option<Ended>> {
         let linear = self.system.linearise(control)?;
         // Where shifts still move, cells come into the penalty, and F is not one function.
-        let moving = self.system.seeks_shifts() && self.looks.len() <= SETTLING;
+        let moving =
+            self.system.seeks_shifts() && (self.looks.len() <= SETTLING || self.system.sees_more);
         if self.takes_back(linear.0, moving) {
+            return Ok(None);
+        }
+        if self.system.sees_more {
+            self.course = None;
+        }
+        if self.corrects_length(&linear.1) {
             return Ok(None);
         }
         let (objective, slope) = self.settled(linear, control)?;
@@ -130,16 +148,17 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             Some(preconditioner) => preconditioner,
             None => Preconditioner::new(&mut self.system, control)?,
         };
+        let kept = self.system.seeks_shifts().then(|| slope.clone());
         self.search.begin(&self.system, &preconditioner, slope, control)?;
         let first = self.search.product(&mut self.system, control)?;
-        let error = first / self.search.smallest;
+        let error = first / self.search.lowest.expected();
         self.looks.push(Look { sweep: self.products(), objective, error });
         if self.begins_to_refine(error) {
             return Ok(None);
         }
         let ended = self.ended();
         if ended.is_none() {
-            self.step(first, &preconditioner, control)?;
+            self.step(first, kept, &preconditioner, control)?;
             self.preconditioner = (!moving).then_some(preconditioner);
         }
         Ok(ended)
@@ -162,6 +181,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             self.stuck = self.halvings > MOST_HALVINGS;
             let share = 0.5_f64.powi(self.halvings.min(MOST_HALVINGS));
             self.system.advance(x, -share);
+            self.course = None;
             return true;
         }
         self.halvings = 0;
@@ -183,27 +203,32 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn begins_to_refine(&mut self, error: f64) -> bool {
         let near = error <= BEFORE_SHIFTS.max(self.options.tolerance)
             && self.search.iterations >= FEWEST_ITERATIONS;
-        let Some(prior) = self.shift_prior.take_if(|_| near) else { return false };
-        // Of a grid too small for second differences the structure is NaN, which determines nothing.
-        let determined = self.system.structure() >= TOLD;
-        if !determined {
-            self.refinement = Refinement::Undetermined;
+        let Some(mut prior) = self.shift_prior.take_if(|_| near) else { return false };
+        self.refinement = match self.system.determined_directions(&prior) {
+            Directions::None => Refinement::Undetermined,
+            Directions::One(along) => Refinement::Along(along),
+            Directions::Both => Refinement::Done,
+        };
+        if !self.refinement.is_done() {
             return false;
         }
-        self.refinement = Refinement::Done;
+        prior.along = self.refinement.along();
         self.system.seek_shifts(Some(prior));
-        (self.search, self.taken, self.looks) = (Search::default(), None, Vec::new());
+        (self.search, self.taken, self.looks) = (ConjugateGradients::default(), None, Vec::new());
         true
     }
 
-    /// Searches for a step and takes it.
+    /// Searches for a step and takes it, with the slope where it begins if shifts are sought.
     fn step(
         &mut self,
         first: f64,
+        slope: Option<Vec<f64>>,
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
-        let reachable = first * first.clamp(CURVED[0], CURVED[1]);
+        let least = if self.system.is_single() { PRECISION } else { CURVED[0] };
+        let share = if slope.is_some() { BY_SHIFTS } else { first.clamp(least, CURVED[1]) };
+        let reachable = first * share;
         while self.products() + A_LOOK < self.limit {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
@@ -213,7 +238,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             control.check()?;
             let size = self.search.product(&mut self.system, control)?;
             let aim = AIM * self.options.tolerance;
-            let near = size <= reachable || size / self.search.smallest <= aim;
+            let near = size <= reachable || size / self.search.lowest.expected() <= aim;
             if near && self.search.iterations >= FEWEST_ITERATIONS {
                 break;
             }
@@ -222,9 +247,24 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         // A multiple of the beam is no step, but the penalty would see one.
         let cells = self.system.state.beam.len();
         self.system.take_scale_out(&mut step[..cells]);
+        let turn =
+            |slope| Course::turn(&mut step, slope, self.course.as_ref(), self.system.pass.workers);
+        self.course = slope.map(turn);
         self.system.advance(&step, 1.0);
         self.taken = Some(step);
         Ok(())
+    }
+
+    /// Brings the last step to the length at which F falls no further along it.
+    fn corrects_length(&mut self, slope: &[f64]) -> bool {
+        let workers = self.system.pass.workers;
+        let Some(course) = &mut self.course else { return false };
+        let Some(missing) = course.missing(slope, workers) else { return false };
+        self.system.advance(course.direction(), missing);
+        if let Some(taken) = &mut self.taken {
+            workers.add_multiple(taken, missing, course.direction());
+        }
+        true
     }
 
     /// Passes over the measurements so far.
@@ -237,7 +277,10 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let last = self.looks.last()?;
         let settled = last.error == 0.0;
         let certain = self.search.iterations >= FEWEST_ITERATIONS || settled;
-        let stalled = stalled_since(&self.looks).is_some_and(|earlier| earlier >= SETTLING);
+        let patience = if self.system.seeks_shifts() { PATIENCE_BY_SHIFTS } else { 0 };
+        let stalled = stalled_since(&self.looks).is_some_and(|earlier| {
+            earlier >= SETTLING && self.looks[earlier].sweep + patience <= last.sweep
+        });
         if certain && last.error <= self.options.tolerance {
             Some(Ended::Converged)
         } else if last.sweep + A_LOOK >= self.limit {
@@ -249,23 +292,25 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
     }
 
-    /// What was found, with the fluxes in their gauge.
+    /// What was found, and what the fluxes leave to the gauge.
     fn finish(self, ended: Ended, control: &Control) -> Result<Found> {
         let system = &self.system;
         let exposures = system.pass.exposures;
         let without_offset = system.without_offset();
         let history = History { looks: self.looks, ended };
-        let smallest = self.search.smallest;
+        let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
-        if matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_)) {
-            let theta = system.state.theta.first().copied().unwrap_or_default();
-            let drift = system.fluxes.slope.map(|slope| theta * slope);
-            let rotation = exposures.positions().rotations[0];
-            gauge::fix_fluxes(&mut fit, drift, &system.fluxes.open, rotation, exposures.sensor());
-        }
+        let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
+        let theta = system.state.theta.first().copied().unwrap_or_default();
+        let fluxes = fitted.then(|| FluxGauge {
+            drift: system.fluxes.slope.map(|slope| theta * slope),
+            open: system.fluxes.open.clone(),
+            rotation: exposures.positions().rotations[0],
+            sensor: exposures.sensor(),
+        });
         let left_out = without_offset.clone();
-        Ok(Found { fit, left_out, dead: Vec::new(), without_offset })
+        Ok(Found { fit, left_out, dead: Vec::new(), without_offset, fluxes })
     }
 }
 

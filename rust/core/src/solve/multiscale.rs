@@ -19,7 +19,7 @@ use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
-use crate::reduced::{Scale, Search, Smallest};
+use crate::reduced::{ConjugateGradients, Scale, Smallest};
 use crate::sweep::Estimate;
 
 /// Upper limit on products: an experiment that needs more cannot be solved by this method.
@@ -53,7 +53,7 @@ pub(crate) fn minimise<'m, 'a, T: Real>(
     let limit = options.limit(MOST_PRODUCTS)?;
     let scale = Scale::of(exposures);
     let mut estimate = start::estimate(exposures, start, workers, control)?;
-    let mut search = Search::new(exposures, workers, control);
+    let mut search = ConjugateGradients::new(exposures, workers, control);
     let mut smallest = Smallest::default();
     let mut looks: Vec<Look> = Vec::new();
     let (mut halvings, mut rescues) = (0, 0);
@@ -137,7 +137,7 @@ fn ended(
 
 /// The size of P⁻¹ r that a step can reach: what linearising adds, which is a product of relative
 /// steps in M and in L, or what single precision holds.
-fn reachable<T: Real>(search: &Search<'_, '_, T>) -> f64 {
+fn reachable<T: Real>(search: &ConjugateGradients<'_, '_, T>) -> f64 {
     search.largest() * search.size().clamp(PRECISION, MOST_CURVED)
 }
 

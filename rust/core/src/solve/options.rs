@@ -11,6 +11,14 @@ pub enum Method {
     CoordinateDescent,
 }
 
+impl Method {
+    /// Whether the method takes whole shifts alone: fractions are rounded before.
+    #[must_use]
+    pub const fn needs_whole_shifts(self) -> bool {
+        matches!(self, Self::CoordinateDescent)
+    }
+}
+
 /// How to minimise F, and when to stop.
 #[derive(Clone, Copy, Debug)]
 pub struct Options {

@@ -1,6 +1,6 @@
 //! What does not go together.
 
-use super::options::{Method, Options};
+use super::options::Options;
 use crate::error::{Error, Result};
 use crate::exposures::Exposures;
 use crate::frames::Real;
@@ -12,13 +12,14 @@ use crate::frames::Real;
 pub(super) fn check<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Result<()> {
     check_method(exposures, options)?;
     if !exposures.are_whole() && !exposures.positions().differ(exposures.sensor()) {
-        let problem = "are all alike: each pixel sees one place of the beam, and nothing compares \
-                       it with others; move the sensor between exposures";
+        let problem = "are all alike, so that each pixel measures one place of the beam and no two \
+                       pixels the same: move the sensor between exposures";
         return Err(Error::value("shifts", problem));
     }
     if exposures.offset() && exposures.are_one_level() {
-        let problem = "is 'fit' with one flux for all: offset and gain cannot be told apart; take \
-                       exposures at two or more levels and give their 'flux', or subtract a dark";
+        let problem = "is 'fit' with one flux for all exposures, where offset and gain are \
+                       degenerate: take exposures at two or more levels and give their 'flux', or \
+                       subtract a dark";
         return Err(Error::value("dark", problem));
     }
     Ok(())
@@ -26,14 +27,14 @@ pub(super) fn check<T: Real>(exposures: &Exposures<'_, T>, options: &Options) ->
 
 /// Refuses what coordinate descent cannot fit.
 fn check_method<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Result<()> {
-    if options.method == Method::Multiscale || exposures.are_whole() {
+    if !options.method.needs_whole_shifts() || exposures.are_whole() {
         return Ok(());
     }
     let problem = if exposures.seek_more() || exposures.positions().std.is_some() {
-        "is 'coordinate-descent', which knows whole shifts and given fluxes: to fit fluxes, shifts \
-         or the dark take 'multiscale'"
+        "is 'coordinate-descent', which supports only whole shifts and given fluxes: use \
+         'multiscale' to fit fluxes, shifts or the dark"
     } else {
-        "is 'coordinate-descent', which knows whole shifts: round them, or take 'multiscale'"
+        "is 'coordinate-descent', which supports only whole shifts: round them, or use 'multiscale'"
     };
     Err(Error::value("method", problem))
 }

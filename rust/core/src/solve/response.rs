@@ -2,8 +2,8 @@
 
 use crate::convergence::History;
 use crate::exposures::Exposures;
-use crate::fit::add_information;
 use crate::frames::Real;
+use crate::information;
 use crate::median::median;
 
 /// A response below this share of the typical one may be nil; above it none is.
@@ -31,8 +31,8 @@ pub(super) fn without_response<T: Real>(
     let weak = |&pixel: &usize| sensitivity[pixel].abs() <= WEAK_RESPONSE * typical;
     // M²D is what a pixel shows of light: unlike M, the same in any gauge.
     let nil = |&pixel: &usize| {
-        let shown = sensitivity[pixel].powi(2) * information(exposures, beam, pixel);
-        shown <= noise.max(NIL_RESPONSE * ordinary)
+        let strength = sensitivity[pixel].powi(2) * information_at(exposures, beam, pixel);
+        strength <= noise.max(NIL_RESPONSE * ordinary)
     };
     (0..sensitivity.len()).filter(weak).filter(nil).collect()
 }
@@ -44,15 +44,12 @@ fn typical(sensitivity: &[f64]) -> f64 {
     median(&mut sample, f64::total_cmp).unwrap_or(f64::NAN)
 }
 
-/// The weight Σ w c² L² of a pixel's sensitivity, at whole shifts.
-fn information<T: Real>(exposures: &Exposures<'_, T>, beam: &[f64], pixel: usize) -> f64 {
+/// D of a pixel, at whole shifts.
+fn information_at<T: Real>(exposures: &Exposures<'_, T>, beam: &[f64], pixel: usize) -> f64 {
     let (geometry, cols) = (exposures.geometry(), exposures.sensor().cols);
     let (row, col) = (pixel / cols, pixel % cols);
-    let mut sum = [0.0];
-    for (k, (place, &flux)) in geometry.placements.iter().zip(exposures.flux()).enumerate() {
-        let cells = geometry.views[place.view].cells;
-        let light = beam[cells.at(row + place.row, col + place.col)];
-        add_information(exposures, k, [row, col], flux, &[light], &mut sum);
-    }
-    sum[0]
+    information::of_pixel(exposures, [row, col], |k| {
+        let place = &geometry.placements[k];
+        beam[geometry.views[place.view].cells.at(row + place.row, col + place.col)]
+    })
 }

@@ -96,7 +96,7 @@ fn moved<T: Real>(
     };
     let source = Source { shape: beam.shape, origin: beam.origin, value };
     let mut shifts = positions.shifts.clone();
-    if let Some(prior) = ShiftPrior::of(positions).filter(|_| start.refined) {
+    if let Some(prior) = ShiftPrior::of(positions).filter(|_| start.refinement.is_done()) {
         shifts.copy_from_slice(start.shifts);
         prior.keep_near(&mut shifts);
     }

@@ -31,7 +31,7 @@ pub(super) fn minimise<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    memory::check(bytes_needed(exposures.geometry()), || {
+    memory::check(bytes_needed(exposures), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
     let (estimate, history, left_out, misfit) = match options.method {
@@ -44,7 +44,7 @@ pub(super) fn minimise<T: Real>(
             descent::minimise(exposures, options, start, workers, control)?
         }
     };
-    // After the solver, whose vectors then make room for the sets.
+    // After the solver, whose vectors then free memory for the sets.
     let (sensitivity, values) = estimate.into_maps();
     let dead = without_response(exposures, &sensitivity, &values, &history);
     let mut ties = vec![Tie::Firm; sensitivity.len()];
@@ -68,7 +68,7 @@ pub(super) fn minimise<T: Real>(
         leaves_tilt: false,
         smallest_ritz: None,
     };
-    Ok(Found { fit, left_out, dead, without_offset: Vec::new() })
+    Ok(Found { fit, left_out, dead, without_offset: Vec::new(), fluxes: None })
 }
 
 /// What a solver holds beside the measurements at its fullest, in bytes: a search
@@ -81,11 +81,12 @@ pub(super) fn minimise<T: Real>(
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
 /// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell.
-fn bytes_needed(geometry: &Geometry) -> u64 {
+fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
+    let geometry = exposures.geometry();
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let views = geometry.views.len() as u64;
     let turned = if views > 1 { (16 * views + 8) * cells } else { 0 };
-    8 * pixels + 8 * views * cells + turned + reduced::bytes_needed(geometry)
+    8 * pixels + 8 * views * cells + turned + reduced::bytes_needed(exposures)
 }
 
 /// Measurements less unknowns; each component has one unknown less than values, by its gauge. Every

@@ -58,14 +58,14 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                 if control.is_cancelled() {
                     return;
                 }
-                let shown = darkest(exposures, band * BAND + index, &mut scratch);
+                let row = darkest(exposures, band * BAND + index, &mut scratch);
                 for (col, m) in pixels.iter_mut().enumerate() {
-                    let around = &shown[col.saturating_sub(AROUND)..cols.min(col + AROUND + 1)];
+                    let around = &row[col.saturating_sub(AROUND)..cols.min(col + AROUND + 1)];
                     // Most are settled by the two at the ends.
-                    if shown[col] > BRIGHT * around[0].min(around[around.len() - 1]) {
+                    if row[col] > BRIGHT * around[0].min(around[around.len() - 1]) {
                         let median = median(&mut around.to_vec(), f64::total_cmp).unwrap_or(0.0);
-                        if median > 0.0 && shown[col] > BRIGHT * median && shown[col].is_finite() {
-                            *m = shown[col] / median;
+                        if median > 0.0 && row[col] > BRIGHT * median && row[col].is_finite() {
+                            *m = row[col] / median;
                         }
                     }
                 }
@@ -101,7 +101,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         })
     }
 
-    /// Makes room for L where there is none, by the threads that will use it.
+    /// Allocates L where there is none, by the threads that will use it.
     fn remember_beams(&mut self, control: &Control) {
         let cells = self.exposures.geometry().beam.len();
         for beam in self.beams.iter_mut().filter(|beam| beam.is_empty()) {

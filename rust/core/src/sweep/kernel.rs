@@ -15,7 +15,7 @@ pub(super) struct Line<'s, T> {
     pub(super) flux: f64,
 }
 
-/// Room for the weights of every exposure along one stretch.
+/// Buffers for the weights of every exposure along one stretch.
 pub(super) struct Scratch {
     pub(super) weights: Vec<[f64; STRETCH]>,
 }

@@ -4,7 +4,7 @@ use super::joint::JointCovariance;
 use super::reduced::ReducedCovariance;
 use super::sampling::ErrorMap;
 use crate::control::Control;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::exposures::Exposures;
 use crate::fit::{Fit, Solution};
 use crate::frames::Real;
@@ -15,6 +15,7 @@ use crate::parallel::Workers;
 /// All answers are in units of the variance of a value of weight 1, which is [`Fit::unit`].
 pub struct Uncertainty<'m, 'a, T> {
     problem: Problem<'m, 'a, T>,
+    pixels: usize,
     control: &'m Control,
 }
 
@@ -45,7 +46,43 @@ impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
             let reduced = ReducedCovariance::new(exposures, solution, workers, control)?;
             Problem::Reduced(Box::new(reduced))
         };
-        Ok(Self { problem, control })
+        Ok(Self { problem, pixels: exposures.sensor().len(), control })
+    }
+
+    /// The same with the noise of a dark that was subtracted from all exposures, of these variances by
+    /// pixel, in units of the variance of a value of weight 1. The weights must be those without it.
+    ///
+    /// # Errors
+    /// [`Error::Shape`](crate::Error::Shape) if they are not one for each pixel,
+    /// [`Error::Value`](crate::Error::Value) if one is no number or below 0.
+    pub fn with_dark(mut self, variance: &[f64]) -> Result<Self> {
+        check_dark(variance, self.pixels)?;
+        match &mut self.problem {
+            Problem::Reduced(problem) => problem.set_dark(variance, self.control)?,
+            Problem::Joint(problem) => problem.set_dark(variance, self.control)?,
+        }
+        Ok(self)
+    }
+
+    /// What the noise of the dark adds on average to F, the sum of squared residuals; 0 without a dark.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn misfit_by_dark(&mut self) -> Result<f64> {
+        match &mut self.problem {
+            Problem::Reduced(problem) => problem.misfit_by_dark(self.control),
+            Problem::Joint(problem) => problem.misfit_by_dark(self.control),
+        }
+    }
+
+    /// How many searches of the answers so far ended before they were as exact as they should be: the
+    /// measurements barely constrain some pattern, and variances that it is part of are too small.
+    #[must_use]
+    pub fn incomplete(&self) -> u64 {
+        match &self.problem {
+            Problem::Reduced(problem) => problem.incomplete(),
+            Problem::Joint(problem) => problem.incomplete(),
+        }
     }
 
     /// The standard deviation of M in each pixel.
@@ -94,6 +131,23 @@ impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
             Problem::Reduced(_) => Ok(None),
             Problem::Joint(problem) => problem.offset_variances(self.control),
         }
+    }
+}
+
+fn check_dark(variance: &[f64], pixels: usize) -> Result<()> {
+    if variance.len() != pixels {
+        return Err(Error::Shape {
+            argument: "dark_variance",
+            got: format!("{} values", variance.len()),
+            wanted: format!("{pixels}, one for each pixel"),
+        });
+    }
+    match variance.iter().find(|v| !(v.is_finite() && **v >= 0.0)) {
+        None => Ok(()),
+        Some(wrong) => Err(Error::Value {
+            argument: "dark_variance",
+            problem: format!("holds {wrong}, expected finite numbers not below 0"),
+        }),
     }
 }
 

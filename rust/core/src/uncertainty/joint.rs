@@ -13,34 +13,39 @@
 //!
 //! Three things stand beside S. A prior on fluxes leaves a tilt of M open that S does not see
 //! (`joint/flux.rs`): its covariance is added. Shifts that have a prior but were not refined are wrong by
-//! its full width: what that does to M is drawn too. And of all this the gauge of the result takes
+//! its full width: what that does to M is drawn too, and likewise along the direction in which they were
+//! not refined; the two directions are taken as independent. And of all this the gauge of the result takes
 //! out the mean of M, and the tilt where free fluxes leave it undetermined.
+//!
+//! On larger sensors the squares of C x are smoothed (`smoothed.rs`).
+//!
+//! The noise of a dark that was subtracted from all exposures is a fourth (`joint_dark.rs`).
 
-use super::joint_gauge::{Hidden, Tilts, count, form};
-use super::joint_pulls::{add_change, product, pull_by, pull_of};
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
+use super::joint_dark::Dark;
+use super::joint_gauge::{Hidden, Tilts, count, form, valid};
+use super::joint_pulls::{add_change, product, pull_of};
+use super::sampling::{ErrorMap, LACK_OF_FUNCTIONAL, LACK_WITH_DARK, NEGLIGIBLE, NOTHING};
+use super::sampling::{Sampled, mean_misfit};
+use super::smoothed::{is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::Solution;
+use crate::fit::{Refinement, Solution};
 use crate::frames::Real;
-use crate::joint::{self, Fluxes, Follow, Grid, Preconditioner, Search, ShiftPrior, State, System};
+use crate::joint::{
+    self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
+};
 use crate::memory;
 use crate::parallel::Workers;
-use crate::random;
+
+mod draws;
+#[cfg(test)]
+mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
 
-/// What is drawn besides the noise of exposures.
-enum Other {
-    Penalty,
-    Priors,
-    Shifts,
-}
-/// How many of them there are.
-const OTHERS: usize = 3;
 /// A linear functional of what was found.
 enum Functional {
     /// Σ g M.
@@ -56,7 +61,7 @@ enum Functional {
 pub(super) struct JointCovariance<'m, 'a, T> {
     system: System<'m, 'a, T>,
     preconditioner: Preconditioner,
-    search: Search,
+    search: ConjugateGradients,
     tilts: Tilts,
     /// The shifts that are uncertain though they were not refined.
     considered: Option<ShiftPrior>,
@@ -66,6 +71,9 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     valid: Vec<f32>,
     /// The mean of D⁻¹: in these units squares have no extreme values.
     scale: f64,
+    /// The noise of a dark that was subtracted from all exposures.
+    dark: Option<Dark>,
+    incomplete: u64,
 }
 
 impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
@@ -83,28 +91,65 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         })?;
         let mut system = problem(exposures, solution, workers, control)?;
         let prior = ShiftPrior::of(exposures.positions());
-        let (refined, considered) = if solution.refined { (prior, None) } else { (None, prior) };
+        let (refined, considered) = parted(solution.refinement, prior);
         system.seek_shifts(refined);
+        system.allows_single = false;
         system.linearise(control)?;
         let preconditioner = Preconditioner::new(&mut system, control)?;
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
         let (valid, scale) = valid(&system, &determined);
         Ok(Self {
-            tilts: Tilts::of(&system, &valid),
+            tilts: Tilts::of(&system, solution, &valid),
             system,
             preconditioner,
-            search: Search::default(),
+            search: ConjugateGradients::default(),
             considered,
             determined,
             valid,
             scale,
+            dark: None,
+            incomplete: 0,
         })
+    }
+
+    /// Takes the noise of the dark into account, of these variances. A sought offset takes all of it.
+    pub(super) fn set_dark(&mut self, variance: &[f64], control: &Control) -> Result<()> {
+        if self.system.pass.with_offset {
+            return Ok(());
+        }
+        let mut dark = Dark::of(&mut self.system, variance, control)?;
+        let propagated: Vec<f64> = dark.propagated().collect();
+        let in_gauge = self.tilts.gauge.diagonal(&propagated);
+        dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
+        self.dark = Some(dark);
+        Ok(())
+    }
+
+    /// What the noise of the dark adds to F, on average; 0 without a dark.
+    pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
+        let Some(left) = self.dark.as_ref().map(|dark| dark.left) else { return Ok(0.0) };
+        let pixels = count(&self.valid);
+        if left <= NEGLIGIBLE * pixels {
+            return Ok(left);
+        }
+        self.search = ConjugateGradients::default();
+        let propagated = mean_misfit(pixels, |draw| {
+            let slope = self.pulls_of_noise(draw, false, control)?;
+            self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
+            Ok(self.search.energy)
+        })?;
+        Ok(left - propagated)
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.search = Search::default();
-        let sampled = Sampled::of(self, control)?;
+        self.search = ConjugateGradients::default();
+        let sensor = self.system.pass.exposures.sensor();
+        let sampled = if is_smoothed(sensor) {
+            smoothed(self, sensor, control)?
+        } else {
+            Sampled::of(self, control)?
+        };
         let std = self.determined.iter().enumerate().map(|(pixel, &determined)| match determined {
             true => (self.scale * sampled.variance(pixel)).sqrt(),
             false => f64::NAN,
@@ -140,7 +185,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if !self.system.pass.with_offset {
             return Ok(None);
         }
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
         Ok(Some([along, self.mean_variance_of_offset_alone()]))
     }
@@ -150,66 +195,55 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         functionals: impl ExactSizeIterator<Item = Functional>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        self.search = Search::default();
+        self.search = ConjugateGradients::default();
         let total = functionals.len() as u64;
+        let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
             control.report("uncertainty", index, total);
-            self.variance_of(functional, LACK_OF_FUNCTIONAL, control)
+            self.variance_of(functional, lack, control)
         });
         found.collect()
     }
 
     /// The part of the variance that is known: the diagonal of P D⁻¹ Pᵀ, and what S does not see.
     fn known_part(&self) -> Vec<f32> {
-        let own = self.own();
-        let parts = &self.tilts.gauge.parts;
-        let dot = |a: &[f64], b: &[f64]| -> f64 {
-            a.iter().zip(b).zip(&own).map(|((a, b), own)| a * b * own).sum()
-        };
-        // (1 − U Wᵀ) V (1 − W Uᵀ) = V − U Wᵀ V − V W Uᵀ + U (Wᵀ V W) Uᵀ.
-        let mixed: Vec<Vec<f64>> =
-            parts.iter().map(|[_, w]| parts.iter().map(|[_, v]| dot(w, v)).collect()).collect();
-        let variance = |pixel: usize| {
-            let mut variance = own[pixel];
-            for ([u, w], mixed) in parts.iter().zip(&mixed) {
-                variance -= 2.0 * u[pixel] * own[pixel] * w[pixel];
-                for ([v, _], mixed) in parts.iter().zip(mixed) {
-                    variance += u[pixel] * mixed * v[pixel];
-                }
-            }
+        let mut own = self.own();
+        if let Some(dark) = &self.dark {
+            own.iter_mut().zip(dark.propagated()).for_each(|(own, propagated)| *own += propagated);
+        }
+        let in_gauge = self.tilts.gauge.diagonal(&own).enumerate();
+        let variance = in_gauge.map(|(pixel, mut variance)| {
             if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
                 variance += form(covariance, [tilts[0][pixel], tilts[1][pixel]]);
             }
             (variance / self.scale) as f32
-        };
-        (0..own.len()).map(variance).collect()
+        });
+        variance.collect()
     }
 
-    /// Adds the square of the change of M in one draw, solved until it lacks at most this share of
-    /// x · b.
-    fn add_square(
+    /// The change of M, in the gauge, with S x = b − S_d δ where considered shifts are wrong by δ, solved
+    /// until it lacks at most this share of x · b.
+    fn change(
         &mut self,
-        draw: u64,
+        mut slope: Vec<f64>,
+        wrong: &[f64],
         lack: f64,
-        squares: &mut [f32],
         control: &Control,
-    ) -> Result<()> {
-        let mut slope = self.draw(draw, control)?;
+    ) -> Result<Vec<f64>> {
         let mut change = vec![0.0; self.valid.len()];
         if self.considered.is_some() {
-            // S x = b − S_d δ for shifts that are wrong by δ.
-            let mut sign = self.other_signs(draw, Other::Shifts);
-            let wrong = self.considered_variances().into_iter().map(|v| sign() * v.sqrt());
-            let mut moved = vec![0.0; slope.len()];
+            let others = self.others();
+            let mut moved = vec![0.0; others];
             moved.extend(wrong);
             let pulled = self.considering(|system| {
                 let pulled = product(system, &moved, control);
                 add_change(system, &mut change);
                 pulled
             })?;
-            slope.iter_mut().zip(pulled).for_each(|(slope, pulled)| *slope -= pulled);
+            let pulled = slope[..others].iter_mut().zip(pulled);
+            pulled.for_each(|(slope, pulled)| *slope -= pulled);
         }
-        self.solve(slope, lack, control)?;
+        self.apply_inverse(slope, lack, control)?;
         let x = std::mem::take(&mut self.search.x);
         product(&mut self.system, &x, control)?;
         add_change(&self.system, &mut change);
@@ -218,10 +252,15 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             workers.add_multiple(&mut change, x[self.system.state.beam.len()], drift);
         }
         self.tilts.gauge.apply(&mut change, workers);
-        for (square, change) in squares.iter_mut().zip(&change) {
-            *square += (change * change / self.scale) as f32;
-        }
-        Ok(())
+        Ok(change)
+    }
+
+    /// What the noise of the dark adds to the variance of a functional, Σ g M or with g = 0 another one,
+    /// once S x = its pull is solved.
+    fn variance_by_dark(&mut self, gain: &[f64], control: &Control) -> Result<f64> {
+        let Some(dark) = &self.dark else { return Ok(0.0) };
+        let influence = self.system.propagate_common(&self.search.x, control)?;
+        Ok(dark.variance_of(gain, &influence))
     }
 
     /// The variance of a functional, in the gauge of the result, solved until it lacks at most this
@@ -231,11 +270,16 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             Functional::Gain(gain) => self.variance_of_gain(gain, lack, control),
             Functional::Shifts(shifts) => {
                 let mut pull = vec![0.0; self.system.size()];
-                let own = self.system.centred_pulls(shifts);
-                let others = pull.len() - own.as_flattened().len();
+                let own = self.system.centred_pulls(shifts.clone());
+                let others = self.others();
                 pull[others..].copy_from_slice(own.as_flattened());
-                self.solve(pull, lack, control)?;
-                Ok(self.search.energy)
+                self.apply_inverse(pull, lack, control)?;
+                // What was not refined has its prior's variance.
+                let kept = self.considered.iter().flat_map(|prior| prior.centred_pulls(&shifts));
+                let kept = kept.flatten().zip(self.considered_variances());
+                let kept: f64 = kept.map(|(q, v)| q * q * v).sum();
+                let no_gain = vec![0.0; self.valid.len()];
+                Ok(self.search.energy + kept + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -247,8 +291,6 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         lack: f64,
         control: &Control,
     ) -> Result<f64> {
-        let cells = self.system.state.beam.len();
-        let others = cells + self.system.fluxes.columns.len();
         let workers = self.system.pass.workers;
         self.tilts.gauge.transpose(&mut gain, workers);
         let none = vec![0.0; gain.len()];
@@ -257,25 +299,36 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             let heights = [0, 1].map(|axis| workers.dot(&tilts[axis], &gain));
             variance += form(covariance, heights);
         }
-        let mut pull = if self.considered.is_some() {
-            self.considering(|system| pull_of(system, &gain, &none, control))?
-        } else {
-            pull_of(&mut self.system, &gain, &none, control)?
-        };
-        if let Some(drift) = &self.tilts.drift {
-            pull[cells] += workers.dot(drift, &gain);
-        }
-        let seen = if self.considered.is_some() { pull.split_off(others) } else { Vec::new() };
-        self.solve(pull, lack, control)?;
-        variance += self.search.energy;
+        let (pull, seen) = self.pull_of_gain(&gain, control)?;
+        let others = self.others();
+        self.apply_inverse(pull, lack, control)?;
+        variance += self.search.energy + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
+            x.truncate(others);
             x.resize(others + seen.len(), 0.0);
             let pulled = self.considering(|system| product(system, &x, control))?;
             let left = seen.iter().zip(&pulled[others..]).map(|(seen, pulled)| seen - pulled);
             variance += left.zip(self.considered_variances()).map(|(h, v)| h * h * v).sum::<f64>();
         }
         Ok(variance)
+    }
+
+    /// Cᵀ g, and what of it considered shifts get, of a functional in the gauge.
+    fn pull_of_gain(&mut self, gain: &[f64], control: &Control) -> Result<(Vec<f64>, Vec<f64>)> {
+        let cells = self.system.state.beam.len();
+        let (others, none) = (self.others(), vec![0.0; gain.len()]);
+        let mut pull = pull_of(&mut self.system, gain, &none, control)?;
+        if let Some(drift) = &self.tilts.drift {
+            pull[cells] += self.system.pass.workers.dot(drift, gain);
+        }
+        let seen = if self.considered.is_some() {
+            let all = self.considering(|system| pull_of(system, gain, &none, control))?;
+            all[others..].to_vec()
+        } else {
+            Vec::new()
+        };
+        Ok((pull, seen))
     }
 
     /// With h = M/Σ M² the variance of Σ h O.
@@ -312,8 +365,13 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             found = height * height / size;
             workers.add_multiple(&mut pull, -height / size, &pulled);
         }
-        self.solve(pull, lack, control)?;
+        self.apply_inverse(pull, lack, control)?;
         Ok(variance + found + self.search.energy)
+    }
+
+    /// How many unknowns come before the shifts.
+    fn others(&self) -> usize {
+        self.system.state.beam.len() + self.system.fluxes.columns.len()
     }
 
     fn considered_variances(&self) -> Vec<f64> {
@@ -329,18 +387,17 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         result
     }
 
-    /// Solves S x = b.
-    fn solve(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
+    /// S⁻¹ b, left in the search.
+    fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
         search.begin(system, preconditioner, b, control)?;
-        let mut earlier = 0.0;
+        let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
-            if !search.step(system, preconditioner)
-                || iteration >= FEWEST_ITERATIONS
-                    && search.square / search.smallest <= lack * search.energy
-            {
-                break;
+            let goes_on = search.step(system, preconditioner);
+            let left = search.square / search.lowest.found();
+            if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
+                return Ok(());
             }
             if iteration % FEWEST_ITERATIONS == 0 {
                 if search.energy - earlier <= NOTHING * lack * search.energy {
@@ -349,55 +406,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 earlier = search.energy;
             }
         }
+        // Rounding may leave a Ritz value next to 0, but then the residual is rounding too.
+        self.incomplete += u64::from(search.square > NOTHING * lack * first);
         Ok(())
     }
 
-    /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
-    fn draw(&mut self, draw: u64, control: &Control) -> Result<Vec<f64>> {
-        let streams: Vec<u64> =
-            (0..self.system.pass.exposures.count()).map(|k| self.stream(draw, k, 0)).collect();
-        let mut of_penalty = self.other_signs(draw, Other::Penalty);
-        let mut of_priors = self.other_signs(draw, Other::Priors);
-        let system = &mut self.system;
-        let mut slope = pull_by(system, control, |pass, row_index, row, room| {
-            let cols = pass.exposures.sensor().cols;
-            let (weights, values, sums) = room.parts();
-            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
-                let mut sign = random::signs(streams[k] + row_index as u64);
-                let pixels = weights.iter().zip(&*row.sensitivity);
-                for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
-                    // As a change of the light, which a pixel without response does not show.
-                    let shown = weight.sqrt() * flux * m;
-                    *value = if shown == 0.0 { 0.0 } else { sign() / shown };
-                }
-            }
-            let fluxes = &pass.flux[..];
-            pulp::Arch::new().dispatch(Follow { row, fluxes, weights, values, sums, share: 0.0 });
-        })?;
-        let cells = system.state.beam.len();
-        if let Some(penalty) = &system.penalty {
-            let beam = &system.state.beam;
-            penalty.add_draw(beam, &mut of_penalty, &mut slope[..cells], system.pass.workers);
-        }
-        let params = system.fluxes.columns.len();
-        let mut pulls = system.precisions();
-        pulls.iter_mut().for_each(|precision| *precision = precision.sqrt() * of_priors());
-        let of_shifts = system.centred_pulls(pulls.split_off(params).as_chunks().0.to_vec());
-        let priors = pulls.iter().chain(of_shifts.as_flattened());
-        slope[cells..].iter_mut().zip(priors).for_each(|(slope, pull)| *slope += pull);
-        Ok(slope)
-    }
-
-    /// The number of a stream of signs: of a row of an exposure, or behind those of what else is drawn.
-    fn stream(&self, draw: u64, exposure: usize, row: usize) -> u64 {
-        let (rows, count) =
-            (self.system.pass.exposures.sensor().rows, self.system.pass.exposures.count());
-        (draw * (count + OTHERS) as u64 + exposure as u64) * rows as u64 + row as u64
-    }
-
-    /// The stream of signs for what else is drawn.
-    fn other_signs(&self, draw: u64, which: Other) -> impl FnMut() -> f64 + use<T> {
-        random::signs(self.stream(draw, self.system.pass.exposures.count() + which as usize, 0))
+    /// Searches that ended before their answer was as exact as it should be.
+    pub(super) const fn incomplete(&self) -> u64 {
+        self.incomplete
     }
 
     /// D⁻¹ of each pixel's M.
@@ -433,6 +449,21 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     }
 }
 
+/// The part of the prior on shifts that were refined, and the part along which they were not.
+fn parted(
+    refinement: Refinement,
+    prior: Option<ShiftPrior>,
+) -> (Option<ShiftPrior>, Option<ShiftPrior>) {
+    let along = |[row, col]: [f64; 2]| {
+        prior.clone().map(|prior| ShiftPrior { along: Some([row, col]), ..prior })
+    };
+    match refinement {
+        Refinement::Done => (prior, None),
+        Refinement::Along([row, col]) => (along([row, col]), along([-col, row])),
+        _ => (None, prior),
+    }
+}
+
 /// The problem at a solution.
 fn problem<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
@@ -454,35 +485,4 @@ fn problem<'m, 'a, T: Real>(
     let mut system = System::new(exposures, grid, fluxes, state, workers, control);
     system.unit = solution.unit;
     Ok(system)
-}
-
-/// 1 in the determined pixels that have a weight, and their mean D⁻¹.
-fn valid<T: Real>(system: &System<'_, '_, T>, determined: &[bool]) -> (Vec<f32>, f64) {
-    let mut valid = vec![0.0; determined.len()];
-    let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
-    system.pass.for_rows(|[_, inverse, ..]| {
-        for (pixel, inverse) in (first..).zip(inverse) {
-            if *inverse > 0.0 && determined[pixel] {
-                valid[pixel] = 1.0;
-                sum += inverse;
-                count += 1.0;
-            }
-        }
-        first += inverse.len();
-    });
-    (valid, sum / count)
-}
-
-impl<T: Real> Drawn for JointCovariance<'_, '_, T> {
-    fn valid(&self) -> &[f32] {
-        &self.valid
-    }
-
-    fn known(&mut self, _: &Control) -> Result<Vec<f32>> {
-        Ok(self.known_part())
-    }
-
-    fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
-        self.add_square(draw, LACK_OF_DRAW, squares, control)
-    }
 }

@@ -1,6 +1,7 @@
 //! The gauge of a joint fit's result, and the tilts of M that its linear problem does not see.
 
 use crate::exposures::FluxKind;
+use crate::fit::Solution;
 use crate::frames::Real;
 use crate::gauge;
 use crate::geometry::Rotation;
@@ -28,6 +29,27 @@ impl Gauge {
         }
     }
 
+    /// The diagonal of P V Pᵀ for a diagonal V.
+    pub(super) fn diagonal<'v>(&'v self, own: &'v [f64]) -> impl Iterator<Item = f64> + 'v {
+        let parts = &self.parts;
+        let dot = |a: &[f64], b: &[f64]| -> f64 {
+            a.iter().zip(b).zip(own).map(|((a, b), own)| a * b * own).sum()
+        };
+        // (1 − U Wᵀ) V (1 − W Uᵀ) = V − U Wᵀ V − V W Uᵀ + U (Wᵀ V W) Uᵀ.
+        let mixed: Vec<Vec<f64>> =
+            parts.iter().map(|[_, w]| parts.iter().map(|[_, v]| dot(w, v)).collect()).collect();
+        (0..own.len()).map(move |pixel| {
+            let mut variance = own[pixel];
+            for ([u, w], mixed) in parts.iter().zip(&mixed) {
+                variance -= 2.0 * u[pixel] * own[pixel] * w[pixel];
+                for ([v, _], mixed) in parts.iter().zip(mixed) {
+                    variance += u[pixel] * mixed * v[pixel];
+                }
+            }
+            variance
+        })
+    }
+
     /// Pᵀ g.
     pub(super) fn transpose(&self, functional: &mut [f64], workers: &Workers) {
         let heights: Vec<f64> =
@@ -47,8 +69,12 @@ pub(super) struct Tilts {
 }
 
 impl Tilts {
-    /// Those of a problem, with 1 in the `valid` pixels, whose mean M is 1.
-    pub(super) fn of<T: Real>(system: &System<'_, '_, T>, valid: &[f32]) -> Self {
+    /// Those of a problem at a solution, with 1 in the `valid` pixels, whose mean M is 1.
+    pub(super) fn of<T: Real>(
+        system: &System<'_, '_, T>,
+        solution: &Solution<'_>,
+        valid: &[f32],
+    ) -> Self {
         let exposures = system.pass.exposures;
         let (sensor, rotation) = (exposures.sensor(), exposures.positions().rotations[0]);
         let [m, _] = system.pixels();
@@ -63,8 +89,8 @@ impl Tilts {
             let covariance = turned.map(|row| row.map(|x| x / system.unit));
             hidden = Some(Hidden { tilts, covariance });
         } else if !system.fluxes.open.is_empty() {
-            let labels: Vec<i32> = valid.iter().map(|valid| *valid as i32 - 1).collect();
-            let slopes = gauge::slopes(&m, &labels, sensor);
+            let counted = gauge::slope_pixels(solution.sensitivity, solution.flags);
+            let slopes = gauge::slopes(&counted, sensor);
             for direction in &system.fluxes.open {
                 let direction = rotation.in_sensor(*direction);
                 let mut slope = along(direction, &slopes);
@@ -75,6 +101,23 @@ impl Tilts {
         }
         Self { gauge: Gauge { parts }, hidden, drift }
     }
+}
+
+/// 1 in the determined pixels that have a weight, and their mean D⁻¹.
+pub(super) fn valid<T: Real>(system: &System<'_, '_, T>, determined: &[bool]) -> (Vec<f32>, f64) {
+    let mut valid = vec![0.0; determined.len()];
+    let (mut first, mut sum, mut count) = (0, 0.0, 0.0);
+    system.pass.for_rows(|[_, inverse, ..]| {
+        for (pixel, inverse) in (first..).zip(inverse) {
+            if *inverse > 0.0 && determined[pixel] {
+                valid[pixel] = 1.0;
+                sum += inverse;
+                count += 1.0;
+            }
+        }
+        first += inverse.len();
+    });
+    (valid, sum / count)
 }
 
 /// How many pixels are valid.

@@ -3,7 +3,7 @@
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
-use crate::joint::{Pass, Room, Row, System};
+use crate::joint::{Pass, Row, System, Workspace};
 
 /// Cᵀ of a functional: what changes of the other unknowns do to it through M and O, which follow a
 /// change u = c M v of the light by −α = −(i₁₁ eᵀw u + i₁₂ 1ᵀw u) and −β = −(i₁₂ eᵀw u + i₂₂ 1ᵀw u).
@@ -13,11 +13,11 @@ pub(super) fn pull_of<T: Real>(
     offset: &[f64],
     control: &Control,
 ) -> Result<Vec<f64>> {
-    pull_by(system, control, |pass, row_index, row, room| {
+    pull_by(system, control, |pass, row_index, row, workspace| {
         let cols = pass.exposures.sensor().cols;
         let (gain, offset) = (&gain[row_index * cols..], &offset[row_index * cols..]);
         let [_, i12, i22] = row.offset;
-        let (weights, values, _) = room.parts();
+        let (weights, values, _) = workspace.parts();
         for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
             let light = &row.light[k * cols..];
             for (col, value) in values.of_mut(k).iter_mut().enumerate() {
@@ -33,20 +33,20 @@ pub(super) fn pull_of<T: Real>(
     })
 }
 
-/// What pixels pull at the unknowns if `work` leaves their pulls in the room's values, with their
+/// What pixels pull at the unknowns if `work` leaves their pulls in the workspace's values, with their
 /// weights beside.
 pub(super) fn pull_by<T: Real>(
     system: &mut System<'_, '_, T>,
     control: &Control,
-    work: impl Fn(&Pass<'_, '_, T>, usize, Row<'_>, &mut Room) + Sync,
+    work: impl Fn(&Pass<'_, '_, T>, usize, Row<'_>, &mut Workspace) + Sync,
 ) -> Result<Vec<f64>> {
     let beam = std::mem::take(&mut system.state.beam);
     let views = system.pass.views_of(&beam);
     let mut pull = vec![0.0; beam.len()];
-    let found = system.pass.run(&mut pull, control, |pass, row_index, row, room, _| {
-        pass.weigh_row(row_index, room);
-        pass.see_slopes(&views, row_index, room);
-        work(pass, row_index, row, room);
+    let found = system.pass.run(&mut pull, control, |pass, row_index, row, workspace, _| {
+        pass.weigh_row(row_index, workspace);
+        pass.see_slopes(&views, row_index, workspace);
+        work(pass, row_index, row, workspace);
     });
     drop(views);
     system.state.beam = beam;
@@ -71,4 +71,38 @@ pub(super) fn add_change<T: Real>(system: &System<'_, '_, T>, change: &mut [f64]
     system.pass.for_rows(|[_, _, change, ..]| {
         sums.by_ref().zip(change).for_each(|(sum, change)| *sum += change);
     });
+}
+
+/// What the noise of each cell of the beam, at the M that there is, does by itself to the variance of M:
+/// Σ_k (i₁₁ w e c M)² V with 1/V = Σ w c² M² over the pixels that see a cell.
+pub(super) fn variance_by_cells<T: Real>(
+    system: &mut System<'_, '_, T>,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let of_cells = std::mem::take(&mut system.weights);
+    let views = system.pass.views_of(&of_cells);
+    let mut no_pull = vec![0.0; of_cells.len()];
+    let done = system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, _| {
+        pass.weigh_row(row_index, workspace);
+        workspace.values().clear();
+        pass.see(&views, row_index, workspace);
+        let cols = row.change.len();
+        let (weights, values, _) = workspace.parts();
+        row.change.fill(0.0);
+        for (k, flux) in pass.flux.iter().enumerate() {
+            let (weights, light) = (&weights[k * cols..][..cols], &row.light[k * cols..][..cols]);
+            for (col, weight) in values.of_mut(k).iter_mut().enumerate() {
+                let share =
+                    row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
+                row.change[col] += if *weight > 0.0 { share * share / *weight } else { 0.0 };
+                *weight = 0.0;
+            }
+        }
+    });
+    drop(views);
+    system.weights = of_cells;
+    done?;
+    let mut variance = vec![0.0; system.pass.exposures.sensor().len()];
+    add_change(system, &mut variance);
+    Ok(variance)
 }

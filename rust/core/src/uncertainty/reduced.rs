@@ -15,33 +15,44 @@
 //! the gauge mean(M) = 1 is δM − M mean(δM).
 //!
 //! A linear functional gᵀM has the variance gᵀ S⁻¹ g: one linear problem, no draws.
+//!
+//! The noise of a dark that was subtracted from all exposures adds a e + r (`reduced/dark_noise.rs`). The
+//! variance of a e is known; r and its product with a e are sampled, in the same draws. To a functional
+//! it adds Σ_p v (Σ_k h_k)², h_k = w c L (x − M h) being the influence of measurement k with S x = g.
 
-use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, NOTHING, Sampled};
+use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
+use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
-use crate::geometry::{Geometry, View};
+use crate::geometry::View;
 use crate::memory;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
-use crate::reduced::{self, Search, Smallest};
+use crate::reduced::{self, ConjugateGradients, Draw, Smallest};
 
 /// The covariance at a fit of M and L alone, of its linear problem at the solution.
 pub(super) struct ReducedCovariance<'m, 'a, T> {
     exposures: &'m Exposures<'a, T>,
     workers: &'m Workers,
-    search: Search<'m, 'a, T>,
+    search: ConjugateGradients<'m, 'a, T>,
     smallest: Smallest,
     /// 1 in the pixels whose mean M is 1, else 0.
     valid: Vec<f32>,
     count: f64,
     /// b.
     slope: Vec<f32>,
+    /// The variance of what M follows of the dark at once, in the gauge; empty without a dark.
+    propagated: Vec<f32>,
     undetermined: Vec<bool>,
+    incomplete: u64,
 }
+
+/// Upper limit on iterations for one right-hand side.
+const MOST_ITERATIONS: u64 = 1000;
 
 impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
     /// # Errors
@@ -53,11 +64,11 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
-        memory::check(bytes_needed(exposures.geometry()), || {
+        memory::check(bytes_needed(exposures), || {
             format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
         })?;
         let (sensitivity, beam) = (solution.sensitivity, solution.beam.values);
-        let mut search = Search::new(exposures, workers, control);
+        let mut search = ConjugateGradients::new(exposures, workers, control);
         let finite = |values: &[f64]| -> Vec<f64> {
             values.iter().map(|value| if value.is_finite() { *value } else { 0.0 }).collect()
         };
@@ -87,33 +98,90 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         }
         let slope = padding.zeros(exposures.sensor().rows, workers, control);
         let smallest = Smallest::default();
-        Ok(Self { exposures, workers, search, smallest, valid, count, slope, undetermined })
+        let propagated = Vec::new();
+        Ok(Self {
+            exposures,
+            workers,
+            search,
+            smallest,
+            valid,
+            count,
+            slope,
+            propagated,
+            undetermined,
+            incomplete: 0,
+        })
+    }
+
+    /// Takes the noise of the dark into account, of these variances.
+    pub(super) fn set_dark(&mut self, variance: &[f64], control: &Control) -> Result<()> {
+        self.search.reduced.set_dark(variance, control)?;
+        self.propagated = self.in_gauge(self.search.reduced.propagated());
+        Ok(())
+    }
+
+    /// The diagonal of P V Pᵀ for a diagonal V.
+    fn in_gauge(&self, mut variance: Vec<f32>) -> Vec<f32> {
+        let mean = dot(&variance, &self.valid, self.workers) / (self.count * self.count);
+        for (v, &m) in variance.iter_mut().zip(&self.search.reduced.sensitivity) {
+            let m = f64::from(m);
+            *v = (f64::from(*v) * (1.0 - 2.0 * m / self.count) + m * m * mean) as f32;
+        }
+        variance
+    }
+
+    /// What the noise of the dark adds to F, on average; 0 without a dark.
+    pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
+        if !self.search.reduced.has_dark() {
+            return Ok(0.0);
+        }
+        self.smallest = Smallest::default();
+        mean_misfit(self.count, |draw| {
+            let Self { search, count, .. } = self;
+            let left = search.reduced.draw(Draw::Dark(draw), &mut search.residual, control)?;
+            if left <= NEGLIGIBLE * *count {
+                return Ok(left);
+            }
+            self.apply_inverse(LACK_OF_FUNCTIONAL, control)?;
+            Ok(left - self.search.energy)
+        })
     }
 
     fn image(&self, control: &Control) -> Vec<f32> {
         self.search.reduced.padding.zeros(self.exposures.sensor().rows, self.workers, control)
     }
 
-    /// Solves S x = b, b being the residual, until x · b lacks at most this share.
-    fn solve(&mut self, lack: f64, control: &Control) -> Result<()> {
+    /// S⁻¹ b, left in the search, b being the residual, until x · b lacks at most this share.
+    fn apply_inverse(&mut self, lack: f64, control: &Control) -> Result<()> {
         let Self { search, smallest, .. } = self;
         search.begin(control)?;
         let (mut iterations, mut earlier) = (0, 0.0);
+        // What single precision holds.
+        let nothing = NOTHING * lack.max(LACK_OF_DRAW);
         while smallest.iterate(search, control)? {
             iterations += 1;
             if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
                 break;
             }
+            if iterations == MOST_ITERATIONS {
+                self.incomplete += 1;
+                break;
+            }
             // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
             // iterations brought tells.
             if iterations % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= NOTHING * lack * search.energy {
+                if search.energy - earlier <= nothing * search.energy {
                     break;
                 }
                 earlier = search.energy;
             }
         }
         Ok(())
+    }
+
+    /// Searches that ended before their answer was as exact as it should be.
+    pub(super) const fn incomplete(&self) -> u64 {
+        self.incomplete
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
@@ -153,9 +221,13 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             *g -= mean as f32 * valid;
         }
         search.residual.copy_from_slice(slope);
-        self.solve(LACK_OF_FUNCTIONAL, control)?;
+        let with_dark = search.reduced.has_dark();
+        let lack = if with_dark { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
+        self.apply_inverse(lack, control)?;
         let Self { search, slope, workers, .. } = self;
-        Ok(dot(slope, &search.x, workers) * (largest * search.reduced.scale.deviation()).powi(2))
+        let by_dark = search.reduced.variance_by_dark(&search.x, control)?;
+        let variance = dot(slope, &search.x, workers) + by_dark;
+        Ok(variance * (largest * search.reduced.scale.deviation()).powi(2))
     }
 
     /// The standard deviations in the units of M, row by row.
@@ -179,7 +251,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         });
         for (pixel, inverse) in reduced.left_out_variances() {
             if inverse > 0.0 && !self.undetermined[pixel] {
-                std[pixel] = scale * inverse.sqrt();
+                std[pixel] = scale * inverse.sqrt().hypot(reduced.left_out_by_dark(pixel, inverse));
             }
         }
         std
@@ -212,17 +284,28 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
             let m = f64::from(m);
             *variance += (m * (m * mean - 2.0 * f64::from(*u) / *count)) as f32;
         }
+        variance.iter_mut().zip(&self.propagated).for_each(|(variance, dark)| *variance += dark);
         Ok(variance)
+    }
+
+    fn propagated(&self) -> &[f32] {
+        &self.propagated
     }
 
     /// Adds the square of T x, in the gauge, of one draw x.
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
         let Self { search, slope, .. } = self;
-        search.reduced.draw(draw, &mut search.residual, control)?;
-        slope.copy_from_slice(&search.residual);
-        self.solve(LACK_OF_DRAW, control)?;
+        search.reduced.draw(Draw::Measurements(draw), slope, control)?;
+        if search.reduced.has_dark() {
+            search.reduced.draw(Draw::Dark(draw), &mut search.residual, control)?;
+            search.residual.iter_mut().zip(&*slope).for_each(|(b, of_noise)| *b += of_noise);
+        } else {
+            search.residual.copy_from_slice(slope);
+        }
+        self.apply_inverse(LACK_OF_DRAW, control)?;
+        let propagated = self.propagate_dark(draw, control)?;
         let Self { search, slope, workers, valid, count, .. } = self;
-        // T x = x − D⁻¹ S x, and S x = b − r.
+        // T x = x − D⁻¹ S x of the noise, and x of the dark: x − D⁻¹ (b − r), b being that of the noise.
         let inverse = &search.reduced.inverse_diagonal;
         workers.map_blocks(slope, PART, |part, slope| {
             let from = part * PART;
@@ -239,9 +322,27 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
             for (index, square) in squares.iter_mut().enumerate() {
                 let rest = slope[from + index] - mean * m[from + index];
                 *square += rest * rest;
+                if let Some(propagated) = propagated.get(from + index) {
+                    *square += 2.0 * rest * propagated;
+                }
             }
         });
         Ok(())
+    }
+}
+
+impl<T: Real> ReducedCovariance<'_, '_, T> {
+    /// What M follows at once of the dark in one draw, in the gauge; empty without a dark.
+    fn propagate_dark(&self, draw: u64, control: &Control) -> Result<Vec<f32>> {
+        if !self.search.reduced.has_dark() {
+            return Ok(Vec::new());
+        }
+        let mut propagated = self.image(control);
+        self.search.reduced.propagate(draw, &mut propagated, control)?;
+        let mean = (dot(&propagated, &self.valid, self.workers) / self.count) as f32;
+        let m = &self.search.reduced.sensitivity;
+        propagated.iter_mut().zip(m).for_each(|(value, m)| *value -= mean * m);
+        Ok(propagated)
     }
 }
 
@@ -259,7 +360,8 @@ fn dot(a: &[f32], b: &[f32], workers: &Workers) -> f64 {
 
 /// What both take beside the measurements, in bytes: a search and three images more, a copy of L in
 /// each view, and the map.
-fn bytes_needed(geometry: &Geometry) -> u64 {
+fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
+    let geometry = exposures.geometry();
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
@@ -267,5 +369,5 @@ fn bytes_needed(geometry: &Geometry) -> u64 {
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     let turned = if views > 1 { of_views } else { 0 };
     let more = 12 * places(geometry.sensor.rows) + turned;
-    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(geometry)
+    16 * pixels + more + 8 * views * cells + reduced::bytes_needed(exposures)
 }

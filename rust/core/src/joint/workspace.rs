@@ -1,11 +1,11 @@
-//! Room of one thread for a row of pixels, and what a pass gathers.
+//! The arrays of one thread for a row of pixels, and what a pass gathers.
 
 use super::kernel::Lines;
 use crate::geometry::TAPS;
 use crate::parallel::Add;
 
-/// Room of one thread for a row of pixels.
-pub(crate) struct Room {
+/// The arrays of one thread for a row of pixels.
+pub(crate) struct Workspace {
     pub(crate) weights: Vec<f64>,
     /// Values of the row, then its pulls; before them the pulls of the rows before.
     pub(crate) lines: [Lines; TAPS],
@@ -15,7 +15,7 @@ pub(crate) struct Room {
     pub(crate) slopes: [Vec<f64>; 2],
 }
 
-impl Room {
+impl Workspace {
     /// Values of the row.
     pub(crate) fn values(&mut self) -> &mut Lines {
         &mut self.lines[TAPS - 1]
@@ -37,7 +37,7 @@ impl Room {
         }
     }
 
-    /// What the kernels need beside the row: the weights, the values, and room for sums.
+    /// What the kernels need beside the row: the weights, the values, and arrays for sums.
     pub(crate) fn parts(&mut self) -> (&[f64], &mut Lines, &mut [Vec<f64>; 4]) {
         (&self.weights, &mut self.lines[TAPS - 1], &mut self.sums)
     }

@@ -4,6 +4,7 @@
 //! Lanczos, whose eigenvalues, the Ritz values, approach those of P⁻¹S from within; the smallest is
 //! what turns a residual into an estimate of the error (see [`convergence`](crate::convergence)).
 
+use super::blocks::count_waves;
 use super::operator::Reduced;
 use super::two_level::TwoLevel;
 use crate::coarse;
@@ -11,7 +12,6 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
-use crate::geometry::Geometry;
 use crate::padded::Padding;
 use crate::parallel::Workers;
 use crate::ritz::Ritz;
@@ -30,16 +30,19 @@ const ROUNDING: f64 = 4.0 * f64::EPSILON;
 /// |---|---|
 /// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
 /// | L², h | 2 · 4 for each place of each view |
-/// | the coarse matrix and its factor | some 2700 for each hat, or of a full matrix |
-pub(crate) fn bytes_needed(geometry: &Geometry) -> u64 {
+/// | the coarse matrices and their factors | some 2700 for each hat, 8000 for one of a wave, or of a full matrix |
+pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
+    let geometry = exposures.geometry();
     let padding = Padding::of(geometry);
     let places = |rows| padding.size(rows) as u64;
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
-    24 * places(geometry.sensor.rows) + of_views + coarse::bytes_needed(geometry)
+    24 * places(geometry.sensor.rows)
+        + of_views
+        + coarse::bytes_needed(geometry, count_waves(exposures))
 }
 
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
-pub(crate) struct Search<'m, 'a, T> {
+pub(crate) struct ConjugateGradients<'m, 'a, T> {
     workers: &'m Workers,
     pub(crate) reduced: Reduced<'m, 'a, T>,
     two_level: TwoLevel<'m>,
@@ -57,8 +60,8 @@ pub(crate) struct Search<'m, 'a, T> {
     pub(crate) ritz: Ritz,
 }
 
-impl<'m, 'a, T: Real> Search<'m, 'a, T> {
-    /// Room for a search.
+impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
+    /// Buffers for a search.
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
         workers: &'m Workers,

@@ -6,11 +6,11 @@ use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
-use crate::ritz::Ritz;
+use crate::ritz::{Lowest, Ritz};
 
 /// A solution in the making.
 #[derive(Default)]
-pub(crate) struct Search {
+pub(crate) struct ConjugateGradients {
     pub(crate) x: Vec<f64>,
     residual: Vec<f64>,
     direction: Vec<f64>,
@@ -22,13 +22,13 @@ pub(crate) struct Search {
     pub(crate) energy: f64,
     ritz: Ritz,
     /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
-    pub(crate) smallest: f64,
+    pub(crate) lowest: Lowest,
     pub(crate) iterations: u64,
     /// Whether the preconditioner does.
     sees_large_scales: bool,
 }
 
-impl Search {
+impl ConjugateGradients {
     pub(crate) fn begin<T: Real>(
         &mut self,
         system: &System<'_, '_, T>,
@@ -37,7 +37,7 @@ impl Search {
         control: &Control,
     ) -> Result<()> {
         if self.iterations == 0 {
-            self.smallest = DAMPING;
+            self.lowest = Lowest::new(DAMPING);
         }
         self.sees_large_scales = preconditioner.sees_large_scales();
         let zeros = || system.pass.workers.filled(slope.len(), 0.0, control);
@@ -88,7 +88,7 @@ impl Search {
         std::mem::swap(&mut self.direction, &mut self.product);
         self.ritz.push(step, self.keep);
         self.square = square;
-        self.smallest = self.smallest.min(self.ritz.smallest());
+        self.lowest.push(self.ritz.smallest());
         self.iterations += 1;
         square > 0.0
     }

@@ -1,0 +1,69 @@
+"""Verdicts on what is given, before any fit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from equipix.calibration.verdicts import Verdict
+from equipix.exposures.clipping import clipping_advice
+from equipix.exposures.reach import micrometre_step
+from equipix.exposures.repeated import repeated
+
+if TYPE_CHECKING:
+    from equipix.exposures.exposures import Exposures
+
+
+def on_input(exposures: Exposures) -> list[Verdict]:
+    """Verdicts on exposures that the values given contradict."""
+    found = [
+        _on_clipping(exposures),
+        _on_raw(exposures),
+        _on_units(exposures),
+        _on_repeats(exposures),
+    ]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def _on_clipping(exposures: Exposures) -> Verdict | None:
+    """Verdict on a saturation level that is missing or too high."""
+    if exposures.clipped is None:
+        return None
+    return Verdict("saturation", clipping_advice(exposures.clipped))
+
+
+def _on_raw(exposures: Exposures) -> Verdict | None:
+    """Verdict on averages without a dark."""
+    if not exposures.raw:
+        return None
+    return Verdict(
+        "raw",
+        "no dark was subtracted from the averages, so that an offset of the camera counts as "
+        "light: give 'dark' to equipix.average (--dark), or subtract it before",
+    )
+
+
+def _on_units(exposures: Exposures) -> Verdict | None:
+    """Verdict on shifts that look like micrometres."""
+    shifts = exposures.positions.shifts
+    step = micrometre_step(shifts, exposures.shape)
+    if step is None:
+        return None
+    return Verdict(
+        "unit",
+        f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
+        f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
+        "pitch, see 'From micrometres to pixels' in README",
+    )
+
+
+def _on_repeats(exposures: Exposures) -> Verdict | None:
+    """Verdict on one exposure that is given for two positions."""
+    pair = repeated(exposures.values, exposures.positions)
+    if pair is None:
+        return None
+    first, second = pair
+    return Verdict(
+        "repeated",
+        f"exposures {first} and {second} are equal, value for value, which noise prevents: give "
+        "each position its own frames, and see whether the sensor moved",
+    )

@@ -1,0 +1,241 @@
+"""Whether residuals are those of a right model, and what the likely cause is if not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.calibration import causes
+from equipix.calibration.residual_tests import lag_one
+from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
+
+if TYPE_CHECKING:
+    from equipix._types import Array, Bools, Floats
+    from equipix.calibration.residual_tests import Correlation
+    from equipix.calibration.residuals import Residuals
+    from equipix.calibration.weights import Weighted
+
+_SIGMAS = 5.0
+"""Standard errors that noise does not reach."""
+
+_LEAST = 0.03
+"""Deviation of reduced χ² from 1 that does no harm: error bars are wrong by half of it."""
+
+_CORRELATED = 0.01
+"""Correlation of neighbouring residuals that does no harm: a misfit of a tenth of the noise."""
+
+_MOST = 0.5
+"""Share of an excess from which a cause is the likely one."""
+
+_ABOVE = 3.0
+"""Steps of a beam from cell to cell, in noise of a measurement, from which they are its own."""
+
+_FINE = 6.0
+"""Shortest period, in pixels, that a spline through cells holds."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What residuals show.
+
+    Attributes
+    ----------
+    chi2, std : float
+        Reduced χ², and its standard error where the model and the variances are right; NaN without
+        variances.
+    correlation : Correlation
+        That of neighbouring residuals, along the axis where it is the larger.
+    cause : str
+        Likely cause: "flux", "shifts", "rows", "columns", "exposure", "region", "signal",
+        "structure", "noise" or "unknown".
+    remedy : str
+        The cause in words, and what to do.
+    """
+
+    chi2: float
+    std: float
+    correlation: Correlation
+    cause: str
+    remedy: str
+
+    @property
+    def words(self) -> str:
+        """What is wrong, the value, the limit and the remedy."""
+        limit = max(_LEAST, _SIGMAS * self.std)
+        if abs(self.chi2 - 1) > limit:
+            return (
+                f"the residuals are {self.chi2**0.5:.3g} times as large as the variances predict "
+                f"(reduced chi-square {self.chi2:.3g}, expected 1 ± {limit:.2g}): {self.remedy}"
+            )
+        return (
+            f"residuals of neighbouring pixels are correlated by {self.correlation.size:.1%}, "
+            f"{abs(self.correlation.z):.0f} standard errors (limit {_SIGMAS:g}): {self.remedy}"
+        )
+
+
+def misfit(weighted: Weighted, residuals: Residuals) -> Misfit | None:
+    """Test the residuals of a fit; None where nothing speaks against it.
+
+    Notes
+    -----
+    Two questions. Where variances are known, reduced χ² must be within five standard errors
+    √(2/dof) of 1, or within 3 %. And residuals of neighbouring pixels must not be correlated by
+    more than five standard errors and 1 %, which requires no variances. A fit that has not come to
+    its minimum, or data without noise, answer neither.
+    """
+    inexactness = residuals.inexactness
+    if weighted.fit.degrees_of_freedom < FEWEST or not inexactness < 1:
+        return None
+    known = weighted.exposures.variance is not None
+    chi2 = weighted.reduced_chi2 if known else float("nan")
+    std = (2 / weighted.fit.degrees_of_freedom) ** 0.5 if known else float("nan")
+    limit = max(_LEAST, _SIGMAS * std)
+    high = chi2 * (1 - inexactness**2) > 1 + limit
+    low = chi2 < 1 - limit
+    largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
+    correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
+    correlated &= inexactness <= EXACT
+    if not (high or low or correlated):
+        return None
+    cause, remedy = _cause(weighted, residuals, largest, correlated=bool(correlated), low=bool(low))
+    return Misfit(chi2, std, largest, cause, remedy)
+
+
+def _cause(
+    weighted: Weighted, residuals: Residuals, largest: Correlation, *, correlated: bool, low: bool
+) -> tuple[str, str]:
+    """The likely cause and its remedy."""
+    if correlated:
+        found = _common(weighted, residuals, largest)
+        if found is not None:
+            return found
+    values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
+    if low:
+        return "noise", (
+            "the variances are too large, so error bars are too. Is the noise of the dark counted "
+            "in every exposure, or were the frames smoothed or clipped?"
+        )
+    noise = residuals.share * residuals.scale
+    excess = float(np.nansum(values**2)) - noise * np.count_nonzero(np.isfinite(values))
+    inside = np.where(_flat(_seen_by_all(weighted, residuals)), values, np.nan)
+    if weighted.exposures.variance is not None and causes.by_signal(inside, signal) > _MOST:
+        return "signal", (
+            "they grow with the signal: give 'variance' as a NoiseModel with photon noise, and see "
+            "whether the response is linear"
+        )
+    found = _local(values, residuals, noise, excess)
+    if found is not None:
+        return found
+    if not correlated:
+        return "noise", (
+            "they are white, so the variances are too small. Multiply them by reduced chi-square"
+        )
+    return "unknown", (
+        "no single cause was found. Check the shifts and their orientation, reflections, and an "
+        "illumination that changes; if there is dust use robust=True"
+    )
+
+
+def _common(
+    weighted: Weighted, residuals: Residuals, largest: Correlation
+) -> tuple[str, str] | None:
+    """A cause of correlated residuals: fluxes, shifts, rows, columns, one place, fine structure."""
+    values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
+    excess = abs(largest.product) * np.count_nonzero(np.isfinite(values))
+    noise = max(float(np.nanmean(values**2)) - abs(largest.product), 0.0)
+    if _is_fine(weighted, residuals):
+        return "structure", (
+            "between pixels a spline does not hold structure of the beam with periods below some "
+            f"{_FINE:g} pixels: defocus the beam, or move the sensor by whole pixels"
+        )
+    slopes = np.stack([_flat(each) for each in residuals.slopes])
+    flux = causes.by_flux(values, signal, noise)
+    if flux.explained > _MOST * excess:
+        return "flux", (
+            "exposures differ by a factor that no tilt explains: use flux='fit' or 'flux_std'"
+        )
+    shifts = causes.by_shifts(values, signal, slopes, noise)
+    if shifts.explained > _MOST * excess:
+        return "shifts", (
+            "they are proportional to the slope of the beam: check the shifts"
+            f"{_scale_words(weighted, causes.moves(values, signal, slopes))}, or give 'shift_std'"
+        )
+    for axis, name in ((2, "rows"), (1, "columns")):
+        if causes.by_lines(shifts.remaining, axis, noise).explained > _MOST * excess:
+            return name, (
+                f"they are common to the pixels of {name}, as noise of the read-out is: subtract "
+                "it with reference pixels. Error bars do not contain it"
+            )
+    return _local(values, residuals, noise, excess)
+
+
+def _local(
+    values: Floats, residuals: Residuals, noise: float, excess: float
+) -> tuple[str, str] | None:
+    """A cause in one exposure or in one region."""
+    explained, (row, col) = causes.by_region(values, noise)
+    if explained > _MOST * excess:
+        at = f"({residuals.rows.ravel()[min(row, residuals.rows.size - 1)]}, {col})"
+        return "region", (
+            f"they are largest in a region, around pixel {at}: look for dust or a reflection, "
+            "mask it or use robust=True"
+        )
+    explained, worst = causes.by_exposure(values, noise)
+    # Sensitivity and beam each take 1/n of what is wrong with one exposure.
+    if explained > _MOST * (1 - 1 / len(values)) ** 2 * excess:
+        return "exposure", (
+            f"exposure {worst} (from 0) has the most: check it, leave it out or use robust=True"
+        )
+    return None
+
+
+def _scale_words(weighted: Weighted, found: Floats) -> str:
+    """By how much the shifts seem too large along each axis, where one factor explains errors."""
+    positions = weighted.exposures.positions
+    if positions.rotation.any():
+        return ""
+    away = positions.shifts - positions.shifts.mean(axis=0)
+    errors = found - found.mean(axis=0)
+    count = len(positions)
+    words = []
+    for name, d, e in zip(("rows", "columns"), away.T, errors.T, strict=True):
+        length = float(d @ d)
+        factor = float(d @ e) / length if length > 0 else 0.0
+        if factor**2 * length > _MOST * float(e @ e) and abs(factor) > 1e-3:
+            # The sensitivity takes 1/n of what an error of a shift leaves.
+            words.append(f"{-factor / (1 - 1 / count):+.1%} along {name}")
+    return f" (their scale seems wrong by about {' and '.join(words)})" if words else ""
+
+
+def _is_fine(weighted: Weighted, residuals: Residuals) -> bool:
+    """Whether a beam between pixels has structure that is finer than a spline holds.
+
+    A wave of period P and amplitude A has second differences of amplitude 4 A sin²(π/P), which for
+    P < 6 are larger than A.
+    """
+    shifts = np.array(weighted.fit.shifts)
+    beam = weighted.fit.beam.values
+    if not weighted.fit.is_joint or np.array_equal(shifts, np.rint(shifts)) or min(beam.shape) < 8:
+        return False
+    logarithm = np.log(beam, where=beam > 0, out=np.full(beam.shape, np.nan))
+    differences = [np.diff(logarithm, 2, axis=axis) for axis in (0, 1)]
+    fine = max(float(np.nanmean(each**2)) for each in differences)
+    steps = max(float(np.nanmean(np.diff(logarithm, axis=axis) ** 2)) for axis in (0, 1))
+    relative = np.nanmean(residuals.values**2) / np.nanmean(residuals.signal**2)
+    # Second over first differences are 2 sin(π/P); in those of noise alone nothing is fine.
+    return steps > _ABOVE**2 * float(relative) and fine > 4 * np.sin(np.pi / _FINE) ** 2 * steps
+
+
+def _seen_by_all(weighted: Weighted, residuals: Residuals) -> Bools:
+    """Measurements in cells that all exposures see: elsewhere the beam takes more of a residual."""
+    positions, shape = weighted.exposures.positions, weighted.exposures.shape
+    if len(set(positions.rotation.tolist())) > 1:
+        return np.isfinite(residuals.values)
+    return np.asarray(testable(residuals.rows, on_sensor(positions), shape) > 1 - 1e-9)
+
+
+def _flat(image: Array) -> Array:
+    """Bands (n, bands, rows, cols) as one image of all their rows for each exposure."""
+    return image.reshape(len(image), -1, image.shape[-1])

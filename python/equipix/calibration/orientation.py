@@ -1,0 +1,268 @@
+"""Which orientation of the axes of the shifts the data confirm."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.calibration.window_fit import WindowFit
+from equipix.errors import InputError, InsufficientMemoryError
+from equipix.exposures.orientation import Orientation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from equipix._native import Fit
+    from equipix._types import Array, ShiftSign
+    from equipix.exposures.exposures import Exposures
+    from equipix.exposures.options import FitOptions
+    from equipix.exposures.positions import Positions
+
+_MOST_EXPOSURES = 12
+"""Most exposures of the test: each has a flux to be fitted."""
+
+_FEWEST = 1000
+"""Least number of measurements beyond those of two exposures."""
+
+_WIDE, _LEAST = 4, 80
+"""Side of the window in largest shifts, and the pixels that it may have whatever they are."""
+
+_ROUNDS = 4
+"""Rounds of finer fits, and of leaving out outliers."""
+
+AS_GIVEN = Orientation()
+_QUESTIONS = {"rows": "rows", "cols": "columns", "exchanged": "order of axes", "turned": "turns"}
+_REMEDY = (
+    "compare the axes of the stage once with the figure of shifts in README, or put an object with "
+    "structure into the beam"
+)
+
+
+@dataclass(frozen=True)
+class OrientationTest:
+    """Outcome of the comparison of orientations.
+
+    Attributes
+    ----------
+    rows, cols : {"confirmed", "contradicted", "undetermined"}
+        The sign of the shifts along rows and columns, as given.
+    exchanged : {"confirmed", "contradicted", "undetermined"}
+        The order of the two values of a shift, as given.
+    turned : {"confirmed", "contradicted", "undetermined"}
+        The direction of quarter turns, as given; "confirmed" without any.
+    sign : {"confirmed", "contradicted", "undetermined"}
+        All of them: whether the orientation as given fits better than every other, or another
+        better than it.
+    best : Orientation
+        The orientation with the lowest F: what is to be changed.
+    ratio : float
+        F of the given orientation over that of the best; None where nothing was compared.
+    reason : str
+        Why nothing was concluded; empty where `sign` is not "undetermined".
+    """
+
+    rows: ShiftSign = "undetermined"
+    cols: ShiftSign = "undetermined"
+    exchanged: ShiftSign = "undetermined"
+    turned: ShiftSign = "undetermined"
+    sign: ShiftSign = "undetermined"
+    best: Orientation = AS_GIVEN
+    ratio: float | None = None
+    reason: str = ""
+
+    @property
+    def words(self) -> str:
+        """The outcome, and what to do, as a sentence."""
+        if self.sign == "confirmed":
+            return "the data confirm the signs and the order of the shifts"
+        if self.sign == "contradicted":
+            return f"the data contradict the orientation of the shifts: {self.best.words}"
+        known = {name: getattr(self, name) for name in _QUESTIONS if name != "turned"}
+        told = [f"{_QUESTIONS[name]} {it}" for name, it in known.items() if it != "undetermined"]
+        parts = f" ({', '.join(told)})" if told else ""
+        return f"the data do not determine the orientation of the shifts{parts}: {self.reason}"
+
+
+def orientation_test(exposures: Exposures, fit: Fit, options: FitOptions) -> OrientationTest:
+    """Compare the fit with the shifts as given to those in all other orientations.
+
+    Parameters
+    ----------
+    exposures : Exposures
+        The measurements, their weights, and the shifts as they were given.
+    fit : Fit
+        Their fit: the free fluxes start from its fluxes.
+    options : FitOptions
+        Number of threads and progress.
+
+    Returns
+    -------
+    OrientationTest
+        The verdicts. Undetermined without a comparison where an offset is sought.
+
+    Notes
+    -----
+    The orientations are both signs along each axis, with the axes as given and exchanged; where
+    exposures are turned by 90 or 270 degrees, also with the opposite turns. Another orientation is
+    excluded if its F is higher than that of the best by more than 6·√(2/dof) of itself, in two
+    thirds of all blocks of 4×4 pixels, and by a misfit above 0.5 % of the signal, rms. Also, the
+    residuals of the best must be white, or the misfit 30 times the part of its own residuals that
+    neighbours have in common. F/dof has the standard deviation √(2/dof) of itself. Fluxes are free,
+    since in a smooth beam the residuals of a wrong orientation are degenerate with a lamp drift. A
+    Gaussian beam leaves none: ln L is quadratic, and other L, M and fluxes fit as well.
+
+    F is accurate where the estimated error of M is below 0.3 of the relative noise that the fit
+    leaves (it was then at most 2e-4 of itself above its minimum); else it is reduced by the square
+    of error over noise. Only the higher F must be accurate, since the lower one can only decrease.
+    Outliers of one of the fits, such as dust, are left out of all.
+    """
+    if exposures.offset:
+        return OrientationTest(reason="it is not tested where the dark is fitted; " + _REMEDY)
+    exposures = dataclasses.replace(
+        exposures,
+        flux=exposures.flux.free(np.array(fit.flux)),
+        positions=dataclasses.replace(exposures.positions, std=None),
+    )
+    asked = chosen_exposures(exposures.positions, _MOST_EXPOSURES)
+    turns = bool((exposures.positions.rotation % 180 == 90).any())
+    ways = _distinct(exposures.positions.chosen(asked), Orientation.every(quarter_turns=turns))
+    side = _side(exposures.positions.chosen(asked), ways, exposures.shape)
+    pixels = min(side, exposures.shape[0]) * min(side, exposures.shape[1])
+    if len(ways) < 2 or len(asked) < 3 or (len(asked) - 2) * pixels < _FEWEST:
+        return OrientationTest(reason="there are too few measurements; " + _REMEDY)
+    # The window first: the exposures chosen are copied.
+    windows = {way: exposures.oriented(way).window(side).chosen(asked) for way in ways}
+    try:
+        return _outcome(_fits(windows, options))
+    except (InputError, InsufficientMemoryError):
+        # All arguments are valid for the whole sensor: the window has too little light or memory.
+        return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
+
+
+def chosen_exposures(positions: Positions, most: int) -> Array:
+    """Indices of at most so many exposures, at places as far apart as possible.
+
+    The first is the first exposure. Each of the others is the one that is farthest from all chosen
+    before; exposures at a place that is already chosen are not. All are chosen if there are few.
+    """
+    count = len(positions)
+    if count <= most:
+        return np.arange(count)
+    # A turned exposure is far from one that is not.
+    turned = positions.rotation[:, None] / 90 * (1 + np.ptp(positions.shifts))
+    places = np.hstack([positions.shifts, turned])
+    chosen, nearest = [0], np.full(count, np.inf)
+    while len(chosen) < most:
+        distance = np.linalg.norm(places - places[chosen[-1]], axis=1)
+        nearest = np.minimum(nearest, distance)
+        if not nearest.max() > 0:
+            break
+        chosen.append(int(nearest.argmax()))
+    return np.sort(chosen)
+
+
+def _distinct(positions: Positions, ways: list[Orientation]) -> list[Orientation]:
+    """Orientations that differ in more than a move common to all exposures, the simplest first."""
+    kept: list[tuple[Orientation, Array]] = []
+    for way in ways:
+        changed = positions.oriented(way)
+        moves = changed.shifts - changed.shifts[0]
+        places = np.hstack([moves, changed.rotation[:, None]])
+        if not any(np.allclose(places, known, rtol=0, atol=1e-6) for _, known in kept):
+            kept.append((way, places))
+    return [way for way, _ in kept]
+
+
+def _side(positions: Positions, ways: list[Orientation], shape: tuple[int, int]) -> int:
+    """Pixels along the window: some four times the largest shift s.
+
+    Where that is large, it is the smallest that leaves half a measurement a pixel for the test:
+    (n − 1)·w² − (w + s)² ≥ w²/2, the cells being at most (w + s)². 0 if nothing moves.
+    """
+    middle = (np.array(shape) - 1) / 2
+    reach = 0.0
+    for way in ways:
+        changed = positions.oriented(way)
+        # Where the sensor's middle looks: a quarter turn exchanges its coordinates.
+        turned = changed.rotation % 180 == 90
+        middles = np.where(turned[:, None], middle[::-1], middle)
+        reach = max(reach, float(np.ptp(middles + changed.shifts, axis=0).max()))
+    enough: float = reach / (max(len(positions) - 1.5, 1.5) ** 0.5 - 1)
+    return round(min(_WIDE * reach, max(_LEAST, enough)))
+
+
+def _fits(
+    windows: Mapping[Orientation, Exposures], options: FitOptions
+) -> dict[Orientation, WindowFit]:
+    """Fits in every orientation, as exact as necessary."""
+    fits = {way: WindowFit.of(window, options) for way, window in windows.items()}
+    for _ in range(_ROUNDS):
+        odd = np.any([fit.outliers() for fit in fits.values()], axis=0)
+        if odd.any():
+            windows = {way: window.without(odd) for way, window in windows.items()}
+            fits = {way: WindowFit.of(window, options) for way, window in windows.items()}
+            continue
+        unsettled = [way for way in _undecided(fits) if not fits[way].final]
+        if not unsettled:
+            break
+        finer = {way: WindowFit.of(windows[way], options, fits[way]) for way in unsettled}
+        fits |= finer
+    return fits
+
+
+def _best(fits: Mapping[Orientation, WindowFit]) -> Orientation:
+    """The orientation with the lowest F, the simplest of equal ones."""
+    return min(fits, key=lambda way: fits[way].left)
+
+
+def _undecided(fits: Mapping[Orientation, WindowFit]) -> list[Orientation]:
+    """Orientations that finer fits may still exclude, with the best if there are any."""
+    best = _best(fits)
+    low = fits[best]
+    others = [
+        way
+        for way, high in fits.items()
+        if way != best and not (high.is_far_above(low) or high.cannot_be_far_above(low))
+    ]
+    return [best, *others] if others else []
+
+
+def _outcome(fits: Mapping[Orientation, WindowFit]) -> OrientationTest:
+    """The verdicts on the axes from final fits."""
+    best = _best(fits)
+    left = {way for way, fit in fits.items() if way == best or not fit.is_far_above(fits[best])}
+    answers = {name: _answer(left, name) for name in _QUESTIONS}
+    sign: ShiftSign = "undetermined"
+    if AS_GIVEN not in left:
+        sign = "contradicted"
+    elif left == {AS_GIVEN}:
+        sign = "confirmed"
+    return OrientationTest(
+        **answers,
+        sign=sign,
+        best=best,
+        ratio=fits[AS_GIVEN].left / fits[best].left if fits[best].left > 0 else None,
+        reason=_reason(fits[best], left, best) if sign == "undetermined" else "",
+    )
+
+
+def _answer(left: set[Orientation], name: str) -> ShiftSign:
+    """Whether all orientations that are left agree in one question."""
+    changed = {getattr(way, name) for way in left}
+    if len(changed) > 1:
+        return "undetermined"
+    return "contradicted" if changed == {True} else "confirmed"
+
+
+def _reason(low: WindowFit, left: set[Orientation], best: Orientation) -> str:
+    if low.is_white:
+        also = next(way.changes for way in left if way != AS_GIVEN)
+        return f"the data fit equally well with {also}, since the beam is too smooth; {_REMEDY}"
+    return (
+        f"in the best orientation ('{best.words}') residuals of neighbours are still correlated by "
+        f"{max(abs(each.size) for each in low.neighbours):.0%}: look for another cause, such as "
+        f"the scale of the shifts, dust or an illumination that changes; {_REMEDY}"
+    )

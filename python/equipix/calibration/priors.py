@@ -1,0 +1,131 @@
+"""Priors on fluxes and shifts that the data contradict, and fits with wider ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from equipix.calibration.significance import chi2_tail
+from equipix.drift import affine_columns
+from equipix.exposures.positions import WIDEST
+
+if TYPE_CHECKING:
+    from equipix._types import Array, Floats
+    from equipix.calibration.options import Options
+    from equipix.calibration.weights import Weighted
+    from equipix.exposures.exposures import Exposures
+
+_RARE = 1e-3
+"""Probability of such deviations from a prior below which it is contradicted."""
+
+_FACTOR = 1.5
+"""Least factor by which a prior is widened: error bars scatter by as much with few exposures."""
+
+
+class Contradiction(NamedTuple):
+    """A prior that the data contradict.
+
+    `name` is the keyword, `factor` the deviations in standard deviations, rms, and `freedom` the
+    number of combinations of the values that the data determine.
+    """
+
+    name: str
+    factor: float
+    freedom: int
+
+    @property
+    def words(self) -> str:
+        """What is wrong, the value, the limit and the remedy."""
+        what = {"flux_std": "fluxes", "shift_std": "shifts"}[self.name]
+        return (
+            f"the data contradict '{self.name}': the {what} found differ from those given by "
+            f"{self.factor:.1f} of their standard deviations, rms ({self.freedom} degrees of "
+            f"freedom, expected 1). It was multiplied by {self.factor:.1f}, and the fit repeated: "
+            "check how they were measured"
+        )
+
+
+def widened(weighted: Weighted, options: Options) -> tuple[Weighted, list[Contradiction]]:
+    """Repeat a fit with wider priors where the data contradict those given.
+
+    Notes
+    -----
+    Deviations x of what was found from what was given, in standard deviations of the prior, are
+    taken without what the data do not determine: a common factor of the fluxes, where no exposure
+    is turned also what is affine in the shifts, and a displacement common to all shifts. Their sum
+    of squares follows χ² of the remaining degrees of freedom f where the prior is right, and is
+    less where the data hold little beside it. The factor is √(Σ x²/f).
+    """
+    found = contradictions(weighted)
+    if not found:
+        return weighted, []
+    exposures = weighted.exposures
+    for each in found:
+        exposures = _wider(exposures, each)
+    fit = exposures.fit(options.fit, weighted.fit)
+    return weighted._replace(exposures=exposures, fit=fit), found
+
+
+def contradictions(weighted: Weighted) -> list[Contradiction]:
+    """The priors that the data contradict."""
+    if weighted.fit.ended != "converged":
+        return []
+    asked = [_of_fluxes(weighted), _of_shifts(weighted)]
+    return [each for each in asked if each is not None]
+
+
+def _of_fluxes(weighted: Weighted) -> Contradiction | None:
+    flux, positions = weighted.exposures.flux, weighted.exposures.positions
+    if flux.kind != "prior" or flux.std is None:
+        return None
+    turned = len(set(positions.rotation.tolist())) > 1
+    columns = np.ones((len(positions), 1))
+    if not turned:
+        columns = affine_columns(positions.shifts, None)
+    deviations = np.log(np.array(weighted.fit.flux) / flux.values)
+    return _contradiction("flux_std", deviations[:, None], flux.std[:, None], columns)
+
+
+def _of_shifts(weighted: Weighted) -> Contradiction | None:
+    positions = weighted.exposures.positions
+    if positions.std is None or weighted.fit.refinement != "refined":
+        return None
+    deviations = np.array(weighted.fit.shifts) - positions.shifts
+    return _contradiction("shift_std", deviations, positions.std, np.ones((len(positions), 1)))
+
+
+def _contradiction(
+    name: str, deviations: Floats, std: Floats, columns: Floats
+) -> Contradiction | None:
+    """Test deviations (n, axes), each axis without its part along the columns."""
+    total, freedom = 0.0, 0
+    for values, scale in zip(deviations.T, std.T, strict=True):
+        known = scale > 0
+        left, unknowns = _rest(columns[known] / scale[known, None], values[known] / scale[known])
+        total += float(left @ left)
+        freedom += len(left) - unknowns
+    if freedom < 1:
+        return None
+    factor = (total / freedom) ** 0.5
+    if chi2_tail(total, freedom) >= _RARE or factor < _FACTOR:
+        return None
+    return Contradiction(name, factor, freedom)
+
+
+def _rest(columns: Array, values: Array) -> tuple[Floats, int]:
+    """What least squares along columns leaves, and their rank."""
+    found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=None)
+    return np.asarray(values - columns @ found), int(rank)
+
+
+def _wider(exposures: Exposures, found: Contradiction) -> Exposures:
+    """Exposures with one prior multiplied by its factor."""
+    flux, positions = exposures.flux, exposures.positions
+    if found.name == "flux_std" and flux.std is not None:
+        flux = dataclasses.replace(flux, std=found.factor * flux.std)
+    elif positions.std is not None:
+        std = np.minimum(found.factor * positions.std, WIDEST)
+        positions = dataclasses.replace(positions, std=std)
+    return dataclasses.replace(exposures, flux=flux, positions=positions)

@@ -1,0 +1,146 @@
+"""Residuals of a fit on a sample of the sensor, in standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.exposures.positions import in_beam
+
+if TYPE_CHECKING:
+    from equipix._types import Array, Floats
+    from equipix.calibration.weights import Weighted
+    from equipix.exposures.positions import Positions
+
+FEWEST = 1000
+"""Least degrees of freedom of a fit whose residuals say anything."""
+
+EXACT = 0.3
+"""Largest `Residuals.inexactness` at which F is as good as at its minimum."""
+
+SAMPLED = 2**18
+"""Measurements of a sample: a correlation of 1.2 % is then five standard errors."""
+
+_BAND = 32
+"""Rows of a band: several blocks of neighbours, and more than most shifts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals in bands of whole rows, spread evenly over the sensor.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, bands, rows of a band, cols)
+        (y − c L M)/σ; in the units of the frames where no variance is known. NaN where nothing is
+        measured or predicted.
+    light : ndarray of the same shape
+        c L.
+    response : ndarray of the same shape
+        M/σ.
+    rows : ndarray, shape (bands, rows of a band), int
+        The row of the sensor of each row.
+    share : float
+        Degrees of freedom of the fit over its measurements: the mean square of residuals where
+        variances are right.
+    scale : float
+        The variance of a value of weight 1, so the mean square of an error of measurement.
+    error : float
+        Estimated error of M.
+    """
+
+    values: Floats
+    light: Floats
+    response: Floats
+    rows: Array
+    share: float
+    scale: float
+    error: float
+
+    @property
+    def inexactness(self) -> float:
+        """Estimated error of M over the relative noise that the fit leaves.
+
+        F may still decrease by the order of its square. Infinite where there is no noise.
+        """
+        power, square = (np.nansum(np.square(each)) for each in (self.signal, self.values))
+        if not (self.share > 0 and square > 0):
+            return float("inf")
+        return float(self.error * (self.share * power / square) ** 0.5)
+
+    @property
+    def signal(self) -> Floats:
+        """The expected signal c L M/σ."""
+        return self.light * self.response
+
+    @property
+    def slopes(self) -> Floats:
+        """Slopes M/σ · ∂(c L) along rows and columns, (2, n, ...): what errors of shifts leave."""
+        slopes = np.zeros((2, *self.light.shape))
+        for slope, axis in zip(slopes, (-2, -1), strict=True):
+            if self.light.shape[axis] > 1:
+                np.multiply(np.gradient(self.light, axis=axis), self.response, out=slope)
+        return slopes
+
+
+def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None) -> Residuals:
+    """Residuals of a fit, of at most about so many measurements."""
+    exposures, fit = weighted.exposures, weighted.fit
+    rows = bands(exposures.shape[0], most // (len(exposures) * exposures.shape[1]))
+    shape = (len(exposures), *rows.shape, exposures.shape[1])
+    values, light, response = np.empty(shape), np.empty(shape), np.empty(shape)
+    size = (rows.shape[1], exposures.shape[1])
+    for b, first in enumerate(rows[:, 0].tolist()):
+        part = slice(first, first + size[0])
+        corners = exposures.positions.corners((first, 0), size, exposures.shape)
+        for k, (row, col) in enumerate(np.array(fit.shifts) + corners):
+            turn = int(exposures.positions.rotation[k])
+            seen = fit.beam.light(size, (row, col), turn, workers=workers)
+            np.multiply(fit.flux[k], seen, out=light[k, b])
+            response[k, b] = fit.sensitivity[part]
+            values[k, b] = exposures.values[k, part] - light[k, b] * response[k, b]
+            if fit.offset is not None:
+                values[k, b] -= fit.offset[part]
+    if exposures.mask is not None:
+        values[np.broadcast_to(exposures.mask[..., rows, :], shape)] = np.nan
+    variance = exposures.variance
+    if variance is not None:
+        deep = variance[:, rows] if variance.ndim == 3 else variance[:, None, None, None]
+        root = np.sqrt(deep, dtype=np.float64)
+        values /= root
+        response /= root
+    measured = max(int(np.count_nonzero(exposures.usable())), 1)
+    share = fit.degrees_of_freedom / measured
+    error = float(fit.error_estimate[-1])
+    return Residuals(values, light, response, rows, share, weighted.noise_variance, error)
+
+
+def bands(count: int, most: int) -> Array:
+    """Rows (bands, rows of a band): all, as one band, or bands of some, spread evenly."""
+    number = most // _BAND
+    if number * _BAND >= count or count <= _BAND:
+        return np.arange(count)[None]
+    first = np.linspace(0, count - _BAND, max(number, 2)).round().astype(int)
+    return np.asarray(first[:, None] + np.arange(_BAND))
+
+
+def on_sensor(positions: Positions) -> Floats:
+    """Shifts (n, 2) along the axes of the sensor, where all exposures are turned alike."""
+    turn = int(positions.rotation[0])
+    axes = [in_beam(unit, turn, (1, 1)) - in_beam((0, 0), turn, (1, 1)) for unit in np.eye(2)]
+    return np.asarray(positions.shifts @ np.array(axes).T)
+
+
+def testable(rows: Array, shifts: Floats, shape: tuple[int, int]) -> Floats:
+    """Share of each measurement (n, bands, rows, cols) that the beam does not take."""
+    count = len(shifts)
+    moves = np.rint(shifts[:, None] - shifts)
+    seen = []
+    for axis, places in enumerate((rows.ravel(), np.arange(shape[1]))):
+        at = places + moves[..., axis, None]
+        seen.append(((at >= 0) & (at < shape[axis])).astype(np.float64))
+    # Each exposure sees its own cells.
+    seers = np.einsum("kjr,kjc->krc", *seen).reshape(count, *rows.shape, shape[1])
+    return np.asarray((1 - 1 / seers) / (1 - 1 / count))

@@ -1,0 +1,112 @@
+"""Main figures of what the command line reads and writes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.calibration.result import Calibration
+from equipix.flags import Flag
+from equipix.frames import FrameStatistics
+
+if TYPE_CHECKING:
+    from equipix._types import Array
+    from equipix.correction.protocol import Correction
+
+
+def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
+    """Collect the main figures of what a file holds."""
+    if isinstance(content, FrameStatistics):
+        return of_statistics(content)
+    if isinstance(content, Calibration):
+        return of_calibration(content)
+    return {
+        "shape": list(content.shape),
+        "order": len(content.coefficients) - 1,
+        "flagged_pixels": flagged(content),
+    }
+
+
+def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
+    """Collect the main figures of averaged frames."""
+    several = (frames.count > 1).any()
+    return {
+        "shape": list(frames.mean.shape),
+        "frames": int(frames.count.max()),
+        "mean": float(np.nanmean(frames.mean)),
+        "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
+        "saturation": frames.saturation,
+        "saturated_pixels": int(np.count_nonzero(frames.saturated)),
+        "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
+    }
+
+
+def flagged(correction: Correction) -> dict[str, int]:
+    """Count the pixels that have each flag."""
+    return {
+        flag.name or "": int(np.count_nonzero(correction.flags & flag))
+        for flag in Flag
+        if (correction.flags & flag).any()
+    }
+
+
+def of_calibration(calibration: Calibration) -> dict[str, Any]:
+    """Collect the main figures of a calibration."""
+    sensitivity = calibration.sensitivity
+    options = calibration.metadata.get("options", {})
+    orientation = calibration.orientation
+    return {
+        "shape": list(calibration.shape),
+        "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
+        "spread": float(np.nanstd(sensitivity, dtype=np.float64)),
+        **_uncertainty(calibration),
+        "converged": calibration.converged,
+        "error_estimate": calibration.error_estimate,
+        "sweeps": calibration.sweeps,
+        _misfit_name(options): calibration.reduced_chi2,
+        "components": calibration.components,
+        "shift_sign": calibration.shift_sign,
+        **({"orientation": orientation.words} if orientation else {}),
+        "fluxes": options.get("flux", "known"),
+        "flagged_pixels": flagged(calibration),
+        **_rejected(calibration),
+        "is_partial": calibration.is_partial,
+        "verdicts": [asdict(verdict) for verdict in calibration.verdicts],
+    }
+
+
+def _rejected(calibration: Calibration) -> dict[str, Any]:
+    """Count the values of each exposure that a robust calibration left out, by its name."""
+    counts = calibration.metadata.get("rejected")
+    if counts is None:
+        return {}
+    names = calibration.metadata.get("exposures", range(len(counts)))
+    return {"rejected_values": dict(zip(map(str, names), counts, strict=True))}
+
+
+def _misfit_name(options: dict[str, Any]) -> str:
+    """Name of the mean square residual: without variances it is a variance in DN²."""
+    return "variance_of_a_value" if options.get("weights") == "equal" else "reduced_chi2"
+
+
+def _uncertainty(calibration: Calibration) -> dict[str, Any]:
+    """Standard deviations by noise, if they were computed, and their exactness."""
+    std, tilt_std = calibration.sensitivity_std, calibration.tilt_std
+    if std is None or tilt_std is None:
+        return {}
+    exactness = calibration.metadata["uncertainty"]["relative_standard_error"]
+    return {
+        "sensitivity_std": float(np.nanmedian(std)),
+        "sensitivity_std_is_exact_to": exactness,
+        "tilt": dict(zip(("rows", "cols"), calibration.tilt.tolist(), strict=True)),
+        "tilt_std": dict(zip(("rows", "cols"), tilt_std.tolist(), strict=True)),
+        "tilt_is": _tilt_in_words(tilt_std),
+    }
+
+
+def _tilt_in_words(std: Array) -> str:
+    """Say which tilts are undetermined: JSON has no infinite standard deviation."""
+    names = [name for name, each in zip(("rows", "cols"), std, strict=True) if np.isinf(each)]
+    return f"undetermined along {' and '.join(names)}, and set to 0" if names else "determined"

@@ -1,0 +1,130 @@
+"""A saturation level that nobody has named: many values at exactly one highest value."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from equipix._types import Array, Bools
+    from equipix.frames import FrameStatistics
+
+_MANY = 16
+"""Fewest values at the highest one."""
+
+_CROWDED = 2.0
+"""How many times as many values are at the highest one as just below, where it is a level."""
+
+_BELOW = 0.0025
+"""Width of "just below" over the highest value; at least one step between values."""
+
+_RARE = 0.05
+"""Largest share of pixels without scatter where its absence shows a level."""
+
+_ROUNDING = 1e-9
+"""Relative rounding of means from which a dark was subtracted, and added again."""
+
+_SIGMAS = 6
+"""Distance from a level, in standard deviations, at which no sample reaches it."""
+
+_FEWEST_BITS = 8
+"""Fewest bits of a camera."""
+
+
+class Clipping(NamedTuple):
+    """A probable saturation level, in the units of the frames, and the values found at it."""
+
+    level: float
+    values: int
+
+
+def clipping(values: Array, crowded: float = _CROWDED) -> Clipping | None:
+    """Find the level that values of one exposure are clipped at; what is NaN does not count.
+
+    At the level must be more than `crowded` times as many values as just below.
+
+    Notes
+    -----
+    The number of values per step of the scale changes little near the highest one, unless a level
+    clips them: then all above it are at it. Where most values are at it, an even scene does the
+    same, and only the largest number of some bits is taken for a level.
+    """
+    known = values[np.isfinite(values)]
+    if known.size <= _MANY:
+        return None
+    top = float(known.max())
+    rounding = _ROUNDING * abs(top)
+    below = known[known < top - rounding]
+    count = known.size - below.size
+    if count < _MANY or not below.size or top <= 0:
+        return None
+    width = max(_BELOW * top, top - float(below.max())) + rounding
+    if count <= crowded * np.count_nonzero(below >= top - width):
+        return None
+    level = float(np.rint(top)) if abs(top - np.rint(top)) <= rounding else top
+    return Clipping(level, count) if 2 * count < known.size or _is_of_bits(level) else None
+
+
+def clipping_of(frames: FrameStatistics) -> Clipping | None:
+    """Find the level that averaged frames are clipped at, before the dark was subtracted.
+
+    A pixel that saturates in every frame has the level as its mean and no scatter. Where scatter is
+    missing from few other pixels, those at the level need not be compared with those just below,
+    which contain the pixels that saturate in some frames only.
+    """
+    raw = np.where(frames.saturated > 0, np.nan, _raw(frames))
+    found = clipping(raw, crowded=0.0)
+    if found is None:
+        return None
+    steady = frames.variance == 0
+    others = np.isfinite(raw) & (raw < found.level * (1 - _ROUNDING))
+    if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:
+        return found
+    return clipping(raw)
+
+
+def unclipped(frames: FrameStatistics, clipped: Clipping) -> Bools:
+    """Find pixels whose samples all lie below a level: only their scatter is that of the camera.
+
+    The limit is six standard deviations of a sample below the level, those of pixels at 50 to 90 %
+    of it: near the level they have up to √2 times that.
+    """
+    raw = _raw(frames)
+    bright = (raw > 0.5 * clipped.level) & (raw < 0.9 * clipped.level)
+    variances = frames.variance[bright & np.isfinite(frames.variance)]
+    scatter = float(np.sqrt(np.median(variances))) if variances.size else 0.0
+    below: Bools = raw < clipped.level - _SIGMAS * scatter
+    return below
+
+
+def _raw(frames: FrameStatistics) -> Array:
+    """Mean before the dark was subtracted."""
+    return frames.mean if frames.dark is None else frames.mean + frames.dark.mean
+
+
+def clipping_advice(clipped: Clipping) -> str:
+    """Say what was found and what to write."""
+    level = f"{clipped.level:.10g}"
+    return (
+        f"{clipped.values} values are exactly {level}, the highest one: they probably saturate and "
+        f"count as valid. Write saturation = {level} in [sensor] of experiment.toml, or give it as "
+        "'saturation' to equipix.average or, of arrays, to calibrate"
+    )
+
+
+def highest(found: Iterable[Clipping | None]) -> Clipping | None:
+    """Return the highest level of several exposures, with the values of all of them there."""
+    levels = [each for each in found if each is not None]
+    if not levels:
+        return None
+    level = max(each.level for each in levels)
+    return Clipping(level, sum(each.values for each in levels if each.level == level))
+
+
+def _is_of_bits(level: float) -> bool:
+    """Whether a level is 2^bits − 1."""
+    bits = np.log2(level + 1)
+    return bool(bits >= _FEWEST_BITS and bits == np.rint(bits))

@@ -1,0 +1,68 @@
+//! The information D = Σ w c² L² of each pixel on M: the inverse variance of M with a known beam.
+
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::{Exposures, Stretch};
+use crate::frames::Real;
+use crate::parallel::Workers;
+
+/// D of all pixels, row by row, with the light L that `light(k)` gives of each exposure; light that is
+/// not known counts for nothing.
+///
+/// # Errors
+/// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+pub(crate) fn of_sensor<T: Real>(
+    exposures: &Exposures<'_, T>,
+    flux: &[f64],
+    light: impl Fn(usize) -> Vec<f64>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let (sensor, cols) = (exposures.sensor(), exposures.sensor().cols);
+    let mut information = workers.filled(sensor.len(), 0.0, control);
+    for (k, &flux) in flux.iter().enumerate() {
+        control.check()?;
+        let light = light(k);
+        workers.map_blocks(&mut information, cols, |row, sums| {
+            add(exposures, k, [row, 0], flux, &light[row * cols..][..cols], sums);
+        });
+    }
+    control.check()?;
+    Ok(information)
+}
+
+/// D of one pixel, likewise, with the fluxes as given.
+pub(crate) fn of_pixel<T: Real>(
+    exposures: &Exposures<'_, T>,
+    pixel: [usize; 2],
+    light: impl Fn(usize) -> f64,
+) -> f64 {
+    let mut sum = [0.0];
+    for (k, &flux) in exposures.flux().iter().enumerate() {
+        add(exposures, k, pixel, flux, &[light(k)], &mut sum);
+    }
+    sum[0]
+}
+
+/// Adds w c² L² of the measurements of exposure `k` from a pixel on along its row.
+fn add<T: Real>(
+    exposures: &Exposures<'_, T>,
+    k: usize,
+    [row, col]: [usize; 2],
+    flux: f64,
+    light: &[f64],
+    sums: &mut [f64],
+) {
+    let mut scratch = vec![0.0; light.len()];
+    let weight = match exposures.stretch(k, row, col..col + light.len(), &mut scratch) {
+        Stretch::Uniform(_, weight) => Some(weight),
+        Stretch::Weighted(..) => None,
+    };
+    for (i, (sum, light)) in sums.iter_mut().zip(light).enumerate() {
+        let (weight, light) = (weight.unwrap_or(scratch[i]), flux * light);
+        // Light that is not known has no number, and a measurement that is not used no weight.
+        if weight > 0.0 && light.is_finite() {
+            *sum += weight * light * light;
+        }
+    }
+}

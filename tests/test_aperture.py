@@ -1,0 +1,127 @@
+"""What a first fit determines of the pixels under a spot, and the factors in it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.calibration.weights import Weighted
+from equipix.errors import InputError
+from equipix.experiment.aperture import Equalisation
+from equipix.exposures.front import exposures_of
+from equipix.exposures.options import FitOptions
+from equipix.flags import Flag
+from equipix.shifts import Spot
+
+SHAPE, CROSS = (40, 50), equipix.cross_pattern(3, 5)
+LARGEST = 0.008**2
+"""Variance of a centroid by unequal pixels before any calibration."""
+
+
+def fitted(shifts=CROSS, *, variance=None):
+    """A weighted fit of noisy frames with a dark, in whole shifts from 0 on."""
+    rng = np.random.default_rng(1)
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng)
+    flux = 1 + 0.1 * np.arange(len(shifts))
+    frames = simulate.exposures(truth, simulate.tilted_beam(SHAPE, width=60), shifts, flux=flux)
+    frames += 1e-3 * rng.standard_normal(frames.shape)
+    exposures = exposures_of(frames, shifts, variance=variance, flux=flux)
+    exposures = dataclasses.replace(exposures, dark=np.full(SHAPE, 7.0))
+    return Weighted(exposures, exposures.fit(FitOptions()), None)
+
+
+def light_of(fit, shift):
+    """L on each pixel in an exposure at a whole shift."""
+    row, col = np.add(fit.beam.origin, shift).astype(int)
+    return fit.beam.values[row : row + SHAPE[0], col : col + SHAPE[1]]
+
+
+def around(variance):
+    """Equalisation of pixels with these variances."""
+    return Equalisation(np.ones(variance.shape), np.zeros(variance.shape), variance)
+
+
+def spot(row, col):
+    return Spot(np.array([row, col], float), np.zeros(2))
+
+
+@pytest.mark.parametrize(("count", "factor"), [(5, 5 / 3), (4, 2), (3, 3), (2, 2)])
+def test_variances_are_those_of_n_measurements_that_determine_the_beam_too(count, factor):
+    """n/(n − 2) over Σ w c²L² M², the relative variance with a known beam; 2 with two."""
+    variance = 1e-6 * (1 + np.arange(count))
+    weighted = fitted(CROSS[:count], variance=variance)
+    exposures, fit = weighted.exposures, weighted.fit
+    strength = sum(
+        (c * light_of(fit, shift)) ** 2 / v
+        for c, shift, v in zip(exposures.flux.values, CROSS, variance, strict=False)
+    )
+    found = Equalisation.of(weighted, np.zeros(SHAPE, np.uint32)).variance
+    # Sums of `count` products, and a handful of roundings.
+    wanted = factor / (strength * fit.sensitivity**2)
+    np.testing.assert_allclose(found, wanted, rtol=20 * np.finfo(float).eps)
+
+
+def test_without_variances_the_residuals_give_the_noise():
+    none = np.zeros(SHAPE, np.uint32)
+    unit, known = fitted(), fitted(variance=np.full(5, 1.0))
+    np.testing.assert_allclose(
+        Equalisation.of(unit, none).variance,
+        unit.reduced_chi2 * Equalisation.of(known, none).variance,
+        rtol=1e-12,
+    )
+
+
+def test_images_are_corrected_but_in_pixels_that_are_not_to_be_used():
+    weighted = fitted()
+    flags = np.zeros(SHAPE, np.uint32)
+    flags[3, 4], flags[5, 6] = Flag.DEAD | Flag.DO_NOT_USE, Flag.SATURATED
+    found = Equalisation.of(weighted, flags)
+    images = np.random.default_rng(2).uniform(100, 200, (2, *SHAPE))
+    wanted = (images - 7) / weighted.fit.sensitivity
+    wanted[:, 3, 4] = images[:, 3, 4] - 7
+    np.testing.assert_array_equal(found.apply(images), wanted)
+    assert np.argwhere(np.isnan(found.variance)).tolist() == [[3, 4]]
+    with pytest.raises(InputError, match=r"of a sensor of \(40, 50\), .* have \(40, 49\)"):
+        found.apply(images[:, :, 1:])
+
+
+def test_a_fit_without_a_dark_is_refused():
+    weighted = fitted()
+    weighted = weighted._replace(exposures=dataclasses.replace(weighted.exposures, dark=None))
+    with pytest.raises(InputError, match="holds no dark frame"):
+        Equalisation.of(weighted, np.zeros(SHAPE, np.uint32))
+
+
+def test_unequal_pixels_move_a_centroid_by_the_root_of_their_variance_over_4_pi():
+    """Centroids of a disc on pixels of random gain."""
+    rows, cols = np.indices((25, 25)) - 12.0
+    disc = np.hypot(rows, cols) < 10
+    rng, relative, draws = np.random.default_rng(3), 0.01, 4000
+    gains = 1 + relative * rng.standard_normal((draws, np.count_nonzero(disc)))
+    centroids = gains @ rows[disc] / gains.sum(axis=1)
+    predicted = around(np.full(SHAPE, relative**2)).unequal_pixels(spot(20, 20))
+    # Five standard errors of a variance over so many draws; a disc of pixels is round to 1 %.
+    assert np.var(centroids) == pytest.approx(predicted, rel=5 * np.sqrt(2 / draws) + 0.01)
+
+
+def test_the_pixels_under_a_spot_count_alone():
+    small = 1e-6
+    variance = np.full(SHAPE, 9e-6)
+    variance[12:28, 22:38] = small
+    assert around(variance).unequal_pixels(spot(20.3, 29.8)) == pytest.approx(small / (4 * np.pi))
+    assert around(variance).unequal_pixels(spot(5, 5)) == pytest.approx(9e-6 / (4 * np.pi))
+    corner = np.full(SHAPE, small)
+    corner[8:], corner[:, 8:] = 1.0, 1.0
+    assert around(corner).unequal_pixels(spot(0, 0)) == pytest.approx(small / (4 * np.pi))
+
+
+def test_pixels_are_not_taken_for_worse_than_before_a_calibration():
+    assert around(np.full(SHAPE, 1.0)).unequal_pixels(spot(20, 20)) == LARGEST
+    assert around(np.full(SHAPE, np.nan)).unequal_pixels(spot(20, 20)) == LARGEST
+    edge = 4 * np.pi * LARGEST
+    below = around(np.full(SHAPE, 0.99 * edge)).unequal_pixels(spot(20, 20))
+    assert below == pytest.approx(0.99 * LARGEST)

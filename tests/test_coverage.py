@@ -1,0 +1,132 @@
+"""A calibration that determines too little is named as such, with its cause."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import cli, errors, simulate
+
+SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)
+
+
+def exposures(shifts, noise=1e-3):
+    rng = np.random.default_rng(1)
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng)
+    frames = simulate.exposures(truth, simulate.gaussian_beam(SHAPE), shifts)
+    return frames + noise * rng.standard_normal(frames.shape)
+
+
+def stripes():
+    """A mask that leaves stripes of two rows, farther apart than the shifts reach."""
+    mask = np.ones(SHAPE, bool)
+    mask[::20] = mask[1::20] = False
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("shifts", "options", "cause"),
+    [
+        ([(0, 0), (0, 11)], {}, "2 exposures compare pixels along one direction only"),
+        ([(3, 3)] * 4, {}, "they are all alike: move the sensor"),
+        ([(0, 0), (0, 7), (0, 11), (0, 19)], {}, "they lie on one line"),
+        (equipix.cross_pattern(4, 6), {}, "leave 4 parts .* unconnected: choose other shifts"),
+        (CROSS, {"mask": stripes()}, "pixels between them are masked"),
+        (CROSS, {"saturation": 0.97}, "most of the others reach the saturation level"),
+    ],
+    ids=["two", "alike", "line", "lattice", "mask", "saturation"],
+)
+def test_the_cause_is_named(shifts, options, cause):
+    with pytest.warns(errors.IdentifiabilityWarning, match=rf"only \d+ of \d+ unmasked .*{cause}"):
+        found = equipix.calibrate(exposures(shifts), shifts, **options)
+    assert found.is_partial
+    assert [each.kind for each in found.verdicts].count("components") == 0
+
+
+def test_bad_pixels_are_a_cause():
+    """Two thirds of the sensor scatter ten times as much as the noise model that is given."""
+    rng = np.random.default_rng(2)
+    noise = np.where(np.arange(SHAPE[1]) < 17, 5.0, 50.0)
+    frames = [
+        equipix.average(2000 * each + noise * rng.standard_normal((8, *SHAPE)))
+        for each in exposures(CROSS, 0)
+    ]
+    with pytest.warns(errors.IdentifiabilityWarning, match=r"count as dead, hot or noisy"):
+        found = equipix.calibrate(frames, CROSS, variance=equipix.NoiseModel(5.0, 0.0))
+    assert found.is_partial
+
+
+def test_masked_pixels_are_not_missed():
+    """Two thirds of the sensor are masked; the rest is determined."""
+    mask = np.zeros(SHAPE, bool)
+    mask[:, 17:] = True
+    found = equipix.calibrate(exposures(CROSS), CROSS, mask=mask)  # warnings are errors here
+    assert not found.is_partial
+
+
+def test_the_verdict_is_saved(tmp_path):
+    with pytest.warns(errors.IdentifiabilityWarning):
+        equipix.calibrate(exposures(CROSS[:2]), CROSS[:2]).save(tmp_path / "cal.npz")
+    assert equipix.load(tmp_path / "cal.npz").is_partial
+
+
+@pytest.fixture(scope="module")
+def manifest(tmp_path_factory):
+    """An experiment of which only the first and the last exposure are listed."""
+    rng = np.random.default_rng(3)
+    virtual = simulate.experiment(
+        simulate.paper_sensitivity(SHAPE, rng=rng),
+        simulate.gaussian_beam(SHAPE, width=150),
+        CROSS,
+        frames=4,
+        rng=rng,
+    )
+    path = virtual.write(tmp_path_factory.mktemp("partial") / "experiment")
+    path.write_text(
+        re.sub(r"\[\[exposure\]\]\nname = \"p[1-3]\"\n(?:\w+ = .*\n)+\n*", "", path.read_text())
+    )
+    text = re.sub(r"aperture_before.*\naperture_after.*", "shift = [7, 0]", path.read_text())
+    path.write_text(text)
+    return path
+
+
+def test_the_command_writes_it_only_if_asked(manifest, tmp_path, capsys):
+    output = tmp_path / "cal.tif"
+    command = ["calibrate", str(manifest), "-o", str(output)]
+    with pytest.raises(SystemExit) as done:
+        cli.main(command)
+    captured = capsys.readouterr()
+    assert (done.value.code, captured.out) == (1, "")
+    (line,) = captured.err.splitlines()
+    assert line.startswith(f"equipix: error: '{output}' is not written (--partial writes it): the")
+    assert "2 exposures compare pixels along one direction only" in line
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SystemExit) as done:
+        cli.main([*command, "--partial"])
+    assert not done.value.code
+    assert "equipix: warning: the exposures determine only" in capsys.readouterr().err
+    assert equipix.load(output).is_partial
+
+
+def test_a_fit_far_from_its_minimum_is_written_only_if_asked(manifest, tmp_path, capsys):
+    """A hundredth of a pixel is no shift: 50 sweeps end at an estimated error of about 100."""
+    small, output = manifest.with_name("small.toml"), tmp_path / "cal.npz"
+    small.write_text(manifest.read_text().replace("shift = [7, 0]", "shift = [0.01, 0]"))
+    command = ["calibrate", str(small), "-o", str(output), "--max-sweeps", "50"]
+    with pytest.raises(SystemExit) as done:
+        cli.main(command)
+    captured = capsys.readouterr()
+    assert (done.value.code, captured.out) == (1, "")
+    last = captured.err.splitlines()[-1]
+    assert "is not written (--partial writes it): the fit ended far from its minimum" in last
+    assert captured.err.count("the fit ended far") == 1
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SystemExit) as done:
+        cli.main([*command, "--partial"])
+    assert not done.value.code
+    found = equipix.load(output)
+    assert found.is_partial
+    assert found.error_estimate > 1

@@ -1,0 +1,70 @@
+"""Which finding sets which bits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.calibration.options import Options
+from equipix.calibration.pixel_flags import pixel_flags
+from equipix.calibration.weights import Weighted, contradictory_found, weighted_fit
+from equipix.defects import Findings
+from equipix.exposures.front import exposures_of
+from equipix.exposures.options import FitOptions
+from equipix.flags import BITS, Flag
+
+CROSS = equipix.cross_pattern(2, 3)
+FINDINGS = [field.name for field in dataclasses.fields(Findings)]
+
+
+def weighted():
+    beam, truth = simulate.gaussian_beam((20, 24)), np.ones((20, 24))
+    exposures = exposures_of(simulate.exposures(truth, beam, CROSS), CROSS)
+    return weighted_fit(exposures, Options(FitOptions()))
+
+
+def with_findings(**found):
+    fitted = weighted()
+    exposures = dataclasses.replace(fitted.exposures, findings=Findings(**found))
+    return fitted._replace(exposures=exposures)
+
+
+def test_every_finding_has_bits_and_all_bits_have_a_finding():
+    assert {*FINDINGS, "contradictory"} == set(BITS)
+
+
+def test_only_saturation_leaves_a_pixel_in_use():
+    assert [name for name, bits in BITS.items() if not bits & Flag.DO_NOT_USE] == ["saturated"]
+
+
+@pytest.mark.parametrize("finding", FINDINGS)
+def test_a_finding_sets_its_bits_alone(finding):
+    found = np.zeros((20, 24), bool)
+    found[5, 7] = True
+    flags = pixel_flags(with_findings(**{finding: found}), FitOptions())
+    assert flags[5, 7] == BITS[finding]
+    assert np.count_nonzero(flags) == 1
+
+
+def test_findings_add_up():
+    found = np.zeros((20, 24), bool)
+    found[5, 7] = True
+    flags = pixel_flags(with_findings(**dict.fromkeys(FINDINGS, found)), FitOptions())
+    wanted = Flag.SATURATED | Flag.DEAD | Flag.HOT | Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE
+    assert flags[5, 7] == wanted
+
+
+def test_most_measurements_left_out_contradict_each_other():
+    given = weighted().exposures
+    left_out = np.zeros((5, 20, 24), bool)
+    left_out[:3, 4, 4] = left_out[:2, 8, 8] = True
+    exposures = contradictory_found(given.without(left_out), given.usable())
+    fit = exposures.fit(FitOptions())
+    flags = pixel_flags(Weighted(exposures, fit, left_out), FitOptions())
+    assert fit.flags[4, 4] == BITS["contradictory"]
+    assert np.argwhere(flags == BITS["contradictory"]).tolist() == [[4, 4]]
+    assert np.count_nonzero(flags) == 1

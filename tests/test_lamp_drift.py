@@ -1,0 +1,153 @@
+"""`cal.drift`: what the data say of fluxes that were given, and the tilt that a drift hides."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.calibration.lamp_drift import WARNED, lamp_drift
+from equipix.calibration.options import Options
+from equipix.calibration.residuals import sampled
+from equipix.calibration.significance import chi2_tail
+from equipix.calibration.weights import weighted_fit
+from equipix.drift import slope_covariance, slope_std
+from equipix.errors import DriftWarning
+from equipix.exposures.front import exposures_of
+from equipix.exposures.options import FitOptions
+from equipix.maps import tilt, tilt_weights
+
+SENSOR, NOISE = (48, 64), 1e-3
+SEVEN = np.array([(0, 0), (3, 9), (9, 2), (-7, 8), (5, -9), (-3, -8), (-9, 1)], float)
+
+
+def photograph(rng, drift, shifts=SEVEN, **how):
+    flux = np.exp(drift * rng.standard_normal(len(shifts)))
+    truth = simulate.cosine_sensitivity(SENSOR, rng=rng)
+    beam = simulate.gaussian_beam(SENSOR, width=150)
+    frames = simulate.exposures(truth, beam, shifts, flux=flux, **how)
+    return frames + NOISE * rng.standard_normal(frames.shape), truth, flux
+
+
+def estimated(seed, drift, shifts=SEVEN, **options):
+    """The drift that is found, and the error of the tilt."""
+    frames, truth, flux = photograph(np.random.default_rng([1, seed]), drift, shifts)
+    exposures = exposures_of(frames, shifts, variance=np.full(len(shifts), NOISE**2), **options)
+    weighted = weighted_fit(exposures, Options(FitOptions(tolerance=1e-6)))
+    valid = np.ones(SENSOR, bool)
+    error = tilt(weighted.fit.sensitivity, valid) - tilt(truth, valid)
+    return lamp_drift(weighted, sampled(weighted)), error, flux
+
+
+def test_fluxes_without_drift_scatter_as_noise_does():
+    """Probabilities of 100 right experiments are even: Kolmogorov's limit of 1e-3 is 1.95/√100."""
+    found = np.sort([estimated(seed, 0.0)[0].probability for seed in range(100)])
+    ranks = (np.arange(100) + 0.5) / 100
+    assert np.abs(found - ranks).max() < 1.95 / 100**0.5
+
+
+def test_a_drift_of_thirty_standard_errors_is_found():
+    shown = estimated(0, 0.0)[0].flux_std
+    found = [estimated(seed, 30 * shown)[0] for seed in range(60)]
+    # With four degrees of freedom one in 6000 is missed.
+    assert all(each.probability < WARNED for each in found)
+    # χ² of 240 degrees of freedom: the root mean square scatters by 4.6 %; three of these.
+    mean = np.mean([each.size**2 for each in found]) ** 0.5
+    assert mean == pytest.approx(30 * shown, rel=0.15)
+
+
+def test_the_tilt_follows_students_t():
+    """Errors over their standard deviations: 50 and 90 % of t with four degrees of freedom."""
+    found = [estimated(seed, 1e-3) for seed in range(100)]
+    ratio = np.abs([error / drift.tilt_std for drift, error, _ in found])
+    for quantile, share in ((0.741, 0.5), (2.132, 0.9)):
+        # 200 values: four standard errors of a share.
+        limit = 4 * (share * (1 - share) / 200) ** 0.5
+        assert np.mean(ratio < quantile) == pytest.approx(share, abs=limit)
+
+
+def test_a_drift_that_is_not_linear_contradicts_a_linear_one():
+    times = np.arange(7.0)
+    drift, _, _ = estimated(1, 1e-3, flux="linear", time=times)
+    assert drift.degrees_of_freedom == 3
+    assert drift.probability < WARNED
+
+
+def test_it_is_not_asked_where_fluxes_are_found():
+    for options in ({"flux": "fit"}, {"flux": np.ones(7), "flux_std": 1e-3}):
+        assert estimated(1, 1e-3, **options)[0] is None
+    assert estimated(1, 1e-3, SEVEN[:3])[0] is None
+
+
+def test_it_is_said_and_added_to_error_bars(tmp_path):
+    frames, _, _ = photograph(np.random.default_rng(2), 1e-3)
+    variance = np.full(7, NOISE**2)
+    with pytest.warns(DriftWarning, match="contradict the fluxes.*4 degrees of freedom"):
+        cal = equipix.calibrate(frames, SEVEN, variance=variance, uncertainty=True)
+    assert [verdict.kind for verdict in cal.verdicts] == ["drift"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        free = equipix.calibrate(frames, SEVEN, variance=variance, flux="fit", uncertainty=True)
+    noise = free.sensitivity_std
+    rows, cols = np.indices(SENSOR)
+    away = np.stack([rows - rows.mean(), cols - cols.mean()])
+    hidden = np.einsum("arc,ab,brc->rc", away, cal.drift.slope_covariance, away)
+    # M is 1 within 10 %, and so the place where a tilt leaves it.
+    np.testing.assert_allclose(cal.sensitivity_std, np.hypot(noise, np.sqrt(hidden)), rtol=0.15)
+    weights = tilt_weights(np.ones(SENSOR, bool))
+    np.testing.assert_allclose(cal.std_of(weights), cal.tilt_std, rtol=1e-3)
+    cal.save(tmp_path / "cal.npz")
+    kept = equipix.load(tmp_path / "cal.npz").drift
+    np.testing.assert_array_equal(kept.slope_covariance, cal.drift.slope_covariance)
+    assert kept.degrees_of_freedom == 4
+
+
+def test_sensors_turned_alike_see_the_same_drift():
+    """A sensor turned by 180°: shifts run the other way along its axes."""
+    rng = np.random.default_rng(3)
+    frames, _, _ = photograph(rng, 1e-3)
+    turned = np.ascontiguousarray(frames[:, ::-1, ::-1])
+    found = []
+    for values, rotation in ((frames, None), (turned, np.full(7, 180))):
+        exposures = exposures_of(values, SEVEN, rotation=rotation, variance=np.full(7, NOISE**2))
+        weighted = weighted_fit(exposures, Options(FitOptions(tolerance=1e-6)))
+        found.append(lamp_drift(weighted, sampled(weighted)))
+    assert found[1].size == pytest.approx(found[0].size, rel=1e-3)
+    np.testing.assert_allclose(found[1].tilt_std, found[0].tilt_std, rtol=1e-3)
+
+
+def test_the_covariance_of_slopes_has_their_standard_deviations():
+    covariance = slope_covariance(SEVEN, 1e-3, None)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), slope_std(SEVEN, 1e-3), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "freedom", "tail"),
+    [
+        (3.841459, 1, 0.05),
+        (9.21034, 2, 0.01),
+        (7.814728, 3, 0.05),
+        (23.209251, 10, 0.01),
+        (0, 3, 1),
+    ],
+)
+def test_the_tail_of_chi_square(value, freedom, tail):
+    """Quantiles from tables, given to six digits."""
+    assert chi2_tail(value, freedom) == pytest.approx(tail, rel=1e-5)
+
+
+def test_the_tilt_of_a_linear_drift_is_named():
+    shape, shifts, rate = (64, 80), equipix.cross_pattern(5, 7), 2e-3
+    flux = np.exp(rate * np.arange(5))
+    clean = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts, flux=flux)
+    frames = clean + 1e-4 * np.random.default_rng(3).standard_normal(clean.shape)
+    with pytest.warns(DriftWarning, match="if it is linear in the order of the exposures"):
+        cal = equipix.calibrate(frames, shifts)
+    # The rate is known to the standard error of what the trend leaves: 3.5 % of its variance.
+    visible = rate * np.sqrt(10 * equipix.plan.distinct_trend(shifts))
+    error = 5 * cal.drift.flux_std / visible
+    np.testing.assert_allclose(cal.drift.trend_tilt, np.abs(cal.tilt), rtol=error)
+    assert (cal.drift.trend_tilt > 2 * cal.drift.tilt_std).all()

@@ -1,0 +1,207 @@
+"""What `calibrate` says of residuals: reduced χ², correlation of neighbours, and likely causes."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.calibration.misfit import misfit
+from equipix.calibration.residual_tests import lag_one
+from equipix.calibration.residuals import bands, sampled
+from equipix.errors import EquipixWarning, MisfitWarning
+
+SENSOR, CROSS = (64, 96), equipix.cross_pattern(11, 19)
+NOISE = 1e-3
+
+
+def photograph(rng, beam, shifts=CROSS, *, noise=NOISE, given=None):
+    """Frames of a sensor, with white noise, and the shifts that are given."""
+    sensor = simulate.cosine_sensitivity(SENSOR, rng=rng)
+    frames = simulate.exposures(sensor, beam, shifts)
+    frames = frames + noise * rng.standard_normal(frames.shape)
+    return frames, shifts if given is None else given
+
+
+def found_in(frames, shifts, variance=NOISE**2, **options):
+    """The misfit of a calibration, or None; its warning is tested elsewhere."""
+    if variance is not None:
+        variance = np.broadcast_to(variance, len(frames))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EquipixWarning)
+        cal = equipix.calibrate(frames, shifts, variance=variance, tolerance=1e-4, **options)
+    return misfit(cal.weighted, sampled(cal.weighted))
+
+
+def smooth():
+    return simulate.gaussian_beam(SENSOR, width=150)
+
+
+def wavy(seed):
+    return simulate.wavy_beam(SENSOR, rng=seed)
+
+
+def with_row_noise(rng):
+    frames, shifts = photograph(rng, smooth())
+    return frames + 0.5 * NOISE * rng.standard_normal((5, SENSOR[0], 1)), shifts
+
+
+def with_column_noise(rng):
+    frames, shifts = photograph(rng, smooth())
+    return frames + 0.5 * NOISE * rng.standard_normal((5, 1, SENSOR[1])), shifts
+
+
+def with_dust(rng):
+    frames, shifts = photograph(rng, smooth())
+    row, col = rng.integers(20, 40), rng.integers(30, 60)
+    frames[2, row : row + 6, col : col + 6] *= 0.97
+    return frames, shifts
+
+
+def with_a_bad_exposure(rng):
+    frames, shifts = photograph(rng, smooth())
+    frames[3] += 2 * NOISE * rng.standard_normal(SENSOR)
+    return frames, shifts
+
+
+def with_photon_noise(rng):
+    frames, shifts = photograph(rng, simulate.gaussian_beam(SENSOR, width=60), noise=0)
+    root = np.sqrt(0.1 + frames / frames.max())
+    return frames + 1.5 * NOISE * root * rng.standard_normal(frames.shape), shifts
+
+
+def with_a_false_scale(rng):
+    return photograph(rng, wavy(rng), given=CROSS * np.array([1.01, 1.0]))
+
+
+def with_false_shifts(rng):
+    errors = 0.05 * rng.standard_normal(CROSS.shape)
+    return photograph(rng, wavy(rng), CROSS + errors, given=CROSS.astype(float))
+
+
+def with_drift(rng):
+    frames, shifts = photograph(rng, smooth())
+    return frames * np.exp(2e-3 * rng.standard_normal(5))[:, None, None], shifts
+
+
+def with_fine_speckle(rng):
+    k = 2 * np.pi / rng.uniform(3, 5, 60)
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, 60))
+
+    def beam(rows, cols):
+        waves = zip(k * np.sin(angle), k * np.cos(angle), phase, strict=True)
+        return (
+            1
+            + 0.02 * sum(np.cos(a * rows + b * cols + start) for a, b, start in waves)
+            + 0 * (rows + cols)
+        )
+
+    return photograph(rng, beam, CROSS + rng.uniform(-0.5, 0.5, CROSS.shape))
+
+
+def with_small_variances(rng):
+    return photograph(rng, smooth(), noise=1.3 * NOISE)
+
+
+CAUSES = {
+    "rows": with_row_noise,
+    "columns": with_column_noise,
+    "region": with_dust,
+    "exposure": with_a_bad_exposure,
+    "signal": with_photon_noise,
+    "shifts": with_false_shifts,
+    "flux": with_drift,
+    "structure": with_fine_speckle,
+    "noise": with_small_variances,
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_the_cause_is_named(cause):
+    for seed in range(3):
+        found = found_in(*CAUSES[cause](np.random.default_rng([1, seed])))
+        assert found is not None
+        assert found.cause == cause
+
+
+@pytest.mark.parametrize("cause", ["rows", "columns", "region", "shifts", "flux", "structure"])
+def test_correlated_residuals_show_without_variances(cause):
+    for seed in range(3):
+        found = found_in(*CAUSES[cause](np.random.default_rng([2, seed])), variance=None)
+        assert found is not None
+        assert found.cause == cause
+        assert "neighbouring pixels are correlated" in found.words
+
+
+def test_a_false_scale_is_named_with_its_size():
+    for seed in range(3):
+        found = found_in(*with_a_false_scale(np.random.default_rng([3, seed])))
+        assert found is not None
+        assert found.cause == "shifts"
+        scale = float(found.remedy.split("wrong by about ")[1].split("%")[0])
+        # 1 % along rows, to a third: the sensitivity takes a part of what it leaves.
+        assert scale == pytest.approx(1, abs=0.34)
+
+
+def test_variances_that_are_too_large_are_noticed():
+    found = found_in(*photograph(np.random.default_rng(4), smooth(), noise=0.6 * NOISE))
+    assert found.cause == "noise"
+    assert "too large" in found.words
+
+
+def test_no_false_alarm_over_right_models():
+    """100 experiments: whole and fractional shifts, smooth and structured beams, with masks."""
+    for seed in range(100):
+        rng = np.random.default_rng([5, seed])
+        beam = (smooth(), wavy(rng), simulate.striped_beam(SENSOR))[seed % 3]
+        shifts = CROSS + (rng.uniform(-0.5, 0.5, CROSS.shape) if seed % 2 else 0)
+        frames, shifts = photograph(rng, beam, shifts, noise=NOISE)
+        mask = rng.random(SENSOR) < 0.05 if seed % 4 == 0 else None
+        variance = None if seed % 5 == 0 else NOISE**2
+        assert found_in(frames, shifts, variance, mask=mask) is None
+
+
+def test_the_correlation_of_white_residuals_is_normal():
+    """z of 200 right models: mean 0, variance 1; limits are four standard errors of these."""
+    z = []
+    for seed in range(100):
+        frames, shifts = photograph(np.random.default_rng([6, seed]), smooth())
+        cal = equipix.calibrate(frames, shifts, tolerance=1e-4)
+        residuals = sampled(cal.weighted)
+        z += [each.z for each in lag_one(residuals.values, residuals.share)]
+    assert abs(np.mean(z)) < 4 / 200**0.5
+    assert abs(np.std(z) - 1) < 4 / 400**0.5
+
+
+def test_it_is_a_warning_and_a_verdict():
+    frames, shifts = photograph(np.random.default_rng(7), smooth(), noise=1.3 * NOISE)
+    with pytest.warns(MisfitWarning, match=r"1\.3 times as large as the variances predict"):
+        cal = equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2))
+    assert [verdict.kind for verdict in cal.verdicts] == ["misfit"]
+
+
+def test_data_without_noise_say_nothing():
+    frames, shifts = photograph(np.random.default_rng(8), smooth(), noise=0)
+    assert equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2)).verdicts == ()
+
+
+def test_a_sample_has_the_residuals_of_its_rows():
+    frames, shifts = photograph(np.random.default_rng(9), wavy(9), CROSS + 0.25)
+    cal = equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2), tolerance=1e-4)
+    whole, part = sampled(cal.weighted), sampled(cal.weighted, most=5 * 96 * 32)
+    expected = cal.residuals(frames, variance=np.full(5, NOISE**2))
+    np.testing.assert_allclose(whole.values[:, 0], expected, rtol=0, atol=1e-9)
+    assert part.values.shape == (5, 2, 32, 96)
+    np.testing.assert_allclose(part.values, expected[:, part.rows], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("count", "most"), [(10, 3), (100, 500), (100, 64), (100, 0), (33, 33)])
+def test_bands_are_rows_of_the_sensor(count, most):
+    rows = bands(count, most)
+    assert rows.min() >= 0
+    assert rows.max() < count
+    assert (np.diff(rows, axis=1) == 1).all()
+    assert len(np.unique(rows)) <= max(most, 64)

@@ -1,0 +1,179 @@
+"""`cal.orientation`: which signs and which order of the shifts' axes the data confirm."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.calibration.orientation import chosen_exposures
+from equipix.errors import EquipixWarning, ShiftSignWarning
+from equipix.exposures.orientation import Orientation
+from equipix.exposures.positions import Positions
+
+SENSOR, CROSS = (96, 120), equipix.cross_pattern(11, 19)
+EVERY = Orientation.every(quarter_turns=False)
+
+
+def fringes(_shape, *, period=20.0, contrast=0.18):
+    """Fringes along rows only: no part of the beam depends on the column."""
+    return lambda rows, cols: 1 + contrast * np.cos(2 * np.pi / period * rows) + 0 * cols
+
+
+def speckle(seed, shape, smallest, largest):
+    """Beam of random waves of periods from `smallest` to `largest` pixels, 10 % rms."""
+    rng = np.random.default_rng(seed)
+    waves = 60
+    k = 2 * np.pi / rng.uniform(smallest, largest, waves)
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, waves))
+    gaussian = simulate.gaussian_beam(shape)
+
+    def beam(rows, cols):
+        arguments = zip(k * np.sin(angle), k * np.cos(angle), phase, strict=True)
+        structure = sum(np.cos(a * rows + b * cols + start) for a, b, start in arguments)
+        return gaussian(rows, cols) * (1 + 0.1 * np.sqrt(2 / waves) * structure)
+
+    return beam
+
+
+def photograph(seed, beam, shifts=CROSS, noise=1e-3, **how):
+    """Frames of a sensor in a beam."""
+    rng = np.random.default_rng([5, seed])
+    frames = simulate.exposures(simulate.cosine_sensitivity(SENSOR, rng=rng), beam, shifts, **how)
+    return frames + noise * rng.standard_normal(frames.shape)
+
+
+def asked(frames, shifts, **options):
+    """What is said of the orientation; other warnings of a wrong one do not matter here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EquipixWarning)
+        return equipix.calibrate(frames, shifts, tolerance=1e-2, **options).orientation
+
+
+@pytest.mark.parametrize("given", EVERY, ids=lambda way: way.words)
+def test_each_of_eight_orientations_is_found_and_named(given):
+    """The best orientation turns the shifts that are given into the true ones."""
+    true = CROSS + np.random.default_rng(1).uniform(-0.5, 0.5, CROSS.shape)
+    frames = photograph(1, simulate.wavy_beam(SENSOR, rng=4), true)
+    wrong = given.shifts(true)
+    found = asked(frames, wrong)
+    np.testing.assert_allclose(found.best.shifts(wrong), true, atol=1e-12)
+    assert found.sign == ("confirmed" if given == Orientation() else "contradicted")
+    assert found.best.words in found.words or found.sign == "confirmed"
+
+
+@pytest.mark.parametrize(("true", "given"), [(90, 270), (270, 90)])
+def test_an_opposite_quarter_turn_is_named(true, given):
+    shifts, turns = np.vstack([CROSS, [(4, -3)]]), np.zeros(6, int)
+    turns[-1] = true
+    frames = photograph(2, simulate.wavy_beam(SENSOR, rng=5), shifts, rotation=turns)
+    assert asked(frames, shifts, rotation=turns, flux="fit").turned == "confirmed"
+    turns[-1] = given
+    found = asked(frames, shifts, rotation=turns, flux="fit")
+    assert (found.turned, found.sign) == ("contradicted", "contradicted")
+    assert found.best == Orientation(turned=True)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_fringes_along_rows_determine_no_sign_along_columns(mirrored):
+    frames = photograph(3, fringes(SENSOR))
+    found = asked(frames, Orientation(cols=mirrored).shifts(CROSS.astype(float)))
+    assert (found.rows, found.cols, found.sign) == ("confirmed", "undetermined", "undetermined")
+    assert "rows confirmed" in found.words
+    also = "the data fit equally well with the sign of the shifts along columns reversed, since"
+    assert also in found.words
+    assert "structure" in found.words
+
+
+def test_rows_reversed_in_fringes_are_never_confirmed():
+    """With both axes in the fringes, and with one axis: no verdict, or the right one."""
+    for seed in range(6):
+        beam = fringes(SENSOR, period=12 + 6 * seed)
+        if seed % 2:
+            beam = simulate.striped_beam(SENSOR, period=12 + 6 * seed, contrast=0.18)
+        found = asked(photograph(seed, beam), Orientation(rows=True).shifts(CROSS.astype(float)))
+        assert found.sign == "contradicted"
+        assert found.rows != "confirmed"
+
+
+@pytest.mark.parametrize("periods", [(3, 10), (4, 8)])
+def test_fine_speckle_contradicts_reversed_shifts(periods):
+    for seed in range(2):
+        frames = photograph(seed, speckle(seed, SENSOR, *periods))
+        assert asked(frames, -CROSS).sign == "contradicted"
+        assert asked(frames, CROSS).sign == "confirmed"
+
+
+def test_a_scale_that_fits_in_no_orientation_is_not_confirmed():
+    """Shifts a third too large, in a beam with structure: every orientation fits badly."""
+    frames = photograph(6, simulate.wavy_beam(SENSOR, rng=7))
+    found = asked(frames, CROSS * 1.5)
+    assert found.sign == "undetermined"
+    assert "correlated" in found.words
+
+
+class TestExposuresThatReturn:
+    """23 exposures, every second one at home."""
+
+    SHIFTS = np.zeros((23, 2))
+    SHIFTS[1::2] = np.random.default_rng(8).integers(-12, 13, (11, 2))
+
+    def test_are_chosen_by_their_shifts(self):
+        chosen = chosen_exposures(Positions.of(self.SHIFTS), 12)
+        assert len({tuple(shift) for shift in self.SHIFTS[chosen].tolist()}) == 12
+
+    def test_get_a_verdict(self):
+        frames = photograph(9, simulate.wavy_beam(SENSOR, rng=9), self.SHIFTS)
+        assert asked(frames, self.SHIFTS).sign == "confirmed"
+        assert asked(frames, -self.SHIFTS).sign == "contradicted"
+
+
+def smooth_field(rng, scale, rms):
+    """Random field over the sensor with a correlation length of so many pixels."""
+    padded = [size + 4 * scale for size in SENSOR]
+    squares = [(np.pi * scale * np.fft.fftfreq(size)) ** 2 / 2 for size in padded]
+    transfer = np.exp(-squares[0][:, None] - squares[1])
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal(padded)) * transfer).real
+    return rms * field[: SENSOR[0], : SENSOR[1]] / np.sqrt(np.mean(field**2))
+
+
+def with_nuisance(kind, frames, beam_of, rng):
+    """Frames of a beam with what is no structure of the beam."""
+    if kind == "illumination":
+        rms, scale = 10 ** rng.uniform(-3.5, -2.5), int(20 * 10 ** rng.uniform(0, 1))
+        return frames * (1 + np.stack([smooth_field(rng, scale, rms) for _ in frames]))
+    if kind == "non-linear":
+        return frames * (1 + 0.01 * frames / frames.max())
+    ghost = simulate.exposures(np.ones(SENSOR), beam_of, -CROSS)
+    return frames + 0.005 * ghost
+
+
+@pytest.mark.parametrize("kind", ["illumination", "ghost", "non-linear"])
+def test_nuisances_give_no_verdict(kind):
+    """In smooth beams: neither a right verdict nor a wrong one."""
+    for seed in range(10):
+        rng = np.random.default_rng([6, seed])
+        beam = simulate.gaussian_beam(SENSOR, width=(300, 1000)[seed % 2])
+        noise = 10 ** rng.uniform(-4, -3)
+        ghost = simulate.wavy_beam(SENSOR, contrast=0.3, rng=seed)
+        frames = with_nuisance(kind, photograph(seed, beam, noise=0), ghost, rng)
+        frames = frames + noise * rng.standard_normal(frames.shape)
+        for shifts in (CROSS, -CROSS):
+            assert asked(frames, shifts).sign == "undetermined"
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+def test_a_contradiction_is_a_warning_that_names_the_remedy():
+    frames = photograph(1, simulate.wavy_beam(SENSOR, rng=4))
+    with pytest.warns(ShiftSignWarning, match=r"exchange the two values.*\(row, col\), not"):
+        equipix.calibrate(frames, CROSS[:, ::-1], tolerance=1e-2)
+
+
+def test_it_is_kept_in_files(tmp_path):
+    frames = photograph(3, fringes(SENSOR))
+    cal = equipix.calibrate(frames, CROSS, tolerance=1e-2)
+    cal.save(tmp_path / "cal.npz")
+    assert equipix.load(tmp_path / "cal.npz").orientation == cal.orientation

@@ -1,0 +1,142 @@
+"""Verdicts: the limit of each at both sides, and what follows from one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+from equipix.calibration import verdicts
+from equipix.calibration.options import Options
+from equipix.calibration.orientation import OrientationTest
+from equipix.calibration.weights import Weighted
+from equipix.calibration.window_fit import WindowFit
+from equipix.errors import ConvergenceWarning, MisfitWarning
+from equipix.exposures.options import FitOptions
+
+CROSS = equipix.cross_pattern(3, 5)
+GOOD = {
+    "ended": "converged",
+    "components": 1,
+    "smallest_ritz": None,
+    "leaves_tilt": False,
+    "is_joint": True,
+    "error_estimate": np.array([1e-7]),
+    "misfit": 1000.0,
+    "degrees_of_freedom": 1000,
+}
+"""What verdicts read of a fit with which nothing is wrong."""
+
+
+def verdicts_on(*, variance=True, uncertainty=True, **found):
+    """Verdicts on a fit that differs from a good one in what is given."""
+    exposures = SimpleNamespace(variance=np.ones(5) if variance else None)
+    weighted = Weighted(exposures, SimpleNamespace(**GOOD | found), None)
+    options = Options(FitOptions(), uncertainty=uncertainty)
+    return verdicts.on_fit(weighted, options, OrientationTest(), None, None)
+
+
+def kinds(**found):
+    return [verdict.kind for verdict in verdicts_on(**found)]
+
+
+def test_a_good_fit_has_no_verdict():
+    assert kinds() == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "within", "beyond"),
+    [
+        ("pattern", {"smallest_ritz": 1e-4}, {"smallest_ritz": 0.999e-4}),
+        (
+            "uncertainty",
+            {"error_estimate": np.array([3.0, 0.1])},
+            {"error_estimate": np.array([0.01, 0.1001])},
+        ),
+    ],
+)
+def test_a_limit_at_both_sides(kind, within, beyond):
+    assert kinds(**within) == []
+    assert kinds(**beyond) == [kind]
+
+
+def test_messages_contain_the_value_and_the_limit():
+    for found, value, limit in (
+        ({"smallest_ritz": 2e-5}, "2.0e-05", "limit 0.0001"),
+        ({"error_estimate": np.array([0.3])}, "3.0e-01", "limit 0.1"),
+    ):
+        (verdict,) = verdicts_on(**found)
+        assert value in verdict.message
+        assert limit in verdict.message
+
+
+def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit():
+    far = {"error_estimate": np.array([0.3])}
+    assert kinds(**far, uncertainty=False) == []
+    assert kinds(**far, is_joint=False) == []
+
+
+def experiment(noise=1e-3, contrast=0.0):
+    rng = np.random.default_rng(3)
+    truth = simulate.cosine_sensitivity((24, 30), rng=rng)
+    truth *= 1 + contrast * np.linspace(-1, 1, 30)
+    frames = simulate.exposures(truth, simulate.wavy_beam((24, 30), rng=1), CROSS + 0.25)
+    return frames + noise * rng.standard_normal(frames.shape)
+
+
+def test_a_fit_too_far_from_its_minimum_has_no_standard_deviations():
+    frames = experiment(contrast=0.8)
+    with (
+        pytest.warns(ConvergenceWarning, match="no standard deviations: .* limit 0.1"),
+        pytest.warns(ConvergenceWarning, match="not converged"),
+    ):
+        cal = equipix.calibrate(
+            frames, CROSS + 0.25, variance=np.full(5, 1e-6), max_sweeps=1, uncertainty=True
+        )
+    assert "uncertainty" in [verdict.kind for verdict in cal.verdicts]
+    assert cal.error_estimate > 0.1
+    assert cal.sensitivity_std is cal.tilt_std is cal.shift_std is None
+
+
+def test_five_standard_errors_and_three_per_cent_are_the_limit_of_chi_square():
+    frames = experiment()[:, :, :28]
+    plain = equipix.calibrate(frames, CROSS, variance=np.full(5, 1e-6))
+    # Reduced χ² goes with 1/variance; the fit does not depend on their common factor.
+    freedom = plain.weighted.fit.degrees_of_freedom
+    limit = max(0.03, 5 * np.sqrt(2 / freedom))
+    for chi2 in (1 + 0.99 * limit, 1 - 0.99 * limit):
+        variance = np.full(5, plain.reduced_chi2 * 1e-6 / chi2)
+        assert equipix.calibrate(frames, CROSS, variance=variance).verdicts == ()
+    for chi2 in (1 + 1.01 * limit, 1 - 1.01 * limit):
+        variance = np.full(5, plain.reduced_chi2 * 1e-6 / chi2)
+        with pytest.warns(MisfitWarning, match="times as large as the variances predict"):
+            equipix.calibrate(frames, CROSS, variance=variance)
+
+
+def window_fit(left, freedom, *, rng):
+    """A settled fit of a window with residuals of that mean square."""
+    fit = SimpleNamespace(error_estimate=np.array([1e-9]), ended="converged")
+    residuals = np.sqrt(left) * rng.choice([-1.0, 1.0], (3, 8, 8))
+    return WindowFit(fit, left, freedom, 1.0, 1.0, residuals)
+
+
+@pytest.mark.parametrize("freedom", [1000, 7200, 10**6])
+def test_an_orientation_needs_six_standard_deviations(freedom):
+    """√(2/dof) is the standard deviation of F/dof, relative to it."""
+    rng = np.random.default_rng(1)
+    limit = 6 * np.sqrt(2 / freedom)
+    low = window_fit(0.7, freedom, rng=rng)
+    assert window_fit(0.7 * (1 + 1.001 * limit), freedom, rng=rng).is_far_above(low)
+    assert not window_fit(0.7 * (1 + 0.999 * limit), freedom, rng=rng).is_far_above(low)
+    few = [window_fit(left, 999, rng=rng) for left in (0.7, 7.0)]
+    assert not few[1].is_far_above(few[0])
+
+
+def test_nothing_is_concluded_from_a_misfit_of_half_a_per_cent():
+    rng = np.random.default_rng(2)
+    low = window_fit(1e-8, 10**4, rng=rng)
+    assert window_fit(1e-8 + 1.01 * 0.005**2, 10**4, rng=rng).is_far_above(low)
+    assert not window_fit(1e-8 + 0.99 * 0.005**2, 10**4, rng=rng).is_far_above(low)
