@@ -36,8 +36,7 @@ fn applied<I: Raw, O: Corrected>(
 ) -> (Vec<O>, u64) {
     let mut out = vec![zero; SHAPE.len()];
     let workers = Workers::new(std::num::NonZeroUsize::new(workers)).unwrap();
-    let limited =
-        corrector.apply(frame, &mut out, largest, &workers, &Control::new()).unwrap();
+    let limited = corrector.apply(frame, &mut out, largest, &workers, &Control::new()).unwrap();
     (out, limited)
 }
 
@@ -50,7 +49,8 @@ fn formula(planes: usize, pixel: usize, y: f32) -> f32 {
 #[test]
 fn single_precision_follows_the_formula_at_every_order() {
     for planes in 1..=4 {
-        let (out, limited) = applied(&corrector(planes, &[], Unusable::Kept), &frame(), 0_f32, 0.0, 1);
+        let (out, limited) =
+            applied(&corrector(planes, &[], Unusable::Kept), &frame(), 0_f32, 0.0, 1);
         for (pixel, (&got, &y)) in out.iter().zip(&frame()).enumerate() {
             assert_eq!(got.to_bits(), formula(planes, pixel, f32::from(y)).to_bits());
         }
@@ -130,6 +130,16 @@ fn replaced_pixels_are_means_of_their_usable_neighbours() {
     for pixel in (0..out.len()).filter(|pixel| !bad.contains(pixel)) {
         assert_eq!(out[pixel], kept[pixel]);
     }
+}
+
+#[test]
+fn a_raw_value_that_is_no_number_does_not_spread_to_its_neighbours() {
+    let mut raw: Vec<f32> = frame().iter().map(|&y| y.into()).collect();
+    raw[1] = f32::NAN;
+    let (out, _) = applied(&corrector(2, &[0], Unusable::Replaced), &raw, 0_f32, 0.0, 1);
+    let nan: Vec<usize> = (0..out.len()).filter(|&pixel| out[pixel].is_nan()).collect();
+    assert_eq!(nan, [1]);
+    assert_eq!(out[0], (out[53] + out[54]) / 2.0);
 }
 
 #[test]

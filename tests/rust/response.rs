@@ -16,10 +16,7 @@ fn curves(terms: usize) -> Vec<f64> {
     let deviation = |p: usize, v: f64| {
         truth(p)[..terms].iter().rev().fold(0.0, |sum, coefficient| sum * v + coefficient)
     };
-    REFERENCES
-        .iter()
-        .flat_map(|&v| (0..SHAPE.len()).map(move |p| v + deviation(p, v)))
-        .collect()
+    REFERENCES.iter().flat_map(|&v| (0..SHAPE.len()).map(move |p| v + deviation(p, v))).collect()
 }
 
 fn fitted(data: &[f64], noise: Option<&[LevelNoise]>, form: Form, workers: usize) -> Vec<Vec<f64>> {
@@ -31,12 +28,13 @@ fn fitted(data: &[f64], noise: Option<&[LevelNoise]>, form: Form, workers: usize
 }
 
 fn noise() -> Vec<LevelNoise> {
-    REFERENCES.iter().map(|_| LevelNoise { constant: 4.0, slope: 0.25 }).collect()
+    REFERENCES.iter().map(|_| LevelNoise { constant: 4.0, slope: 0.25, dark: 30.0 }).collect()
 }
 
 #[test]
 fn curves_without_noise_come_back_at_every_order() {
-    for (form, terms) in [(Form::Offset, 1), (Form::Line, 2), (Form::Quadratic, 3), (Form::Cubic, 4)]
+    for (form, terms) in
+        [(Form::Offset, 1), (Form::Line, 2), (Form::Quadratic, 3), (Form::Cubic, 4)]
     {
         for noise in [None, Some(noise())] {
             let found = fitted(&curves(terms), noise.as_deref(), form, 1);
@@ -54,8 +52,10 @@ fn curves_without_noise_come_back_at_every_order() {
 
 #[test]
 fn a_gain_alone_goes_through_zero() {
-    let data: Vec<f64> =
-        REFERENCES.iter().flat_map(|&v| (0..SHAPE.len()).map(move |p| v * (1.0 + truth(p)[1]))).collect();
+    let data: Vec<f64> = REFERENCES
+        .iter()
+        .flat_map(|&v| (0..SHAPE.len()).map(move |p| v * (1.0 + truth(p)[1])))
+        .collect();
     let found = fitted(&data, Some(&noise()), Form::Gain, 1);
     for p in 0..SHAPE.len() {
         assert!(found[0][p].abs() < 1e-12);
@@ -77,7 +77,7 @@ fn coefficients_and_variances_are_those_of_weighted_least_squares() {
         let (mut a, mut k, mut variances) = (0.0, 0.0, [0.0; 2]);
         for _ in 0..2 {
             let w: Vec<f64> =
-                REFERENCES.iter().map(|v| 1.0 / (4.0 + 0.25 * (v + a + k * v))).collect();
+                REFERENCES.iter().map(|v| 1.0 / (4.0 + 0.25 * (v + a + k * v - 30.0))).collect();
             let sum = |f: &dyn Fn(usize) -> f64| (0..6).map(|j| w[j] * f(j)).sum::<f64>();
             let (s, sx) = (sum(&|_| 1.0), sum(&|j| REFERENCES[j]));
             let sxx = sum(&|j| REFERENCES[j].powi(2));

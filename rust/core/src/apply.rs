@@ -214,15 +214,19 @@ impl Corrector {
         let mut repaired = self.repaired.lock().unwrap_or_else(PoisonError::into_inner);
         let mut limited = 0;
         for (index, &pixel) in self.repairs.pixels.iter().enumerate() {
-            let sources = self.repairs.sources(index);
-            let sum: f32 = sources
-                .iter()
-                .map(|source| match *source {
+            // A value that is not a number counts in no mean, so it does not spread.
+            let (mut sum, mut count) = (0.0, 0_u32);
+            for source in self.repairs.sources(index) {
+                let value = match *source {
                     Source::Pixel(pixel) => self.value(frame, pixel as usize),
                     Source::Repaired(before) => repaired[before as usize],
-                })
-                .sum();
-            repaired[index] = sum / sources.len() as f32;
+                };
+                if !value.is_nan() {
+                    sum += value;
+                    count += 1;
+                }
+            }
+            repaired[index] = sum / count as f32;
             let (value, changed) = O::of(repaired[index], largest);
             out[pixel as usize] = value;
             limited += u64::from(changed);

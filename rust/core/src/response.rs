@@ -11,7 +11,7 @@
 //! is a weighted least-squares fit of its own,
 //!
 //! ```text
-//! min Σ_j [V_j − V̄_j − Σ_i q_i x_j^i]² / σ_j²,   x = (V̄ − centre) / half,   σ_j² = r_j + g_j · signal
+//! min Σ_j [V_j − V̄_j − Σ_i q_i x_j^i]² / σ_j²,   x = (V̄ − centre) / half,   σ_j² = r_j + g_j · (V − dark)
 //! ```
 //!
 //! in x, which lies in [−1, 1], so that the normal equations are well conditioned; the coefficients
@@ -75,18 +75,20 @@ impl Form {
     }
 }
 
-/// Variance of a level's mean as a function of the signal: `constant + slope · signal`.
+/// Variance of a level's mean as a function of its value: `constant + slope · (value − dark)`.
 #[derive(Clone, Copy, Debug)]
 pub struct LevelNoise {
-    /// Variance without light.
+    /// Variance at `dark` and below.
     pub constant: f64,
     /// Photon noise per unit of signal.
     pub slope: f64,
+    /// Value from which the signal is counted: 0 where a dark was subtracted.
+    pub dark: f64,
 }
 
 impl LevelNoise {
-    fn variance(self, signal: f64) -> f64 {
-        self.constant + self.slope * signal.max(0.0)
+    fn variance(self, value: f64) -> f64 {
+        self.constant + self.slope * (value - self.dark).max(0.0)
     }
 }
 
@@ -389,7 +391,9 @@ fn checked<T: Real>(levels: &Levels<'_, T>, form: Form) -> Result<()> {
         return Err(Error::value("levels", format!("hold one of mean {bad}: no pixel is usable")));
     }
     let noise = levels.noise.unwrap_or_default();
-    let wrong = |noise: &&LevelNoise| !(noise.constant > 0.0 && noise.slope >= 0.0);
+    let wrong = |noise: &&LevelNoise| {
+        !(noise.constant > 0.0 && noise.slope >= 0.0 && noise.dark.is_finite())
+    };
     match noise.iter().find(wrong) {
         Some(bad) => Err(Error::value(
             "noise",

@@ -47,8 +47,11 @@ impl PyCorrector {
         flagged: &str,
     ) -> PyResult<Self> {
         let [planes, rows, cols] = [0, 1, 2].map(|axis| coefficients.shape()[axis]);
-        let made = Stack::new("coefficients", coefficients.as_slice()?, planes, Shape::new(rows, cols))
-            .and_then(|stack| Corrector::new(stack, unusable.as_slice().unwrap_or(&[]), then(flagged)?));
+        let made =
+            Stack::new("coefficients", coefficients.as_slice()?, planes, Shape::new(rows, cols))
+                .and_then(|stack| {
+                    Corrector::new(stack, unusable.as_slice().unwrap_or(&[]), then(flagged)?)
+                });
         made.map(Self).map_err(|error| errors::exception(py, &error))
     }
 

@@ -19,28 +19,26 @@ use crate::arrays::{PyFrames, image, stack};
 use crate::{errors, run};
 
 /// Coefficients, their variances, misfit, levels used.
-type PyResponse =
-    (Py<PyArray3<f64>>, Py<PyArray3<f64>>, Py<PyArray2<f64>>, Py<PyArray2<u32>>);
+type PyResponse = (Py<PyArray3<f64>>, Py<PyArray3<f64>>, Py<PyArray2<f64>>, Py<PyArray2<u32>>);
 
 /// Deviation of each pixel from the array's mean, as a polynomial of that mean.
 #[pyfunction]
-#[pyo3(signature = (means, references, *, form, noise, workers, progress))]
+#[pyo3(signature = (means, references, *, form, noise, workers))]
 pub(crate) fn fit_response(
     py: Python<'_>,
     means: PyFrames<'_>,
     references: Vec<f64>,
     form: &str,
-    noise: Option<Vec<(f64, f64)>>,
+    noise: Option<Vec<(f64, f64, f64)>>,
     workers: Option<NonZeroUsize>,
-    progress: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<PyResponse> {
     let form = form_of(form).map_err(|error| errors::exception(py, &error))?;
-    let law = |(constant, slope)| LevelNoise { constant, slope };
+    let law = |(constant, slope, dark)| LevelNoise { constant, slope, dark };
     let noise: Option<Vec<_>> = noise.map(|noise| noise.into_iter().map(law).collect());
     let ask = Question { references: &references, noise: noise.as_deref(), form, workers };
     match means {
-        PyFrames::Single(means) => ask.put(py, &means, progress),
-        PyFrames::Double(means) => ask.put(py, &means, progress),
+        PyFrames::Single(means) => ask.put(py, &means),
+        PyFrames::Double(means) => ask.put(py, &means),
     }
 }
 
@@ -57,14 +55,13 @@ impl Question<'_> {
         &self,
         py: Python<'_>,
         means: &PyReadonlyArray3<'_, T>,
-        progress: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<PyResponse> {
         let levels = Levels {
             means: stack("levels", means)?,
             references: self.references,
             noise: self.noise,
         };
-        let found = run::interruptible(py, progress, |control| {
+        let found = run::interruptible(py, None, |control| {
             fit(&levels, self.form, &Workers::new(self.workers)?, control)
         })?;
         arrays(py, found, self.form, Shape::new(means.shape()[1], means.shape()[2]))
