@@ -22,6 +22,7 @@ class Flag(IntFlag):
     SATURATED = 1 << 1
     DEAD = 1 << 10
     HOT = 1 << 11
+    NONLINEAR = 1 << 16
     NO_FLAT_FIELD = 1 << 18
     UNRELIABLE_FLAT = 1 << 25
 
@@ -32,9 +33,12 @@ BITS = {
     "hot": Flag.HOT | Flag.DO_NOT_USE,
     "noisy": Flag.HOT | Flag.DO_NOT_USE,
     "contradictory": Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE,
+    "undetermined": Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE,
+    "falling": Flag.NONLINEAR | Flag.DO_NOT_USE,
 }
 """Bits that each finding sets; a saturated value is left out of its exposure, and the pixel keeps
-the sensitivity that the others determine."""
+the sensitivity that the others determine. The last two are findings on response curves: no curve,
+and one that does not rise everywhere."""
 
 
 def set_bits(flags: Array, finding: str, pixels: Bools | None) -> None:

@@ -82,12 +82,7 @@ def apply_gain(
 
     The parameters are those of `equipix.Calibration.correct`.
     """
-    if isinstance(dark, FrameStatistics):
-        refuse_subtracted(dark)
-        dark = dark.mean
-    offset = np.zeros((), np.float32) if dark is None else as_array("dark", dark, ndim=2)
-    if dark is not None and offset.shape != gain.shape:
-        raise InputError(f"'dark' has shape {offset.shape}, the sensor {gain.shape}")
+    offset = np.zeros((), np.float32) if dark is None else dark_frame(dark, gain.shape)
 
     def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
         np.subtract(frame, offset, out=corrected, dtype=corrected.dtype, casting="same_kind")
@@ -97,17 +92,29 @@ def apply_gain(
     return apply(frames, formula, flags=flags, flagged=flagged, out=out)
 
 
+def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Check a dark frame that is to be subtracted; of averages it is the mean."""
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
+        dark = dark.mean
+    offset = as_array("dark", dark, ndim=2)
+    if offset.shape != shape:
+        raise InputError(f"'dark' has shape {offset.shape}, the sensor {shape}")
+    return offset
+
+
 def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> None:
     """Put the mean of the nearest good pixels in place of each bad one.
 
     The good ones of the eight neighbours count; where there are none, those that were filled in
-    the round before. An image without any good pixel becomes NaN.
+    the round before. A value that is NaN counts in no mean. An image without any good pixel
+    becomes NaN.
     """
     rows, cols = image.shape
     good = np.zeros((rows + 2, cols + 2), bool)
-    good[1:-1, 1:-1] = ~bad
+    good[1:-1, 1:-1] = ~bad & ~np.isnan(image)
     values = np.zeros(good.shape)
-    values[1:-1, 1:-1] = np.where(bad, 0, image)
+    values[1:-1, 1:-1] = np.where(good[1:-1, 1:-1], image, 0)
     todo = np.argwhere(bad) + 1
     around = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
     while len(todo):
