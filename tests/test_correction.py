@@ -162,14 +162,14 @@ class TestLoad:
     def test_refuses_an_unknown_kind_by_name(self, bent, tmp_path, monkeypatch):
         bent.save(tmp_path / "bent.npz")
         monkeypatch.delitem(loading.READERS, "bent response")
-        with pytest.raises(FileError, match="holds bent response, expected calibration that"):
+        with pytest.raises(FileError, match="holds bent response, expected calibration or"):
             equipix.load(tmp_path / "bent.npz")
 
     @pytest.mark.parametrize("content", [{}, {"kind": None}, {"kind": ["calibration"]}, [1], 3])
     def test_refuses_what_has_no_kind(self, tmp_path, content):
         path = tmp_path / "other.npz"
         np.savez(path, metadata=np.array(json.dumps(content)), values=np.ones((3, 3)))
-        with pytest.raises(FileError, match="holds .*, expected calibration that equipix has"):
+        with pytest.raises(FileError, match="holds .*, expected calibration or response that"):
             equipix.load(path)
 
     @pytest.mark.parametrize("suffix", [".tif", ".npz"])

@@ -41,7 +41,7 @@ LAYERS = (
     {"pictures"},
     {"demo"},
     {"comparison", "experiment", "loading"},
-    {"calibration"},
+    {"calibration", "nuc"},
     {"exposures", "plan", "simulate"},
     {"correction", "defects", "uncertainty"},
     {"noise"},
@@ -86,9 +86,11 @@ CHAIN = (
 """The core: a module uses those to its right; none of two in one place uses the other."""
 
 BESIDE = {
+    "apply": set[str](),
     "centroid": {"connectivity"},
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
+    "response": set[str](),
     "statistics": set[str](),
 }
 """Core modules beside the chain: they use these, and what is right of `geometry`."""

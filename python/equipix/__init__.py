@@ -1,4 +1,4 @@
-"""Pixel sensitivity of image sensors, measured without a uniform light source.
+"""Pixel sensitivity of image sensors, measured without a uniform light source or with one.
 
 Importing the package loads nothing else; every public name is loaded on first use.
 """
@@ -13,7 +13,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, plan, simulate, uncertainty
+    from equipix import errors, nuc, plan, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
@@ -48,7 +48,7 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "plan", "simulate", "uncertainty")
+_MODULES = ("errors", "nuc", "plan", "simulate", "uncertainty")
 """Public modules."""
 
 __all__ = [
@@ -70,6 +70,7 @@ __all__ = [
     "errors",
     "load",
     "measure_shift",
+    "nuc",
     "plan",
     "simulate",
     "uncertainty",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 READERS = {
     "calibration": ("equipix.calibration.reading", "read_calibration"),
     "frame statistics": ("equipix.frames", "read_statistics"),
+    "response": ("equipix.nuc.reading", "read_response"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes
 the content of ``(path, pages, metadata)``."""
@@ -40,7 +41,8 @@ def load(path: str | PathLike[str]) -> Correction:
     Returns
     -------
     Correction
-        As it was saved, bit by bit: from a file that `Calibration.save` wrote a `Calibration`.
+        As it was saved, bit by bit: a `Calibration` from a file that `Calibration.save` wrote, a
+        `nuc.Response` from one that `Response.save` wrote.
 
     Raises
     ------

@@ -1,6 +1,4 @@
-"""Correction of pixels by a uniform source: response curves and their inverses."""
-
-from __future__ import annotations
+"""Correction of non-uniformity by a uniform source: response curves and their inverses."""
 
 from equipix.nuc.fit import fit
 from equipix.nuc.response import Response

@@ -11,6 +11,7 @@ from equipix.reference.joint import JointSolution, joint
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
+from equipix.reference.response import inverse, response
 from equipix.reference.uncertainty import covariance
 
 __all__ = [
@@ -23,8 +24,10 @@ __all__ = [
     "covariance",
     "exposures",
     "grid_cells",
+    "inverse",
     "joint",
     "multiscale",
     "objective",
+    "response",
     "solve_dense",
 ]
