@@ -161,9 +161,25 @@ fn a_sensor_without_a_usable_pixel_is_blank() {
 
 #[test]
 fn any_number_of_workers_gives_the_same_bytes() {
-    let corrector = corrector(4, &[7, 8, 9], Unusable::Replaced);
-    let wanted = applied(&corrector, &frame(), 0_u16, 65535.0, 1);
-    assert_eq!(applied(&corrector, &frame(), 0_u16, 65535.0, 3), wanted);
+    // Above 2^20 pixels, where several threads work.
+    let shape = Shape::new(1031, 1029);
+    let planes: Vec<f32> = (0..2 * shape.len())
+        .map(|index| if index < shape.len() { -20.0 } else { 1.0 + (index % 997) as f32 * 1e-4 })
+        .collect();
+    let mut unusable = vec![false; shape.len()];
+    unusable[70_000..70_009].fill(true);
+    let stack = Stack::new("coefficients", &planes, 2, shape).unwrap();
+    let corrector = Corrector::new(stack, &unusable, Unusable::Replaced).unwrap();
+    let raw: Vec<u16> = (0..shape.len()).map(|pixel| (pixel * 7919 % 65536) as u16).collect();
+    let by = |workers| {
+        let (mut out, control) = (vec![0_u16; shape.len()], Control::new());
+        let workers = Workers::new(std::num::NonZeroUsize::new(workers)).unwrap();
+        let limited = corrector.apply(&raw, &mut out, 65535.0, &workers, &control).unwrap();
+        (out, limited)
+    };
+    let wanted = by(1);
+    assert!(wanted.1 > 0);
+    assert_eq!(by(3), wanted);
 }
 
 #[test]

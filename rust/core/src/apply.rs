@@ -23,6 +23,10 @@ use crate::parallel::Workers;
 /// Pixels that a thread corrects at a time.
 const BLOCK: usize = 1 << 15;
 
+/// Most pixels that the calling thread corrects alone: a quarter of a millisecond, in which other
+/// threads would hardly have started.
+const ALONE: usize = 1 << 20;
+
 /// Largest number of coefficients: those of a cubic.
 const PLANES: usize = 4;
 
@@ -161,16 +165,17 @@ impl Corrector {
                 });
             }
         }
-        let limited = workers.map_blocks(out, BLOCK, |index, block| {
+        let correct = |index: usize, block: &mut [O]| {
             control.check()?;
             let at = index * BLOCK;
             Ok(self.correct_block(at, &frame[at..at + block.len()], block, largest))
-        });
-        let mut total = 0;
-        for count in limited {
-            total += count?;
-        }
-        Ok(total + self.repair(frame, out, largest))
+        };
+        let limited: Result<u64> = if out.len() <= ALONE {
+            out.chunks_mut(BLOCK).enumerate().map(|(index, block)| correct(index, block)).sum()
+        } else {
+            workers.map_blocks(out, BLOCK, correct).into_iter().sum()
+        };
+        Ok(limited? + self.repair(frame, out, largest))
     }
 
     /// Coefficients of power `power` from pixel `at` on.

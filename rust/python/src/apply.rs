@@ -9,6 +9,7 @@
 use std::num::NonZeroUsize;
 
 use equipix_core::apply::{Corrected, Corrector, Raw, Unusable};
+use equipix_core::control::Control;
 use equipix_core::{Error, Shape, Stack, Workers};
 use numpy::{
     Element, PyReadonlyArray2, PyReadonlyArray3, PyReadwriteArray3, PyUntypedArrayMethods,
@@ -16,6 +17,9 @@ use numpy::{
 use pyo3::prelude::*;
 
 use crate::{errors, run};
+
+/// Most values that are corrected without a look at signals: some milliseconds.
+const BRIEF: usize = 1 << 24;
 
 /// Raw frames of any type that cameras deliver.
 #[derive(FromPyObject)]
@@ -102,14 +106,16 @@ impl Job<'_> {
         out: &mut [O],
     ) -> PyResult<u64> {
         let size = self.corrector.shape().len();
-        run::interruptible(py, None, |control| {
+        let brief = frames.len() <= BRIEF;
+        let work = |control: &Control| {
             let workers = Workers::new(self.workers)?;
             let mut limited = 0;
             for (frame, out) in frames.chunks(size).zip(out.chunks_mut(size)) {
                 limited += self.corrector.apply(frame, out, self.largest, &workers, control)?;
             }
             Ok(limited)
-        })
+        };
+        if brief { run::brief(py, work) } else { run::interruptible(py, None, work) }
     }
 }
 
