@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from equipix.calibration.history import History
     from equipix.calibration.result import Calibration
     from equipix.comparison import Comparison, compare
+    from equipix.correction.corrector import Corrector
     from equipix.correction.protocol import Correction
     from equipix.experiment.run import Experiment
     from equipix.flags import Flag
@@ -31,6 +32,7 @@ _HOMES = {
     "Calibration": "calibration.result",
     "Comparison": "comparison",
     "Correction": "correction.protocol",
+    "Corrector": "correction.corrector",
     "Experiment": "experiment.run",
     "Flag": "flags",
     "FrameStatistics": "frames",
@@ -55,6 +57,7 @@ __all__ = [
     "Calibration",
     "Comparison",
     "Correction",
+    "Corrector",
     "Experiment",
     "Flag",
     "FrameStatistics",

@@ -9,10 +9,11 @@ import numpy as np
 
 from equipix._check import as_array
 from equipix._readonly import ReadOnly
-from equipix.correction.apply import apply, dark_frame
+from equipix.correction.apply import apply, apply_polynomial, dark_frame
+from equipix.correction.corrector import check_depth
 from equipix.errors import InputError
 from equipix.flags import usable
-from equipix.nuc.curve import counted_from, polynomial, response_at
+from equipix.nuc.curve import counted_from, response_at
 from equipix.nuc.inverse import exact_inverse
 from equipix.nuc.saved import save_fields
 
@@ -148,7 +149,9 @@ class Response(ReadOnly):
             Whether to invert orders 2 and 3 exactly, some 20 times slower, with the slope at the
             end of the valid range beyond it. The cubic differs by at most `inverse_error`.
         out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64.
+            Array for the result, of the frames' shape, float32 or float64; of frames of 8 or 16
+            bits and float32, unless `exact`, also uint8 or uint16: rounded half to even, and
+            limited to the range of the type (`equipix.Corrector` counts such values).
 
         Returns
         -------
@@ -164,16 +167,13 @@ class Response(ReadOnly):
         """
         self._check_depth(frames)
         offset = self._offset(dark)
-        if exact:
-            zero = np.zeros(self.shape) if offset is None else offset
-
-            def formula(frame: Array, corrected: Array) -> None:
-                corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
-        else:
+        if not exact:
             inverse = self.inverse if offset is None else counted_from(self.inverse, offset)
+            return apply_polynomial(frames, inverse, flags=self.flags, flagged=flagged, out=out)
+        zero = np.zeros(self.shape) if offset is None else offset
 
-            def formula(frame: Array, corrected: Array) -> None:
-                corrected[...] = polynomial(inverse, frame)
+        def formula(frame: Array, corrected: Array) -> None:
+            corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
 
         return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
 
@@ -260,8 +260,4 @@ class Response(ReadOnly):
                 f"'frames' holds {largest}, above the saturation level {level:g} DN of the levels: "
                 "frames of another sensor or bit depth"
             )
-        if dtype.kind == "u" and np.iinfo(dtype).max < level / 2:
-            raise InputError(
-                f"'frames' is {dtype}, but the levels saturate at {level:g} DN: frames of another "
-                "bit depth"
-            )
+        check_depth(dtype, level)

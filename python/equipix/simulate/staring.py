@@ -234,7 +234,7 @@ class StaringArray:
         """
         dark = self._maps["dark_e"] * 2 ** (warmer_k / self.doubling_k)
         collected = self._maps["area"] * (self._maps["sensitivity"] * np.asarray(light_e) + dark)
-        return np.clip(collected, 0, self.well_e)
+        return np.asarray(np.clip(collected, 0, self.well_e))
 
     def mean(
         self, light_e: ArrayLike, *, warmer_k: float = 0.0, time_s: float | None = None
@@ -322,7 +322,7 @@ class StaringArray:
         drift = np.zeros(self.shape)
         for frequency, phase in zip(frequencies, self._phases, strict=True):
             drift += np.cos(2 * np.pi * frequency * time_s + phase)
-        return offset + self._maps["drift_dn"] * np.sqrt(2 / _WAVES) * drift
+        return np.asarray(offset + self._maps["drift_dn"] * np.sqrt(2 / _WAVES) * drift)
 
     @cached_property
     def _phases(self) -> Floats:
