@@ -134,7 +134,7 @@ class TestFiles:
 
     def test_are_corrected_as_arrays_are(self, bent, images, tmp_path):
         frames, source = images
-        assert correct_files(bent, source, tmp_path / "out.tif", flagged="replace") == 4
+        assert correct_files(bent, source, tmp_path / "out.tif", flagged="replace").frames == 4
         wanted = bent.correct(frames, flagged="replace")
         np.testing.assert_array_equal(io.read_frames(tmp_path / "out.tif"), wanted)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from equipix.comparison import Comparison, compare
     from equipix.correction.corrector import Corrector
     from equipix.correction.protocol import Correction
+    from equipix.experiment.levels import LevelExperiment
     from equipix.experiment.run import Experiment
     from equipix.flags import Flag
     from equipix.frames import FrameStatistics, average
@@ -37,6 +38,7 @@ _HOMES = {
     "Flag": "flags",
     "FrameStatistics": "frames",
     "History": "calibration.history",
+    "LevelExperiment": "experiment.levels",
     "NoiseModel": "noise",
     "ShiftMeasurement": "shifts",
     "Spot": "shifts",
@@ -62,6 +64,7 @@ __all__ = [
     "Flag",
     "FrameStatistics",
     "History",
+    "LevelExperiment",
     "NoiseModel",
     "ShiftMeasurement",
     "Spot",

@@ -85,9 +85,9 @@ class Corrector:
         workers: int | None = None,
     ) -> None:
         self.shape = correction.shape
-        self.dtype = _dtype(dtype)
+        self.dtype = output_dtype(dtype)
         self._saturation: float | None = getattr(correction, "saturation", None)
-        self._largest = _largest(self.dtype, bit_depth)
+        self._largest = largest_value(self.dtype, bit_depth)
         self._workers = positive_workers(workers)
         check_flagged(flagged)
         self._native = native(correction.coefficients, correction.flags, flagged)
@@ -180,7 +180,8 @@ def largest_of(dtype: np.dtype[Any]) -> float:
     return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
 
 
-def _dtype(dtype: DTypeLike) -> np.dtype[Any]:
+def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
+    """Return a type that corrected frames may have, and refuse others."""
     try:
         found = np.dtype(dtype)
     except TypeError as error:
@@ -190,7 +191,7 @@ def _dtype(dtype: DTypeLike) -> np.dtype[Any]:
     return found
 
 
-def _largest(dtype: np.dtype[Any], bit_depth: int | None) -> float:
+def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
     """Return the largest value of whole numbers of so many bits."""
     if bit_depth is None:
         return largest_of(dtype)

@@ -111,11 +111,28 @@ def fit(
     >>> response.correct(500 * gain + 20).round(6)
     array([[520., 520., 520.]])
     """
+    check_order(order, by)
+    with naming_memory("fitting response curves"):
+        given = levels_of(levels, variance=variance, mask=mask, saturation=saturation)
+    return fitted(given, order=order, by=by, workers=workers)
+
+
+def fitted(
+    given: Levels,
+    *,
+    order: Order,
+    by: By,
+    workers: int | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> Response:
+    """Fit response curves to checked levels; `provenance` is added to the metadata.
+
+    The other parameters and the errors are those of `fit`.
+    """
     started = datetime.now(UTC)
     check_order(order, by)
     workers = positive_workers(workers)
     with naming_memory("fitting response curves"):
-        given = levels_of(levels, variance=variance, mask=mask, saturation=saturation)
         options: dict[str, Any] = {"order": order, "by": by}
         if order == "auto":
             chosen, options["prediction_errors"] = chosen_order(given, by, workers=workers)
@@ -130,7 +147,7 @@ def fit(
             "options": options,
             "started": started.isoformat(timespec="seconds"),
         }
-        return _fitted(given, chosen, by, workers, metadata)
+        return _fitted(given, chosen, by, workers, metadata | (provenance or {}))
 
 
 def _fitted(

@@ -171,6 +171,8 @@ def levels_of(
 
 def _saturation_of(levels: object, given: float | None) -> float | None:
     """Return the level of saturation given, or that of averages where all have one."""
+    if isinstance(levels, Averaged):
+        return levels.saturation
     if given is not None or not isinstance(levels, list | tuple):
         return given
     known = {getattr(each, "saturation", None) for each in levels}
