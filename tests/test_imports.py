@@ -43,7 +43,7 @@ LAYERS = (
     {"comparison", "experiment", "loading"},
     {"calibration", "nuc"},
     {"exposures", "plan", "simulate"},
-    {"correction", "defects", "uncertainty"},
+    {"correction", "defects", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
     {"drift", "flags", "maps", "mending"},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import errors, nuc
+from equipix import errors, metrics, nuc
 from equipix.simulate import StaringArray, blackbody
 
 SHAPE = (48, 64)
@@ -28,11 +28,8 @@ def residual(array, order, light=6.5e6, **how):
 
 def ratio(response, array, light, rng):
     """σ_spatial/σ_temporal of corrected frames, with its sign: the source's C."""
-    frames = np.stack(list(array.frames(light, 32, rng=rng))).astype(np.float64)
-    corrected = response.correct(frames)
-    temporal = np.nanmean(np.nanvar(corrected, axis=0, ddof=1))
-    spatial = np.nanvar(corrected.mean(axis=0)) - temporal / len(frames)
-    return np.sign(spatial) * np.sqrt(abs(spatial) / temporal)
+    frames = np.stack(list(array.frames(light, 32, rng=rng)))
+    return metrics.correctability(response.correct(frames)).ratio
 
 
 class TestCauses:

@@ -13,7 +13,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, nuc, plan, simulate, uncertainty
+    from equipix import errors, metrics, nuc, plan, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
@@ -52,7 +52,7 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "nuc", "plan", "simulate", "uncertainty")
+_MODULES = ("errors", "metrics", "nuc", "plan", "simulate", "uncertainty")
 """Public modules."""
 
 __all__ = [
@@ -76,6 +76,7 @@ __all__ = [
     "errors",
     "load",
     "measure_shift",
+    "metrics",
     "nuc",
     "plan",
     "simulate",
