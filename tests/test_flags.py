@@ -34,7 +34,8 @@ def with_findings(**found):
 
 
 def test_every_finding_has_bits_and_all_bits_have_a_finding():
-    of_responses = {"undetermined", "falling"}
+    of_responses = {"undetermined", "falling", "nonlinear", "non_responding", "flickering"}
+    of_responses |= {"out_of_range"}
     assert {*FINDINGS, "contradictory", *of_responses} == set(BITS)
 
 

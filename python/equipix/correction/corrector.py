@@ -47,6 +47,8 @@ class Corrector:
         value, or were not a number.
     frames : int
         Frames corrected so far.
+    replaced : int
+        Pixels that are replaced in each frame.
 
     Raises
     ------
@@ -91,6 +93,8 @@ class Corrector:
         self._workers = positive_workers(workers)
         check_flagged(flagged)
         self._native = native(correction.coefficients, correction.flags, flagged)
+        bad = int(np.count_nonzero(~usable(correction.flags)))
+        self.replaced = bad if flagged == "replace" else 0
         self.clipped = self.frames = 0
 
     def __repr__(self) -> str:

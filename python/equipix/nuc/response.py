@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from equipix.nuc.saved import save_fields
 
 if TYPE_CHECKING:
     from os import PathLike
+    from typing import Self
 
     from numpy.typing import ArrayLike
 
@@ -209,6 +210,32 @@ class Response(ReadOnly):
         offset = self._offset(dark)
         low, high = self.valid_range if offset is None else self.valid_range + offset
         return np.asarray(~((raw >= low) & (raw <= high)))
+
+    def with_flags(self, flags: Array) -> Self:
+        """Return a copy with more flags, such as those of `find_defects`.
+
+        Parameters
+        ----------
+        flags : ndarray, shape (rows, cols), of whole numbers
+            Bits of `equipix.Flag`, combined with those that are there by OR.
+
+        Returns
+        -------
+        Response
+            The copy; these flags survive saving.
+
+        Raises
+        ------
+        InputError
+            If the shape or dtype does not fit.
+        """
+        more = as_array("flags", flags, ndim=2)
+        if more.shape != self.shape or more.dtype.kind not in "iu":
+            raise InputError(
+                f"'flags' is {more.dtype} of shape {more.shape}, expected whole numbers of shape "
+                f"{self.shape}"
+            )
+        return replace(self, flags=self.flags | more.astype(np.uint32))
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.
