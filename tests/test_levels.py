@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, LevelExperiment, cli, errors, io, nuc
+from equipix import Flag, LevelExperiment, cli, errors, io, metrics, nuc
 from equipix.correction.whole import Conversion, picture
 from equipix.simulate import StaringArray
 
@@ -186,6 +186,54 @@ class TestCommands:
         assert not output.exists()
         assert run("nuc", "fit", "--help")[0] == 0
         assert run("nuc")[0] in (0, 2)
+
+
+class TestDefectsAndQuality:
+    @pytest.fixture
+    def saved(self, folder, tmp_path):
+        response = LevelExperiment.load(folder / "levels.toml").run(order=2)
+        response.save(tmp_path / "response.tif")
+        return response, tmp_path / "response.tif"
+
+    def test_defects_are_those_of_the_function(self, run, saved, folder, tmp_path):
+        response, path = saved
+        output = tmp_path / "flagged.npz"
+        options = ("-o", output, "--noise-limit", "1.05", "--json")
+        status, out, _ = run("nuc", "defects", path, folder / "level2.tif", *options)
+        assert status == 0
+        raw = io.read_frames(folder / "level2.tif")
+        wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(noise=1.05))
+        told = json.loads(out)
+        assert {name: told[name] for name in wanted.counts} == wanted.counts
+        assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
+        np.testing.assert_array_equal(equipix.load(output).flags, response.flags | wanted.flags)
+
+    def test_defects_of_curves_alone(self, run, saved):
+        status, out, _ = run("nuc", "defects", saved[1])
+        assert status == 0
+        assert "non responding" in out
+
+    def test_quality_is_that_of_the_functions(self, run, saved, folder):
+        response, path = saved
+        status, out, _ = run("nuc", "quality", path, folder / "level2.tif", "--json")
+        assert status == 0
+        raw, told = io.read_frames(folder / "level2.tif"), json.loads(out)
+        wanted = metrics.correctability(response.correct(raw))
+        assert (told["C"], told["C_from"], told["C_to"]) == pytest.approx(
+            (wanted.ratio, wanted.low, wanted.high)
+        )
+        replaced = response.correct(raw, flagged="replace")
+        noise = metrics.three_d_noise(replaced)
+        assert told["noise_variances"] == pytest.approx(vars(noise))
+        assert told["roughness"] == pytest.approx(metrics.roughness(replaced.mean(axis=0)))
+
+    def test_files_of_another_kind_are_refused(self, run, saved, folder):
+        status, _, err = run("nuc", "quality", saved[1], saved[1])
+        assert (status, "expected raw frames" in err) == (1, True)
+        mean = saved[1].with_name("mean.npz")
+        equipix.average(folder / "level1.tif").save(mean)
+        status, _, err = run("nuc", "defects", mean)
+        assert (status, "holds frame statistics, expected response" in err) == (1, True)
 
 
 @pytest.fixture

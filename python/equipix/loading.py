@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from equipix.calibration.result import Calibration
     from equipix.correction.protocol import Correction
+    from equipix.nuc.response import Response
 
 READERS = {
     "calibration": ("equipix.calibration.reading", "read_calibration"),
@@ -67,6 +68,15 @@ def load_calibration(path: str | PathLike[str]) -> Calibration:
     """
     calibration: Calibration = _load(path, {"calibration": READERS["calibration"]})
     return calibration
+
+
+def load_response(path: str | PathLike[str]) -> Response:
+    """Read a response from the file that `Response.save` wrote, and refuse other corrections.
+
+    The parameters and errors are those of `load`.
+    """
+    response: Response = _load(path, {"response": READERS["response"]})
+    return response
 
 
 def _load(path: str | PathLike[str], readers: Mapping[str, tuple[str, str]]) -> Any:

@@ -20,7 +20,7 @@ COMMANDS = {
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
-    "nuc": ("nuc", "Response curves from levels of a uniform source: nuc fit."),
+    "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
     "simulate": (
         "simulate",
         "Write the images of an experiment with a virtual camera, and its truth.",
