@@ -46,7 +46,7 @@ LAYERS = (
     {"correction", "defects", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
-    {"drift", "flags", "maps", "mending"},
+    {"batches", "drift", "flags", "maps", "mending", "rejection"},
     {"io"},
     {"_check", "_readonly"},
     {"_types"},

@@ -17,7 +17,7 @@ from equipix.errors import InputError
 from equipix.experiment.provenance import sha256_of
 from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
-from equipix.frames import refuse_subtracted
+from equipix.frames import refuse_subtracted, saved_shape
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
@@ -36,6 +36,10 @@ def average(
     ] = None,
     saturation: Saturation = None,
     mask: Mask = None,
+    reject: Annotated[
+        float | None,
+        typer.Option(help="Leave out samples by so many standard deviations: cosmic rays, 5."),
+    ] = None,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
@@ -49,13 +53,21 @@ def average(
     with progress_bars() as progress, naming_mask(mask):
         offset = None
         if dark:
-            offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+            averaged = any(saved_shape(file) for file in offsets)
+            offset = average_frames(
+                dark,
+                saturation=saturation,
+                reject=None if averaged else reject,
+                workers=workers,
+                progress=progress,
+            )
             refuse_subtracted(offset, " ".join(dark))
         frames = average_frames(
             source,
             dark=offset,
             saturation=saturation,
             mask=excluded,
+            reject=reject,
             workers=workers,
             progress=progress,
         )
