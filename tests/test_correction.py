@@ -169,7 +169,9 @@ class TestLoad:
     def test_refuses_what_has_no_kind(self, tmp_path, content):
         path = tmp_path / "other.npz"
         np.savez(path, metadata=np.array(json.dumps(content)), values=np.ones((3, 3)))
-        with pytest.raises(FileError, match="holds .*, expected calibration or response that"):
+        with pytest.raises(
+            FileError, match="holds .*, expected calibration or polynomial or response that"
+        ):
             equipix.load(path)
 
     @pytest.mark.parametrize("suffix", [".tif", ".npz"])

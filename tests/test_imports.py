@@ -43,7 +43,7 @@ LAYERS = (
     {"comparison", "experiment", "loading"},
     {"calibration", "nuc"},
     {"exposures", "plan", "simulate"},
-    {"correction", "defects", "metrics", "uncertainty"},
+    {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
     {"batches", "drift", "flags", "maps", "mending", "rejection"},

@@ -13,13 +13,14 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, metrics, nuc, plan, simulate, uncertainty
+    from equipix import errors, lens, metrics, nuc, plan, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
     from equipix.calibration.result import Calibration
     from equipix.comparison import Comparison, compare
     from equipix.correction.corrector import Corrector
+    from equipix.correction.polynomial import Polynomial, combine
     from equipix.correction.protocol import Correction
     from equipix.experiment.levels import LevelExperiment
     from equipix.experiment.run import Experiment
@@ -40,11 +41,13 @@ _HOMES = {
     "History": "calibration.history",
     "LevelExperiment": "experiment.levels",
     "NoiseModel": "noise",
+    "Polynomial": "correction.polynomial",
     "ShiftMeasurement": "shifts",
     "Spot": "shifts",
     "__version__": "_native",
     "average": "frames",
     "calibrate": "calibration.calibrate",
+    "combine": "correction.polynomial",
     "compare": "comparison",
     "cross_pattern": "shifts",
     "load": "loading",
@@ -52,7 +55,7 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "metrics", "nuc", "plan", "simulate", "uncertainty")
+_MODULES = ("errors", "lens", "metrics", "nuc", "plan", "simulate", "uncertainty")
 """Public modules."""
 
 __all__ = [
@@ -66,14 +69,17 @@ __all__ = [
     "History",
     "LevelExperiment",
     "NoiseModel",
+    "Polynomial",
     "ShiftMeasurement",
     "Spot",
     "__version__",
     "average",
     "calibrate",
+    "combine",
     "compare",
     "cross_pattern",
     "errors",
+    "lens",
     "load",
     "measure_shift",
     "metrics",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 READERS = {
     "calibration": ("equipix.calibration.reading", "read_calibration"),
     "frame statistics": ("equipix.frames", "read_statistics"),
+    "polynomial": ("equipix.correction.polynomial", "read_polynomial"),
     "response": ("equipix.nuc.reading", "read_response"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes
