@@ -1,5 +1,7 @@
 //! Frames corrected by the kernel against the formula written out.
 
+#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
+
 use equipix_core::apply::{Corrected, Corrector, Raw, Unusable};
 use equipix_core::{Control, Shape, Stack, Workers};
 

@@ -318,17 +318,18 @@ class StaringArray:
         offset = self._maps["offset_dn"]
         if time_s is None or not self._maps["drift_dn"].any():
             return offset
-        frequencies = np.geomspace(_SLOWEST_HZ, _FASTEST_HZ, _WAVES)
         drift = np.zeros(self.shape)
-        for frequency, phase in zip(frequencies, self._phases, strict=True):
+        for frequency, phase in zip(*self._waves, strict=True):
             drift += np.cos(2 * np.pi * frequency * time_s + phase)
         return np.asarray(offset + self._maps["drift_dn"] * np.sqrt(2 / _WAVES) * drift)
 
     @cached_property
-    def _phases(self) -> Floats:
-        """Phase of each wave of the drift in each pixel."""
-        rng = np.random.default_rng(self.seed)
-        return rng.uniform(0, 2 * np.pi, (_WAVES, *self.shape))
+    def _waves(self) -> tuple[Floats, Floats]:
+        """Frequencies and phases of the waves of the drift in each pixel."""
+        rng, shape = np.random.default_rng(self.seed), (_WAVES, *self.shape)
+        steps = np.arange(_WAVES)[:, None, None] + rng.random(shape)
+        frequencies = _SLOWEST_HZ * (_FASTEST_HZ / _SLOWEST_HZ) ** (steps / _WAVES)
+        return frequencies, rng.uniform(0, 2 * np.pi, shape)
 
 
 MATERIALS: dict[str, tuple[float, dict[str, tuple[float, float]]]] = {

@@ -167,7 +167,7 @@ struct Abscissa {
     form: Form,
     /// x of each level.
     x: Vec<f64>,
-    /// Row i: what each coefficient in x adds to the coefficient of V̄^i.
+    /// Row i: what the coefficient of x^i adds to the coefficient of each power of V̄.
     to_dn: [Terms; TERMS],
 }
 
@@ -181,7 +181,7 @@ impl Abscissa {
         let centred = form.first() == 0 && form.order() > 0;
         let centre = if centred { 0.5 * (low + high) } else { 0.0 };
         let half = if centred { 0.5 * (high - low) } else { low.abs().max(high.abs()) };
-        if form.order() > 0 && !(half > 0.0) {
+        if form.order() > 0 && half <= 0.0 {
             return Err(Error::value(
                 "levels",
                 format!("all have the mean {low:.6}: take levels that differ"),
@@ -222,7 +222,8 @@ impl Abscissa {
             misfit: normal.misfit(&q),
             used: normal.used,
         };
-        for (power, row) in self.to_dn.iter().enumerate() {
+        for power in 0..TERMS {
+            let row = self.to_dn.map(|powers| powers[power]);
             pixel.coefficients[power] = (0..TERMS).map(|i| row[i] * q[i]).sum();
             pixel.variances[power] = (0..TERMS)
                 .map(|i| (0..TERMS).map(|j| row[i] * covariance[i][j] * row[j]).sum::<f64>())
@@ -351,15 +352,13 @@ fn horner(coefficients: &Terms, x: f64) -> f64 {
     coefficients.iter().rev().fold(0.0, |sum, coefficient| sum * x + coefficient)
 }
 
-/// ((V̄ − centre)/half)^i as powers of V̄: entry [power][i] is binomial(i, power) (−centre)^(i − power)
+/// ((V̄ − centre)/half)^i as powers of V̄: entry [i][power] is binomial(i, power) (−centre)^(i − power)
 /// / half^i.
 fn powers_of_dn(centre: f64, half: f64) -> [Terms; TERMS] {
     let mut table = [[0.0; TERMS]; TERMS];
     let mut row = [1.0, 0.0, 0.0, 0.0];
-    for i in 0..TERMS {
-        for power in 0..TERMS {
-            table[power][i] = row[power];
-        }
+    for entry in &mut table {
+        *entry = row;
         let mut next = [0.0; TERMS];
         for power in 0..TERMS {
             next[power] -= centre / half * row[power];
