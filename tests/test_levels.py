@@ -266,6 +266,19 @@ class TestCorrectedFiles:
         assert wanted > 0
         assert told["limited_values"] == wanted
 
+    def test_large_files_are_read_frame_by_frame(self, corrected, monkeypatch):
+        _, call = corrected
+        whole, _ = call("whole.tif")
+        read = []
+        monkeypatch.setattr(io.images, "_AT_ONCE", 1)
+        stream = io.tiff.stream_frames
+        monkeypatch.setattr(
+            io.tiff, "stream_frames", lambda path: read.append(path) or stream(path)
+        )
+        single, _ = call("single.tif")
+        assert len(read) == 1
+        np.testing.assert_array_equal(io.read_frames(single), io.read_frames(whole))
+
     def test_the_corrector_gives_the_same(self, corrected, folder):
         response, call = corrected
         path, _ = call("out.tif", "--dtype", "uint16", "--flagged", "replace")

@@ -59,7 +59,7 @@ class Corrector:
     -----
     A corrected value is c₀ + y·(c₁ + y·(c₂ + y·c₃)), in float32 by Horner's scheme, each operation
     rounded: the same bytes on every processor. Whole numbers are rounded half to even. A value of
-    16 bits with four coefficients is off by less than 0.02 DN through float32.
+    16 bits with four coefficients is off by less than 0.05 DN through float32.
 
     A pixel is replaced by the mean of the good ones of its eight neighbours; where there are none,
     by that of neighbours replaced before. NaN counts in no mean, so it does not spread.

@@ -22,6 +22,7 @@
 use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::frames::{Real, Stack};
+use crate::memory;
 use crate::parallel::Workers;
 
 /// Most coefficients of a pixel: those of a cubic.
@@ -120,7 +121,7 @@ pub struct ResponseFit {
 ///
 /// # Errors
 /// [`Error::Value`] if there are fewer levels than coefficients, references that are not finite or
-/// do not differ, or noise that is no variance; [`Error::Cancelled`].
+/// do not differ, or noise that is no variance; [`Error::Memory`]; [`Error::Cancelled`].
 pub fn fit<T: Real>(
     levels: &Levels<'_, T>,
     form: Form,
@@ -129,6 +130,9 @@ pub fn fit<T: Real>(
 ) -> Result<ResponseFit> {
     let abscissa = Abscissa::of(levels, form)?;
     let pixels = levels.means.shape().len();
+    memory::check(bytes_needed(pixels, form), || {
+        format!("fitting response curves of {}", levels.means.shape())
+    })?;
     let cols = levels.means.shape().cols;
     let rows = workers.map(levels.means.shape().rows, |row| {
         control.check()?;
@@ -152,6 +156,12 @@ pub fn fit<T: Real>(
         }
     }
     Ok(found)
+}
+
+/// Bytes of the polynomials, row by row, and of the planes that they are copied to.
+fn bytes_needed(pixels: usize, form: Form) -> u64 {
+    let planes = (2 * (form.order() + 1) + 1) * size_of::<f64>() + size_of::<u32>();
+    pixels as u64 * (size_of::<Polynomial>() + planes) as u64
 }
 
 /// The polynomial of one pixel.
