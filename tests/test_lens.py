@@ -177,6 +177,12 @@ class TestCombine:
         response = nuc.fit(self.levels(), order=2)
         with pytest.raises(errors.InputError, match="'then' has order 3"):
             equipix.combine(response, response)
+        line = response.coefficients[:2]
+        one, other = (
+            equipix.Polynomial(line, response.flags, {"sensor": {"name": name}}) for name in "AB"
+        )
+        with pytest.raises(errors.InputError, match="of the sensor 'A', 'then' of 'B'"):
+            equipix.combine(one, other)
         small = equipix.Polynomial(np.ones((2, 3, 4)), np.zeros((3, 4), np.uint32))
         with pytest.raises(errors.InputError, match="'first' is of shape"):
             equipix.combine(response, small)

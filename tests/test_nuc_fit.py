@@ -392,6 +392,9 @@ class TestRefusals:
         [
             ({"order": 4}, "'order' is 4"),
             ({"order": True}, "'order' is True"),
+            ({"order": 1.0}, "'order' is 1.0"),
+            ({"order": "two"}, "'order' is 'two'"),
+            ({"mask": np.ones(SHAPE, bool)}, r"'levels': 0.0% .* no value in 100.0%"),
             ({"by": "both"}, "'by' is 'both'"),
             ({"order": 2, "by": "gain"}, "order 2 corrects offset and gain"),
             ({"mask": np.zeros((2, 2), bool)}, "'mask' has shape"),
@@ -405,6 +408,13 @@ class TestRefusals:
     def test_wrong_arguments(self, levels, given, message):
         with pytest.raises(errors.InputError, match=message):
             nuc.fit(levels, **given)
+
+    def test_a_level_without_a_value(self, levels):
+        levels[3] = np.nan
+        with pytest.raises(errors.InputError, match="Level 3 has no value in 100.0%"):
+            nuc.fit(levels)
+        with pytest.raises(errors.InputError, match=r"'levels' has shape \(0,\)"):
+            nuc.fit([])
 
     def test_levels_of_other_shapes(self, levels):
         averages = [equipix.average(np.stack([each, each + 1])) for each in levels]

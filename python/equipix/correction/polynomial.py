@@ -146,7 +146,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     Raises
     ------
     InputError
-        If the sensors differ in shape, or `then` is of an order above 1.
+        If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
+        order above 1.
 
     Examples
     --------
@@ -160,6 +161,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     """
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
+    one, other = _sensor(first), _sensor(then)
+    if one and other and one != other:
+        raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
     after = np.asarray(then.coefficients, np.float64)
     if len(after) > 2:
         raise InputError(
@@ -171,3 +175,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     coefficients[0] += after[0]
     metadata = {"first": first.metadata, "then": then.metadata}
     return Polynomial(coefficients, first.flags | then.flags, metadata)
+
+
+def _sensor(correction: Correction) -> str:
+    """Return the name of the sensor in the metadata, if there is one."""
+    sensor = correction.metadata.get("sensor")
+    return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""

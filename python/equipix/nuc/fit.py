@@ -137,7 +137,7 @@ def fitted(
         if order == "auto":
             chosen, options["prediction_errors"] = chosen_order(given, by, workers=workers)
         else:
-            chosen = order
+            chosen = int(order)
         check_count(given, chosen)
         if chosen == 0 and by == "gain":
             check_gain(given)

@@ -231,7 +231,7 @@ def _with_odd_responses(
     values: Array, noise: tuple[LevelNoise, ...] | None, findings: Findings
 ) -> Findings:
     """Add pixels that rise by less than half, or more than twice, as much as their neighbours."""
-    if len(values) < 2:
+    if len(values) < 2 or not np.isfinite(values).any(axis=(1, 2)).all():
         return findings
     means = [float(np.nanmedian(each)) for each in values]
     low, high = int(np.argmin(means)), int(np.argmax(means))

@@ -33,7 +33,8 @@ def form_of(order: int, by: By) -> str:
 
 def check_order(order: object, by: object) -> None:
     """Refuse an unknown order, an unknown `by`, and a `by` that an order does not have."""
-    if isinstance(order, bool) or order not in get_args(Order):
+    whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
+    if not (whole or order == "auto") or order not in get_args(Order):
         raise InputError(f"'order' is {order!r}, expected one of {get_args(Order)}")
     if by not in get_args(By):
         raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
