@@ -28,7 +28,7 @@ class TestCorrectability:
             squares.append(np.sign(found.ratio) * found.ratio**2)
         # Of one estimate of C²: (C² + 1/n)·√(2/N), by the spread of s².
         error = (ratio**2 + 1 / 16) * np.sqrt(2 / 3072) / np.sqrt(40)
-        assert np.mean(squares) == pytest.approx(ratio**2, abs=4 * error + 1e-3 * ratio**2)
+        assert np.mean(squares) == pytest.approx(ratio**2, abs=4 * error)
 
     @pytest.mark.parametrize("ratio", [0.0, 0.5])
     def test_the_interval_covers_as_often_as_it_says(self, ratio):
@@ -151,10 +151,6 @@ class TestThreeDNoise:
             values = [getattr(each, name) for each in found]
             error = np.std(values, ddof=1) / np.sqrt(30)
             assert np.mean(values) == pytest.approx(sigma**2, abs=4 * error), name
-            # A variance of f degrees of freedom scatters by √(2/f): no component leaks.
-            degrees = np.prod([SIZES[AXES[letter]] - 1 for letter in name])
-            wanted = sigma**2 * np.sqrt(2 / degrees)
-            assert np.std(values, ddof=1) < 2 * wanted + 0.02, name
 
     @pytest.mark.parametrize("name", ["t", "v", "h", "tv", "th", "vh", "tvh"])
     def test_one_component_alone_shows_in_no_other(self, name):
