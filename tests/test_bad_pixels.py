@@ -70,6 +70,13 @@ class TestKinds:
         assert found.counts["dead"] == 2
         assert found.counts["non_responding"] == 1
 
+    def test_a_sample_without_a_value_hides_no_bad_pixel(self, array, response):
+        stack = frames(array, 8e6, 100, 99).astype(float)
+        stack[0, 0, 0] = np.nan
+        found = nuc.find_defects(response, stack)
+        assert NOISY in places(found.flags, Flag.HOT)
+        assert places(found.flags, Flag.TELEGRAPH) == {FLICKER}
+
     def test_averages_show_noise_but_no_flicker(self, array, response):
         average = equipix.average(frames(array, 8e6, 100, 99))
         found = nuc.find_defects(response, average)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,14 @@ class TestAgainstNumPy:
         raw = np.tile(frames(count=1), (1, 30, 24))
         one, three = (Corrector(large, workers=each).apply(raw) for each in (1, 3))
         assert one.tobytes() == three.tobytes()
+
+    def test_counts_of_several_threads_add_up(self):
+        corrector = Corrector(Given(np.stack([np.full(SHAPE, -1.0), np.zeros(SHAPE)])), "uint16")
+        raw = frames(count=40)
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda _: corrector.apply(raw), range(100)))
+        assert corrector.frames == 100 * len(raw)
+        assert corrector.clipped == 100 * raw.size
 
 
 class TestNotANumber:

@@ -146,19 +146,38 @@ class TestCombine:
         wanted = falloff.correct(response.correct(frame))
         np.testing.assert_allclose(both.correct(frame), wanted, rtol=1e-12)
 
-    def test_response_curves_then_a_shift_calibration(self):
-        truth = simulate.cosine_sensitivity((48, 64), rng=2)
-        shifts = equipix.cross_pattern(5, 7)
-        beam = simulate.gaussian_beam((48, 64), width=100, amplitude=1000)
-        cal = equipix.calibrate(simulate.exposures(truth, beam, shifts), shifts)
-        bent = truth * 0.5 + 1
-        response = nuc.fit([level * bent + 20 for level in (100.0, 900.0)], order=1)
+    def test_a_shift_calibration_repairs_curves_of_an_uneven_source(self):
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.cosine_sensitivity(shape, rng=2)
+        uneven = simulate.gaussian_beam(shape, width=60)(*np.indices(shape))
+        response = nuc.fit([level * truth * uneven + 20 for level in (100.0, 900.0)], order=1)
+        beam = simulate.gaussian_beam(shape, width=100, amplitude=1000)
+        raw = simulate.exposures(truth, beam, shifts) + 20
+        raw += 0.02 * np.random.default_rng(3).standard_normal(raw.shape)
+        cal = equipix.calibrate(response.correct(raw), shifts)
         both = equipix.combine(response, cal)
-        frame = 500 * bent + 20
-        np.testing.assert_allclose(
-            both.correct(frame), cal.correct(response.correct(frame), dark=None), rtol=1e-12
-        )
+        flat = 500 * truth + 20
+        spread = [c.std() / c.mean() for c in (response.correct(flat), both.correct(flat))]
+        assert spread[0] > 0.01
+        # Noise of 2e-5, where curves have little light up to 1e-4; tilts ten times that.
+        assert spread[1] < 1e-3
         assert set(both.metadata) == {"first", "then"}
+
+    def test_a_dark_is_not_subtracted_twice(self):
+        shifts = equipix.cross_pattern(5, 7)
+        beam = simulate.gaussian_beam(SHAPE, width=100, amplitude=1000)
+        frames = simulate.exposures(np.ones(SHAPE), beam, shifts) + 60
+        rng = np.random.default_rng(4)
+        noise = rng.standard_normal((6, 2, *SHAPE))
+        dark = equipix.average(list(60 + noise[0]))
+        averages = [
+            equipix.average(list(y + of_y), dark=dark)
+            for y, of_y in zip(frames, noise[1:], strict=True)
+        ]
+        cal = equipix.calibrate(averages, shifts)
+        response = nuc.fit(self.levels(), order=2)
+        with pytest.raises(errors.InputError, match="'then' subtracts a dark frame of 60"):
+            equipix.combine(response, cal)
 
     def test_flags_add_up_and_files_keep_it(self, tmp_path):
         response = nuc.fit(self.levels(), order=2)

@@ -283,6 +283,13 @@ class TestFrames:
         assert np.median(metrics.netd(cold, drifting, 5.0)) == pytest.approx(0.1, rel=0.01)
         assert (metrics.netd(cold, cold, 5.0) == np.inf).all()
 
+    def test_a_value_that_is_none_stays_in_its_pixel(self):
+        rng = np.random.default_rng(14)
+        cold, hot = (level + 2 * rng.standard_normal((16, *SHAPE)) for level in (1000, 1100))
+        cold[3, 5, 6] = np.nan
+        found = metrics.netd(cold, hot, delta_t=5.0)
+        assert np.argwhere(~np.isfinite(found)).tolist() == [[5, 6]]
+
     def test_netd_refusals(self):
         cold = np.random.default_rng(1).random((3, 4, 5))
         with pytest.raises(errors.InputError, match="'delta_t' is 0"):

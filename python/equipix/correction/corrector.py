@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -96,6 +97,7 @@ class Corrector:
         bad = int(np.count_nonzero(~usable(correction.flags)))
         self.replaced = bad if flagged == "replace" else 0
         self.clipped = self.frames = 0
+        self._counting = threading.Lock()
 
     def __repr__(self) -> str:
         """Short form: sizes and types."""
@@ -132,8 +134,10 @@ class Corrector:
             )
         check_depth(raw.dtype, self._saturation)
         result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
-        self.clipped += run(self._native, raw, result, self._largest, self._workers)
-        self.frames += 1 if raw.ndim == 2 else len(raw)
+        clipped = run(self._native, raw, result, self._largest, self._workers)
+        with self._counting:
+            self.clipped += clipped
+            self.frames += 1 if raw.ndim == 2 else len(raw)
         return result
 
     def _checked(self, out: Array, raw: Array) -> Array:

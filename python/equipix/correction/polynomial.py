@@ -136,7 +136,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     first : Correction
         Applied to raw frames: such as response curves, or a lens fall-off.
     then : Correction
-        Applied to the result: offset and gain, such as a shift calibration without a dark.
+        Applied to the result, so measured on frames that `first` has corrected: offset and gain,
+        such as a lens fall-off, or a shift calibration of corrected exposures. One of raw exposures
+        holds the gain that `first` takes away already, which would be taken away twice.
 
     Returns
     -------
@@ -147,7 +149,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     ------
     InputError
         If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
-        order above 1.
+        order above 1 or subtracts a dark frame.
 
     Examples
     --------
@@ -164,6 +166,12 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     one, other = _sensor(first), _sensor(then)
     if one and other and one != other:
         raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
+    dark = getattr(then, "dark", None)
+    if dark is not None:
+        raise InputError(
+            f"'then' subtracts a dark frame of {np.nanmean(dark):.4g} DN in the mean, which frames "
+            "that 'first' has corrected do not hold: expected a correction without one"
+        )
     after = np.asarray(then.coefficients, np.float64)
     if len(after) > 2:
         raise InputError(

@@ -30,8 +30,9 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     -------
     ndarray, shape (rows, cols), float64
         ΔT·σ/ΔV in kelvin: σ is the temporal noise of one frame, rms of the two levels, with the
-        drift of the frame mean removed. Infinite for a pixel that does not respond; usual figures
-        are the median or the mean over good pixels.
+        drift of the frame mean removed, over pixels that have a value in all frames. NaN for a pixel
+        that has not, infinite for one that does not respond; usual figures are the median or the
+        mean over good pixels.
 
     Raises
     ------
@@ -54,8 +55,10 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
         raise InputError(f"'hot' has shape {high.shape}, expected frames of {low.shape[1:]}")
     variances = []
     for stack in (low, high):
-        drift = stack.mean(axis=(1, 2), keepdims=True) - stack.mean()
-        variances.append((stack - drift).var(axis=0, ddof=1))
+        # A bad pixel, which corrected frames hold as NaN, has no part in the drift of the others.
+        known = np.isfinite(stack).all(axis=0)
+        means = np.mean(stack, axis=(1, 2), keepdims=True, where=known)
+        variances.append((stack - (means - means.mean())).var(axis=0, ddof=1))
     rise = np.abs(high.mean(axis=0) - low.mean(axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(delta_t * np.sqrt((variances[0] + variances[1]) / 2) / rise)

@@ -198,6 +198,7 @@ def _of_frames(
     else:
         stack = stack_of("frames", frames)
         _check_shape(stack.shape[1:], shape)
+        good = good & np.isfinite(stack).all(axis=0)
         stack -= np.mean(stack, axis=(1, 2), keepdims=True, where=good)
         variance, count = stack.var(axis=0, ddof=1), len(stack)
         slow = _von_neumann(stack) < -limits.correlation
