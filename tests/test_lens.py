@@ -153,14 +153,14 @@ class TestCombine:
         response = nuc.fit([level * truth * uneven + 20 for level in (100.0, 900.0)], order=1)
         beam = simulate.gaussian_beam(shape, width=100, amplitude=1000)
         raw = simulate.exposures(truth, beam, shifts) + 20
-        raw += 0.02 * np.random.default_rng(3).standard_normal(raw.shape)
+        raw += 0.1 * np.random.default_rng(3).standard_normal(raw.shape)
         cal = equipix.calibrate(response.correct(raw), shifts)
         both = equipix.combine(response, cal)
         flat = 500 * truth + 20
         spread = [c.std() / c.mean() for c in (response.correct(flat), both.correct(flat))]
-        assert spread[0] > 0.01
-        # Noise of 2e-5, where curves have little light up to 1e-4; tilts ten times that.
-        assert spread[1] < 1e-3
+        assert spread[0] > 0.05
+        # Noise of 1e-4 is up to 1e-3 where the source was faint, and so is the tilt that it leaves.
+        assert spread[1] < 5e-3
         assert set(both.metadata) == {"first", "then"}
 
     def test_a_dark_is_not_subtracted_twice(self):

@@ -30,9 +30,9 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     -------
     ndarray, shape (rows, cols), float64
         ΔT·σ/ΔV in kelvin: σ is the temporal noise of one frame, rms of the two levels, with the
-        drift of the frame mean removed, over pixels that have a value in all frames. NaN for a pixel
-        that has not, infinite for one that does not respond; usual figures are the median or the
-        mean over good pixels.
+        drift of the frame mean removed, over pixels that have a value in all frames. NaN for a
+        pixel that has not, infinite for one that does not respond; usual figures are the median or
+        the mean over good pixels.
 
     Raises
     ------
