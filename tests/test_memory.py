@@ -52,11 +52,36 @@ class TestArraysThatNoMachineHolds:
         with pytest.raises(InsufficientMemoryError, match=r"calibrating: .* PiB"):
             equipix.calibrate(np.ones((5, 8, 9)), CROSS, variance=variance)
 
+    def test_response_curves(self):
+        levels = np.broadcast_to(np.uint8(1), (2, 2**20, 2**29))
+        with pytest.raises(InsufficientMemoryError, match=r"fitting response curves: .* PiB"):
+            equipix.nuc.fit(levels)
+
     @pytest.mark.parametrize("shape", [(2, 2**25, 2**25), (2, 2**31, 2**29)])
     def test_average(self, shape):
         words = r"averaging frames of .* needs .* \(\d{17,} bytes\) .* are available: "
         with pytest.raises(InsufficientMemoryError, match=words):
             equipix.average(np.broadcast_to(np.uint8(1), shape))
+
+
+RESPONSE = """
+import numpy as np, equipix
+from equipix.nuc.levels import levels_of
+levels = levels_of(np.random.default_rng(0).uniform(1, 2, (2, 1500, 1500)) * [[[1]], [[9]]])
+levels.fit("line", workers=1)
+limit(200 * 10**6)
+try:
+    levels.fit("line", workers=1)
+except equipix.errors.InsufficientMemoryError as error:
+    print(error)
+"""
+
+
+def test_response_curves_count_their_bytes():
+    said = run(RESPONSE)
+    assert "fitting response curves of (1500, 1500) needs" in said.stdout
+    # 80 bytes for the polynomial of a pixel, 44 for its planes, and 64 MiB for the allocator.
+    assert f"({124 * 1500**2 + 2**26} bytes)" in said.stdout, said.stdout + said.stderr
 
 
 CHILDREN = f"""

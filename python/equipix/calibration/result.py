@@ -341,7 +341,7 @@ class Calibration(ReadOnly):
             The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
         out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64.
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
 
         Returns
         -------

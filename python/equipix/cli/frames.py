@@ -7,21 +7,23 @@ from typing import Annotated
 
 import typer
 
-from equipix._types import Flagged
+from equipix._types import Display, Flagged, OutputType
 from equipix.cli.options import Force, Json, Mask, Saturation, Workers, naming_mask
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
-from equipix.correction.files import correct_files, is_folder
+from equipix.correction.files import correct_files, is_folder, is_picture
+from equipix.correction.whole import Conversion
 from equipix.errors import InputError
+from equipix.experiment.provenance import sha256_of
 from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
-from equipix.frames import refuse_subtracted
+from equipix.frames import refuse_subtracted, saved_shape
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
 commands = typer.Typer()
 
-_OTHER_FORMATS = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
+_OTHER_FORMATS = (".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
 """Formats of images that `correct` does not write."""
 
 
@@ -34,6 +36,10 @@ def average(
     ] = None,
     saturation: Saturation = None,
     mask: Mask = None,
+    reject: Annotated[
+        float | None,
+        typer.Option(help="Leave out samples by so many standard deviations: cosmic rays, 5."),
+    ] = None,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
@@ -47,13 +53,21 @@ def average(
     with progress_bars() as progress, naming_mask(mask):
         offset = None
         if dark:
-            offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+            averaged = any(saved_shape(file) for file in offsets)
+            offset = average_frames(
+                dark,
+                saturation=saturation,
+                reject=None if averaged else reject,
+                workers=workers,
+                progress=progress,
+            )
             refuse_subtracted(offset, " ".join(dark))
         frames = average_frames(
             source,
             dark=offset,
             saturation=saturation,
             mask=excluded,
+            reject=reject,
             workers=workers,
             progress=progress,
         )
@@ -64,33 +78,61 @@ def average(
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
 def correct(
-    calibration: Annotated[Path, typer.Argument(help="A calibration: .tif or .npz.")],
+    correction: Annotated[Path, typer.Argument(help="A calibration or a response: .tif or .npz.")],
     frames: Annotated[list[str], typer.Argument(help="Image files or globs.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="A .tif of all frames, or a folder of files.")
+        Path,
+        typer.Option(
+            "--output", "-o", help="A .tif of all frames, a .png of one, or a folder of files."
+        ),
     ],
     dark: Annotated[
         str, typer.Option(help="'stored', 'none', or a file: dark frames or their average.")
     ] = "stored",
-    flagged: Annotated[Flagged, typer.Option(help="What flagged pixels become.")] = "nan",
+    flagged: Annotated[
+        Flagged, typer.Option(help="What flagged pixels become; 'nan' is 0 in whole numbers.")
+    ] = "nan",
+    dtype: Annotated[
+        OutputType | None,
+        typer.Option(
+            help="Type of the result: whole numbers are rounded half to even, and values that had "
+            "to be limited are counted. float32 unless given; uint16 for a .png."
+        ),
+    ] = None,
+    bit_depth: Annotated[
+        int | None, typer.Option(help="Significant bits of whole numbers, 8 to 16.")
+    ] = None,
+    display: Annotated[
+        Display | None,
+        typer.Option(
+            help="8-bit pictures: 'linear' between the percentiles 0.5 and 99.5 of each frame, or "
+            "by its 'histogram' with a plateau of 4 times the mean of its bins."
+        ),
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Divide frames by the sensitivity, their dark level subtracted."""
+    """Correct frames by a calibration or by response curves."""
     _refuse_image(output)
     check_output(output, force=force, folder=is_folder(output))
-    refuse_inputs([output], [calibration])
+    refuse_inputs([output], [correction])
+    usual: OutputType = "uint16" if is_picture(output) else "float32"
+    chosen = dtype or ("uint8" if display else usual)
     with progress_bars() as progress:
         done = correct_files(
-            load(calibration),
+            load(correction),
             frames,
             output,
             dark=dark,
             flagged=flagged,
+            conversion=Conversion(chosen, bit_depth=bit_depth, display=display),
+            origin=f"correction sha256 {sha256_of([correction])[correction]}",
             force=force,
             progress=progress,
         )
-    show_result({"output": str(output), "frames": done}, as_json=as_json)
+    result = {"output": str(output), "frames": done.frames, "dtype": chosen}
+    limited = {} if chosen == "float32" or display else {"limited_values": done.clipped}
+    show_result(result | limited, as_json=as_json)
 
 
 def _refuse_image(output: Path) -> None:
@@ -98,5 +140,5 @@ def _refuse_image(output: Path) -> None:
     if output.suffix.lower() in _OTHER_FORMATS and not output.is_dir():
         raise InputError(
             f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif: name "
-            "a .tif file, or a folder for a .tif of each input"
+            "a .tif file, a .png, or a folder for a .tif of each input"
         )

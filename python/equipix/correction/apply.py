@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix._check import as_array
-from equipix._types import Flagged
+from equipix.correction.corrector import FAST, check_flagged, largest_of, native, run
 from equipix.errors import InputError
-from equipix.flags import Flag
+from equipix.flags import usable
 from equipix.frames import FrameStatistics, refuse_subtracted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix._types import Flagged
 
 
 def apply(
@@ -52,14 +54,10 @@ def apply(
     InputError
         If a shape does not fit, or `flagged` is unknown.
     """
-    raw = as_array("frames", frames, ndim=(2, 3))
-    if raw.shape[-2:] != flags.shape:
-        raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
-    if flagged not in get_args(Flagged):
-        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
+    raw = _checked(frames, flags, flagged)
     dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
     result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
-    bad = (flags & Flag.DO_NOT_USE) != 0
+    bad = ~usable(flags)
     for source, target in zip(_each(raw), _each(result), strict=True):
         formula(source, target)
         if flagged == "nan":
@@ -67,6 +65,35 @@ def apply(
         elif flagged == "replace":
             replace_bad(target, bad)
     return result
+
+
+def apply_polynomial(
+    frames: ArrayLike,
+    coefficients: NDArray[Any],
+    *,
+    flags: NDArray[Any],
+    flagged: Flagged,
+    out: NDArray[Any] | None,
+) -> NDArray[Any]:
+    """Σ c_j y^j of each value y by Horner's scheme, and the values of flagged pixels.
+
+    Frames of 8 or 16 bits and float32 are corrected in float32 by the compiled part; `out` may
+    then be of whole numbers, which are rounded half to even and limited to the range of the type.
+    Others are corrected in float64. The other parameters are those of `apply`.
+    """
+    fast = _fast(frames, coefficients, flags=flags, flagged=flagged, out=out)
+    if fast is not None:
+        return fast
+
+    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
+        total = np.zeros(frame.shape)
+        with np.errstate(invalid="ignore"):  # a dead pixel has infinite coefficients
+            for coefficient in coefficients[::-1]:
+                total *= frame
+                total += coefficient
+        corrected[...] = total
+
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
 
 
 def apply_gain(
@@ -78,36 +105,82 @@ def apply_gain(
     flagged: Flagged,
     out: NDArray[Any] | None,
 ) -> NDArray[Any]:
-    """(frame − dark) / gain, frame by frame, and the values of flagged pixels.
+    """(frame − dark) / gain of each value, and the values of flagged pixels.
 
-    The parameters are those of `equipix.Calibration.correct`.
+    The parameters are those of `equipix.Calibration.correct`; frames and results of some types go
+    to the compiled part, as in `apply_polynomial`.
     """
-    if isinstance(dark, FrameStatistics):
-        refuse_subtracted(dark)
-        dark = dark.mean
-    offset = np.zeros((), np.float32) if dark is None else as_array("dark", dark, ndim=2)
-    if dark is not None and offset.shape != gain.shape:
-        raise InputError(f"'dark' has shape {offset.shape}, the sensor {gain.shape}")
+    offset = np.zeros((), np.float32) if dark is None else dark_frame(dark, gain.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
+        coefficients = np.stack([-offset / gain, 1 / gain])
+    fast = _fast(frames, coefficients, flags=flags, flagged=flagged, out=out)
+    if fast is not None:
+        return fast
 
     def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
         np.subtract(frame, offset, out=corrected, dtype=corrected.dtype, casting="same_kind")
-        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
+        with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(corrected, gain, out=corrected, casting="same_kind")
 
     return apply(frames, formula, flags=flags, flagged=flagged, out=out)
+
+
+def _fast(
+    frames: ArrayLike,
+    coefficients: NDArray[Any],
+    *,
+    flags: NDArray[Any],
+    flagged: Flagged,
+    out: NDArray[Any] | None,
+) -> NDArray[Any] | None:
+    """Correct frames by the compiled part; None where it does not take their types."""
+    raw = _checked(frames, flags, flagged)
+    if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
+        return None
+    result = np.empty(raw.shape, np.float32) if out is None else out
+    run(native(coefficients, flags, flagged), raw, result, largest_of(result.dtype), None)
+    return result
+
+
+def _is_plain(out: NDArray[Any], raw: NDArray[Any]) -> bool:
+    """Whether the compiled part can write to an array."""
+    fits = isinstance(out, np.ndarray) and out.dtype in FAST and out.shape == raw.shape
+    free = fits and out.flags.c_contiguous and out.flags.writeable
+    return bool(free and not np.may_share_memory(out, raw))
+
+
+def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArray[Any]:
+    """Refuse frames of another shape than the sensor, and unknown treatments."""
+    raw = as_array("frames", frames, ndim=(2, 3))
+    if raw.shape[-2:] != flags.shape:
+        raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
+    check_flagged(flagged)
+    return raw
+
+
+def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Check a dark frame that is to be subtracted; of averages it is the mean."""
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
+        dark = dark.mean
+    offset = as_array("dark", dark, ndim=2)
+    if offset.shape != shape:
+        raise InputError(f"'dark' has shape {offset.shape}, the sensor {shape}")
+    return offset
 
 
 def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> None:
     """Put the mean of the nearest good pixels in place of each bad one.
 
     The good ones of the eight neighbours count; where there are none, those that were filled in
-    the round before. An image without any good pixel becomes NaN.
+    the round before. A value that is NaN counts in no mean. An image without any good pixel
+    becomes NaN.
     """
     rows, cols = image.shape
     good = np.zeros((rows + 2, cols + 2), bool)
-    good[1:-1, 1:-1] = ~bad
+    good[1:-1, 1:-1] = ~bad & ~np.isnan(image)
     values = np.zeros(good.shape)
-    values[1:-1, 1:-1] = np.where(bad, 0, image)
+    values[1:-1, 1:-1] = np.where(good[1:-1, 1:-1], image, 0)
     todo = np.argwhere(bad) + 1
     around = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
     while len(todo):

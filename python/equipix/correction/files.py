@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from equipix._types import Flagged, Progress
+from equipix.correction.whole import Conversion
 from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
 from equipix.frames import average, refuse_subtracted
 from equipix.io import (
@@ -19,6 +20,7 @@ from equipix.io import (
     refuse_saved,
     stream_frames,
     write_frames,
+    write_png,
     write_whole,
 )
 
@@ -33,7 +35,15 @@ if TYPE_CHECKING:
 
 
 _MARK = "corrected by equipix"
-"""Description of what `correct_files` writes, so that a second correction is detected."""
+"""Beginning of the description of what `correct_files` writes, so that a second correction is
+detected."""
+
+
+class Done(NamedTuple):
+    """What was written."""
+
+    frames: int
+    clipped: int
 
 
 def correct_files(
@@ -43,9 +53,11 @@ def correct_files(
     *,
     dark: str = "stored",
     flagged: Flagged = "nan",
+    conversion: Conversion | None = None,
+    origin: str = "",
     force: bool = False,
     progress: Progress | None = None,
-) -> int:
+) -> Done:
     """Correct the frames of files, a few at a time.
 
     Parameters
@@ -55,13 +67,17 @@ def correct_files(
     source : list of str
         Image files or globs.
     output : Path
-        A name that ends in .tif: one file of all frames. Another: a folder to make, with a TIFF
-        for each input file.
+        A name that ends in .tif: one file of all frames; in .png: the only frame, as whole numbers.
+        Another: a folder to make, with a TIFF for each input file.
     dark : str
         "stored", "none", a file or glob of dark frames, or one of their saved statistics. Only a
         correction that subtracts a dark frame takes another than "stored".
     flagged : {"nan", "keep", "replace"}
-        What becomes of flagged pixels.
+        What becomes of flagged pixels; NaN is 0 in whole numbers.
+    conversion : Conversion, optional
+        Type of the output; float32 unless given.
+    origin : str
+        ASCII text that names the correction, such as its hash: it is stored in each file.
     force : bool
         Whether an existing file may be replaced; of a folder, the files of the same names.
     progress : callable, optional
@@ -69,8 +85,8 @@ def correct_files(
 
     Returns
     -------
-    int
-        Number of frames.
+    Done
+        Number of frames, and of values that had to be limited to the range of whole numbers.
 
     Raises
     ------
@@ -78,17 +94,20 @@ def correct_files(
         If a file cannot be read or written, two outputs would have the same name, or one would
         replace an input.
     InputError
-        If the frames have another shape than the correction, or it takes no other dark frame.
+        If the frames have another shape than the correction, it takes no other dark frame, or more
+        than one frame would go to a .png, or floating-point numbers.
 
     Warns
     -----
     AlreadyCorrectedWarning
         If files were written by this function.
     """
+    conversion = conversion or Conversion(display=None)
     files = find_files(source)
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
     counts = {file: _count(file, correction) for file in files}
+    _refuse_pictures(output, sum(counts.values()), conversion)
     _warn_of_corrected(files)
     correct = _with_dark(correction, dark)
     total, done = sum(counts.values()), 0
@@ -96,29 +115,57 @@ def correct_files(
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
         nonlocal done
         for _, frames in stream_frames(inputs):
-            yield from correct(frames, flagged=flagged)
+            yield from map(conversion.of, correct(frames, flagged=flagged))
             done += len(frames)
             if progress is not None:
                 progress(done, total, "correcting")
 
-    frame_bytes = 4 * correction.shape[0] * correction.shape[1]
+    frame_bytes = conversion.dtype.itemsize * correction.shape[0] * correction.shape[1]
+    mark = f"{_MARK}{origin and f', {origin}'}"
     if not is_folder(output):
         with write_whole(output, force=force) as temporary:
-            write_frames(temporary, corrected(files), nbytes=total * frame_bytes, description=_MARK)
-        return total
+            _write(temporary, corrected(files), nbytes=total * frame_bytes, mark=mark)
+        return Done(total, conversion.clipped)
     with folder_beside(output) as folder:
         for file, path in zip(files, outputs, strict=True):
             nbytes = counts[file] * frame_bytes
-            write_frames(folder / path.name, corrected([file]), nbytes=nbytes, description=_MARK)
+            _write(folder / path.name, corrected([file]), nbytes=nbytes, mark=mark)
         output.mkdir(exist_ok=True)
         for path in outputs:
             (folder / path.name).replace(path)
-    return total
+    return Done(total, conversion.clipped)
+
+
+def _write(path: Path, frames: Iterator[NDArray[Any]], *, nbytes: int, mark: str) -> None:
+    """Write frames to a TIFF, or the only one to a PNG."""
+    if is_picture(path):
+        for frame in frames:
+            write_png(path, frame, description=mark)
+    else:
+        write_frames(path, frames, nbytes=nbytes, description=mark)
+
+
+def is_picture(output: Path) -> bool:
+    """Whether an output is a PNG, by its name."""
+    return output.suffix.lower() == ".png"
+
+
+def _refuse_pictures(output: Path, total: int, conversion: Conversion) -> None:
+    """Refuse several frames, or floating-point numbers, in a PNG."""
+    if not is_picture(output):
+        return
+    if total != 1:
+        raise InputError(
+            f"'{output}' holds one frame, but {total} are to be corrected: name a .tif of all, or "
+            "a folder"
+        )
+    if conversion.dtype.kind != "u":
+        raise InputError(f"'{output}' holds whole numbers: expected 'dtype' uint8 or uint16")
 
 
 def is_folder(output: Path) -> bool:
     """Whether an output is a folder of files, by its name."""
-    return output.suffix.lower() not in (".tif", ".tiff")
+    return output.suffix.lower() not in (".tif", ".tiff", ".png")
 
 
 def _outputs(output: Path, files: list[Path]) -> list[Path]:
@@ -132,9 +179,9 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
 
 
 def _warn_of_corrected(files: list[Path]) -> None:
-    """Warn of files that this module has written: cameras write no floating-point numbers."""
-    floats = [file for file in files if frame_format(file)[1].kind == "f"]
-    if corrected := [file for file in floats if description(file) == _MARK]:
+    """Warn of files that this module has written."""
+    tiffs = [file for file in files if file.suffix.lower() in (".tif", ".tiff")]
+    if corrected := [file for file in tiffs if description(file).startswith(_MARK)]:
         others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
         warn(
             f"{corrected[0]}{others}: corrected already; a second correction divides by the "

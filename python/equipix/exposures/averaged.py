@@ -52,6 +52,8 @@ class Averaged:
         Whether no dark was subtracted from averages of whole numbers.
     dark : FrameStatistics or None
         The dark frames that were subtracted.
+    pedestal : float
+        Value from which noise models count the signal, in DN: 0 unless `count_from_lowest` sets it.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Averaged:
         self.count, self.gain, self.saturation = count, gain, saturation
         self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
+        self.pedestal = 0.0
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
         self._of_dark: list[float] = []
@@ -125,10 +128,17 @@ class Averaged:
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
+    def count_from_lowest(self) -> None:
+        """Let noise models count the signal from the lowest of several exposures.
+
+        Raw values contain the level without light, which adds no photon noise.
+        """
+        self.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+
     @cached_property
     def noise(self) -> NoiseModel | None:
         """Noise model of one frame, fitted over all pixels of all frames; None without scatter."""
-        points = list(self._points)
+        points = [each - (self.pedestal, 0, 0) for each in self._points]
         known = any(map(len, points))
         if self.dark is not None:
             points.append(_dark_points(self.dark))
@@ -158,7 +168,7 @@ class Averaged:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
-            noisy = noisy_pixels(self.values, self.variances, self._frames, noise)
+            noisy = noisy_pixels(self._signals, self.variances, self._frames, noise)
         hot = np.zeros(self.saturated.shape, bool)
         if self.dark is not None:
             hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
@@ -175,8 +185,13 @@ class Averaged:
         """Pixels that are dead in every exposure in which they do not saturate."""
         models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
-        dead: Bools = dead_pixels(self.values, models) & measured
+        dead: Bools = dead_pixels(self._signals, models) & measured
         return dead
+
+    @property
+    def _signals(self) -> Array:
+        """Values above the pedestal."""
+        return self.values - self.pedestal if self.pedestal else self.values
 
     def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
         """Noise model of each mean frame less the dark, for one exposure by itself."""

@@ -12,6 +12,7 @@ from equipix.io.pages import (
     save_pages,
     saved_kind,
 )
+from equipix.io.png import write_png
 from equipix.io.tiff import description, write_frames
 from equipix.io.whole import folder_beside, replace_folder, write_whole
 
@@ -34,5 +35,6 @@ __all__ = [
     "saved_kind",
     "stream_frames",
     "write_frames",
+    "write_png",
     "write_whole",
 ]

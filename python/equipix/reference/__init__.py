@@ -11,6 +11,7 @@ from equipix.reference.joint import JointSolution, joint
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
+from equipix.reference.response import inverse, response
 from equipix.reference.uncertainty import covariance
 from equipix.reference.weak_light import weak_light_prior
 
@@ -24,9 +25,11 @@ __all__ = [
     "covariance",
     "exposures",
     "grid_cells",
+    "inverse",
     "joint",
     "multiscale",
     "objective",
+    "response",
     "solve_dense",
     "weak_light_prior",
 ]

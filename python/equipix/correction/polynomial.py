@@ -1,0 +1,191 @@
+"""A correction that is its coefficients, and the combination of two corrections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._readonly import ReadOnly
+from equipix.correction.apply import apply_polynomial
+from equipix.errors import InputError
+from equipix.io import check_format, check_pages, save_pages
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from os import PathLike
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Flagged
+    from equipix.correction.protocol import Correction
+
+_KIND, _FORMAT = "polynomial", 1
+_MOST = 4
+"""Most coefficients that the compiled part applies."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Polynomial(ReadOnly):
+    """A correction Σ c_j y^j of raw values y, such as two corrections combined.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (order + 1, rows, cols)
+        Coefficients c for y in DN, lowest power first, order 1 to 3; NaN where undetermined.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`.
+    metadata : dict
+        Origin, as JSON values.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not fit.
+    """
+
+    coefficients: Array
+    flags: Array
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
+        ReadOnly.__post_init__(self)
+        planes, shape = self.coefficients.shape[:1], self.coefficients.shape[1:]
+        if shape != self.flags.shape or not 2 <= planes[0] <= _MOST or len(shape) != 2:
+            raise InputError(
+                f"'coefficients' has shape {self.coefficients.shape} and 'flags' "
+                f"{self.flags.shape}, expected (2 to {_MOST}, rows, cols) and (rows, cols)"
+            )
+
+    def __repr__(self) -> str:
+        """Short form: sizes and order."""
+        rows, cols = self.shape
+        return f"<Polynomial of {rows} x {cols} pixels, order {len(self.coefficients) - 1}>"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.flags.shape
+        return rows, cols
+
+    def correct(
+        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
+    ) -> Array:
+        """Frames as a sensor of equal pixels would have given them.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames, in DN.
+        flagged : {"nan", "keep", "replace"}
+            The value of pixels flagged ``DO_NOT_USE``: NaN, that of the formula, or the mean of the
+            nearest good pixels around.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of dtype float64 for float64 frames, else float32; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, or `flagged` is unknown.
+        """
+        return apply_polynomial(
+            frames, self.coefficients, flags=self.flags, flagged=flagged, out=out
+        )
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        pages = {"coefficients": self.coefficients, "flags": self.flags}
+        content = {"format": _FORMAT, "kind": _KIND, "metadata": self.metadata}
+        save_pages(path, pages, content, force=force)
+
+
+def read_polynomial(
+    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
+) -> Polynomial:
+    """Make a correction of the arrays and metadata of the file that `Polynomial.save` wrote."""
+    check_format(path, content, _KIND, _FORMAT)
+    check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
+    return Polynomial(pages["coefficients"], pages["flags"], content["metadata"])
+
+
+def combine(first: Correction, then: Correction) -> Polynomial:
+    """Correction that does what two do one after the other.
+
+    Parameters
+    ----------
+    first : Correction
+        Applied to raw frames: such as response curves, or a lens fall-off.
+    then : Correction
+        Applied to the result, so measured on frames that `first` has corrected: offset and gain,
+        such as a lens fall-off, or a shift calibration of corrected exposures. One of raw exposures
+        holds the gain that `first` takes away already, which would be taken away twice.
+
+    Returns
+    -------
+    Polynomial
+        Of the order of `first`, with the flags of both; `metadata` holds that of both.
+
+    Raises
+    ------
+    InputError
+        If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
+        order above 1 or subtracts a dark frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> gain = np.array([[0.9, 1.0, 1.1]])
+    >>> response = equipix.nuc.fit([100 * gain, 1000 * gain], order=1)
+    >>> twice = equipix.combine(response, response)
+    >>> bool(np.allclose(twice.coefficients[1], response.coefficients[1] ** 2))
+    True
+    """
+    if first.shape != then.shape:
+        raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
+    one, other = _sensor(first), _sensor(then)
+    if one and other and one != other:
+        raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
+    dark = getattr(then, "dark", None)
+    if dark is not None:
+        raise InputError(
+            f"'then' subtracts a dark frame of {np.nanmean(dark):.4g} DN in the mean, which frames "
+            "that 'first' has corrected do not hold: expected a correction without one"
+        )
+    after = np.asarray(then.coefficients, np.float64)
+    if len(after) > 2:
+        raise InputError(
+            f"'then' has order {len(after) - 1}, expected offset and gain: combine in the other "
+            "order, or correct frames twice"
+        )
+    gain = after[1] if len(after) == 2 else 0.0
+    coefficients = np.asarray(first.coefficients, np.float64) * gain
+    coefficients[0] += after[0]
+    metadata = {"first": first.metadata, "then": then.metadata}
+    return Polynomial(coefficients, first.flags | then.flags, metadata)
+
+
+def _sensor(correction: Correction) -> str:
+    """Return the name of the sensor in the metadata, if there is one."""
+    sensor = correction.metadata.get("sensor")
+    return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""

@@ -1,0 +1,7 @@
+"""Correction of non-uniformity by a uniform source: response curves and their inverses."""
+
+from equipix.nuc.bad_pixels import DefectLimits, Defects, find_defects
+from equipix.nuc.fit import fit
+from equipix.nuc.response import Response
+
+__all__ = ["DefectLimits", "Defects", "Response", "find_defects", "fit"]

@@ -1,0 +1,264 @@
+"""Corrections applied by the compiled part: types, rounding, limits, bad pixels, buffers."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Corrector, Flag, errors, nuc, simulate
+from equipix.correction.apply import replace_bad
+
+SHAPE = (37, 53)
+TYPES = (np.uint8, np.uint16, np.float32)
+
+
+class Given:
+    """A correction whose coefficients and flags are given."""
+
+    def __init__(self, coefficients, bad=()):
+        self.coefficients = np.asarray(coefficients)
+        self.flags = np.zeros(self.coefficients.shape[1:], np.uint32)
+        self.flags.flat[list(bad)] = Flag.DO_NOT_USE
+        self.metadata = {}
+
+    @property
+    def shape(self):
+        return self.flags.shape
+
+    def correct(self, frames, *, flagged="nan", out=None):
+        raise NotImplementedError
+
+    def save(self, path, *, force=False):
+        raise NotImplementedError
+
+
+def coefficients(planes, seed=1):
+    rng = np.random.default_rng(seed)
+    typical = np.array([-20.0, 1.0, 2e-6, -3e-11])[:planes]
+    return (typical[:, None, None] * rng.uniform(0.7, 1.3, (planes, *SHAPE))).astype(np.float32)
+
+
+def frames(dtype=np.uint16, count=3):
+    rng = np.random.default_rng(2)
+    largest = 255 if dtype == np.uint8 else 65535
+    return rng.integers(0, largest + 1, (count, *SHAPE)).astype(dtype)
+
+
+def horner(planes, raw):
+    """Σ c_j y^j in float32, every operation rounded."""
+    values = raw.astype(np.float32)
+    total = np.zeros(raw.shape, np.float32)
+    for plane in planes[::-1]:
+        total = total * values + plane
+    return total
+
+
+class TestAgainstNumPy:
+    @pytest.mark.parametrize("planes", [1, 2, 3, 4])
+    @pytest.mark.parametrize("raw", TYPES)
+    @pytest.mark.parametrize("dtype", TYPES)
+    def test_every_type_and_order(self, planes, raw, dtype):
+        given = Given(coefficients(planes))
+        corrector = Corrector(given, dtype)
+        got = corrector.apply(frames(raw))
+        wanted = horner(given.coefficients, frames(raw))
+        if dtype == np.float32:
+            # A product and a sum may not be fused: the same bytes.
+            assert got.tobytes() == wanted.tobytes()
+            assert corrector.clipped == 0
+            return
+        rounded = np.rint(wanted)
+        largest = np.iinfo(dtype).max
+        np.testing.assert_array_equal(got, np.clip(rounded, 0, largest))
+        assert corrector.clipped == np.count_nonzero((rounded < 0) | (rounded > largest))
+
+    def test_whole_numbers_round_half_to_even(self):
+        halves = np.array([[0.5, 1.5, 2.5, -0.5, -0.50001, 254.5, 255.5]], np.float32)
+        corrector = Corrector(Given(halves[None]), "uint8")
+        got = corrector.apply(np.zeros(halves.shape, np.uint8))
+        assert got.tolist() == [[0, 2, 2, 0, 0, 254, 255]]
+        assert corrector.clipped == 2
+
+    @pytest.mark.parametrize("bits", range(8, 17))
+    def test_the_bits_of_the_camera_limit_values(self, bits):
+        given = Given(coefficients(2))
+        corrector = Corrector(given, bit_depth=bits)
+        got, largest = corrector.apply(frames()), 2**bits - 1
+        wanted = np.rint(horner(given.coefficients, frames()))
+        np.testing.assert_array_equal(got, np.clip(wanted, 0, largest))
+        assert corrector.clipped == np.count_nonzero((wanted < 0) | (wanted > largest))
+
+    @pytest.mark.parametrize("flagged", ["replace", "nan", "keep"])
+    def test_flagged_pixels(self, flagged):
+        bad = [0, 60, *(r * SHAPE[1] + c for r in range(10, 14) for c in range(20, 25))]
+        given = Given(coefficients(2), bad)
+        got = Corrector(given, "float32", flagged=flagged).apply(frames())
+        mask = given.flags != 0
+        for each, raw in zip(got, frames(), strict=True):
+            wanted = horner(given.coefficients, raw)
+            if flagged == "replace":
+                replace_bad(wanted, mask)
+            elif flagged == "nan":
+                wanted[mask] = np.nan
+            np.testing.assert_array_equal(each[~mask], wanted[~mask])
+            # A sum of eight values in float32: some roundings of it.
+            np.testing.assert_allclose(each[mask], wanted[mask], rtol=1e-6)
+
+    def test_a_stack_is_its_frames_one_by_one(self):
+        corrector = Corrector(Given(coefficients(4), [70]))
+        stack = corrector.apply(frames())
+        assert corrector.frames == 3
+        for each, raw in zip(stack, frames(), strict=True):
+            np.testing.assert_array_equal(corrector.apply(raw), each)
+        assert corrector.frames == 6
+
+    def test_any_number_of_workers_gives_the_same_bytes(self):
+        # Above 2^20 pixels, where several threads work.
+        large = Given(np.tile(coefficients(2), (1, 30, 24)), [5])
+        raw = np.tile(frames(count=1), (1, 30, 24))
+        one, three = (Corrector(large, workers=each).apply(raw) for each in (1, 3))
+        assert one.tobytes() == three.tobytes()
+
+    def test_counts_of_several_threads_add_up(self):
+        corrector = Corrector(Given(np.stack([np.full(SHAPE, -1.0), np.zeros(SHAPE)])), "uint16")
+        raw = frames(count=40)
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda _: corrector.apply(raw), range(100)))
+        assert corrector.frames == 100 * len(raw)
+        assert corrector.clipped == 100 * raw.size
+
+
+class TestNotANumber:
+    def test_a_raw_value_does_not_spread(self):
+        corrector = Corrector(Given(coefficients(2), [60]), "float32")
+        raw = frames(np.float32, 1)[0]
+        raw.flat[61] = np.nan
+        got = corrector.apply(raw)
+        assert np.flatnonzero(np.isnan(got)).tolist() == [61]
+        whole = Corrector(Given(coefficients(2), [60]), "uint16")
+        assert whole.apply(raw).flat[61] == 0
+        assert whole.clipped >= 1
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    def test_coefficients_of_a_replaced_pixel_play_no_part(self, value):
+        planes = coefficients(2)
+        wanted = Corrector(Given(planes, [60])).apply(frames())
+        planes[:, 1, 7] = value
+        got = Corrector(Given(planes, [60])).apply(frames())
+        np.testing.assert_array_equal(got, wanted)
+
+    def test_a_nan_image_value_is_no_neighbour_in_numpy_either(self):
+        image = np.ones((5, 5))
+        image[2, 2], image[1, 1] = 7, np.nan
+        bad = np.zeros((5, 5), bool)
+        bad[2, 2] = True
+        replace_bad(image, bad)
+        assert image[2, 2] == 1
+        assert np.flatnonzero(np.isnan(image)).tolist() == [6]
+
+
+class TestBuffers:
+    def test_the_result_goes_where_the_caller_says(self):
+        corrector = Corrector(Given(coefficients(2)))
+        out = np.empty(SHAPE, np.uint16)
+        assert corrector.apply(frames()[0], out) is out
+        np.testing.assert_array_equal(out, corrector.apply(frames()[0]))
+
+    def test_a_frame_need_not_be_contiguous(self):
+        corrector = Corrector(Given(coefficients(2)))
+        wide = np.repeat(frames(), 2, axis=2)
+        np.testing.assert_array_equal(corrector.apply(wide[:, :, ::2]), corrector.apply(frames()))
+
+    @pytest.mark.parametrize(
+        ("out", "message"),
+        [
+            (np.empty(SHAPE, np.uint8), "'out' is uint8"),
+            (np.empty((3, 4), np.uint16), r"'out' is uint16 of shape \(3, 4\)"),
+            ([1, 2], "'out' is list"),
+            (np.empty((SHAPE[0], 106), np.uint16)[:, ::2], "contiguous"),
+        ],
+    )
+    def test_other_buffers_are_refused(self, out, message):
+        with pytest.raises(errors.InputError, match=message):
+            Corrector(Given(coefficients(2))).apply(frames()[0], out)
+
+    def test_the_frames_themselves_are_no_buffer(self):
+        raw = frames()[0]
+        with pytest.raises(errors.InputError, match="overlaps"):
+            Corrector(Given(coefficients(2))).apply(raw, raw)
+        locked = np.empty(SHAPE, np.uint16)
+        locked.flags.writeable = False
+        with pytest.raises(errors.InputError, match="read-only"):
+            Corrector(Given(coefficients(2))).apply(raw, locked)
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"dtype": "float64"}, "'dtype' is float64, expected"),
+            ({"dtype": "nonsense"}, "'dtype' is 'nonsense'"),
+            ({"bit_depth": 17}, "'bit_depth' is 17, expected 8 to 16"),
+            ({"bit_depth": 7}, "'bit_depth' is 7, expected 8 to 16"),
+            ({"dtype": "uint8", "bit_depth": 12}, "'bit_depth' is 12, expected 8 to 8"),
+            ({"dtype": "float32", "bit_depth": 12}, "expected None for float32"),
+            ({"flagged": "bad"}, "'flagged' is 'bad'"),
+            ({"workers": 0}, "'workers'"),
+        ],
+    )
+    def test_wrong_arguments(self, given, message):
+        with pytest.raises(errors.InputError, match=message):
+            Corrector(Given(coefficients(2)), **given)
+
+    def test_frames_of_other_shapes_and_types(self):
+        corrector = Corrector(Given(coefficients(2)))
+        with pytest.raises(errors.InputError, match=r"shape \(3, 4\), the sensor \(37, 53\)"):
+            corrector.apply(np.zeros((3, 4), np.uint16))
+        with pytest.raises(errors.InputError, match="'frames' is float64, expected uint8"):
+            corrector.apply(np.zeros(SHAPE))
+
+    def test_five_coefficients(self):
+        with pytest.raises(errors.InputError, match="coefficients"):
+            Corrector(Given(np.ones((5, *SHAPE))))
+
+    def test_frames_of_another_bit_depth(self):
+        level = np.random.default_rng(1).integers(1000, 2000, (2, 4, *SHAPE), dtype=np.uint16)
+        averages = [
+            equipix.average(each + 500 * k, saturation=4095) for k, each in enumerate(level)
+        ]
+        corrector = Corrector(nuc.fit(averages, order=0))
+        with pytest.raises(errors.InputError, match="uint8, but the levels saturate at 4095"):
+            corrector.apply(np.zeros(SHAPE, np.uint8))
+
+
+@pytest.fixture(scope="module", params=["calibration", "response"])
+def result(request):
+    truth = simulate.paper_sensitivity(SHAPE, rng=1)
+    if request.param == "response":
+        return nuc.fit([truth * level + 5 for level in (500.0, 2000.0, 3000.0)], order=2)
+    shifts = equipix.cross_pattern(5, 7)
+    beam = simulate.gaussian_beam(SHAPE, width=100, amplitude=1000)
+    cal = equipix.calibrate(simulate.exposures(truth, beam, shifts), shifts)
+    return equipix.Calibration(**vars(cal) | {"dark": np.full(SHAPE, 60.0)})
+
+
+class TestResults:
+    """`correct` of both results goes the same way."""
+
+    @pytest.mark.parametrize("raw", TYPES)
+    @pytest.mark.parametrize("dtype", TYPES)
+    def test_into_every_type(self, result, raw, dtype):
+        out = np.empty((3, *SHAPE), dtype)
+        assert result.correct(frames(raw), flagged="replace", out=out) is out
+        np.testing.assert_array_equal(out, Corrector(result, dtype).apply(frames(raw)))
+
+    def test_close_to_double_precision(self, result):
+        single = result.correct(frames(), flagged="keep")
+        double = result.correct(frames().astype(np.float64), flagged="keep")
+        assert (single.dtype, double.dtype) == (np.float32, np.float64)
+        # Coefficients, products and sums of Horner's scheme: three roundings a power.
+        atol = 9 * np.finfo(np.float32).eps * 65535
+        np.testing.assert_allclose(single, double, rtol=0, atol=atol)
