@@ -191,7 +191,8 @@ def response_outliers(
     dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
     with np.errstate(invalid="ignore"):
         # Where no pixel is twice as sensitive as another, none is twice its neighbours' median.
-        if not np.nanmin(sensitivity) < DEAD_RESPONSE * np.nanmax(sensitivity):
+        lowest, highest = (f.reduce(sensitivity, axis=None) for f in (np.fmin, np.fmax))
+        if not lowest < DEAD_RESPONSE * highest:
             return dead, hot
     usual, deviation = _block_medians(sensitivity), std()
     for found, sign, limit in ((dead, -1, DEAD_RESPONSE), (hot, 1, 1 / DEAD_RESPONSE)):

@@ -190,8 +190,8 @@ impl Components {
 }
 
 impl Components {
-    /// Gives pixels that are not tied firmly and belong to no component, and cells that they alone see, the
-    /// label of the largest one in their piece, `pieces` being those of all pixels however they are tied.
+    /// Gives loosely tied pixels that belong to no component, and cells that they alone see, the label of the
+    /// largest one in their piece, `pieces` being those of all pixels however they are tied.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.

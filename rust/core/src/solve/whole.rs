@@ -14,6 +14,7 @@ use crate::frames::Real;
 use crate::geometry::Geometry;
 use crate::memory;
 use crate::parallel::Workers;
+use crate::prior::Prior;
 use crate::reduced;
 
 /// Minimises F, with whole shifts and known fluxes.
@@ -56,24 +57,10 @@ pub(super) fn minimise<T: Real>(
     // After the solver, whose vectors then free memory for the sets.
     let (sensitivity, values) = estimate.into_maps();
     let dead = without_response(exposures, &sensitivity, &values, &history);
-    let mut ties = vec![Tie::Firm; sensitivity.len()];
-    held.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
-    dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
-    let mut components = Components::of(exposures, &ties, control)?;
-    if let Some(prior) = &prior {
-        // Weak pixels apart from the largest part stand out by noise.
-        let apart = |&pixel: &usize| {
-            prior.weights[pixel] > 0.0 && components.pixels[pixel] > 0 && ties[pixel] == Tie::Firm
-        };
-        let more: Vec<usize> = (0..ties.len()).filter(apart).collect();
-        if !more.is_empty() {
-            more.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
-            held.extend(more);
-            held.sort_unstable();
-            components = Components::of(exposures, &ties, control)?;
-        }
-        components.adopt(exposures, &prior.pieces, &ties, control)?;
-    }
+    let components = match &prior {
+        Some(prior) => weakly_tied(exposures, prior, &mut held, &dead, control)?,
+        None => Components::of(exposures, &ties(sensitivity.len(), &[], &dead), control)?,
+    };
     let Geometry { beam: shape, origin, .. } = *exposures.geometry();
     let fit = Fit {
         sensitivity,
@@ -93,6 +80,46 @@ pub(super) fn minimise<T: Real>(
         smallest_ritz: None,
     };
     Ok(Found { fit, held, dead, without_offset: Vec::new(), fluxes: None })
+}
+
+/// How each pixel is tied, of which `loose` ones are in weak light and `dead` ones do not respond.
+fn ties(pixels: usize, loose: &[usize], dead: &[usize]) -> Vec<Tie> {
+    let mut ties = vec![Tie::Firm; pixels];
+    loose.iter().for_each(|&pixel| ties[pixel] = Tie::Loose);
+    dead.iter().for_each(|&pixel| ties[pixel] = Tie::None);
+    ties
+}
+
+/// The components where some pixels have a prior: those of them that are `held` tie nothing together, and
+/// belong to the part whose mean holds them. Adds others with a prior that the rest leaves apart from the
+/// largest part, since they stand out by noise.
+fn weakly_tied<T: Real>(
+    exposures: &Exposures<'_, T>,
+    prior: &Prior,
+    held: &mut Vec<usize>,
+    dead: &[usize],
+    control: &Control,
+) -> Result<Components> {
+    let pixels = prior.weights.len();
+    let has_prior = |pixel: &usize| prior.weights[*pixel] > 0.0;
+    let mut loose: Vec<usize> = held.iter().copied().filter(has_prior).collect();
+    let mut tied = ties(pixels, &loose, dead);
+    let mut components = Components::of(exposures, &tied, control)?;
+    if components.sizes.is_empty() {
+        // All are held: with no better one to belong to, they belong to each other.
+        return Components::of(exposures, &ties(pixels, &[], dead), control);
+    }
+    let is_apart = |pixel: &usize| components.pixels[*pixel] > 0 && tied[*pixel] == Tie::Firm;
+    let apart: Vec<usize> = (0..pixels).filter(has_prior).filter(is_apart).collect();
+    if !apart.is_empty() {
+        loose.extend(&apart);
+        held.extend(apart);
+        held.sort_unstable();
+        tied = ties(pixels, &loose, dead);
+        components = Components::of(exposures, &tied, control)?;
+    }
+    components.adopt(exposures, &prior.pieces, &tied, control)?;
+    Ok(components)
 }
 
 /// What a solver holds beside the measurements at its fullest, in bytes: a search
