@@ -31,7 +31,7 @@ def measured(shape, shifts=CROSS, *, noise=1e-3, seed=1, **options):
 
 @st.composite
 def experiments(draw):
-    """Random frames, positions and options of one small experiment, in light that needs no prior."""
+    """A small random experiment, in light that needs no prior: frames, positions and options."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     rows, cols, count = draw(st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(2, 6)))
     dtype = draw(st.sampled_from([np.float32, np.float64]))

@@ -20,4 +20,4 @@ mod kernel;
 mod lines;
 
 pub use estimate::Estimate;
-pub(crate) use kernel::{Logarithmic, Plain};
+pub(crate) use kernel::{Difference, Logarithmic, Plain};
