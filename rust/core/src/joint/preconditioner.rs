@@ -121,15 +121,29 @@ impl Preconditioner {
     }
 
     /// z = P⁻¹ r.
-    pub(crate) fn apply<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64], z: &mut Vec<f64>) {
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn apply<T: Real>(
+        &self,
+        system: &System<'_, '_, T>,
+        r: &[f64],
+        z: &mut Vec<f64>,
+        control: &Control,
+    ) -> Result<()> {
         let (workers, cols) = (system.pass.workers, system.pass.grid.geometry.beam.cols);
         let (of_cells, of_params) = r.split_at(self.inverse.len());
         let mut heights = self.wide.gather(of_cells, workers);
         heights.extend_from_slice(of_params);
         self.coarse.correct(&mut heights, DAMPING);
+        control.check()?;
         let lines = self.waves.correct(&self.wide, of_cells, workers);
+        control.check()?;
         z.resize(of_cells.len(), 0.0);
         workers.map_blocks(z, BAND * cols, |band, part| {
+            if control.is_cancelled() {
+                return;
+            }
             let first = band * BAND;
             if self.filters {
                 self.filter(of_cells, first, part);
@@ -140,6 +154,7 @@ impl Preconditioner {
             self.wide.spread(&heights, first, part);
             self.waves.spread(&self.wide, &lines, first, part);
         });
+        control.check()?;
         self.rim.add(of_cells, z, workers);
         let coarse = &heights[self.wide.hats.count()..];
         let params = of_params.iter().zip(&self.params).zip(coarse);
@@ -150,6 +165,7 @@ impl Preconditioner {
         let shifts = &mut z[self.inverse.len() + system.fluxes.columns.len()..];
         let moves = system.centred(shifts);
         shifts.copy_from_slice(moves.as_flattened());
+        Ok(())
     }
 
     /// The part of waves of P⁻¹ r.

@@ -242,7 +242,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         while self.products() + A_LOOK < self.limit {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
-            if !self.search.step(&self.system, preconditioner) {
+            if !self.search.step(&self.system, preconditioner, control)? {
                 break;
             }
             control.check()?;

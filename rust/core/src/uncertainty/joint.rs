@@ -402,7 +402,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
-            let goes_on = search.step(system, preconditioner);
+            let goes_on = search.step(system, preconditioner, control)?;
             let left = search.square / search.lowest.found();
             if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
                 return Ok(());
