@@ -10,7 +10,8 @@ from equipix import Flag, reference, simulate
 
 CROSS = equipix.cross_pattern(11, 19)
 SMALL_CROSS = equipix.cross_pattern(3, 5)
-BETWEEN = CROSS + np.array([(0, 0), (0.3, 0.1), (0.2, 0.4), (0.45, 0.3), (0.1, 0.2)])
+FRACTIONS = np.array([(0, 0), (0.3, 0.1), (0.2, 0.4), (0.45, 0.3), (0.1, 0.2)])
+BETWEEN, SMALL_BETWEEN = CROSS + FRACTIONS, SMALL_CROSS + FRACTIONS
 WEAK = Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE
 
 
@@ -107,6 +108,102 @@ class TestAlwaysAnAnswer:
         bias = abs(moved - 0.3)
         # The noise is that of one draw in both, but for its share at another M.
         assert (bias < 0.3 * 5 * even.sensitivity_std[chosen]).all()
+
+    @pytest.mark.parametrize("width", [12, 20])
+    def test_a_beam_on_a_small_part_of_the_sensor(self, width):
+        shape = (180, 240)
+        frames, truth = experiment(shape, simulate.gaussian_beam(shape, width=width), SMALL_CROSS)
+        cal = equipix.calibrate(frames, SMALL_CROSS)
+        assert cal.converged
+        good = (cal.flags & Flag.DO_NOT_USE) == 0
+        # Most pixels are in the dark, a bright one of all among them.
+        assert 0.02 < good.mean() < 0.2
+        error = cal.sensitivity - truth / truth[good].mean()
+        # 5 standard deviations of at most 4 %, as of others in this light.
+        assert abs(error[good]).max() < 0.2
+
+    @pytest.mark.parametrize("noise", [0.15, 0.3, 0.45])
+    def test_even_weak_light_needs_no_prior(self, noise):
+        shape, block = (60, 80), np.s_[20:40, 20:60]
+        rng = np.random.default_rng(0)
+        truth = np.ones(shape)
+        truth[block] = 1.5
+        clean = simulate.exposures(truth, simulate.gaussian_beam(shape, width=300), CROSS)
+        cal = equipix.calibrate(clean + noise * rng.standard_normal(clean.shape), CROSS)
+        assert cal.converged
+        # But for a pixel here and there that is as dark as if the light were.
+        assert (cal.flags > 0).mean() < 2e-3
+        # M of 800 and 1200 pixels of five exposures with this noise, the beam being found with it:
+        # twice the variance that a known one leaves. Products of noise add its square.
+        deviation = noise * (2 / 5 * (1 / 800 + 1.5**2 / 1200)) ** 0.5
+        found = cal.sensitivity[block].mean() / cal.sensitivity[:15].mean()
+        assert found == pytest.approx(1.5, abs=5 * deviation + noise**2 / 5)
+
+    @pytest.mark.parametrize("side", [27, 30])
+    def test_masked_pixels_are_no_unknowns(self, side):
+        """With a fifth of the sensor in use there are fewer measurements than pixels."""
+        shape = (60, 60)
+        frames, truth = experiment(shape, simulate.gaussian_beam(shape, width=120), SMALL_CROSS)
+        mask = np.ones(shape, bool)
+        mask[15 : 15 + side, 15 : 15 + side] = False
+        cal = equipix.calibrate(frames, SMALL_CROSS, mask=mask)
+        assert cal.weighted.fit.prior is None
+        errors = (cal.sensitivity - truth / truth[~mask].mean())[~mask]
+        # Of a pixel's noise of 1e-3 in five exposures, and the beam's as much again.
+        assert np.sqrt(np.mean(errors**2)) < 2 * 1e-3 / 5**0.5 / 0.8
+
+    @pytest.mark.parametrize("value", [50.0, np.nan])
+    def test_values_of_masked_pixels_count_for_nothing(self, value):
+        shape = (60, 80)
+        frames, _ = experiment(shape, simulate.gaussian_beam(shape, width=200), SMALL_CROSS)
+        mask = np.ones(shape, bool)
+        mask[:, 38:42] = False
+        changed = frames.copy()
+        changed[:, mask] = value
+        natural, cal = (equipix.calibrate(f, SMALL_CROSS, mask=mask) for f in (frames, changed))
+        assert cal.converged
+        np.testing.assert_array_equal(cal.sensitivity, natural.sensitivity)
+
+    def test_pixels_in_the_dark_are_at_the_mean_of_lit_ones_between_pixels_too(self):
+        shape = (100, 120)
+        beam = simulate.gaussian_beam(shape, width=14)
+        frames, _ = experiment(shape, beam, SMALL_BETWEEN, noise=2e-3)
+        cal = equipix.calibrate(frames, SMALL_BETWEEN)
+        assert cal.converged
+        dark = np.ones(shape, bool)
+        dark[15:-15, 15:-15] = False
+        # M of the dark is that of its prior: μ, held after three steps, when M is within 1 %.
+        assert np.median(cal.sensitivity[dark]) == pytest.approx(1, abs=0.01)
+
+    def test_flags_do_not_depend_on_the_method(self):
+        shape = (60, 80)
+        rng = np.random.default_rng(0)
+        truth = 1 + rng.uniform(-0.05, 0.05, shape)
+        truth[:, 40:] *= 0.3
+        clean = simulate.exposures(truth, simulate.gaussian_beam(shape, width=20), SMALL_CROSS)
+        frames = clean + 4e-3 * rng.standard_normal(clean.shape)
+        fast, swept = (
+            equipix.calibrate(frames, SMALL_CROSS, method=method, tolerance=1e-7)
+            for method in ("multiscale", "coordinate-descent")
+        )
+        assert fast.converged
+        assert swept.converged
+        assert 0.1 < (fast.flags > 0).mean() < 0.9
+        np.testing.assert_array_equal(fast.flags, swept.flags)
+
+    def test_one_pass_has_the_beam_that_fits_best(self):
+        frames, _ = experiment((24, 32), simulate.gaussian_beam((24, 32), width=60), SMALL_CROSS)
+        with pytest.warns(equipix.errors.ConvergenceWarning):
+            cal = equipix.calibrate(frames, SMALL_CROSS, max_sweeps=1)
+        cells, size, _ = reference.grid_cells((24, 32), SMALL_CROSS)
+        above, below = (
+            np.bincount(cells.ravel(), values.ravel(), size[0] * size[1])
+            for values in (cal.sensitivity * frames, 0 * frames + cal.sensitivity**2)
+        )
+        seen = below > 0
+        # Sums of at most five.
+        wanted = above[seen] / below[seen]
+        np.testing.assert_allclose(cal.beam.ravel()[seen], wanted, rtol=1e-14)
 
     def test_enough_light_changes_nothing(self):
         frames, _ = experiment((60, 80), simulate.gaussian_beam((60, 80), width=160), noise=1e-2)

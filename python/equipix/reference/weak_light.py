@@ -16,7 +16,13 @@ SPREAD = 0.2
 """Standard deviation of M, relative to its mean, that is assumed without light."""
 
 LIT = 100.0
-"""D of the faintest pixel without a prior, in variances of a measurement of weight 1."""
+"""D of a pixel that needs no prior, in variances of a measurement of weight 1."""
+
+UNKNOWN = 4.0
+"""D of a pixel that needs one in any light, likewise."""
+
+WEAK = 1 / 16
+"""D of a pixel in weak light, at most, as a share of a bright pixel's."""
 
 
 def weak_light_prior(
@@ -29,7 +35,10 @@ def weak_light_prior(
     flux: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
 ) -> NDArray[Any]:
-    """Weights λ = σ²/0.2² (1 − D/100σ²)² of the prior, with D = Σ w·c²·L² at M = 1.
+    """Weights λ = σ²/0.2² (1 − D/D₀)² of the prior, with D = Σ w·c²·L² at M = 1.
+
+    D₀ is 100σ², but no more than a sixteenth of a bright pixel's D or 4σ², whichever is more. A
+    bright pixel is at 90 % of those above 100σ², or of all if fewer than 16 are.
 
     Parameters
     ----------
@@ -41,11 +50,14 @@ def weak_light_prior(
     Returns
     -------
     ndarray, shape (rows, cols)
-        λ; 0 from D = 100σ² on, and in pixels without a measurement.
+        λ; 0 from D = D₀ on, and in pixels without a measurement.
     """
     data = problem(frames, shifts, variance=variance, mask=mask, flux=flux, rotation=rotation)
     beam = np.nan_to_num(best_beam(data, np.ones(data.values.shape[1:])))
     weights = data.weights * data.flux[:, None, None] ** 2
     information = (weights * beam.flat[data.cells] ** 2).sum(axis=0)
-    lacking = np.maximum(1 - information / (LIT * unit), 0)
+    lit = np.sort(information[information > LIT * unit])
+    lit = lit if lit.size >= 16 else np.sort(information[information > 0])
+    enough = min(LIT * unit, max(WEAK * lit[int(0.9 * lit.size)], UNKNOWN * unit))
+    lacking = np.maximum(1 - information / enough, 0)
     return np.where((data.weights > 0).any(axis=0), unit / SPREAD**2 * lacking**2, 0)

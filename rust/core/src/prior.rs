@@ -4,12 +4,13 @@
 //! such pixels see: M L fits noise at any M, and F has no minimum. So there
 //!
 //! ```text
-//! R = Σ_p λ_p (M_p/μ − 1)²,   λ = σ²/A² · (1 − D/(K σ²))²   where D < K σ², else 0
+//! R = Σ_p λ_p (M_p/μ − 1)²,   λ = σ²/A² · (1 − D/D₀)²   where D < D₀, else 0
 //! ```
 //!
 //! is added to F, with the mean μ of M over the piece of connected pixels, σ² the variance of a measurement of
-//! weight 1 and D = Σ w c² L². It acts on weak pixels alone. A prior on all pixels would count N of them as
-//! N measurements of a mean, and bias patterns of the sensor's own size.
+//! weight 1 and D = Σ w c² L². It acts on weak pixels alone: D₀ is 100 σ², but no more than a sixteenth of a
+//! bright pixel's D. A prior on all pixels would count N of them as N measurements of a mean, and bias patterns
+//! of the sensor's own size. Where M is not known to 50 % it has a prior however even the light.
 
 use std::sync::Arc;
 
@@ -19,16 +20,18 @@ use crate::median::{MEDIAN_OF_SQUARES, median};
 /// The standard deviation A of M, relative to its mean, that is assumed where there is no light. With a larger
 /// one noise is fitted by M L at the price of M = 0, and the minimum is not at M near its mean.
 const SPREAD: f64 = 0.2;
-/// D of the faintest pixel without a prior, in units of σ²: its M is known to 10 %.
+/// D of a pixel that needs no prior, in units of σ²: its M is known to 10 %.
 pub(crate) const LIT: f64 = 100.0;
+/// D of a pixel that needs one in any light, in units of σ²: its M is not known to 50 %.
+const UNKNOWN: f64 = 4.0;
 /// D of the faintest reliable pixel in weak light, in units of σ²: its M is known to 4 %.
 const RELIABLE: f64 = 625.0;
 /// D of a bright pixel over that of one in weak light, at least: a quarter of the light.
 const WEAK: f64 = 16.0;
-/// The share of pixels that is fainter than a bright one: a few brighter ones do not count.
+/// The share of lit pixels that is fainter than a bright one: a few brighter ones do not count.
 const BRIGHT: f64 = 0.9;
-/// Pixels whose D is sampled for a bright one.
-const SAMPLES: usize = 1024;
+/// Fewer lit pixels are chance.
+const FEWEST: usize = 16;
 
 /// The weights λ of the prior, and of which piece each pixel is.
 #[derive(Clone, Debug)]
@@ -43,20 +46,32 @@ pub(crate) struct Prior {
     common: Vec<f64>,
 }
 
-/// λ at this D.
-pub(crate) fn weight(information: f64, variance: f64) -> f64 {
-    let lacking = (1.0 - information / (LIT * variance)).max(0.0);
-    variance / (SPREAD * SPREAD) * lacking * lacking
+/// λ of each pixel at this D.
+pub(crate) fn weights(information: &[f64], variance: f64) -> Arc<[f64]> {
+    let weak = bright(information, variance) / WEAK;
+    let enough = (LIT * variance).min(weak.max(UNKNOWN * variance));
+    let weight = |&d: &f64| {
+        let lacking = if d > 0.0 { (1.0 - d / enough).max(0.0) } else { 0.0 };
+        variance / (SPREAD * SPREAD) * lacking * lacking
+    };
+    information.iter().map(weight).collect()
 }
 
-/// The least D above 0, and that of a bright pixel.
+/// D of a bright pixel: of those that are lit, however few they are, or else of all.
+fn bright(information: &[f64], variance: f64) -> f64 {
+    let above = |least: f64| information.iter().copied().filter(|d| *d > least).collect();
+    let mut lit: Vec<f64> = above(LIT * variance);
+    if lit.len() < FEWEST {
+        lit = above(0.0);
+    }
+    let place = (lit.len() as f64 * BRIGHT) as usize;
+    if lit.is_empty() { 0.0 } else { *lit.select_nth_unstable_by(place, f64::total_cmp).1 }
+}
+
+/// The least D above 0, and the largest.
 pub(crate) fn range(information: &[f64]) -> [f64; 2] {
     let seen = || information.iter().copied().filter(|d| *d > 0.0);
-    let step = information.len().div_ceil(SAMPLES) | 1;
-    let mut sample: Vec<f64> = seen().step_by(step).collect();
-    sample.sort_unstable_by(f64::total_cmp);
-    let bright = sample.get((sample.len() as f64 * BRIGHT) as usize).copied();
-    [seen().fold(f64::INFINITY, f64::min), bright.unwrap_or(0.0)]
+    [seen().fold(f64::INFINITY, f64::min), seen().fold(0.0, f64::max)]
 }
 
 /// The variance of a measurement of weight 1 from squares of residuals: their median, which a few false ones do
@@ -65,17 +80,17 @@ pub(crate) fn variance(mut squares: Vec<f64>) -> f64 {
     median(&mut squares, f64::total_cmp).unwrap_or(0.0) / MEDIAN_OF_SQUARES
 }
 
-/// The pixels in light so weak that the prior weighs more than the data, or that M is not reliable.
+/// The pixels that have a prior, or light so weak beside others' that M is not reliable; D is that where the
+/// mean of M is 1.
 pub(crate) fn held(weights: &[f64], information: &[f64], variance: f64) -> Vec<usize> {
-    let [_, bright] = range(information);
-    let reliable = (RELIABLE * variance).min(bright / WEAK);
-    let is_held = |(weight, d): (&f64, &f64)| weight > d || (*d > 0.0 && *d < reliable);
+    let reliable = (RELIABLE * variance).min(bright(information, variance) / WEAK);
+    let is_held = |(weight, d): (&f64, &f64)| *weight > 0.0 || (*d > 0.0 && *d < reliable);
     let pixels = weights.iter().zip(information).enumerate();
     pixels.filter(|&(_, pixel)| is_held(pixel)).map(|(pixel, _)| pixel).collect()
 }
 
 /// The part of the pixels' unknowns that the data leave to the prior, as the expectation of F shows it, where M
-/// scatters about its mean by `scatter`:
+/// scatters about its mean of 1 by `scatter`:
 ///
 /// ```text
 /// Σ_p (1 − h)² (1 + D s²/σ²),   h = D/(D + λ)

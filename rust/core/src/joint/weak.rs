@@ -34,8 +34,8 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// The variance of a measurement of weight 1 from a sample of residuals, with so many degrees of
-    /// freedom.
-    pub(crate) fn variance(&self, freedom: f64) -> f64 {
+    /// freedom; `None` with none.
+    pub(crate) fn variance(&self, freedom: f64) -> Option<f64> {
         let Shape { rows, cols } = self.pass.exposures.sensor();
         let count = self.pass.exposures.count();
         let (mut squares, mut scratch) = (Vec::new(), vec![0.0; cols]);
@@ -59,7 +59,27 @@ impl<T: Real> System<'_, '_, T> {
                 }
             }
         }
-        prior::variance(squares) * self.pass.exposures.used() as f64 / freedom
+        let used = self.pass.exposures.used() as f64;
+        (freedom >= 1.0).then(|| prior::variance(squares) * used / freedom)
+    }
+
+    /// Takes the mean of M over lit pixels as that of the prior, which in a joint fit is held between steps;
+    /// in weak light M may be noise before it has a prior.
+    pub(crate) fn renew_mean(&mut self) {
+        let Some(mut prior) = self.prior.take() else { return };
+        let (mut sum, mut count, mut weights) = (0.0, 0_usize, prior.weights.iter());
+        self.pass.for_rows(|[sensitivity, inverse, ..]| {
+            for ((m, inverse), weight) in sensitivity.iter().zip(inverse).zip(weights.by_ref()) {
+                if *inverse > 0.0 && *weight == 0.0 {
+                    (sum, count) = (sum + m, count + 1);
+                }
+            }
+        });
+        let mean = if count > 0 { sum / count as f64 } else { self.mean };
+        let change = (prior.mean / mean).powi(2);
+        prior.weights.iter_mut().for_each(|weight| *weight *= change);
+        prior.mean = mean;
+        self.prior = Some(prior);
     }
 
     /// A prior of M pulls at the multiple of the beam, which is held: what pulls at cells is without that.

@@ -138,8 +138,9 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         terms.for_each(|((x, b), inverse)| *x = b * inverse);
     }
 
-    /// Takes out of the right-hand side what lies along the gauge direction M, in which S is 0: b is orthogonal
-    /// to M but for differences that do not add up.
+    /// Takes out of the right-hand side what lies along the gauge direction M, in which S is 0, for the whole sensor:
+    /// b is orthogonal to M but for differences that do not add up. Where the sensor is in pieces that is
+    /// approximate.
     pub(crate) fn take_gauge_out(&mut self) {
         let Reduced { sensitivity, inverse_diagonal, .. } = &self.reduced;
         let places = self.residual.iter().zip(sensitivity).zip(inverse_diagonal);

@@ -178,6 +178,11 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         Ok(bands.into_iter().sum::<f64>() + of_prior)
     }
 
+    /// The least D above 0 and that of a bright pixel, without the prior, where the mean of M is 1.
+    pub(crate) fn information_range(&self) -> [f64; 2] {
+        self.range.map(|d| d * self.mean * self.mean)
+    }
+
     /// The first half of a product: h, in each view, of an input.
     pub(super) fn eliminate(&mut self, input: Input<'_>, control: &Control) {
         let mut eliminated = std::mem::take(&mut self.eliminated);

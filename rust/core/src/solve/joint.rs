@@ -148,7 +148,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         if self.corrects_length(&linear.1) {
             return Ok(None);
         }
-        if self.weak.update_joint(&mut self.system, control)? {
+        let is_weighed_anew = self.weak.update_joint(&mut self.system, control)?;
+        if is_weighed_anew || (self.looks.len() < SETTLING && self.system.prior.is_some()) {
+            self.system.renew_mean();
             linear = self.system.linearise(control)?;
             self.preconditioner = None;
         }
@@ -311,8 +313,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         let (held, freed) = system.prior.as_ref().map_or((Vec::new(), 0.0), |prior| {
-            let (information, m) = (system.information(), &fit.sensitivity);
-            self.weak.held(&prior.weights, &information, m, system.mean)
+            let square = prior.mean * prior.mean;
+            let weights: Vec<f64> = prior.weights.iter().map(|weight| weight * square).collect();
+            self.weak.held(&weights, system.information(), &fit.sensitivity, prior.mean)
         });
         fit.degrees_of_freedom =
             degrees_of_freedom(system, &fit, without_offset.len()) + freed.round() as i64;

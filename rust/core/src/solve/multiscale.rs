@@ -94,8 +94,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
+        let limit = options.limit(MOST_PRODUCTS)?;
         Ok(Self {
-            limit: options.limit(MOST_PRODUCTS)?,
+            limit,
             estimate: start::estimate(exposures, start, workers, control)?,
             search: ConjugateGradients::new(exposures, workers, control),
             smallest: Smallest::default(),
@@ -104,7 +105,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             scale: Scale::of(exposures).slope(),
             products: 0,
             looks: Vec::new(),
-            by_logarithms: start.is_none(),
+            // The last look must have the best L.
+            by_logarithms: start.is_none() && limit > 2,
             length: 1.0,
             halvings: 0,
             rescues: 0,
@@ -133,6 +135,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.halvings = 0;
         if !first && self.weak.update(&mut self.estimate, &mut self.search, control)? {
             objective = self.slopes::<Plain>(control)?;
+            // That of another S.
+            self.smallest = Smallest::default();
         }
         self.look(objective, first, control)?;
         self.smallest.stuck |= stuck;
@@ -156,7 +160,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     /// nothing.
     fn gives_up_logarithms(&mut self, fell: bool, control: &Control) -> Result<bool> {
         let may_stay = !self.by_logarithms || self.looks.len() != 1;
-        if may_stay || (fell && !WeakLight::may_be(&self.estimate, &self.search)) {
+        if may_stay || (fell && !self.weak.may_be(&self.estimate, &self.search, control)?) {
             return Ok(false);
         }
         self.by_logarithms = false;

@@ -14,7 +14,7 @@ use crate::sweep::{Estimate, Plain};
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
 
-/// M of another fit, or equal pixels but for bright ones.
+/// M of another fit, or equal pixels but for those that stand out.
 pub(super) fn estimate<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
     start: Option<&Solution<'_>>,

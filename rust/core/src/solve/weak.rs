@@ -1,8 +1,9 @@
 //! Where light is weak: the noise that decides it, and the prior of M there.
 //!
-//! λ follows from D at the first beam, that of equal pixels, and from the variance σ² of a measurement of unit
-//! weight, so all methods have the same. σ² is that of residuals, rounded up to a power of 2. It only falls as the
-//! fit goes on, and λ with it, so that F + R never rises.
+//! λ follows from D at the first beam, that of equal pixels but for bright ones, and from the variance σ² of a
+//! measurement of unit weight. σ² is that of residuals, rounded up to a power of 2: methods that see nearly the
+//! same residuals have the same λ, unless σ² is next to such a power. It only falls as the fit goes on, and λ
+//! with it, so that F + R never rises.
 
 use std::sync::Arc;
 
@@ -23,8 +24,9 @@ use crate::sweep::{Estimate, Plain};
 const FAINTEST: f64 = 1e-24;
 /// How much D changes at most from the first beam on.
 const CHANGE: f64 = 4.0;
-/// Bytes for each pixel and each cell of each view that the first D takes: D, M and L.
-const BYTES: [u64; 2] = [16, 8];
+/// Bytes that weak light takes for each pixel and each cell of each view: D, M and L of the first beam; λ, λ in
+/// the units of the search and pieces; and the components that these are (`connectivity.rs`).
+const BYTES: [u64; 2] = [16 + 16 + 22, 8 + 13];
 
 /// The prior while it is sought.
 pub(crate) struct WeakLight {
@@ -34,6 +36,8 @@ pub(crate) struct WeakLight {
     variance: f64,
     /// D at the first beam, once light may be weak.
     first: Option<Vec<f64>>,
+    /// How many pixels have a measurement, once they are counted.
+    pixels: Option<usize>,
     /// The piece of connected pixels of each pixel, once one has a prior.
     pieces: Option<Arc<[i32]>>,
     /// How many unknowns the data leave to the prior.
@@ -42,12 +46,23 @@ pub(crate) struct WeakLight {
 
 impl WeakLight {
     pub(super) const fn new() -> Self {
-        Self { noise: 0.0, variance: f64::INFINITY, first: None, pieces: None, freed: 0.0 }
+        Self {
+            noise: 0.0,
+            variance: f64::INFINITY,
+            first: None,
+            pixels: None,
+            pieces: None,
+            freed: 0.0,
+        }
     }
 
-    /// Takes this noise; whether σ² falls.
-    fn hears<T: Real>(&mut self, exposures: &Exposures<'_, T>, noise: f64) -> bool {
-        self.noise = if exposures.variance_is_known() { noise.min(1.0) } else { noise };
+    /// Takes this noise, if residuals show any; whether σ² falls.
+    fn hears<T: Real>(&mut self, exposures: &Exposures<'_, T>, noise: Option<f64>) -> bool {
+        self.noise = if exposures.variance_is_known() {
+            noise.unwrap_or(1.0).min(1.0)
+        } else {
+            noise.unwrap_or(0.0)
+        };
         self.noise.log2().ceil().exp2() < self.variance
     }
 
@@ -74,9 +89,7 @@ impl WeakLight {
             Some(information) => information,
             None => first_information(exposures, workers, control)?,
         };
-        let is_seen = |d: f64| d > 0.0;
-        let weight = |&d: &f64| if is_seen(d) { prior::weight(d, variance) } else { 0.0 };
-        let weights: Arc<[f64]> = information.iter().map(weight).collect();
+        let weights = prior::weights(&information, variance);
         self.freed = prior::freed(&weights, &information, variance, 0.0);
         let prior = if weights.iter().any(|&weight| weight > 0.0) {
             let found = self.pieces.take().map_or_else(|| pieces(&information), Ok)?;
@@ -91,15 +104,27 @@ impl WeakLight {
 
     /// Whether residuals are so large, or light so weak, that some pixels may need a prior.
     pub(super) fn may_be<T: Real>(
+        &mut self,
         estimate: &Estimate<'_, '_, T>,
         search: &ConjugateGradients<'_, '_, T>,
-    ) -> bool {
+        control: &Control,
+    ) -> Result<bool> {
         let exposures = search.reduced.exposures;
-        let mut weak = Self::new();
-        weak.hears(exposures, estimate.variance(0.0));
-        let [least, bright] = search.reduced.range;
-        let variance = weak.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
-        least < CHANGE * LIT * variance
+        let unknown = self.unknown(exposures, control)?;
+        self.hears(exposures, estimate.variance(unknown));
+        let [least, bright] = search.reduced.information_range();
+        let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
+        Ok(least < CHANGE * LIT * variance)
+    }
+
+    /// How many unknown M the data determine.
+    fn unknown<T: Real>(&mut self, exposures: &Exposures<'_, T>, control: &Control) -> Result<f64> {
+        let pixels = match self.pixels {
+            Some(pixels) => pixels,
+            None => exposures.measured_pixels(control)?,
+        };
+        self.pixels = Some(pixels);
+        Ok(pixels as f64 - self.freed)
     }
 
     /// Gives an estimate, whose beam is up to date, the prior that follows from it; whether it has changed.
@@ -110,7 +135,8 @@ impl WeakLight {
         control: &Control,
     ) -> Result<bool> {
         let exposures = search.reduced.exposures;
-        if !self.hears(exposures, estimate.variance(self.freed)) {
+        let unknown = self.unknown(exposures, control)?;
+        if !self.hears(exposures, estimate.variance(unknown)) {
             return Ok(false);
         }
         if search.reduced.range == [0.0; 2] {
@@ -120,7 +146,7 @@ impl WeakLight {
             let ties = vec![Tie::Firm; exposures.sensor().len()];
             Ok(Components::of(exposures, &ties, control)?.pixels.into())
         };
-        let (range, workers) = (search.reduced.range, search.workers());
+        let (range, workers) = (search.reduced.information_range(), search.workers());
         let found = self.decide(exposures, range, connected, workers, control)?;
         let Some(prior) = found else { return Ok(false) };
         estimate.prior = prior;
@@ -143,7 +169,9 @@ impl WeakLight {
             let piece = |d: &f64| if *d > 0.0 { 0 } else { NONE };
             Ok(information.iter().map(piece).collect())
         };
+        let square = system.mean * system.mean;
         let (range, workers) = (prior::range(&system.information()), system.pass.workers);
+        let range = range.map(|d| d * square);
         let found = self.decide(exposures, range, connected, workers, control)?;
         let Some(prior) = found else { return Ok(false) };
         let mean = system.mean;
@@ -154,17 +182,18 @@ impl WeakLight {
         Ok(true)
     }
 
-    /// The pixels of a result that the prior holds, and how many unknowns the data leave to it.
+    /// The pixels of a result of this mean that the prior holds, and how many unknowns the data leave to it.
     pub(super) fn held(
         &self,
         weights: &[f64],
-        information: &[f64],
+        mut information: Vec<f64>,
         sensitivity: &[f64],
         mean: f64,
     ) -> (Vec<usize>, f64) {
+        information.iter_mut().for_each(|d| *d *= mean * mean);
         let scatter = prior::scatter(weights, sensitivity, mean);
-        let freed = prior::freed(weights, information, self.noise, scatter);
-        (prior::held(weights, information, self.noise), freed)
+        let freed = prior::freed(weights, &information, self.noise, scatter);
+        (prior::held(weights, &information, self.noise), freed)
     }
 }
 

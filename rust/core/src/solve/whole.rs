@@ -51,8 +51,7 @@ pub(super) fn minimise<T: Real>(
     if let Some(prior) = &prior {
         let (information, m) = (estimate.information(control)?, &estimate.sensitivity);
         let mean = m.iter().sum::<f64>() / m.len() as f64;
-        let weights: Vec<f64> = prior.weights.iter().map(|weight| weight / (mean * mean)).collect();
-        (held, freed) = weak.held(&weights, &information, m, mean);
+        (held, freed) = weak.held(&prior.weights, information, m, mean);
     }
     // After the solver, whose vectors then free memory for the sets.
     let (sensitivity, values) = estimate.into_maps();
@@ -127,11 +126,12 @@ fn weakly_tied<T: Real>(
 ///
 /// | array | in bytes |
 /// |---|---|
-/// | M, and D at the first beam where light may be weak | 16 for each pixel |
+/// | M, and one more map | 16 for each pixel |
 /// | L | 8 for each cell of each view |
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
-/// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell.
+/// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell. What weak
+/// light takes besides is asked for where it is found (`weak.rs`).
 fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let geometry = exposures.geometry();
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);

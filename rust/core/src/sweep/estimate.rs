@@ -72,12 +72,15 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                 let row = darkest(exposures, row_of_sensor, &mut scratch);
                 for (col, m) in pixels.iter_mut().enumerate() {
                     let range = col.saturating_sub(AROUND)..cols.min(col + AROUND + 1);
+                    // Where nothing is measured it is infinite.
                     let around = &row[range.clone()];
                     // Most are settled by the two at the ends.
                     let ends = [around[0], around[around.len() - 1]];
                     let [low, high] = [ends[0].min(ends[1]), ends[0].max(ends[1])];
                     if row[col] > UNLIKE * low || UNLIKE * row[col] < high {
-                        let median = median(&mut around.to_vec(), f64::total_cmp).unwrap_or(0.0);
+                        let mut known: Vec<f64> =
+                            around.iter().copied().filter(|y| y.is_finite()).collect();
+                        let median = median(&mut known, f64::total_cmp).unwrap_or(0.0);
                         let place = [row_of_sensor, col];
                         let bright = row[col] > UNLIKE * median
                             && stands_out(exposures, place, &range, |y, m| y > UNLIKE * m);
@@ -216,9 +219,9 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         Ok(found)
     }
 
-    /// The variance of a measurement of weight 1 from a sample of residuals, with `freed` unknowns left to a
-    /// prior.
-    pub(crate) fn variance(&self, freed: f64) -> f64 {
+    /// The variance of a measurement of weight 1 from a sample of residuals, with this number of unknown M;
+    /// `None` if there are as many unknowns as measurements.
+    pub(crate) fn variance(&self, pixels: f64) -> Option<f64> {
         let Shape { rows, cols } = self.exposures.sensor();
         let geometry = self.exposures.geometry();
         let mut squares = Vec::new();
@@ -244,8 +247,8 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         }
         let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
         let used = self.exposures.used() as f64;
-        let freedom = (used + freed - (rows * cols + cells) as f64).max(1.0);
-        prior::variance(squares) * used / freedom
+        let freedom = used - pixels - cells as f64;
+        (freedom >= 1.0).then(|| prior::variance(squares) * used / freedom)
     }
 
     /// Takes M as given; what is not a number becomes 1.

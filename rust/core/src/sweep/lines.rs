@@ -43,12 +43,19 @@ pub(super) fn stands_out<T: Real>(
 ) -> bool {
     let mut scratch = vec![0.0; around.len()];
     (0..exposures.count()).all(|exposure| {
-        let values = match exposures.stretch(exposure, row, around.clone(), &mut scratch) {
-            Stretch::Uniform(values, _) | Stretch::Weighted(values, _) => values,
-        };
-        let mut found: Vec<f64> = values.iter().map(|value| value.to_f64()).collect();
+        let mut found: Vec<f64> =
+            match exposures.stretch(exposure, row, around.clone(), &mut scratch) {
+                Stretch::Uniform(values, _) => values.iter().map(|value| value.to_f64()).collect(),
+                // A measurement that is not used may have any value, or none.
+                Stretch::Weighted(values, weights) => {
+                    let used = |(value, weight): (&T, &f64)| {
+                        if *weight > 0.0 { value.to_f64() } else { f64::NAN }
+                    };
+                    values.iter().zip(weights).map(used).collect()
+                }
+            };
         let own = found[col - around.start];
-        // A measurement that is not used may have any value, or none.
+        found.retain(|value| value.is_finite());
         !own.is_finite() || median(&mut found, f64::total_cmp).is_none_or(|m| differs(own, m))
     })
 }
