@@ -347,7 +347,7 @@ class TestCountsOfLevels:
 
 
 class TestDarks:
-    @pytest.fixture(scope="class")
+    @pytest.fixture
     def calibration(self):
         return calibrated()
 
