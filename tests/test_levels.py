@@ -186,7 +186,9 @@ class TestCommands:
         assert err.count("\n") == 1
         assert not output.exists()
         assert run("nuc", "fit", "--help")[0] == 0
-        assert run("nuc")[0] in (0, 2)
+        status, out, err = run("nuc")
+        assert status == 2
+        assert all(command in out + err for command in ("fit", "defects", "quality"))
 
 
 class TestDefectsAndQuality:
@@ -199,11 +201,25 @@ class TestDefectsAndQuality:
     def test_defects_are_those_of_the_function(self, run, saved, folder, tmp_path):
         response, path = saved
         output = tmp_path / "flagged.npz"
-        options = ("-o", output, "--noise-limit", "1.05", "--json")
-        status, out, _ = run("nuc", "defects", path, folder / "level2.tif", *options)
-        assert status == 0
+        limits = {
+            "response": 0.985,
+            "gain": 1.02,
+            "noise": 1.05,
+            "correlation": 0.1,
+            "range": 1.5,
+            "misfit": 0.5,
+        }
+        given = [text for name, each in limits.items() for text in (f"--{name}-limit", str(each))]
+        options = ("-o", output, *given, "--json")
         raw = io.read_frames(folder / "level2.tif")
-        wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(noise=1.05))
+        raw[::2, 3, 4] += 300  # noise
+        raw[:8, 5, 6] += 300  # flicker
+        io.write_frames(folder / "noisy.tif", iter(raw), nbytes=1)
+        status, out, _ = run("nuc", "defects", path, folder / "noisy.tif", *options)
+        assert status == 0
+        wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(**limits))
+        # Each limit has an effect, so each option is taken.
+        assert min(wanted.counts.values()) > 0
         told = json.loads(out)
         assert {name: told[name] for name in wanted.counts} == wanted.counts
         assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
@@ -227,6 +243,14 @@ class TestDefectsAndQuality:
         noise = metrics.three_d_noise(replaced)
         assert told["noise_variances"] == pytest.approx(vars(noise))
         assert told["roughness"] == pytest.approx(metrics.roughness(replaced.mean(axis=0)))
+
+    @pytest.mark.parametrize("command", ["defects", "quality"])
+    def test_another_sensor_is_refused(self, run, saved, folder, command):
+        arguments = ("nuc", command, saved[1], folder / "level2.tif", "--sensor")
+        assert run(*arguments, "array 7")[0] == 0
+        status, out, err = run(*arguments, "array 8")
+        assert (status, out) == (1, "")
+        assert "'array 8', but the correction is of 'array 7'" in err
 
     def test_files_of_another_kind_are_refused(self, run, saved, folder):
         status, _, err = run("nuc", "quality", saved[1], saved[1])
