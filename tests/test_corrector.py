@@ -430,6 +430,26 @@ class TestResults:
         other = equipix.combine(result, equipix.Polynomial(*identity()))
         assert not np.array_equal(other.correct(frames(), flagged="replace"), first - 1)
 
+    def test_prepared_coefficients_are_those_asked_for(self):
+        planes, flags = identity()
+        flags[3, 4] = Flag.DO_NOT_USE
+        polynomial, other = (equipix.Polynomial(each * planes, flags) for each in (1, 2))
+        for _ in range(2):
+            for flagged in ("nan", "keep", "replace"):
+                for each in (polynomial, other):
+                    wanted = Corrector(each, "float32", flagged=flagged).apply(frames())
+                    found = each.correct(frames(), flagged=flagged)
+                    np.testing.assert_array_equal(found, wanted)
+
+    def test_a_dark_of_the_caller_may_change(self):
+        calibration, dark = calibrated(), np.full(SHAPE, 10.0)
+        first = calibration.correct(frames(), dark=dark)
+        dark += 5
+        wanted = calibration.correct(frames(), dark=np.full(SHAPE, 15.0))
+        again = calibration.correct(frames(), dark=dark)
+        np.testing.assert_array_equal(again, wanted)
+        assert (again < first).all()
+
     def test_prepared_coefficients_end_with_their_result(self):
         polynomial = equipix.Polynomial(*identity())
         before = len(kernel._KEPT)

@@ -22,8 +22,22 @@ if TYPE_CHECKING:
 FAST = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 """Types of frames, and of corrected frames, that the compiled part takes."""
 
-_KEPT: dict[tuple[Any, ...], tuple[tuple[weakref.ref[Array], ...], _native.Corrector]] = {}
-"""Prepared coefficients of results, by the identities of their arrays."""
+
+class _Kept(NamedTuple):
+    """Prepared coefficients, and the arrays and the treatment that they were prepared for."""
+
+    references: tuple[weakref.ref[Array], ...]
+    flagged: str
+    prepared: _native.Corrector
+
+    def fits(self, sources: tuple[Array, ...], flagged: str) -> bool:
+        """Whether they are for these; another array may have the identity of one that is gone."""
+        pairs = zip(self.references, sources, strict=True)
+        return self.flagged == flagged and all(own() is other for own, other in pairs)
+
+
+_KEPT: dict[tuple[int, ...], _Kept] = {}
+"""Prepared coefficients of results, by the identities of their arrays: of each the last ones."""
 
 
 def native(
@@ -42,7 +56,7 @@ def native(
 def kept(
     sources: tuple[Array, ...], flagged: Flagged, coefficients: Callable[[], Array]
 ) -> _native.Corrector:
-    """Prepare coefficients once for a result, as long as its arrays live.
+    """Prepare coefficients once for a result, as long as its arrays live and `flagged` is the same.
 
     Parameters
     ----------
@@ -62,18 +76,17 @@ def kept(
     flags = sources[-1]
     if any(array.flags.writeable for array in sources):
         return native(coefficients(), flags, flagged)
-    key = (flagged, *map(id, sources))
-    references, found = _KEPT.get(key, ((), None))
-    # Another array may have the identity of one that is gone.
-    same = [reference() for reference in references]
-    if found is None or any(one is not other for one, other in zip(same, sources, strict=True)):
-        found = native(coefficients(), flags, flagged)
+    key = tuple(map(id, sources))
+    found = _KEPT.get(key)
+    if found is not None and found.fits(sources, flagged):
+        return found.prepared
 
-        def forget(_: object) -> None:
-            _KEPT.pop(key, None)
+    def forget(_: object) -> None:
+        _KEPT.pop(key, None)
 
-        _KEPT[key] = (tuple(weakref.ref(array, forget) for array in sources), found)
-    return found
+    references = tuple(weakref.ref(array, forget) for array in sources)
+    found = _KEPT[key] = _Kept(references, flagged, native(coefficients(), flags, flagged))
+    return found.prepared
 
 
 class Counts(NamedTuple):
