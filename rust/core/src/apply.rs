@@ -22,7 +22,7 @@ use crate::frames::{Shape, Stack};
 use crate::parallel::Workers;
 
 /// Pixels that a thread corrects at a time.
-const BLOCK: usize = 1 << 14;
+const BLOCK: usize = 1 << 15;
 
 /// Most pixels that the calling thread corrects alone: a quarter of a millisecond, in which other
 /// threads would hardly have started. Of larger stacks each thread takes whole frames, and of larger
@@ -40,9 +40,6 @@ const WHOLE: f32 = 8_388_608.0;
 pub trait Raw: Copy + Send + Sync {
     /// The value in single precision.
     fn value(self) -> f32;
-
-    /// The largest of many values; 0 where none is above 0.
-    fn highest(values: &[Self]) -> f32;
 }
 
 /// A corrected value.
@@ -57,11 +54,6 @@ macro_rules! whole_numbers {
             #[inline(always)]
             fn value(self) -> f32 {
                 f32::from(self)
-            }
-
-            #[inline(always)]
-            fn highest(values: &[Self]) -> f32 {
-                f32::from(values.iter().copied().max().unwrap_or(0))
             }
         }
 
@@ -83,21 +75,6 @@ impl Raw for f32 {
     #[inline(always)]
     fn value(self) -> f32 {
         self
-    }
-
-    #[inline(always)]
-    fn highest(values: &[Self]) -> f32 {
-        const LANES: usize = 16;
-        // A value that is not a number is larger than none.
-        let larger = |one: f32, other: f32| if other > one { other } else { one };
-        let (blocks, rest) = values.as_chunks::<LANES>();
-        let mut lanes = [0.0; LANES];
-        for block in blocks {
-            for i in 0..LANES {
-                lanes[i] = larger(lanes[i], block[i]);
-            }
-        }
-        lanes.iter().chain(rest).copied().fold(0.0, larger)
     }
 }
 
@@ -189,6 +166,13 @@ fn widened([low, high]: [f32; 2]) -> [f32; 2] {
 #[inline(always)]
 fn is_outside(value: f32, [low, high]: [f32; 2]) -> bool {
     (value < low) | (value > high)
+}
+
+/// Bits of a number, which for numbers from 0 on have their order and for others are not above 0; what
+/// is not a number is 0. A maximum of them is found in vector registers, one of numbers is not.
+#[inline(always)]
+fn order_of(value: f32) -> i32 {
+    if value.is_nan() { 0 } else { value.to_bits().cast_signed() }
 }
 
 thread_local! {
@@ -411,7 +395,7 @@ impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, 
 
     #[inline(always)]
     fn call(self) -> Counts {
-        let (mut limited, mut extrapolated) = (0_u32, 0_u32);
+        let (mut limited, mut extrapolated, mut highest) = (0_u32, 0_u32, 0);
         let length = self.out.len();
         let (frame, planes) = (&self.frame[..length], self.planes.map(|plane| &plane[..length]));
         for (i, out) in self.out.iter_mut().enumerate() {
@@ -424,11 +408,12 @@ impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, 
             *out = value;
             limited += u32::from(changed);
             extrapolated += u32::from(is_outside(sum, self.range));
+            highest = highest.max(order_of(y));
         }
         Counts {
             limited: limited.into(),
             extrapolated: extrapolated.into(),
-            highest: I::highest(frame),
+            highest: f32::from_bits(highest.cast_unsigned()),
         }
     }
 }
