@@ -187,7 +187,8 @@ class TestCommands:
         assert not output.exists()
         assert run("nuc", "fit", "--help")[0] == 0
         status, out, err = run("nuc")
-        assert status == 2
+        # Typer shows the help of a group without a command, by releases as a success or a misuse.
+        assert status in (0, 2)
         assert all(command in out + err for command in ("fit", "defects", "quality"))
 
 
