@@ -70,6 +70,9 @@ class FrameStatistics(ReadOnly):
         The level that samples were compared with, in DN; None if there was none.
     raw : bool
         Whether no dark was subtracted from whole numbers, as cameras write them.
+    reject : float or None
+        The deviation, in standard deviations, beyond which samples were left out; None where all
+        count.
     """
 
     mean: NDArray[Any]
@@ -80,6 +83,7 @@ class FrameStatistics(ReadOnly):
     dark: FrameStatistics | None = None
     saturation: float | None = None
     raw: bool = False
+    reject: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
@@ -226,6 +230,8 @@ def average(
             statistics = _average_batches(
                 given, level, workers, progress, _length(source), rejection
             )
+        if reject is not None:
+            statistics = dataclasses.replace(statistics, reject=float(reject))
         return _masked(_subtract(statistics, offset), mask)
 
 
@@ -235,10 +241,10 @@ def save_statistics(
     """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content |= {"saturation": statistics.saturation, "raw": statistics.raw}
+    content |= {name: getattr(statistics, name) for name in ("saturation", "raw", "reject")}
     if dark is not None:
         pages |= {_DARK + name: values for name, values in dark.maps.items()}
-        content[_DARK + "saturation"] = dark.saturation
+        content |= {_DARK + "saturation": dark.saturation, _DARK + "reject": dark.reject}
     io.save_pages(path, pages, content, force=force)
 
 
@@ -265,8 +271,10 @@ def _of_pages(
     pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
 ) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    level = content.get(before + "saturation")
-    return FrameStatistics(mean, variance, of_mean, count, saturated, saturation=level)
+    level, reject = (content.get(before + name) for name in ("saturation", "reject"))
+    return FrameStatistics(
+        mean, variance, of_mean, count, saturated, saturation=level, reject=reject
+    )
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._check import as_array
-from equipix.correction.corrector import FAST, check_flagged, largest_of, native, run
+from equipix._check import as_array, naming_memory
+from equipix.correction.kernel import FAST, check_flagged, kept, largest_of, run
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.frames import FrameStatistics, refuse_subtracted
@@ -54,17 +54,18 @@ def apply(
     InputError
         If a shape does not fit, or `flagged` is unknown.
     """
-    raw = _checked(frames, flags, flagged)
-    dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
-    result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
-    bad = ~usable(flags)
-    for source, target in zip(_each(raw), _each(result), strict=True):
-        formula(source, target)
-        if flagged == "nan":
-            target[bad] = np.nan
-        elif flagged == "replace":
-            replace_bad(target, bad)
-    return result
+    with naming_memory("correcting"):
+        raw = _checked(frames, flags, flagged)
+        dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
+        result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
+        bad = ~usable(flags)
+        for source, target in zip(_each(raw), _each(result), strict=True):
+            formula(source, target)
+            if flagged == "nan":
+                target[bad] = np.nan
+            elif flagged == "replace":
+                replace_bad(target, bad)
+        return result
 
 
 def apply_polynomial(
@@ -81,7 +82,7 @@ def apply_polynomial(
     then be of whole numbers, which are rounded half to even and limited to the range of the type.
     Others are corrected in float64. The other parameters are those of `apply`.
     """
-    fast = _fast(frames, coefficients, flags=flags, flagged=flagged, out=out)
+    fast = _fast(frames, (coefficients, flags), lambda: coefficients, flagged=flagged, out=out)
     if fast is not None:
         return fast
 
@@ -101,6 +102,7 @@ def apply_gain(
     *,
     gain: NDArray[Any],
     dark: FrameStatistics | ArrayLike | None,
+    stored: NDArray[Any] | None,
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
@@ -108,45 +110,64 @@ def apply_gain(
     """(frame − dark) / gain of each value, and the values of flagged pixels.
 
     The parameters are those of `equipix.Calibration.correct`; frames and results of some types go
-    to the compiled part, as in `apply_polynomial`.
+    to the compiled part, as in `apply_polynomial`. Coefficients are prepared once for no dark and
+    for the `stored` one of the result; another may change between two calls.
     """
-    offset = np.zeros((), np.float32) if dark is None else dark_frame(dark, gain.shape)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
-        coefficients = np.stack([-offset / gain, 1 / gain])
-    fast = _fast(frames, coefficients, flags=flags, flagged=flagged, out=out)
+    offset = None if dark is None else dark_frame(dark, gain.shape)
+    sources: tuple[NDArray[Any], ...] = (gain, flags)
+    if dark is stored and stored is not None:
+        sources = (gain, stored, flags)
+    elif offset is not None:
+        sources = (gain, offset.copy(), flags)  # a copy is no array of the result
+    fast = _fast(frames, sources, lambda: gain_coefficients(gain, offset), flagged=flagged, out=out)
     if fast is not None:
         return fast
+    dark_level = np.zeros((), np.float32) if offset is None else offset
 
     def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
-        np.subtract(frame, offset, out=corrected, dtype=corrected.dtype, casting="same_kind")
+        np.subtract(frame, dark_level, out=corrected, dtype=corrected.dtype, casting="same_kind")
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(corrected, gain, out=corrected, casting="same_kind")
 
     return apply(frames, formula, flags=flags, flagged=flagged, out=out)
 
 
+def gain_coefficients(gain: NDArray[Any], dark: NDArray[Any] | None) -> NDArray[Any]:
+    """Coefficients c_0 = −dark/gain, 0 without a dark, and c_1 = 1/gain; NaN where gain is."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have gain 0
+        inverse = 1 / gain.astype(np.float64)
+        offset = np.zeros_like(inverse) if dark is None else -dark * inverse
+    offset[np.isnan(inverse)] = np.nan
+    return np.stack([offset, inverse])
+
+
 def _fast(
     frames: ArrayLike,
-    coefficients: NDArray[Any],
+    sources: tuple[NDArray[Any], ...],
+    coefficients: Callable[[], NDArray[Any]],
     *,
-    flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
 ) -> NDArray[Any] | None:
-    """Correct frames by the compiled part; None where it does not take their types."""
-    raw = _checked(frames, flags, flagged)
-    if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
-        return None
-    result = np.empty(raw.shape, np.float32) if out is None else out
-    run(native(coefficients, flags, flagged), raw, result, largest_of(result.dtype), None)
-    return result
+    """Correct frames by the compiled part; None where it does not take their types.
+
+    `sources` are the arrays that `coefficients` makes coefficients of, the flags last.
+    """
+    with naming_memory("correcting"):
+        raw = _checked(frames, sources[-1], flagged)
+        if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
+            return None
+        result = np.empty(raw.shape, np.float32) if out is None else out
+        if raw.size:
+            prepared = kept(sources, flagged, coefficients)
+            run(prepared, raw, result, largest_of(result.dtype), None)
+        return result
 
 
 def _is_plain(out: NDArray[Any], raw: NDArray[Any]) -> bool:
     """Whether the compiled part can write to an array."""
     fits = isinstance(out, np.ndarray) and out.dtype in FAST and out.shape == raw.shape
-    free = fits and out.flags.c_contiguous and out.flags.writeable
-    return bool(free and not np.may_share_memory(out, raw))
+    return bool(fits and out.flags.carray and not np.may_share_memory(out, raw))
 
 
 def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArray[Any]:

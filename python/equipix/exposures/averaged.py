@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,20 @@ if TYPE_CHECKING:
     from equipix.frames import FrameStatistics
 
 
+class Words(NamedTuple):
+    """What messages call the argument of the measurements, and one of them."""
+
+    argument: str = "'frames'"
+    one: str = "exposure"
+
+    def place(self, number: int, name: str = "") -> str:
+        """Name one of the measurements."""
+        return f"{self.argument}: {self.one} {number}{f' ({name!r})' if name else ''}"
+
+
+EXPOSURES = Words()
+
+
 class Averaged:
     """The part of the `FrameStatistics` of each exposure that a calibration needs.
 
@@ -42,6 +56,10 @@ class Averaged:
         Gain of the camera where it is known, in DN per electron.
     saturation : float, optional
         Level that was averaged with, in DN, where it is known; for messages.
+    saturation_key : str
+        What messages call that level.
+    words : Words
+        What messages call the frames.
 
     Attributes
     ----------
@@ -64,7 +82,9 @@ class Averaged:
         gain: float | None = None,
         saturation: float | None = None,
         saturation_key: str = "saturation",
+        words: Words = EXPOSURES,
     ) -> None:
+        self._words = words
         self.count, self.gain, self.saturation = count, gain, saturation
         self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
@@ -77,9 +97,9 @@ class Averaged:
         self.raw = True
 
     @classmethod
-    def of(cls, frames: Sequence[FrameStatistics]) -> Self:
+    def of(cls, frames: Sequence[FrameStatistics], *, words: Words = EXPOSURES) -> Self:
         """Reduce the statistics of all exposures."""
-        averaged = cls(len(frames))
+        averaged = cls(len(frames), words=words)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -103,15 +123,16 @@ class Averaged:
             self.dark = frames.dark
         if shape != self.saturated.shape:
             raise InputError(
-                f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
+                f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
+                "expected one"
             )
         if not same_statistics(frames.dark, self.dark):
             raise InputError(
-                f"'frames': exposure {exposure} has another dark than the first: average all with "
+                f"{self._words.place(exposure)} has another dark than the first: average all with "
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        which = f"'frames': exposure {exposure}{f' ({name!r})' if name else ''}"
+        which = self._words.place(exposure, name)
         _refuse_no_variance(which, frames)
         self._refuse_saturated(which, frames)
         clipped = clipping_of(frames)
