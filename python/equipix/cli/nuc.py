@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from equipix.correction.protocol import Correction
 
 commands = typer.Typer()
-nuc = typer.Typer(no_args_is_help=True, help="Correction with a uniform source.")
+nuc = typer.Typer(
+    no_args_is_help=True,
+    help="Uniform source: fit response curves, find bad pixels, measure quality.",
+)
 commands.add_typer(nuc, name="nuc")
 
 _ORDERS = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
