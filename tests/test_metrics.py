@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -9,13 +11,58 @@ import equipix
 from equipix import errors, io, metrics
 from equipix.metrics.correctability import _fisher_quantile
 from equipix.metrics.emva import high_passed
+from equipix.metrics.moments import temporal_of
 
 SHAPE = (48, 64)
+EPS = np.finfo(np.float64).eps
 
 
 def frames_of(rng, count=16, spatial=0.0, temporal=1.0, shape=SHAPE):
     pattern = spatial * rng.standard_normal(shape)
     return 1000 + pattern + temporal * rng.standard_normal((count, *shape))
+
+
+class TestTemporal:
+    """The one computation of temporal noise, one frame at a time."""
+
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+    def test_it_is_that_of_the_whole_stack(self, dtype):
+        rng = np.random.default_rng(20)
+        stack = rng.integers(20, 200, (12, *SHAPE)).astype(dtype)
+        mask = rng.random(SHAPE) < 0.1
+        found = temporal_of(stack, mask)
+        whole = stack.astype(np.float64)
+        free = whole - whole[:, ~mask].mean(axis=1)[:, None, None]
+        # Sums of 12 squares of up to 180: some roundings of each.
+        atol = 100 * EPS * 180**2
+        np.testing.assert_allclose(found.variance, free.var(axis=0, ddof=1), rtol=0, atol=atol)
+        np.testing.assert_allclose(found.mean, whole.mean(axis=0), rtol=0, atol=atol)
+        steps = np.sum(np.diff(free, axis=0) ** 2, axis=0)
+        np.testing.assert_allclose(found.steps, steps, rtol=0, atol=12 * atol)
+
+    def test_a_missing_sample_stays_in_its_pixel(self):
+        stack = frames_of(np.random.default_rng(21))
+        stack[3, 5, 6] = np.inf
+        found = temporal_of(stack)
+        for each in (found.variance, found.mean):
+            assert np.argwhere(~np.isfinite(each)).tolist() == [[5, 6]]
+        assert np.argwhere(~found.used).tolist() == [[5, 6]]
+
+    @pytest.mark.parametrize("metric", [metrics.correctability, metrics.three_d_noise])
+    def test_the_stack_is_not_copied(self, metric):
+        stack = np.random.default_rng(22).integers(0, 99, (200, 100, 128), dtype=np.uint16)
+        tracemalloc.start()
+        metric(stack)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        # As float64 the stack would take 200 frames; the sums are some frames.
+        assert peak < 20 * 100 * 128 * 8
+
+    @pytest.mark.parametrize("metric", [metrics.correctability, metrics.three_d_noise])
+    def test_too_little_memory_is_named(self, metric):
+        huge = np.broadcast_to(np.uint16(1), (2, 10**7, 10**7))
+        with pytest.raises(errors.InsufficientMemoryError, match="Unable to allocate"):
+            metric(huge)
 
 
 class TestCorrectability:

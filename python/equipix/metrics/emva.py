@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix._check import naming_memory
 from equipix.errors import InputError
 from equipix.metrics.moments import Moments, moments, signed_root
 
@@ -51,6 +52,7 @@ class EmvaSpatial:
     bright_mean: float
 
 
+@naming_memory("EMVA 1288 non-uniformity")
 def emva_spatial(
     dark: ArrayLike | FrameStatistics,
     bright: ArrayLike | FrameStatistics,

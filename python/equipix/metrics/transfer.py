@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array
+from equipix._check import as_array, naming_memory
 from equipix.errors import InputError
 from equipix.metrics.moments import moments, signed_root
 
@@ -55,6 +55,7 @@ class EmvaTransfer:
     linearity_error: float
 
 
+@naming_memory("photon transfer")
 def emva_transfer(
     dark: Sequence[ArrayLike | FrameStatistics],
     bright: Sequence[ArrayLike | FrameStatistics],

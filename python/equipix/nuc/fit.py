@@ -155,8 +155,7 @@ def _fitted(
 ) -> Response:
     """Fit one order and invert it."""
     deviation, variances, misfit, used = levels.fit(form_of(order, by), workers=workers)
-    terms = order + 1
-    freedom = used.astype(np.int64) - terms
+    freedom = used.astype(np.int64) - (order + 1)
     chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
     if levels.noise is None:
         variances = variances * _pooled(misfit, freedom, levels.usable)
@@ -172,6 +171,7 @@ def _fitted(
         inverse_error=difference,
         limits=limits,
         reduced_chi2=chi2,
+        used=used,
         flags=_flags(deviation, levels, rising),
         levels=levels.references,
         dark=levels.dark,
