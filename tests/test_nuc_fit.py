@@ -7,6 +7,7 @@ import pytest
 
 import equipix
 from equipix import Flag, NoiseModel, errors, nuc, reference
+from equipix.exposures.averaged import Averaged
 
 SHAPE = (48, 64)
 LEVELS = np.linspace(300.0, 3500.0, 8)
@@ -397,6 +398,7 @@ class TestRefusals:
             ({"mask": np.ones(SHAPE, bool)}, r"'levels': 0.0% .* no value in 100.0%"),
             ({"by": "both"}, "'by' is 'both'"),
             ({"order": 2, "by": "gain"}, "order 2 corrects offset and gain"),
+            ({"order": "auto", "by": "gain"}, "order 'auto' corrects offset and gain"),
             ({"mask": np.zeros((2, 2), bool)}, "'mask' has shape"),
             ({"variance": np.ones(3)}, "'variance'"),
             ({"variance": np.ones((8, *SHAPE))}, "expected \\(8,\\) or a NoiseModel"),
@@ -451,6 +453,24 @@ class TestRawAverages:
             limit = 5 * np.sqrt(2 / freedom) + 0.01
             assert response.reduced_chi2.mean() == pytest.approx(1, abs=limit)
             assert np.count_nonzero(response.flags) == 0
+
+    def test_a_gain_of_raw_averages_is_refused(self):
+        raw = self.averages(200)[-1:]
+        with pytest.raises(errors.InputError, match="'levels' are averages of raw frames"):
+            nuc.fit(raw, order=0, by="gain")
+        zero = equipix.average(np.full((2, *SHAPE), 200, np.uint16))
+        subtracted = [equipix.average([raw[0].mean + each for each in (-1, 1)], dark=zero)]
+        found = nuc.fit(subtracted, order=0, by="gain")
+        np.testing.assert_allclose(1 + found.deviation[1], subtracted[0].mean / found.levels[0])
+
+    def test_the_averages_given_are_not_changed(self):
+        averaged = Averaged.of(self.averages(200))
+        plain = averaged.noise
+        response = nuc.fit(averaged, order=1)
+        assert averaged.pedestal == 0
+        assert averaged.noise is plain
+        fresh = nuc.fit(self.averages(200), order=1)
+        np.testing.assert_array_equal(response.variances, fresh.variances)
 
     def test_no_dark_can_replace_the_offset(self):
         response = nuc.fit(self.averages(200), order=1)

@@ -51,7 +51,8 @@ def fit(
         Highest power of the array's mean: 0 one-point, 1 two-point, 2 quadratic, 3 cubic. It needs
         order + 1 levels that differ. "auto" takes the order that best predicts levels left out.
     by : {"offset", "gain"}
-        What a one-point correction changes. "gain" needs levels without dark level.
+        What a one-point correction (``order=0``) changes. "gain" needs levels without dark level:
+        averages of raw frames are refused.
     variance : NoiseModel, array_like of shape (n,), or sequence of NoiseModel, optional
         Variance of the values given, in DN²; by default averages give it, and arrays have equal
         weights.

@@ -145,7 +145,7 @@ def levels_of(
     with _naming_levels():
         averaged = _averaged(levels)
         if averaged is not None and averaged.raw and averaged.count > 1:
-            averaged.count_from_lowest()
+            averaged = averaged.counted_from_lowest()
         measured = measured_of(levels if averaged is None else averaged, variance, saturation)
         given = None if mask is None else as_mask(mask, measured.values.shape)
     if measured.clipped is not None:
