@@ -17,6 +17,10 @@ SIZES = (30.0, 0.05, 4e-6, 1e-9)
 """Spread of a, K, c and e over the pixels, for signals of thousands of DN."""
 
 
+STRONG = pytest.mark.filterwarnings("ignore::equipix.errors.InverseWarning")
+"""For curves of third order that bend more than a cubic inverse can follow, as they are told."""
+
+
 def truth(order, rng, shape=SHAPE):
     """Coefficients whose means over the pixels are 0, so that V̄ is the mean of the array."""
     found = np.stack([size * rng.standard_normal(shape) for size in SIZES[: order + 1]])
@@ -41,6 +45,7 @@ def cubic():
     return deviation, levels, nuc.fit(levels, order=3, variance=NOISE)
 
 
+@STRONG
 class TestAgainstTheReference:
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
     @pytest.mark.parametrize(
@@ -99,6 +104,7 @@ class TestAgainstTheReference:
         np.testing.assert_allclose(corrected, wanted, rtol=100 * EPS)
 
 
+@STRONG
 class TestStatistics:
     def test_coefficients_lie_within_their_standard_errors(self, cubic):
         deviation, _, response = cubic
@@ -152,6 +158,7 @@ class TestStatistics:
         np.testing.assert_array_equal(response.dark, dark.mean)
 
 
+@STRONG
 class TestLaws:
     def test_the_order_of_the_levels_plays_no_part(self, cubic):
         _, levels, response = cubic
@@ -213,6 +220,7 @@ class TestOnePoint:
         np.testing.assert_allclose(response.correct(2 * level), 2 * level.mean(), rtol=10 * EPS)
 
 
+@STRONG
 class TestOrder:
     @pytest.mark.parametrize("order", [1, 2, 3])
     def test_auto_finds_the_order_of_the_curves(self, order):
@@ -251,6 +259,28 @@ class TestInverse:
         assert response.largest_inverse_error == response.inverse_error[good].max()
         assert np.nanmedian(largest / response.inverse_error) > 0.98
 
+    def test_an_error_beyond_the_noise_is_said(self):
+        levels = curves(truth(2, np.random.default_rng(8)))
+        error = nuc.fit(levels, order=2).inverse_error
+        # The limit is 0.3 of the noise: between the fourth and the third largest error three of
+        # 3072 pixels are beyond, which passes; between the fifth and the fourth four are.
+        fifth, fourth, third = np.sort(error.ravel())[[-5, -4, -3]]
+        few, many = (fourth + third) / 2 / 0.3, (fifth + fourth) / 2 / 0.3
+        found = nuc.fit(levels, order=2, variance=np.full(len(LEVELS), few**2))
+        assert found.metadata["inverse"]["pixels_beyond"] == 3
+        assert found.metadata["inverse"]["noise_dn"] == pytest.approx(few)
+        with pytest.warns(errors.InverseWarning, match=r"in 4 of 3072 .* correct\(exact=True\)"):
+            found = nuc.fit(levels, order=2, variance=np.full(len(LEVELS), many**2))
+        assert found.metadata["inverse"]["largest_error_dn"] == pytest.approx(error.max(), rel=1e-6)
+
+    def test_the_noise_of_the_verdict_is_that_of_one_frame(self):
+        rng = np.random.default_rng(14)
+        frames = [noisy(np.repeat(each[None], 16, axis=0), rng) for each in curves(truth(1, rng))]
+        response = nuc.fit([equipix.average(each) for each in frames], order=2)
+        wanted = np.sqrt(NOISE.variance(LEVELS[0]))
+        assert response.metadata["inverse"]["noise_dn"] == pytest.approx(wanted, rel=0.02)
+
+    @STRONG
     def test_the_coefficients_are_what_correct_does(self, cubic):
         _, levels, response = cubic
         frame = levels[3]
