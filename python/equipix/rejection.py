@@ -40,7 +40,7 @@ _DENSITY = 0.4287
 """Density of ln|z|, z a standard normal variable, at its median: the slope that steps divide by."""
 
 _SCATTER = 1.166
-"""Relative standard error of a median absolute deviation of n samples, times √n: 1/(2 · density)."""
+"""Relative standard error of a median absolute deviation of n samples, times √n: 1/(2 density)."""
 
 _MOST = 0.1
 """Largest share of a frame that may be left out: more is another scene."""

@@ -19,7 +19,7 @@ _CHECKED = 17
 """Places at which they are compared: two between extremes of the difference, which has four."""
 
 _SHARE = 0.3
-"""Largest difference, over the noise of a frame, that passes: in squares it adds 4 % to the noise."""
+"""Largest difference, over the noise of a frame, that passes: it adds 4 % to the noise."""
 
 _MOST_BEYOND = 1e-3
 """Largest share of the usable pixels that may differ by more, without a warning."""

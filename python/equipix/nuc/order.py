@@ -40,7 +40,7 @@ def check_order(order: object, by: object) -> None:
         raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
     if by == "gain" and order != 0:
         raise InputError(
-            f"'by' is 'gain', but order {order!r} corrects offset and gain, or may: expected order=0"
+            f"'by' is 'gain', but order {order!r} corrects offset and gain: expected order=0"
         )
 
 
