@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import errors, io, metrics
+from equipix import errors, io, metrics, nuc
 from equipix.metrics.correctability import _fisher_quantile
 from equipix.metrics.emva import high_passed, split_variances
 from equipix.metrics.moments import Moments, temporal_of
+from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
 EPS = np.finfo(np.float64).eps
@@ -178,6 +179,27 @@ class TestValidityInterval:
         assert every == pytest.approx(1 / np.std(drift * direction), rel=error)
         assert good == pytest.approx(1 / np.std((drift * direction)[drift < 1]), rel=error)
         assert every < 0.2 * good
+
+    def test_of_a_simulated_array_it_follows_the_drift(self):
+        """C at each time is that of the array's means without noise, corrected by the curves."""
+        array = StaringArray.of("HgCdTe", SHAPE, rng=2)
+        levels = [
+            equipix.average(array.frames(light, 64, rng=k, time_s=0.0))
+            for k, light in enumerate(np.linspace(2e6, 14e6, 5))
+        ]
+        response, times = nuc.fit(levels, order=2), (10.0, 1e3, 1e5)
+        ratios = []
+        for time in times:
+            frames = np.stack(list(array.frames(8e6, 24, rng=99, time_s=time)))
+            found = metrics.correctability(response.correct(frames))
+            left = response.correct(array.mean(8e6, time_s=time)).var(ddof=1)
+            # Of a fixed pattern: the noise of the mean image alone, and its product with both.
+            noise = found.temporal_variance / 24
+            error = np.sqrt((2 * noise**2 + 4 * noise * left) / found.pixels)
+            assert found.spatial_variance == pytest.approx(left, abs=5 * error)
+            ratios.append(found.ratio)
+        assert ratios == sorted(ratios)
+        assert times[0] < metrics.validity_interval(times, ratios) < times[-1]
 
 
 SIZES = (40, 60, 80)

@@ -218,6 +218,9 @@ class TestOnePoint:
         response = nuc.fit([level], order=0, by="gain")
         np.testing.assert_allclose(response.correct(level), level.mean(), rtol=10 * EPS)
         np.testing.assert_allclose(response.correct(2 * level), 2 * level.mean(), rtol=10 * EPS)
+        assert (response.freedom == 0).all()
+        twice = nuc.fit([level, 2 * level], order=0, by="gain")
+        assert (twice.freedom == 1).all()
 
 
 @STRONG
@@ -353,6 +356,8 @@ class TestBadPixels:
         levels[1:, 8, 9] = np.nan
         response = nuc.fit(levels, order=1)
         assert response.flags[3, 4] == 0
+        assert (response.used[3, 4], response.used[8, 9], response.used[0, 0]) == (7, 1, 8)
+        assert (response.freedom[3, 4], response.freedom[8, 9], response.freedom[0, 0]) == (5, 0, 6)
         assert response.limits[1, 3, 4] == response.levels[6]
         assert response.limits[1, 0, 0] == response.levels[7]
         assert response.flags[8, 9] == Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from equipix.frames import FrameStatistics
     from equipix.nuc.response import Response
 
+__all__ = ["DefectLimits", "Defects", "find_defects"]
+
 PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 """Percentiles that describe the distribution of K."""
 
