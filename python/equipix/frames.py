@@ -168,8 +168,8 @@ def average(
         True = do not use: mean and variances of the pixel become NaN, its counts 0.
     reject : float, optional
         Leave out samples that deviate by more than so many standard deviations from the others of
-        their pixel, such as cosmic rays: 5 is usual. They do not count, as saturated ones neither.
-        It takes five frames of one steady scene, and holds the first nine of them.
+        their pixel, such as cosmic rays: 5 is usual. They count nowhere, not even as saturated. It
+        takes nine frames of one steady scene or more, and holds the first nine of them.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
     progress : callable, optional
@@ -201,7 +201,8 @@ def average(
     Samples that are not finite do not count; saturated ones do, and are counted apart.
 
     With `reject` a sample is compared with the mean of those before, and with a noise that pixels
-    of similar signal have in common: `equipix.rejection.Rejection`. The variance is divided by
+    of similar signal have in common, or with its pixel's own where that is larger:
+    `equipix.rejection.Rejection`, which states the bias that is left. The variance is divided by
     that of a normal distribution cut at so many standard deviations.
 
     References

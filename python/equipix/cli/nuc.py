@@ -19,7 +19,8 @@ from equipix.experiment.levels import LevelExperiment
 from equipix.io import SUFFIXES, find_files, read_frames, read_mask, refuse_inputs, refuse_saved
 from equipix.loading import load, load_response
 from equipix.metrics import correctability, roughness, three_d_noise
-from equipix.nuc.bad_pixels import DefectLimits, find_defects
+from equipix.nuc.bad_pixels import find_defects
+from equipix.nuc.limits import DefectLimits
 
 if TYPE_CHECKING:
     from equipix._types import Array

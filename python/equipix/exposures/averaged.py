@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -71,7 +72,7 @@ class Averaged:
     dark : FrameStatistics or None
         The dark frames that were subtracted.
     pedestal : float
-        Value from which noise models count the signal, in DN: 0 unless `count_from_lowest` sets it.
+        Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
     """
 
     def __init__(
@@ -149,12 +150,15 @@ class Averaged:
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
-    def count_from_lowest(self) -> None:
-        """Let noise models count the signal from the lowest of several exposures.
+    def counted_from_lowest(self) -> Self:
+        """Return a copy whose noise models count the signal from the lowest of several exposures.
 
         Raw values contain the level without light, which adds no photon noise.
         """
-        self.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+        counted = copy.copy(self)
+        vars(counted).pop("noise", None)
+        counted.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+        return counted
 
     @cached_property
     def noise(self) -> NoiseModel | None:

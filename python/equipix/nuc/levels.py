@@ -69,6 +69,9 @@ class Levels(ReadOnly):
         Whether they are averages of whole numbers from which no dark was subtracted.
     saturation : float or None
         Level of saturation in DN, where it is known.
+    frame_noise : float or None
+        Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
+        given; None if it is unknown.
     """
 
     values: Array
@@ -80,6 +83,7 @@ class Levels(ReadOnly):
     dark_variance: Floats | None = None
     raw: bool = False
     saturation: float | None = None
+    frame_noise: float | None = None
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -145,7 +149,7 @@ def levels_of(
     with _naming_levels():
         averaged = _averaged(levels)
         if averaged is not None and averaged.raw and averaged.count > 1:
-            averaged.count_from_lowest()
+            averaged = averaged.counted_from_lowest()
         measured = measured_of(levels if averaged is None else averaged, variance, saturation)
         given = None if mask is None else as_mask(mask, measured.values.shape)
     if measured.clipped is not None:
@@ -166,7 +170,19 @@ def levels_of(
         dark_variance=measured.dark_variance,
         raw=measured.raw,
         saturation=_saturation_of(levels, saturation),
+        frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
     )
+
+
+def _frame_noise(
+    averaged: Averaged | None, noise: tuple[LevelNoise, ...] | None, references: Floats
+) -> float | None:
+    """Noise of one frame at the lowest level; of a value that is given where no more is known."""
+    lowest = int(np.argmin(references))
+    if averaged is not None and averaged.noise is not None:
+        signal = references[lowest] - averaged.pedestal
+        return float(np.sqrt(averaged.noise.variance(signal)))
+    return None if noise is None else float(np.sqrt(noise[lowest].variance(references[lowest])))
 
 
 def _saturation_of(levels: object, given: float | None) -> float | None:

@@ -50,6 +50,8 @@ class Response(ReadOnly):
         Goodness of fit: mean square residual per degree of freedom, in units of the variance of a
         value; 1 on average where the noise is right. Where no noise was known, in DN². NaN with as
         many levels as coefficients.
+    used : ndarray, shape (rows, cols), uint32
+        Number of levels at which the pixel has a value.
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`. ``DEAD`` rises by less than half as much as its neighbours, ``HOT``
         by more than twice as much; the dark and the noise set them as in `equipix.calibrate`.
@@ -78,6 +80,7 @@ class Response(ReadOnly):
     inverse_error: Floats
     limits: Floats
     reduced_chi2: Floats
+    used: Array
     flags: Array
     levels: Floats
     dark: Array | None = None
@@ -95,6 +98,13 @@ class Response(ReadOnly):
     def order(self) -> int:
         """Highest power of V̄ in the deviation; 1 also for one point by gain."""
         return len(self.deviation) - 1
+
+    @property
+    def freedom(self) -> Array:
+        """Degrees of freedom of each pixel's fit: levels used less coefficients, 0 or more."""
+        by_gain = self.metadata.get("options", {}).get("order") == 0
+        terms = 1 if by_gain else len(self.deviation)
+        return np.maximum(self.used.astype(np.int64) - terms, 0)
 
     @property
     def valid_range(self) -> Floats:
