@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -387,12 +388,13 @@ class TestDarks:
             assert np.isinf(dead.correct(raw, dark=None, flagged="keep")[4, 5])
 
 
-@pytest.fixture(scope="module", params=["calibration", "response"])
+@pytest.fixture(scope="module", params=["calibration", "response", "response with a dark"])
 def result(request):
     if request.param == "calibration":
         return calibrated()
     truth = simulate.paper_sensitivity(SHAPE, rng=1)
-    return nuc.fit([truth * level + 5 for level in (500.0, 2000.0, 3000.0)], order=2)
+    response = nuc.fit([truth * level + 5 for level in (500.0, 2000.0, 3000.0)], order=2)
+    return response if request.param == "response" else replace(response, dark=60 * truth)
 
 
 def calibrated():

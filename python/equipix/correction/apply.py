@@ -70,8 +70,9 @@ def apply(
 
 def apply_polynomial(
     frames: ArrayLike,
-    coefficients: NDArray[Any],
+    coefficients: Callable[[], NDArray[Any]],
     *,
+    sources: tuple[NDArray[Any], ...] | None,
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
@@ -80,16 +81,20 @@ def apply_polynomial(
 
     Frames of 8 or 16 bits and float32 are corrected in float32 by the compiled part; `out` may
     then be of whole numbers, which are rounded half to even and limited to the range of the type.
-    Others are corrected in float64. The other parameters are those of `apply`.
+    Others are corrected in float64. `coefficients` makes the coefficients, once for the arrays
+    `sources` of a result, the flags last. The other parameters are those of `apply`.
     """
-    fast = _fast(frames, (coefficients, flags), lambda: coefficients, flagged=flagged, out=out)
+    # A copy is no array of the result.
+    known = (flags.copy(),) if sources is None else sources
+    fast = _fast(frames, known, coefficients, flagged=flagged, out=out)
     if fast is not None:
         return fast
+    planes = coefficients()
 
     def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
         total = np.zeros(frame.shape)
         with np.errstate(invalid="ignore"):  # a dead pixel has infinite coefficients
-            for coefficient in coefficients[::-1]:
+            for coefficient in planes[::-1]:
                 total *= frame
                 total += coefficient
         corrected[...] = total

@@ -10,8 +10,7 @@ import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
 from equipix.correction.apply import dark_frame
-from equipix.correction.depth import check_depth as check_depth
-from equipix.correction.depth import refuse_above
+from equipix.correction.depth import check_depth, refuse_above
 from equipix.correction.kernel import (
     FAST,
     check_flagged,

@@ -102,7 +102,12 @@ class Polynomial(ReadOnly):
         """
         refuse_other_depth(frames, self.saturation)
         return apply_polynomial(
-            frames, self.coefficients, flags=self.flags, flagged=flagged, out=out
+            frames,
+            lambda: self.coefficients,
+            sources=(self.coefficients, self.flags),
+            flags=self.flags,
+            flagged=flagged,
+            out=out,
         )
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:

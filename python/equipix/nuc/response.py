@@ -10,7 +10,7 @@ import numpy as np
 from equipix._check import as_array
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply, apply_polynomial, dark_frame
-from equipix.correction.corrector import check_depth
+from equipix.correction.depth import refuse_other_depth
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.nuc.curve import counted_from, response_at
@@ -176,11 +176,18 @@ class Response(ReadOnly):
             If a shape does not fit, `flagged` is unknown, values exceed the saturation level, or a
             dark is given to a response without one.
         """
-        self._check_depth(frames)
+        refuse_other_depth(frames, self.saturation)
         offset = self._offset(dark)
         if not exact:
-            inverse = self.inverse if offset is None else counted_from(self.inverse, offset)
-            return apply_polynomial(frames, inverse, flags=self.flags, flagged=flagged, out=out)
+            own = () if self.dark is None or offset is None else (self.dark,)
+            return apply_polynomial(
+                frames,
+                lambda: self.inverse if offset is None else counted_from(self.inverse, offset),
+                sources=(self.inverse, *own, self.flags) if offset is self.dark else None,
+                flags=self.flags,
+                flagged=flagged,
+                out=out,
+            )
         zero = np.zeros(self.shape) if offset is None else offset
 
         def formula(frame: Array, corrected: Array) -> None:
@@ -285,16 +292,3 @@ class Response(ReadOnly):
                 "fitted to levels from which no dark was subtracted"
             )
         return dark_frame(dark, self.shape)
-
-    def _check_depth(self, frames: ArrayLike) -> None:
-        """Refuse whole numbers that the sensor of the levels cannot have given."""
-        level, dtype = self.saturation, getattr(frames, "dtype", None)
-        if level is None or dtype is None or dtype.kind not in "iu" or np.size(frames) == 0:
-            return
-        largest = int(np.max(frames))
-        if largest > level:
-            raise InputError(
-                f"'frames' holds {largest}, above the saturation level {level:g} DN of the levels: "
-                "frames of another sensor or bit depth"
-            )
-        check_depth(dtype, level)
