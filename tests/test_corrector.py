@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -259,13 +260,15 @@ class TestRefusals:
             equipix.average(each + 500 * k, saturation=4095) for k, each in enumerate(level)
         ]
         corrector = Corrector(nuc.fit(averages, order=0))
-        with pytest.raises(errors.InputError, match="uint8, but the levels saturate at 4095"):
+        with pytest.raises(
+            errors.InputError, match="uint8, but the correction was measured with 12"
+        ):
             corrector.apply(np.zeros(SHAPE, np.uint8))
 
     @pytest.mark.parametrize("value", [4096, 60000])
-    def test_values_above_the_saturation_level(self, value):
+    def test_values_above_those_of_the_sensor(self, value):
         response = twelve_bits()
-        message = f"'frames' holds {value}, above the saturation level 4095 DN of the levels"
+        message = f"'frames' holds {value}, above 4095, the largest value of the 12 bits"
         raw = np.full(SHAPE, 4095, np.uint16)
         corrector, both = Corrector(response), equipix.combine(response, response)
         corrector.apply(raw)
@@ -282,6 +285,45 @@ class TestRefusals:
         with pytest.raises(errors.InputError, match=message):
             corrector.apply(raw.astype(np.float32))
         assert corrector.frames == 1
+
+    @pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
+    def test_a_level_below_full_scale_refuses_no_value_of_the_sensor(self, dtype):
+        response = twelve_bits(saturation=3900)
+        raw = np.full(SHAPE, 2000, dtype)
+        corrector, both = Corrector(response), equipix.combine(response, response)
+        for value, holds in ((4095, nullcontext()), (4096, pytest.raises(errors.InputError))):
+            raw[3, 4] = value
+            for correct in (response.correct, both.correct, corrector.apply):
+                if correct != corrector.apply or dtype != np.float64:
+                    with holds:
+                        correct(raw)
+
+    def test_the_bit_depth_in_the_metadata_comes_first(self):
+        response = replace(twelve_bits(saturation=2000), metadata={"sensor": {"bit_depth": 13}})
+        raw = np.full(SHAPE, 8191, np.uint16)
+        response.correct(raw)
+        message = "holds 8192, above 8191, the largest value of the 13 bits"
+        for exact in (False, True):
+            with pytest.raises(errors.InputError, match=message):
+                response.correct(raw + 1, exact=exact)
+
+    def test_a_level_without_end_refuses_nothing(self):
+        raw = np.full(SHAPE, 60000, np.uint16)
+        assert np.isfinite(twelve_bits(saturation=np.inf).correct(raw)).all()
+
+    def test_whole_numbers_beyond_the_bits_of_a_calibration(self):
+        metadata = {"sensor": {"name": "", "bit_depth": 12}}
+        calibration = replace(calibrated(), metadata=metadata)
+        corrector, raw = Corrector(calibration), np.full(SHAPE, 4095, np.uint16)
+        for correct in (calibration.correct, corrector.apply):
+            correct(raw)
+            with pytest.raises(errors.InputError, match="'frames' holds 4096, above 4095"):
+                correct(raw + 1)
+            with pytest.raises(errors.InputError, match="uint8, but the correction was measured"):
+                correct(np.zeros(SHAPE, np.uint8))
+            correct(raw.astype(np.float32) * 3)  # electrons, perhaps
+        with pytest.raises(errors.InputError, match="'frames' holds 4096, above 4095"):
+            calibration.correct((raw + 1).astype(np.int64))
 
     def test_a_combination_keeps_the_level_in_its_file(self, tmp_path):
         response = twelve_bits()
@@ -304,10 +346,12 @@ class TestRefusals:
             Corrector(given, sensor="array 8")
 
 
-def twelve_bits():
+def twelve_bits(saturation=4095):
     """A response to levels of 12 bits in 16."""
     level = np.random.default_rng(1).integers(1000, 1100, (2, 4, *SHAPE), dtype=np.uint16)
-    averages = [equipix.average(each + 900 * k, saturation=4095) for k, each in enumerate(level)]
+    averages = [
+        equipix.average(each + 900 * k, saturation=saturation) for k, each in enumerate(level)
+    ]
     return nuc.fit(averages, order=1)
 
 

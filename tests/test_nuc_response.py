@@ -135,8 +135,8 @@ class TestOtherFrames:
         ("given", "message"),
         [
             (np.zeros((3, 4)), r"shape \(3, 4\), the sensor \(24, 32\)"),
-            (np.full(SHAPE, 4096, np.uint16), "4096, above the saturation level 4095"),
-            (np.zeros(SHAPE, np.uint8), "uint8, but the levels saturate at 4095"),
+            (np.full(SHAPE, 4096, np.uint16), "4096, above 4095, the largest value of the 12 bits"),
+            (np.zeros(SHAPE, np.uint8), "uint8, but the correction was measured with 12 bits"),
         ],
     )
     def test_are_refused_with_the_numbers(self, response, given, message):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, naming_memory
+from equipix.correction.depth import UNKNOWN, Depth
 from equipix.correction.kernel import FAST, check_flagged, kept, largest_of, run
 from equipix.errors import InputError
 from equipix.flags import usable
@@ -27,6 +28,7 @@ def apply(
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth = UNKNOWN,
 ) -> NDArray[Any]:
     """Correct frames by a formula, and treat flagged pixels as `flagged` requires.
 
@@ -43,6 +45,8 @@ def apply(
         What becomes of pixels flagged ``DO_NOT_USE``.
     out : ndarray or None
         Array for the result, of the frames' shape, float32 or float64.
+    depth : Depth
+        Bits of the sensor.
 
     Returns
     -------
@@ -52,14 +56,16 @@ def apply(
     Raises
     ------
     InputError
-        If a shape does not fit, or `flagged` is unknown.
+        If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
     """
     with naming_memory("correcting"):
         raw = _checked(frames, flags, flagged)
+        depth.refuse_type(raw.dtype)
         dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
         result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
         bad = ~usable(flags)
         for source, target in zip(_each(raw), _each(result), strict=True):
+            depth.refuse_above(float(np.fmax.reduce(source, axis=None)), raw.dtype)
             formula(source, target)
             if flagged == "nan":
                 target[bad] = np.nan
@@ -76,6 +82,7 @@ def apply_polynomial(
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any]:
     """Σ c_j y^j of each value y by Horner's scheme, and the values of flagged pixels.
 
@@ -86,7 +93,7 @@ def apply_polynomial(
     """
     # A copy is no array of the result.
     known = (flags.copy(),) if sources is None else sources
-    fast = _fast(frames, known, coefficients, flagged=flagged, out=out)
+    fast = _fast(frames, known, coefficients, flagged=flagged, out=out, depth=depth)
     if fast is not None:
         return fast
     planes = coefficients()
@@ -99,7 +106,7 @@ def apply_polynomial(
                 total += coefficient
         corrected[...] = total
 
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
 
 
 def apply_gain(
@@ -111,6 +118,7 @@ def apply_gain(
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any]:
     """(frame − dark) / gain of each value, and the values of flagged pixels.
 
@@ -124,7 +132,11 @@ def apply_gain(
         sources = (gain, stored, flags)
     elif offset is not None:
         sources = (gain, offset.copy(), flags)  # a copy is no array of the result
-    fast = _fast(frames, sources, lambda: gain_coefficients(gain, offset), flagged=flagged, out=out)
+
+    def coefficients() -> NDArray[Any]:
+        return gain_coefficients(gain, offset)
+
+    fast = _fast(frames, sources, coefficients, flagged=flagged, out=out, depth=depth)
     if fast is not None:
         return fast
     dark_level = np.zeros((), np.float32) if offset is None else offset
@@ -134,7 +146,7 @@ def apply_gain(
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(corrected, gain, out=corrected, casting="same_kind")
 
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
 
 
 def gain_coefficients(gain: NDArray[Any], dark: NDArray[Any] | None) -> NDArray[Any]:
@@ -153,6 +165,7 @@ def _fast(
     *,
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any] | None:
     """Correct frames by the compiled part; None where it does not take their types.
 
@@ -162,10 +175,12 @@ def _fast(
         raw = _checked(frames, sources[-1], flagged)
         if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
             return None
+        depth.refuse_type(raw.dtype)
         result = np.empty(raw.shape, np.float32) if out is None else out
         if raw.size:
             prepared = kept(sources, flagged, coefficients)
-            run(prepared, raw, result, largest_of(result.dtype), None)
+            counts = run(prepared, raw, result, largest_of(result.dtype), None)
+            depth.refuse_above(counts.highest, raw.dtype)
         return result
 
 
@@ -182,6 +197,22 @@ def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArra
         raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
     check_flagged(flagged)
     return raw
+
+
+def dark_or_stored(
+    dark: str | FrameStatistics | ArrayLike | None, stored: NDArray[Any] | None
+) -> FrameStatistics | ArrayLike | None:
+    """Return the dark given, or the stored one of a calibration where it is "stored"."""
+    if not isinstance(dark, str):
+        return dark
+    if dark != "stored":
+        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+    if stored is None:
+        raise InputError(
+            "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if it "
+            "is already subtracted"
+        )
+    return stored
 
 
 def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:

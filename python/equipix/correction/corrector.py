@@ -10,7 +10,7 @@ import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
 from equipix.correction.apply import dark_frame
-from equipix.correction.depth import check_depth, refuse_above
+from equipix.correction.depth import depth_of
 from equipix.correction.kernel import (
     FAST,
     check_flagged,
@@ -115,7 +115,7 @@ class Corrector:
     ) -> None:
         self.shape = correction.shape
         self.dtype = output_dtype(dtype)
-        self._saturation: float | None = getattr(correction, "saturation", None)
+        self._depth = depth_of(correction)
         self._largest = largest_value(self.dtype, bit_depth)
         self._workers = positive_workers(workers)
         check_flagged(flagged)
@@ -154,7 +154,7 @@ class Corrector:
         ------
         InputError
             If a shape or dtype does not fit, whole numbers have fewer bits than those of the
-            correction, or a value is above its saturation level: `out` is then of no use.
+            correction, or a value is above what these hold: `out` is then of no use.
         InsufficientMemoryError
             If the memory for the result cannot be had.
         """
@@ -163,7 +163,7 @@ class Corrector:
             self._check(raw)
             result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
             counts = run(self._native, raw, result, self._largest, self._workers)
-        refuse_above(counts.highest, self._saturation)
+        self._depth.refuse_above(counts.highest, raw.dtype)
         with self._counting:
             self.clipped += counts.limited
             self.frames += 1 if raw.ndim == 2 else len(raw)
@@ -180,7 +180,7 @@ class Corrector:
                 f"'frames' is {raw.dtype}, expected uint8, uint16 or float32: convert them, or use "
                 "the correction's own correct()"
             )
-        check_depth(raw.dtype, self._saturation)
+        self._depth.refuse_type(raw.dtype)
 
     def _checked(self, out: Array, raw: Array) -> Array:
         """Refuse an array that the result cannot be written to."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
-from equipix.correction.depth import refuse_other_depth
+from equipix.correction.depth import depth_of
 from equipix.correction.protocol import sensor_of
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
@@ -98,9 +98,8 @@ class Polynomial(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, `flagged` is unknown, or values exceed the saturation level.
+            If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
         """
-        refuse_other_depth(frames, self.saturation)
         return apply_polynomial(
             frames,
             lambda: self.coefficients,
@@ -108,6 +107,7 @@ class Polynomial(ReadOnly):
             flags=self.flags,
             flagged=flagged,
             out=out,
+            depth=depth_of(self),
         )
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:

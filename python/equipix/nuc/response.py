@@ -10,7 +10,7 @@ import numpy as np
 from equipix._check import as_array
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply, apply_polynomial, dark_frame
-from equipix.correction.depth import refuse_other_depth
+from equipix.correction.depth import depth_of
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.nuc.curve import counted_from, response_at
@@ -173,11 +173,10 @@ class Response(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, `flagged` is unknown, values exceed the saturation level, or a
+            If a shape does not fit, `flagged` is unknown, frames are of another bit depth, or a
             dark is given to a response without one.
         """
-        refuse_other_depth(frames, self.saturation)
-        offset = self._offset(dark)
+        offset, depth = self._offset(dark), depth_of(self)
         if not exact:
             own = () if self.dark is None or offset is None else (self.dark,)
             return apply_polynomial(
@@ -187,13 +186,14 @@ class Response(ReadOnly):
                 flags=self.flags,
                 flagged=flagged,
                 out=out,
+                depth=depth,
             )
         zero = np.zeros(self.shape) if offset is None else offset
 
         def formula(frame: Array, corrected: Array) -> None:
             corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
 
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
+        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, depth=depth)
 
     def extrapolated(
         self,
