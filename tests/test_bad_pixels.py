@@ -217,7 +217,7 @@ class TestFlags:
         assert corrector.replaced == 6
         raw = frames(array, 8e6, 2, 5)
         corrected = corrector.apply(raw)
-        # Bad pixels are the mean of neighbours, so noise alone is left: that of a frame, 2 % more by
+        # Bad pixels are the mean of neighbours, so noise alone is left: of a frame, 2 % more by
         # rounding and by the error of the curves, with 5 standard errors of 3072 values.
         noise = np.median(frames(array, 8e6, 100, 99).std(axis=0, ddof=1))
         assert corrected.std(axis=(1, 2)) == pytest.approx(noise, rel=0.02 + 5 / np.sqrt(2 * 3072))
