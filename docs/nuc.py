@@ -3,10 +3,12 @@
 nuc.png shows, on simulated arrays whose truth is known:
 
 - the responses of two pixels before and after two-point correction, as figure 10.7 of the source;
-- the spatial over the temporal noise that each order leaves, against the level;
-- the same against the time since the calibration, with and without the pixels that drift most.
+- the residual that each order leaves, against the level, beside the temporal noise of a frame;
+- the spatial over the temporal noise against the time since the calibration, with and without
+  pixels that were made to drift ten times as much.
 
-The script prints the validity intervals of the last panel.
+The script prints the validity intervals of the last panel, and those of the arrays as simulated.
+Residuals and ratios have the sign of their variance estimates: the axes are linear around 0.
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
+    from equipix.metrics import Correctability as Quality
+
 FILE = Path(__file__).parent / "nuc.png"
 SHAPE = (96, 128)
 LIGHT = np.linspace(2e6, 14e6, 7)
@@ -39,11 +43,17 @@ def averages(array: StaringArray, lights: NDArray, **how: float) -> list[equipix
     return [equipix.average(array.frames(e, FRAMES, rng=k, **how)) for k, e in enumerate(lights)]
 
 
-def ratio(response: nuc.Response, array: StaringArray, light: float, **how: object) -> float:
-    """C of frames at a level, corrected by a response."""
+def quality(response: nuc.Response, array: StaringArray, light: float, **how: object) -> Quality:
+    """C and its parts, of frames at a level, corrected by a response."""
     time_s, mask = how.get("time_s"), how.get("mask")
     frames = np.stack(list(array.frames(light, 24, rng=99, time_s=time_s)))
-    return metrics.correctability(response.correct(frames), mask=mask).ratio
+    return metrics.correctability(response.correct(frames), mask=mask)
+
+
+def intervals(response: nuc.Response, array: StaringArray, mask: NDArray | None) -> tuple:
+    """C against time, and the validity interval."""
+    ratios = [quality(response, array, 8e6, time_s=t, mask=mask).ratio for t in TIMES_S]
+    return ratios, metrics.validity_interval(TIMES_S, ratios)
 
 
 def draw_responses(axes: Axes, axes_after: Axes) -> None:
@@ -70,17 +80,20 @@ def draw_responses(axes: Axes, axes_after: Axes) -> None:
 
 
 def draw_orders(axes: Axes) -> None:
-    """C of each order against the level."""
+    """Residual of each order against the level."""
     array = StaringArray.of("HgCdTe", SHAPE, rng=1)
     levels = averages(array, LIGHT)
     used = {0: levels[3:4], 1: levels[::6], 2: levels, 3: levels}
     lights = np.linspace(2e6, 14e6, 25)
     for order, name in enumerate(("one-point", "two-point", "quadratic", "cubic")):
         response = nuc.fit(used[order], order=order)
-        ratios = [max(ratio(response, array, light), 1e-2) for light in lights]
-        axes.semilogy(lights / 1e6, ratios, label=name)
-    axes.axhline(1, color="0.5", linewidth=0.8)
-    axes.set(title="HgCdTe, by order", xlabel="light, 10⁶ electrons", ylabel="C")
+        found = [quality(response, array, light) for light in lights]
+        residuals = [each.ratio * np.sqrt(each.temporal_variance) for each in found]
+        axes.plot(lights / 1e6, residuals, label=name)
+    noise = [np.sqrt(each.temporal_variance) for each in found]
+    axes.plot(lights / 1e6, noise, "--", color="0.5", label="temporal noise")
+    axes.set_yscale("symlog", linthresh=0.1)
+    axes.set(title="HgCdTe, by order", xlabel="light, 10⁶ electrons", ylabel="residual, DN")
     axes.legend()
 
 
@@ -88,17 +101,18 @@ def draw_time(axes: Axes) -> None:
     """C against time, with and without the pixels that drift most."""
     for material, colour in (("PtSi", "C0"), ("InSb", "C1"), ("HgCdTe", "C2")):
         array = StaringArray.of(material, SHAPE, rng=2)
-        rng = np.random.default_rng(3)
-        bad = rng.random(SHAPE) < SHARE
+        response = nuc.fit(averages(array, LIGHT, time_s=0.0), order=2)
+        print(f"{material} as simulated: valid for {intervals(response, array, None)[1]:.3g} s")
+        bad = np.random.default_rng(3).random(SHAPE) < SHARE
         array = array.with_causes(drift_dn=np.asarray(array.drift_dn) * np.where(bad, 10, 1))
         response = nuc.fit(averages(array, LIGHT, time_s=0.0), order=2)
         for mask, style, name in ((None, "--", "all"), (bad, "-", "good")):
-            ratios = [ratio(response, array, 8e6, time_s=t, mask=mask) for t in TIMES_S]
-            valid = metrics.validity_interval(TIMES_S, ratios)
+            ratios, valid = intervals(response, array, mask)
             print(f"{material}, {name} pixels: valid for {valid:.3g} s")
-            label = f"{material}, {name}"
-            axes.loglog(TIMES_S, np.maximum(ratios, 1e-2), style, color=colour, label=label)
+            axes.plot(TIMES_S, ratios, style, color=colour, label=f"{material}, {name}")
     axes.axhline(1, color="0.5", linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yscale("symlog", linthresh=0.1)
     axes.set(title="after a quadratic correction", xlabel="time, s", ylabel="C")
     axes.legend(fontsize="small", loc="lower right")
 

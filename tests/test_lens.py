@@ -100,11 +100,19 @@ class TestFit:
             ({"law": "cos3"}, "'law' is 'cos3'"),
             ({"sensitivity": np.ones((2, 2))}, "'sensitivity' has shape"),
             ({"mask": np.ones(SHAPE, bool)}, "fewer than 100 finite"),
+            ({"mask": np.full(SHAPE, np.nan)}, "'mask' has dtype float64, expected bool"),
+            ({"mask": np.zeros(SHAPE, np.uint8)}, "'mask' has dtype uint8, expected bool"),
         ],
     )
     def test_refusals(self, given, message):
         with pytest.raises(errors.InputError, match=message):
             lens.fit_falloff(flat(), **given)
+
+    @pytest.mark.parametrize(("law", "rounds"), [("cos4", 1), ("radial", 0)])
+    def test_a_fit_that_has_not_converged_is_refused(self, law, rounds, monkeypatch):
+        monkeypatch.setattr(lens, "_ROUNDS", rounds)
+        with pytest.raises(errors.InputError, match=f"did not converge in {rounds} steps"):
+            lens.fit_falloff(flat(1), law=law)
 
     def test_a_flat_without_fall_off_is_refused(self):
         with pytest.raises(errors.InputError, match="fall-off"):
@@ -123,6 +131,35 @@ class TestCorrection:
         loaded = equipix.load(tmp_path / "lens.tif")
         np.testing.assert_array_equal(loaded.coefficients, correction.coefficients)
         assert loaded.metadata == correction.metadata
+
+    def test_gains_that_the_flat_does_not_show_are_flagged(self):
+        rho = squared() / (np.hypot(*SHAPE) / 2) ** 2
+        image, masked = 1 - 1.3 * rho, rho > 0.6
+        found = lens.fit_falloff(np.where(masked, np.nan, image), law="radial")
+        correction = found.correction()
+        flagged = (correction.flags & equipix.Flag.NO_FLAT_FIELD) != 0
+        np.testing.assert_array_equal(np.isnan(correction.coefficients[1]), flagged)
+        # The reach exceeds the mask by a block of 5 pixels and its diagonal at most.
+        distance = np.sqrt(squared())
+        assert flagged[masked & (distance > distance[~masked].max() + 15)].all()
+        assert not flagged[~masked].any()
+        assert flagged[image < 0.1].all()
+        good = correction.coefficients[1][~flagged]
+        assert (good.min(), good.max()) > (0.9, 1.0)
+        assert good.max() < 10
+        assert correction.metadata["k1"] == pytest.approx(-1.3, abs=1e-3)
+        assert correction.metadata["k2"] == pytest.approx(0, abs=1e-3)
+        whole = lens.fit_falloff(1 - 0.3 * rho, law="radial").correction()
+        assert not whole.flags.any()
+
+    def test_a_corner_with_little_light_is_not_corrected(self):
+        light = lens.cos4(squared(), 90.0)
+        correction = lens.fit_falloff(1000 * light).correction()
+        flagged = correction.flags != 0
+        # But for the error of the law by block means, at most some 0.1 % here.
+        assert flagged[light < 0.099].all()
+        assert not flagged[light > 0.101].any()
+        assert (light < 0.099).any()
 
     def test_the_example_prints_the_corner_of_the_source(self, capsys):
         path = Path(__file__).parents[1] / "examples/lens_falloff.py"

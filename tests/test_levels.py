@@ -10,7 +10,8 @@ import pytest
 
 import equipix
 from equipix import Flag, LevelExperiment, cli, errors, io, metrics, nuc
-from equipix.correction.whole import Conversion, picture
+from equipix.correction.files import correct_files
+from equipix.correction.tone import picture
 from equipix.simulate import StaringArray
 
 SHAPE = (24, 32)
@@ -185,7 +186,10 @@ class TestCommands:
         assert err.count("\n") == 1
         assert not output.exists()
         assert run("nuc", "fit", "--help")[0] == 0
-        assert run("nuc")[0] in (0, 2)
+        status, out, err = run("nuc")
+        # Typer shows the help of a group without a command, by releases as a success or a misuse.
+        assert status in (0, 2)
+        assert all(command in out + err for command in ("fit", "defects", "quality"))
 
 
 class TestDefectsAndQuality:
@@ -198,11 +202,25 @@ class TestDefectsAndQuality:
     def test_defects_are_those_of_the_function(self, run, saved, folder, tmp_path):
         response, path = saved
         output = tmp_path / "flagged.npz"
-        options = ("-o", output, "--noise-limit", "1.05", "--json")
-        status, out, _ = run("nuc", "defects", path, folder / "level2.tif", *options)
-        assert status == 0
+        limits = {
+            "response": 0.985,
+            "gain": 1.02,
+            "noise": 1.05,
+            "correlation": 0.1,
+            "range": 1.5,
+            "misfit": 0.5,
+        }
+        given = [text for name, each in limits.items() for text in (f"--{name}-limit", str(each))]
+        options = ("-o", output, *given, "--json")
         raw = io.read_frames(folder / "level2.tif")
-        wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(noise=1.05))
+        raw[::2, 3, 4] += 300  # noise
+        raw[:8, 5, 6] += 300  # flicker
+        io.write_frames(folder / "noisy.tif", iter(raw), nbytes=1)
+        status, out, _ = run("nuc", "defects", path, folder / "noisy.tif", *options)
+        assert status == 0
+        wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(**limits))
+        # Each limit has an effect, so each option is taken.
+        assert min(wanted.counts.values()) > 0
         told = json.loads(out)
         assert {name: told[name] for name in wanted.counts} == wanted.counts
         assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
@@ -226,6 +244,14 @@ class TestDefectsAndQuality:
         noise = metrics.three_d_noise(replaced)
         assert told["noise_variances"] == pytest.approx(vars(noise))
         assert told["roughness"] == pytest.approx(metrics.roughness(replaced.mean(axis=0)))
+
+    @pytest.mark.parametrize("command", ["defects", "quality"])
+    def test_another_sensor_is_refused(self, run, saved, folder, command):
+        arguments = ("nuc", command, saved[1], folder / "level2.tif", "--sensor")
+        assert run(*arguments, "array 7")[0] == 0
+        status, out, err = run(*arguments, "array 8")
+        assert (status, out) == (1, "")
+        assert "'array 8', but the correction is of 'array 7'" in err
 
     def test_files_of_another_kind_are_refused(self, run, saved, folder):
         status, _, err = run("nuc", "quality", saved[1], saved[1])
@@ -330,9 +356,84 @@ class TestCorrectedFiles:
         values = response.correct(io.read_frames(folder / "level2.tif"), flagged="replace")
         np.testing.assert_array_equal(found[3], picture(values[3], display))
 
-    def test_a_picture_has_no_other_type(self):
+    def test_a_picture_has_no_other_type(self, corrected, folder, tmp_path):
+        response, _ = corrected
         with pytest.raises(errors.InputError, match="'display' makes pictures of 8 bits"):
-            Conversion("uint16", display="linear")
+            correct_files(
+                response,
+                [str(folder / "level2.tif")],
+                tmp_path / "out.tif",
+                dtype="uint16",
+                display="linear",
+            )
+
+    def test_values_beyond_the_levels_and_replaced_pixels_are_counted(self, corrected, folder):
+        response, call = corrected
+        raw = io.read_frames(folder / "level4.tif")
+        good = (response.flags & Flag.DO_NOT_USE) == 0
+        _, told = call("out.tif", "--flagged", "nan", source="level4.tif")
+        wanted = np.count_nonzero(response.extrapolated(raw) & good)
+        # Half of the values of the highest level are above its mean.
+        assert wanted > 0.3 * raw.size
+        # Values at a level count as within it: eight roundings, and as many of the formula.
+        margin = 16 * np.finfo(np.float32).eps * response.limits.max()
+        (low, high), values = response.limits, response.correct(raw.astype(np.float64))
+        certain = np.count_nonzero((values < low - margin) | (values > high + margin))
+        assert certain <= told["extrapolated_values"] <= wanted
+        assert "replaced_pixels" not in told
+        flags = np.zeros(SHAPE, np.uint32)
+        flags[3, 4:6] = Flag.DO_NOT_USE
+        response.with_flags(flags).save(folder / "flagged.tif", force=True)
+        path = folder / "flagged.tif"
+        done = correct_files(
+            equipix.load(path), [str(folder / "level4.tif")], folder / "c.tif", flagged="replace"
+        )
+        assert done.replaced == np.count_nonzero(~good | (flags != 0))
+
+    def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
+        from equipix.correction import corrector as module
+
+        response, _ = corrected
+        made, real = [], module.native
+        monkeypatch.setattr(module, "native", lambda *given: made.append(1) or real(*given))
+        source = [str(folder / "level?.tif")]
+        done = correct_files(response, source, tmp_path / "all", dtype="uint16")
+        assert (done.frames, len(made)) == (64, 1)
+
+    def test_another_sensor_is_refused(self, corrected, run, folder, tmp_path):
+        _, call = corrected
+        call("out.tif", "--sensor", "array 7")
+        arguments = ("correct", tmp_path / "response.tif", folder / "level2.tif", "-o")
+        status, _, err = run(*arguments, tmp_path / "no.tif", "--sensor", "array 8")
+        assert (status, "'array 8', but the correction is of 'array 7'" in err) == (1, True)
+
+    @pytest.mark.usefixtures("corrected")
+    def test_frames_of_more_bits_are_refused(self, run, folder, tmp_path):
+        frame = np.full((1, *SHAPE), 40000, np.uint16)
+        io.write_frames(folder / "deep.tif", frame, nbytes=1)
+        arguments = ("correct", tmp_path / "response.tif", folder / "deep.tif", "-o")
+        status, _, err = run(*arguments, tmp_path / "no.tif")
+        assert (status, "holds 40000, above 16383, the largest" in err) == (1, True)
+        assert not (tmp_path / "no.tif").exists()
+
+    def test_a_png_given_again_is_noticed(self, corrected, run, folder, tmp_path):
+        _, call = corrected
+        io.write_frames(folder / "single.tif", io.read_frames(folder / "level1.tif")[:1], nbytes=1)
+        path, _ = call("out.png", source="single.tif")
+        assert io.description(path).startswith("corrected by equipix, correction sha256")
+        arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.png")
+        status, _, err = run(*arguments)
+        assert status == 0
+        assert "out.png: corrected already, by this correction" in err
+
+    @pytest.mark.usefixtures("corrected")
+    def test_pngs_of_others_have_no_mark(self, run, folder, tmp_path):
+        frame = io.read_frames(folder / "level1.tif")[0]
+        io.write_png(tmp_path / "raw.png", frame, description="of a camera")
+        assert io.description(tmp_path / "raw.png") == "of a camera"
+        arguments = ("correct", tmp_path / "response.tif", tmp_path / "raw.png")
+        status, _, err = run(*arguments, "-o", tmp_path / "out.png")
+        assert (status, "corrected already" in err) == (0, False)
 
 
 class TestToneLaws:

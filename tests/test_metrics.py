@@ -2,20 +2,68 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 import equipix
-from equipix import errors, io, metrics
+from equipix import errors, io, metrics, nuc
 from equipix.metrics.correctability import _fisher_quantile
-from equipix.metrics.emva import high_passed
+from equipix.metrics.emva import high_passed, split_variances
+from equipix.metrics.moments import Moments, temporal_of
+from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
+EPS = np.finfo(np.float64).eps
 
 
 def frames_of(rng, count=16, spatial=0.0, temporal=1.0, shape=SHAPE):
     pattern = spatial * rng.standard_normal(shape)
     return 1000 + pattern + temporal * rng.standard_normal((count, *shape))
+
+
+class TestTemporal:
+    """The one computation of temporal noise, one frame at a time."""
+
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+    def test_it_is_that_of_the_whole_stack(self, dtype):
+        rng = np.random.default_rng(20)
+        stack = rng.integers(20, 200, (12, *SHAPE)).astype(dtype)
+        mask = rng.random(SHAPE) < 0.1
+        found = temporal_of(stack, mask)
+        whole = stack.astype(np.float64)
+        free = whole - whole[:, ~mask].mean(axis=1)[:, None, None]
+        # Sums of 12 squares of up to 180: some roundings of each.
+        atol = 100 * EPS * 180**2
+        np.testing.assert_allclose(found.variance, free.var(axis=0, ddof=1), rtol=0, atol=atol)
+        np.testing.assert_allclose(found.mean, whole.mean(axis=0), rtol=0, atol=atol)
+        steps = np.sum(np.diff(free, axis=0) ** 2, axis=0)
+        np.testing.assert_allclose(found.steps, steps, rtol=0, atol=12 * atol)
+
+    def test_a_missing_sample_stays_in_its_pixel(self):
+        stack = frames_of(np.random.default_rng(21))
+        stack[3, 5, 6] = np.inf
+        found = temporal_of(stack)
+        for each in (found.variance, found.mean):
+            assert np.argwhere(~np.isfinite(each)).tolist() == [[5, 6]]
+        assert np.argwhere(~found.used).tolist() == [[5, 6]]
+
+    @pytest.mark.parametrize("metric", [metrics.correctability, metrics.three_d_noise])
+    def test_the_stack_is_not_copied(self, metric):
+        stack = np.random.default_rng(22).integers(0, 99, (200, 100, 128), dtype=np.uint16)
+        tracemalloc.start()
+        metric(stack)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        # As float64 the stack would take 200 frames; the sums are some frames.
+        assert peak < 20 * 100 * 128 * 8
+
+    @pytest.mark.parametrize("metric", [metrics.correctability, metrics.three_d_noise])
+    def test_too_little_memory_is_named(self, metric):
+        huge = np.broadcast_to(np.uint16(1), (2, 10**7, 10**7))
+        with pytest.raises(errors.InsufficientMemoryError, match="Unable to allocate"):
+            metric(huge)
 
 
 class TestCorrectability:
@@ -125,9 +173,33 @@ class TestValidityInterval:
             ratios["all"].append(metrics.correctability(stack).ratio)
             ratios["good"].append(metrics.correctability(stack, mask=drift > 1).ratio)
         every, good = (metrics.validity_interval(times, ratios[name]) for name in ("all", "good"))
-        # 15 of 3072 pixels at 2t make √(15/3072)·2t = 0.14 t, the others 0.02 t.
-        assert every == pytest.approx(1 / 0.14, rel=0.35)
-        assert good == pytest.approx(50, rel=0.1)
+        # C of this pattern is t times its spread. Its square has a standard error of √(2/3072)
+        # where it is 1, half of it in C; as much again where the line between two times begins.
+        error = 5 * np.sqrt(2 / 3072)
+        assert every == pytest.approx(1 / np.std(drift * direction), rel=error)
+        assert good == pytest.approx(1 / np.std((drift * direction)[drift < 1]), rel=error)
+        assert every < 0.2 * good
+
+    def test_of_a_simulated_array_it_follows_the_drift(self):
+        """C at each time is that of the array's means without noise, corrected by the curves."""
+        array = StaringArray.of("HgCdTe", SHAPE, rng=2)
+        levels = [
+            equipix.average(array.frames(light, 64, rng=k, time_s=0.0))
+            for k, light in enumerate(np.linspace(2e6, 14e6, 5))
+        ]
+        response, times = nuc.fit(levels, order=2), (10.0, 1e3, 1e5)
+        ratios = []
+        for time in times:
+            frames = np.stack(list(array.frames(8e6, 24, rng=99, time_s=time)))
+            found = metrics.correctability(response.correct(frames))
+            left = response.correct(array.mean(8e6, time_s=time)).var(ddof=1)
+            # Of a fixed pattern: the noise of the mean image alone, and its product with both.
+            noise = found.temporal_variance / 24
+            error = np.sqrt((2 * noise**2 + 4 * noise * left) / found.pixels)
+            assert found.spatial_variance == pytest.approx(left, abs=5 * error)
+            ratios.append(found.ratio)
+        assert ratios == sorted(ratios)
+        assert times[0] < metrics.validity_interval(times, ratios) < times[-1]
 
 
 SIZES = (40, 60, 80)
@@ -199,6 +271,23 @@ class TestEmvaSpatial:
         mean, error = np.mean(estimates, axis=0), np.std(estimates, axis=0, ddof=1) / np.sqrt(20)
         np.testing.assert_array_less(np.abs(mean - wanted), 4 * error)
 
+    def test_the_bias_of_the_parts_is_that_which_is_stated(self):
+        rng = np.random.default_rng(16)
+        rows, cols, (r, c, p) = 30, 40, (1.0, 0.3, 0.01)
+        found = []
+        for _ in range(400):
+            image = np.sqrt(r) * rng.standard_normal((rows, 1))
+            image = image + np.sqrt(c) * rng.standard_normal((1, cols))
+            image = image + np.sqrt(p) * rng.standard_normal((rows, cols))
+            found.append(split_variances(Moments(image, 0.0, 2)))
+        size, rest = rows * cols, rows * cols - rows - cols
+        bias = size * (r * (cols - 1) + c * (rows - 1)) / (rest * (size - 1))
+        assert bias == pytest.approx(r / rows + c / cols, rel=0.1)
+        mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(400)
+        wanted = [r + c / cols**2, c + r / rows**2, p - bias]
+        np.testing.assert_array_less(np.abs(mean[1:] - wanted), 4 * error[1:])
+        assert mean[3] < -20 * error[3]
+
     def test_the_high_pass_removes_what_is_smooth_and_keeps_pixels(self):
         rows, cols = np.mgrid[:60, :80]
         smooth = 100 + 0.3 * rows - 0.2 * cols
@@ -246,8 +335,8 @@ class TestEmvaTransfer:
         for mean in electrons:
             photons = mean + np.sqrt(mean) * rng.standard_normal((2, *SHAPE))
             noise = gain * read * rng.standard_normal((2, *SHAPE))
-            bright.append(50 + np.minimum(gain * photons + noise, gain * 9500))
-        return dark, bright, light
+            bright.append(np.rint(50 + np.minimum(gain * photons + noise, gain * 9500)))
+        return [np.rint(each) for each in dark], bright, light
 
     def test_known_values_come_back(self):
         found = metrics.emva_transfer(*self.levels(np.random.default_rng(11)))
@@ -255,14 +344,46 @@ class TestEmvaTransfer:
         assert found.gain_dn_per_e == pytest.approx(0.25, rel=5 * 0.026 / np.sqrt(13))
         assert found.responsivity == pytest.approx(0.125, rel=1e-3)
         assert found.quantum_efficiency == pytest.approx(0.5, rel=5 * 0.026 / np.sqrt(13))
-        quantised = 8.0**2 - 1 / 12 / 0.25**2
-        assert found.read_noise_e == pytest.approx(np.sqrt(quantised), rel=0.05)
+        # The variance of 20 darks of 3072 pixels, halved in the root, over the gain.
+        error = np.hypot(np.sqrt(2 / (20 * 3072)) / 2, 0.026 / np.sqrt(13))
+        assert found.read_noise_e == pytest.approx(8, rel=5 * error)
         assert found.linearity_error < 1e-3
 
     def test_a_curved_response_has_a_linearity_error(self):
         straight = metrics.emva_transfer(*self.levels(np.random.default_rng(12)))
         curved = metrics.emva_transfer(*self.levels(np.random.default_rng(12), curvature=0.05))
-        assert curved.linearity_error > 5 * straight.linearity_error
+        # The parabola itself, and its line of least relative deviations by another routine.
+        light = np.linspace(500, 19500, 20)
+        signal = 0.125 * light * (1 - 0.05 * light / 20000)
+        share = signal / curved.saturation_dn
+        used = (share >= 0.05) & (share <= 0.95)
+        slope, offset = np.polyfit(light[used], signal[used], 1, w=1 / signal[used])
+        line = offset + slope * light[used]
+        wanted = np.mean(np.abs(signal[used] - line) / line)
+        # The relative error of each level, of 6144 values and as many darks: five of their mean.
+        errors_of = np.sqrt((0.25 * signal[used] + 2 * 4) / 6144) / signal[used]
+        error = 5 * np.sqrt(np.sum(errors_of**2)) / used.sum()
+        assert error < wanted / 20
+        assert curved.linearity_error == pytest.approx(wanted, abs=error)
+        assert straight.linearity_error < wanted / 5
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (lambda light: np.where(light > 9000, np.nan, light), "'light' holds nan"),
+            (lambda light: -light, "'light' holds -500"),
+            (lambda light: 0 * light, "'light' is 0 at all levels"),
+            (lambda light: 0 * light + 7, "'light' is 7 at all levels"),
+            (
+                lambda light: np.where(light < 15000, 0, light),
+                "'light' is 0 at all levels up to 70",
+            ),
+        ],
+    )
+    def test_light_that_gives_no_line_is_refused(self, change, message):
+        dark, bright, light = self.levels(np.random.default_rng(15))
+        with pytest.raises(errors.InputError, match=message):
+            metrics.emva_transfer(dark, bright, change(light))
 
     def test_counts_that_do_not_fit_are_refused(self):
         dark, bright, light = self.levels(np.random.default_rng(13))

@@ -7,6 +7,7 @@ import pytest
 
 import equipix
 from equipix import Flag, NoiseModel, errors, nuc, reference
+from equipix.exposures.averaged import Averaged
 
 SHAPE = (48, 64)
 LEVELS = np.linspace(300.0, 3500.0, 8)
@@ -14,6 +15,10 @@ NOISE = NoiseModel(read_noise=2.0, gain=0.25)
 EPS = np.finfo(np.float64).eps
 SIZES = (30.0, 0.05, 4e-6, 1e-9)
 """Spread of a, K, c and e over the pixels, for signals of thousands of DN."""
+
+
+STRONG = pytest.mark.filterwarnings("ignore::equipix.errors.InverseWarning")
+"""For curves of third order that bend more than a cubic inverse can follow, as they are told."""
 
 
 def truth(order, rng, shape=SHAPE):
@@ -40,6 +45,7 @@ def cubic():
     return deviation, levels, nuc.fit(levels, order=3, variance=NOISE)
 
 
+@STRONG
 class TestAgainstTheReference:
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
     @pytest.mark.parametrize(
@@ -98,6 +104,7 @@ class TestAgainstTheReference:
         np.testing.assert_allclose(corrected, wanted, rtol=100 * EPS)
 
 
+@STRONG
 class TestStatistics:
     def test_coefficients_lie_within_their_standard_errors(self, cubic):
         deviation, _, response = cubic
@@ -151,6 +158,7 @@ class TestStatistics:
         np.testing.assert_array_equal(response.dark, dark.mean)
 
 
+@STRONG
 class TestLaws:
     def test_the_order_of_the_levels_plays_no_part(self, cubic):
         _, levels, response = cubic
@@ -210,8 +218,12 @@ class TestOnePoint:
         response = nuc.fit([level], order=0, by="gain")
         np.testing.assert_allclose(response.correct(level), level.mean(), rtol=10 * EPS)
         np.testing.assert_allclose(response.correct(2 * level), 2 * level.mean(), rtol=10 * EPS)
+        assert (response.freedom == 0).all()
+        twice = nuc.fit([level, 2 * level], order=0, by="gain")
+        assert (twice.freedom == 1).all()
 
 
+@STRONG
 class TestOrder:
     @pytest.mark.parametrize("order", [1, 2, 3])
     def test_auto_finds_the_order_of_the_curves(self, order):
@@ -250,6 +262,28 @@ class TestInverse:
         assert response.largest_inverse_error == response.inverse_error[good].max()
         assert np.nanmedian(largest / response.inverse_error) > 0.98
 
+    def test_an_error_beyond_the_noise_is_said(self):
+        levels = curves(truth(2, np.random.default_rng(8)))
+        error = nuc.fit(levels, order=2).inverse_error
+        # The limit is 0.3 of the noise: between the fourth and the third largest error three of
+        # 3072 pixels are beyond, which passes; between the fifth and the fourth four are.
+        fifth, fourth, third = np.sort(error.ravel())[[-5, -4, -3]]
+        few, many = (fourth + third) / 2 / 0.3, (fifth + fourth) / 2 / 0.3
+        found = nuc.fit(levels, order=2, variance=np.full(len(LEVELS), few**2))
+        assert found.metadata["inverse"]["pixels_beyond"] == 3
+        assert found.metadata["inverse"]["noise_dn"] == pytest.approx(few)
+        with pytest.warns(errors.InverseWarning, match=r"in 4 of 3072 .* correct\(exact=True\)"):
+            found = nuc.fit(levels, order=2, variance=np.full(len(LEVELS), many**2))
+        assert found.metadata["inverse"]["largest_error_dn"] == pytest.approx(error.max(), rel=1e-6)
+
+    def test_the_noise_of_the_verdict_is_that_of_one_frame(self):
+        rng = np.random.default_rng(14)
+        frames = [noisy(np.repeat(each[None], 16, axis=0), rng) for each in curves(truth(1, rng))]
+        response = nuc.fit([equipix.average(each) for each in frames], order=2)
+        wanted = np.sqrt(NOISE.variance(LEVELS[0]))
+        assert response.metadata["inverse"]["noise_dn"] == pytest.approx(wanted, rel=0.02)
+
+    @STRONG
     def test_the_coefficients_are_what_correct_does(self, cubic):
         _, levels, response = cubic
         frame = levels[3]
@@ -322,6 +356,8 @@ class TestBadPixels:
         levels[1:, 8, 9] = np.nan
         response = nuc.fit(levels, order=1)
         assert response.flags[3, 4] == 0
+        assert (response.used[3, 4], response.used[8, 9], response.used[0, 0]) == (7, 1, 8)
+        assert (response.freedom[3, 4], response.freedom[8, 9], response.freedom[0, 0]) == (5, 0, 6)
         assert response.limits[1, 3, 4] == response.levels[6]
         assert response.limits[1, 0, 0] == response.levels[7]
         assert response.flags[8, 9] == Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE
@@ -397,6 +433,7 @@ class TestRefusals:
             ({"mask": np.ones(SHAPE, bool)}, r"'levels': 0.0% .* no value in 100.0%"),
             ({"by": "both"}, "'by' is 'both'"),
             ({"order": 2, "by": "gain"}, "order 2 corrects offset and gain"),
+            ({"order": "auto", "by": "gain"}, "order 'auto' corrects offset and gain"),
             ({"mask": np.zeros((2, 2), bool)}, "'mask' has shape"),
             ({"variance": np.ones(3)}, "'variance'"),
             ({"variance": np.ones((8, *SHAPE))}, "expected \\(8,\\) or a NoiseModel"),
@@ -451,6 +488,24 @@ class TestRawAverages:
             limit = 5 * np.sqrt(2 / freedom) + 0.01
             assert response.reduced_chi2.mean() == pytest.approx(1, abs=limit)
             assert np.count_nonzero(response.flags) == 0
+
+    def test_a_gain_of_raw_averages_is_refused(self):
+        raw = self.averages(200)[-1:]
+        with pytest.raises(errors.InputError, match="'levels' are averages of raw frames"):
+            nuc.fit(raw, order=0, by="gain")
+        zero = equipix.average(np.full((2, *SHAPE), 200, np.uint16))
+        subtracted = [equipix.average([raw[0].mean + each for each in (-1, 1)], dark=zero)]
+        found = nuc.fit(subtracted, order=0, by="gain")
+        np.testing.assert_allclose(1 + found.deviation[1], subtracted[0].mean / found.levels[0])
+
+    def test_the_averages_given_are_not_changed(self):
+        averaged = Averaged.of(self.averages(200))
+        plain = averaged.noise
+        response = nuc.fit(averaged, order=1)
+        assert averaged.pedestal == 0
+        assert averaged.noise is plain
+        fresh = nuc.fit(self.averages(200), order=1)
+        np.testing.assert_array_equal(response.variances, fresh.variances)
 
     def test_no_dark_can_replace_the_offset(self):
         response = nuc.fit(self.averages(200), order=1)

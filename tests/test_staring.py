@@ -122,12 +122,26 @@ class TestFrames:
             ({"bit_depth": 7}, "'bit_depth' is 7"),
             ({"well_e": 0.0}, "'well_e' is 0"),
             ({"area": np.ones(3)}, r"'area' has shape \(3,\)"),
+            ({"area": np.full(SHAPE, -0.1)}, "'area' holds -0.1, expected finite numbers not"),
+            ({"read_noise_e": np.nan}, "'read_noise_e' holds nan"),
+            ({"drift_dn": -1.0}, "'drift_dn' holds -1"),
+            ({"offset_dn": np.inf}, "'offset_dn' holds inf, expected finite numbers"),
+            ({"curvature": 1.5}, "'curvature' holds 1.5, expected finite numbers up to 0.5"),
+            ({"band_start_um": 8.0}, "'cutoff_um' holds 5, expected .* 'band_start_um', 8"),
+            ({"cutoff_um": 3.0}, "'cutoff_um' holds 3, expected"),
             ({"shape": (0, 4)}, "'shape'"),
         ],
     )
     def test_wrong_values_are_refused(self, given, message):
         with pytest.raises(errors.InputError, match=message):
             StaringArray(**({"shape": SHAPE} | given))
+
+    @pytest.mark.parametrize("light", [np.nan, -1.0, np.inf])
+    def test_light_that_is_none_is_refused(self, light):
+        values = np.full(SHAPE, 5e6)
+        values[3, 4] = light
+        with pytest.raises(errors.InputError, match=f"'light_e' holds {light:g}, expected"):
+            next(StaringArray(shape=SHAPE).frames(values, 1, rng=1))
 
     def test_an_unknown_material_is_refused(self):
         with pytest.raises(errors.InputError, match="'material' is 'Si'"):
@@ -193,12 +207,29 @@ class TestBlackBody:
         wanted = (1000 / 14387.768775) ** 3 * 2 * 1.2020569
         assert integral == pytest.approx(wanted, rel=1e-5)
 
-    def test_the_series_around_the_mean_cut_off_is_the_integral(self):
-        cutoffs = np.array([4.9, 5.0, 5.1])
-        series = blackbody.band_photons(3.0, cutoffs, 300.0)
-        single = [float(blackbody.band_photons(3.0, each, 300.0)) for each in cutoffs]
-        # The next term: third derivative · 0.1⁴/24, some 1e-3 of the slope's change of 0.1.
-        np.testing.assert_allclose(series, single, rtol=1e-5)
+    def test_cut_offs_far_apart_have_the_integrals_of_each(self):
+        cutoffs = np.array([3.0, 3.01, 5.0, 5.1, 9.7, 12.0])
+        together = blackbody.band_photons(3.0, cutoffs, 300.0)
+        for cutoff, found in zip(cutoffs, together, strict=True):
+            # The trapezium rule errs by h²/12 of the change of the slope: some 1e-8 of the whole.
+            wavelength = np.linspace(3.0, cutoff, 20001)
+            values = blackbody.photon_exitance(wavelength, 300.0)
+            wanted = np.sum(np.diff(wavelength) * (values[1:] + values[:-1]) / 2)
+            assert found == pytest.approx(wanted, rel=1e-7, abs=1e-30)
+        assert together[0] == 0
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ((0.0, 5.0, 300.0), "'start_um' is 0.0"),
+            ((3.0, 5.0, np.nan), "'temperature_k' is nan"),
+            ((3.0, [5.0, 2.9], 300.0), "'cutoff_um' holds 2.9, expected 3 or more"),
+            ((3.0, [5.0, np.nan], 300.0), "'cutoff_um' holds nan"),
+        ],
+    )
+    def test_bands_that_are_none_are_refused(self, given, message):
+        with pytest.raises(errors.InputError, match=message):
+            blackbody.band_photons(*given)
 
     def test_the_gap_of_hansen(self):
         # Of x = 0.2 at 77 K, term by term.

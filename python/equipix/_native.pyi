@@ -56,7 +56,11 @@ class Corrector:
     """A correction prepared for many frames; it keeps a copy of the coefficients."""
 
     def __new__(
-        cls, coefficients: NDArray[Any], unusable: NDArray[Any], flagged: str
+        cls,
+        coefficients: NDArray[Any],
+        unusable: NDArray[Any],
+        flagged: str,
+        levels: NDArray[Any] | None,
     ) -> Corrector: ...
     def apply(
         self,
@@ -65,7 +69,7 @@ class Corrector:
         largest: float,
         *,
         workers: int | None,
-    ) -> int: ...
+    ) -> tuple[int, int, float]: ...
 
 @final
 class Exposures:

@@ -74,6 +74,10 @@ class MisfitWarning(EquipixWarning):
     """Residuals are larger than the variances given explain."""
 
 
+class InverseWarning(EquipixWarning):
+    """The cubic that inverts response curves differs from their inverse by much of the noise."""
+
+
 def warn(message: str, category: type[EquipixWarning]) -> None:
     """Warn, at the line outside of the package that called it."""
     level, frame = 1, sys._getframe()

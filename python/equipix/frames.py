@@ -70,6 +70,9 @@ class FrameStatistics(ReadOnly):
         The level that samples were compared with, in DN; None if there was none.
     raw : bool
         Whether no dark was subtracted from whole numbers, as cameras write them.
+    reject : float or None
+        The deviation, in standard deviations, beyond which samples were left out; None where all
+        count.
     """
 
     mean: NDArray[Any]
@@ -80,6 +83,7 @@ class FrameStatistics(ReadOnly):
     dark: FrameStatistics | None = None
     saturation: float | None = None
     raw: bool = False
+    reject: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
@@ -164,8 +168,8 @@ def average(
         True = do not use: mean and variances of the pixel become NaN, its counts 0.
     reject : float, optional
         Leave out samples that deviate by more than so many standard deviations from the others of
-        their pixel, such as cosmic rays: 5 is usual. They do not count, as saturated ones neither.
-        It takes five frames of one steady scene, and holds the first nine of them.
+        their pixel, such as cosmic rays: 5 is usual. They count nowhere, not even as saturated. It
+        takes nine frames of one steady scene or more, and holds the first nine of them.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
     progress : callable, optional
@@ -197,7 +201,8 @@ def average(
     Samples that are not finite do not count; saturated ones do, and are counted apart.
 
     With `reject` a sample is compared with the mean of those before, and with a noise that pixels
-    of similar signal have in common: `equipix.rejection.Rejection`. The variance is divided by
+    of similar signal have in common, or with its pixel's own where that is larger:
+    `equipix.rejection.Rejection`, which states the bias that is left. The variance is divided by
     that of a normal distribution cut at so many standard deviations.
 
     References
@@ -226,6 +231,8 @@ def average(
             statistics = _average_batches(
                 given, level, workers, progress, _length(source), rejection
             )
+        if reject is not None:
+            statistics = dataclasses.replace(statistics, reject=float(reject))
         return _masked(_subtract(statistics, offset), mask)
 
 
@@ -235,10 +242,10 @@ def save_statistics(
     """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content |= {"saturation": statistics.saturation, "raw": statistics.raw}
+    content |= {name: getattr(statistics, name) for name in ("saturation", "raw", "reject")}
     if dark is not None:
         pages |= {_DARK + name: values for name, values in dark.maps.items()}
-        content[_DARK + "saturation"] = dark.saturation
+        content |= {_DARK + "saturation": dark.saturation, _DARK + "reject": dark.reject}
     io.save_pages(path, pages, content, force=force)
 
 
@@ -265,8 +272,10 @@ def _of_pages(
     pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
 ) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    level = content.get(before + "saturation")
-    return FrameStatistics(mean, variance, of_mean, count, saturated, saturation=level)
+    level, reject = (content.get(before + name) for name in ("saturation", "reject"))
+    return FrameStatistics(
+        mean, variance, of_mean, count, saturated, saturation=level, reject=reject
+    )
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:

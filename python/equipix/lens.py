@@ -11,6 +11,7 @@ from equipix._check import as_array, check_shape
 from equipix._readonly import ReadOnly
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
+from equipix.flags import set_bits
 from equipix.maps import block_means
 
 if TYPE_CHECKING:
@@ -30,6 +31,15 @@ _ROUNDS = 60
 
 _WORST = 1e7
 """Largest condition of the scaled derivatives at which a law is determined."""
+
+_LEAST = 0.1
+"""Illumination up to which a pixel is not corrected: gain and noise would be ten times as large."""
+
+_SETTLED = 1e-4
+"""Largest sum of squares that one more step may take away, over the variance of a residual."""
+
+_ROUNDING = 1e-9
+"""Error of the model and its numerical derivatives, relative to the values."""
 
 _CLIP = 5.0
 """Robust standard deviations beyond which a block is left out."""
@@ -51,9 +61,13 @@ class LensFalloff(ReadOnly):
         k₁ and k₂ of "radial".
     std : dict of str to float
         Standard errors of ``"row"``, ``"col"`` and ``"focal_length"``, or ``"k1"`` and ``"k2"``,
-        from the residuals, which are the sensor's own pattern.
+        from the residuals of block means. They hold if these are independent, as a gain without
+        large scales leaves them; a smooth gain of the sensor that is not given as `sensitivity`
+        adds an error that they do not contain.
     shape : tuple of int
         Sizes of the sensor that it was fitted on.
+    reach : float
+        Largest distance from the axis at which the flat had values, in pixels.
     """
 
     law: Law
@@ -62,23 +76,38 @@ class LensFalloff(ReadOnly):
     coefficients: Floats
     std: dict[str, float]
     shape: tuple[int, int]
+    reach: float
 
     def illumination(self) -> Floats:
         """Relative illumination of each pixel, shape (rows, cols), 1 on the axis."""
-        rows, cols = np.ogrid[: self.shape[0], : self.shape[1]]
-        squared = (rows - self.centre[0]) ** 2 + (cols - self.centre[1]) ** 2
+        squared = self._squared_distance()
         if self.law == "cos4":
             return cos4(squared, self.focal_length)
         return _radial(squared / _half_diagonal(self.shape) ** 2, *self.coefficients)
 
     def correction(self) -> Polynomial:
-        """Gain 1/illumination of each pixel, as a correction of frames without dark level."""
-        gain = 1 / self.illumination()
+        """Gain 1/illumination of each pixel, as a correction of frames without dark level.
+
+        Pixels are flagged ``NO_FLAT_FIELD`` and ``DO_NOT_USE``, their gain NaN, where the law gives
+        less than a tenth of the light, and outside of what a radial law was fitted to: its
+        polynomial may fall below 0 there.
+        """
+        light = self.illumination()
+        unknown = ~(light > _LEAST)
         metadata: dict[str, Any] = {"law": self.law, "centre": list(self.centre)}
         if self.law == "cos4":
             metadata["focal_length"] = self.focal_length
+        else:
+            unknown |= self._squared_distance() > self.reach**2
+            metadata["k1"], metadata["k2"] = map(float, self.coefficients)
+        gain = np.where(unknown, np.nan, 1 / np.where(unknown, 1.0, light))
         flags = np.zeros(self.shape, np.uint32)
+        set_bits(flags, "undetermined", unknown)
         return Polynomial(np.stack([np.zeros_like(gain), gain]), flags, metadata)
+
+    def _squared_distance(self) -> Floats:
+        rows, cols = np.ogrid[: self.shape[0], : self.shape[1]]
+        return np.asarray((rows - self.centre[0]) ** 2 + (cols - self.centre[1]) ** 2)
 
 
 def cos4(squared_distance: ArrayLike, focal_length: float) -> Floats:
@@ -136,7 +165,8 @@ def fit_falloff(
     Raises
     ------
     InputError
-        If an argument has a wrong shape, or the flat shows no fall-off that determines the law.
+        If an argument has a wrong shape or dtype, the flat shows no fall-off that determines the
+        law, or the fit does not converge.
 
     Notes
     -----
@@ -177,15 +207,18 @@ def fit_falloff(
     guess = np.array([float(np.median(values)), *middle, *start])
     found, std = _fitted(model, values, guess)
     centre = (float(found[1] * half), float(found[2] * half))
+    # A block reaches beyond its centre, and so does the margin that fills no whole block.
+    edge = np.sqrt(2.0) * max(1, max(shape) // _SIDE)
+    reach = float(np.hypot(rows - centre[0], cols - centre[1]).max() + edge)
     errors = {"row": std[1] * half, "col": std[2] * half}
     if law == "cos4":
         if not found[3] > 0:
             raise InputError("'flat' is not darker at the edge: it shows no fall-off by cos⁴")
         focal = float(half / np.sqrt(found[3]))
         errors["focal_length"] = focal * std[3] / found[3] / 2
-        return LensFalloff(law, centre, focal, np.empty(0), _plain(errors), shape)
+        return LensFalloff(law, centre, focal, np.empty(0), _plain(errors), shape, reach)
     errors |= {"k1": std[3], "k2": std[4]}
-    return LensFalloff(law, centre, float("nan"), found[3:], _plain(errors), shape)
+    return LensFalloff(law, centre, float("nan"), found[3:], _plain(errors), shape, reach)
 
 
 def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | None) -> Floats:
@@ -198,7 +231,10 @@ def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | Non
         with np.errstate(divide="ignore", invalid="ignore"):
             image = image / as_array("sensitivity", sensitivity, ndim=2)
     if mask is not None:
-        image[as_array("mask", mask, ndim=2).astype(bool)] = np.nan
+        given = as_array("mask", mask, ndim=2)
+        if given.dtype != np.bool_:
+            raise InputError(f"'mask' has dtype {given.dtype}, expected bool: True = do not use")
+        image[given] = np.nan
     image[~np.isfinite(image)] = np.nan
     if np.count_nonzero(np.isfinite(image)) < 100:
         raise InputError("'flat' has fewer than 100 finite values, expected those of a sensor")
@@ -225,14 +261,27 @@ def _fitted(
         residual = values - model(found)
         spread = 1.4826 * np.median(np.abs(residual[used]))
         used = np.abs(residual) <= max(_CLIP * spread, 1e-9 * abs(found[0]))
+    found = _least_squares(model, values, used, found)
     jacobian = _jacobian(model, found)[used]
     sizes = np.linalg.norm(jacobian, axis=0)
     if not sizes.all() or np.linalg.cond(jacobian / sizes) > _WORST:
         raise InputError("'flat' does not determine the law: is there any fall-off in it?")
     freedom = int(used.sum()) - len(found)
     variance = float(np.sum((values - model(found))[used] ** 2)) / freedom
+    _check_settled(jacobian, (values - model(found))[used], variance, abs(float(found[0])))
     scaled = np.linalg.inv((jacobian / sizes).T @ (jacobian / sizes))
     return found, np.sqrt(variance * np.diag(scaled)) / sizes
+
+
+def _check_settled(jacobian: Floats, residual: Floats, variance: float, scale: float) -> None:
+    """Refuse a fit that one more step would change by more than a part of its standard errors."""
+    step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+    gain = float(np.sum((jacobian @ step) ** 2))
+    if gain > _SETTLED * variance + len(residual) * (_ROUNDING * scale) ** 2:
+        raise InputError(
+            f"'flat': the fit of the law did not converge in {_ROUNDS} steps: mask what is no "
+            "fall-off, such as vignetted corners, or take the other law"
+        )
 
 
 def _least_squares(

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
 
-use equipix_core::apply::{Corrected, Corrector, Raw, Unusable};
+use equipix_core::apply::{Corrected, Corrector, Counts, Raw, Unusable};
 use equipix_core::{Control, Shape, Stack, Workers};
 
 const SHAPE: Shape = Shape::new(37, 53);
@@ -36,10 +36,21 @@ fn applied<I: Raw, O: Corrected>(
     largest: f32,
     workers: usize,
 ) -> (Vec<O>, u64) {
-    let mut out = vec![zero; SHAPE.len()];
+    let (out, counts) = counted(corrector, frame, zero, largest, workers);
+    (out, counts.limited)
+}
+
+fn counted<I: Raw, O: Corrected>(
+    corrector: &Corrector,
+    frames: &[I],
+    zero: O,
+    largest: f32,
+    workers: usize,
+) -> (Vec<O>, Counts) {
+    let mut out = vec![zero; frames.len()];
     let workers = Workers::new(std::num::NonZeroUsize::new(workers)).unwrap();
-    let limited = corrector.apply(frame, &mut out, largest, &workers, &Control::new()).unwrap();
-    (out, limited)
+    let counts = corrector.apply(frames, &mut out, largest, &workers, &Control::new()).unwrap();
+    (out, counts)
 }
 
 /// Σ c_j y^j in single precision by Horner's scheme.
@@ -87,9 +98,9 @@ fn halves_round_to_even_and_the_limits_hold_to_the_last_digit() {
     )
     .unwrap();
     let (mut out, workers) = ([9_u8; 8], Workers::new(None).unwrap());
-    let limited = corrector.apply(&[0_u8; 8], &mut out, 255.0, &workers, &Control::new()).unwrap();
+    let counts = corrector.apply(&[0_u8; 8], &mut out, 255.0, &workers, &Control::new()).unwrap();
     assert_eq!(out, [0, 2, 2, 0, 0, 254, 255, 255]);
-    assert_eq!(limited, 2);
+    assert_eq!(counts.limited, 2);
 }
 
 #[test]
@@ -176,8 +187,8 @@ fn any_number_of_workers_gives_the_same_bytes() {
     let by = |workers| {
         let (mut out, control) = (vec![0_u16; shape.len()], Control::new());
         let workers = Workers::new(std::num::NonZeroUsize::new(workers)).unwrap();
-        let limited = corrector.apply(&raw, &mut out, 65535.0, &workers, &control).unwrap();
-        (out, limited)
+        let counts = corrector.apply(&raw, &mut out, 65535.0, &workers, &control).unwrap();
+        (out, counts.limited)
     };
     let wanted = by(1);
     assert!(wanted.1 > 0);
@@ -190,4 +201,68 @@ fn arrays_of_other_sizes_are_refused() {
     let (workers, control) = (Workers::new(None).unwrap(), Control::new());
     let refused = corrector.apply(&[0_u8; 3], &mut [0_u8; 3], 255.0, &workers, &control);
     assert!(refused.unwrap_err().to_string().contains("expected (37, 53)"));
+}
+
+#[test]
+fn a_stack_is_its_frames_one_by_one_for_any_number_of_workers() {
+    // Above 2^20 values, where each thread takes whole frames.
+    let corrector = corrector(4, &[0, 54, 55, 700], Unusable::Replaced);
+    let count = (1 << 20) / SHAPE.len() + 1;
+    let frames: Vec<u16> =
+        (0..count * SHAPE.len()).map(|value| (value * 7919 % 65536) as u16).collect();
+    let (wanted, counts) = counted(&corrector, &frames, 0_u16, 4095.0, 1);
+    assert!(counts.limited > 0);
+    assert_eq!(counted(&corrector, &frames, 0_u16, 4095.0, 3), (wanted.clone(), counts));
+    let mut limited = 0;
+    for (raw, wanted) in frames.chunks(SHAPE.len()).zip(wanted.chunks(SHAPE.len())) {
+        let (out, of_frame) = applied(&corrector, raw, 0_u16, 4095.0, 1);
+        assert_eq!(out, wanted);
+        limited += of_frame;
+    }
+    assert_eq!(limited, counts.limited);
+}
+
+#[test]
+fn values_outside_of_the_levels_of_their_pixel_are_counted() {
+    // The value is the raw one. Two pixels have fewer levels, one has none, one is replaced.
+    let shape = Shape::new(2, 4);
+    let identity = [[0.0; 8], [1.0; 8]].concat();
+    let mut levels = [[10.0_f32; 8], [100.0; 8]].concat();
+    levels[8 + 1] = 50.0;
+    levels[2] = 40.0;
+    (levels[3], levels[8 + 3]) = (f32::NAN, f32::NAN);
+    let mut unusable = [false; 8];
+    unusable[7] = true;
+    let corrector = Corrector::new(
+        Stack::new("coefficients", &identity, 2, shape).unwrap(),
+        &unusable,
+        Unusable::Replaced,
+    )
+    .unwrap()
+    .with_levels(Stack::new("levels", &levels, 2, shape).unwrap())
+    .unwrap();
+    for (raw, wanted) in [
+        ([10_u16, 50, 40, 10, 100, 99, 11, 0], 0),
+        ([10, 51, 39, 10, 100, 99, 11, 0], 2),
+        ([9, 9, 9, 9, 101, 101, 101, 500], 7),
+    ] {
+        let (_, counts) = counted(&corrector, &raw, 0_u16, 65535.0, 1);
+        assert_eq!((counts.extrapolated, counts.limited), (wanted, 0), "{raw:?}");
+    }
+}
+
+#[test]
+fn the_largest_raw_value_is_found_in_every_type() {
+    let corrector = corrector(2, &[], Unusable::Kept);
+    for pixel in [0, 15, 16, 1000, SHAPE.len() - 1] {
+        let mut raw = vec![7_u16; SHAPE.len()];
+        raw[pixel] = 200;
+        let eight: Vec<u8> = raw.iter().map(|&y| y as u8).collect();
+        let mut single: Vec<f32> = raw.iter().map(|&y| y.into()).collect();
+        single[3] = f32::NAN;
+        assert_eq!(counted(&corrector, &raw, 0_f32, 0.0, 1).1.highest, 200.0);
+        assert_eq!(counted(&corrector, &eight, 0_f32, 0.0, 1).1.highest, 200.0);
+        assert_eq!(counted(&corrector, &single, 0_f32, 0.0, 1).1.highest, 200.0);
+    }
+    assert_eq!(counted(&corrector, &vec![-1_f32; SHAPE.len()], 0_f32, 0.0, 1).1.highest, 0.0);
 }

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from equipix._types import Display, Flagged, OutputType
-from equipix.cli.options import Force, Json, Mask, Saturation, Workers, naming_mask
+from equipix.cli.options import Force, Json, Mask, Saturation, Sensor, Workers, naming_mask
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
-from equipix.correction.files import correct_files, is_folder, is_picture
-from equipix.correction.whole import Conversion
+from equipix.correction.files import Corrected, correct_files, is_folder
 from equipix.errors import InputError
 from equipix.experiment.provenance import sha256_of
 from equipix.experiment.repeats import refuse_repeated_files
@@ -109,6 +108,8 @@ def correct(
             "by its 'histogram' with a plateau of 4 times the mean of its bins."
         ),
     ] = None,
+    sensor: Sensor = None,
+    workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -116,8 +117,6 @@ def correct(
     _refuse_image(output)
     check_output(output, force=force, folder=is_folder(output))
     refuse_inputs([output], [correction])
-    usual: OutputType = "uint16" if is_picture(output) else "float32"
-    chosen = dtype or ("uint8" if display else usual)
     with progress_bars() as progress:
         done = correct_files(
             load(correction),
@@ -125,14 +124,28 @@ def correct(
             output,
             dark=dark,
             flagged=flagged,
-            conversion=Conversion(chosen, bit_depth=bit_depth, display=display),
+            dtype=dtype,
+            bit_depth=bit_depth,
+            display=display,
+            sensor=sensor,
+            workers=workers,
             origin=f"correction sha256 {sha256_of([correction])[correction]}",
             force=force,
             progress=progress,
         )
-    result = {"output": str(output), "frames": done.frames, "dtype": chosen}
-    limited = {} if chosen == "float32" or display else {"limited_values": done.clipped}
-    show_result(result | limited, as_json=as_json)
+    counts = _counts(done, whole=done.dtype != "float32" and display is None)
+    result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
+    show_result(result, as_json=as_json)
+
+
+def _counts(done: Corrected, *, whole: bool) -> dict[str, Any]:
+    """Collect what was counted, as far as it can differ from 0."""
+    counts = {"limited_values": done.limited} if whole else {}
+    if done.extrapolated is not None:
+        counts["extrapolated_values"] = done.extrapolated
+    if done.replaced:
+        counts["replaced_pixels"] = done.replaced
+    return counts
 
 
 def _refuse_image(output: Path) -> None:

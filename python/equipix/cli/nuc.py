@@ -8,22 +8,29 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from equipix._check import naming_memory
 from equipix._types import By
-from equipix.cli.options import Force, Json, Mask, Workers, naming_mask
+from equipix.cli.options import Force, Json, Mask, Sensor, Workers, naming_mask
 from equipix.cli.summary import flagged as flag_counts
 from equipix.cli.summary import summary
 from equipix.cli.terminal import check_output, progress_bars, show_result
+from equipix.correction.protocol import check_sensor
 from equipix.experiment.levels import LevelExperiment
 from equipix.io import SUFFIXES, find_files, read_frames, read_mask, refuse_inputs, refuse_saved
 from equipix.loading import load, load_response
 from equipix.metrics import correctability, roughness, three_d_noise
-from equipix.nuc.bad_pixels import DefectLimits, find_defects
+from equipix.nuc.bad_pixels import find_defects
+from equipix.nuc.limits import DefectLimits
 
 if TYPE_CHECKING:
     from equipix._types import Array
+    from equipix.correction.protocol import Correction
 
 commands = typer.Typer()
-nuc = typer.Typer(no_args_is_help=True, help="Correction with a uniform source.")
+nuc = typer.Typer(
+    no_args_is_help=True,
+    help="Uniform source: fit response curves, find bad pixels, measure quality.",
+)
 commands.add_typer(nuc, name="nuc")
 
 _ORDERS = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
@@ -85,6 +92,16 @@ def defects(
     noise_limit: Annotated[
         float, typer.Option(help="Largest noise over the mean one (GB/T 17444-2013).")
     ] = DefectLimits.noise,
+    correlation_limit: Annotated[
+        float, typer.Option(help="Least deviation of von Neumann's ratio for flicker, in sigmas.")
+    ] = DefectLimits.correlation,
+    range_limit: Annotated[
+        float, typer.Option(help="Least share of the range of levels with values.")
+    ] = DefectLimits.range,
+    misfit_limit: Annotated[
+        float, typer.Option(help="Largest deviation of reduced chi2, in sigmas.")
+    ] = DefectLimits.misfit,
+    sensor: Sensor = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -92,9 +109,18 @@ def defects(
     if output is not None:
         check_output(output, force=force, suffixes=SUFFIXES)
         refuse_inputs([output], [response])
-    limits = DefectLimits(response=response_limit, gain=gain_limit, noise=noise_limit)
+    limits = DefectLimits(
+        response=response_limit,
+        gain=gain_limit,
+        noise=noise_limit,
+        correlation=correlation_limit,
+        range=range_limit,
+        misfit=misfit_limit,
+    )
     curves = load_response(response)
-    found = find_defects(curves, None if not frames else _raw(frames), limits=limits)
+    check_sensor(curves, sensor)
+    with naming_memory("finding bad pixels"):
+        found = find_defects(curves, None if not frames else _raw(frames), limits=limits)
     flagged = curves.with_flags(found.flags)
     if output is not None:
         flagged.save(output, force=force)
@@ -110,15 +136,24 @@ def quality(
     confidence: Annotated[
         float, typer.Option(help="Probability of the confidence interval.")
     ] = 0.95,
+    sensor: Sensor = None,
     as_json: Json = False,
 ) -> None:
     """Show spatial over temporal noise of corrected frames, and its parts."""
-    loaded, raw = load(correction), _raw(frames)
-    good = correctability(loaded.correct(raw), confidence=confidence)
-    every = correctability(loaded.correct(raw, flagged="keep"), confidence=confidence)
-    replaced = loaded.correct(raw, flagged="replace")
+    loaded = load(correction)
+    check_sensor(loaded, sensor)
+    with naming_memory("measuring quality"):
+        result = _quality(loaded, _raw(frames), confidence)
+    show_result(result, as_json=as_json)
+
+
+def _quality(correction: Correction, raw: Array, confidence: float) -> dict[str, Any]:
+    """Measure spatial over temporal noise of corrected frames, and its parts."""
+    good = correctability(correction.correct(raw), confidence=confidence)
+    every = correctability(correction.correct(raw, flagged="keep"), confidence=confidence)
+    replaced = correction.correct(raw, flagged="replace")
     noise = asdict(three_d_noise(replaced))
-    result = {
+    return {
         "frames": good.frames,
         "pixels": good.pixels,
         "C": good.ratio,
@@ -130,7 +165,6 @@ def quality(
         "noise_variances": noise,
         "roughness": roughness(replaced.mean(axis=0)),
     }
-    show_result(result, as_json=as_json)
 
 
 def _raw(source: list[str]) -> Array:

@@ -64,6 +64,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
         "saturation": frames.saturation,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
+        **({} if frames.reject is None else {"rejected_beyond_sigmas": frames.reject}),
         "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
     }
 

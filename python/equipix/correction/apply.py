@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._check import as_array
-from equipix.correction.corrector import FAST, check_flagged, largest_of, native, run
+from equipix._check import as_array, naming_memory
+from equipix.correction.depth import UNKNOWN, Depth
+from equipix.correction.kernel import FAST, check_flagged, kept, largest_of, run
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.frames import FrameStatistics, refuse_subtracted
@@ -27,6 +28,7 @@ def apply(
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth = UNKNOWN,
 ) -> NDArray[Any]:
     """Correct frames by a formula, and treat flagged pixels as `flagged` requires.
 
@@ -43,6 +45,8 @@ def apply(
         What becomes of pixels flagged ``DO_NOT_USE``.
     out : ndarray or None
         Array for the result, of the frames' shape, float32 or float64.
+    depth : Depth
+        Bits of the sensor.
 
     Returns
     -------
@@ -52,48 +56,57 @@ def apply(
     Raises
     ------
     InputError
-        If a shape does not fit, or `flagged` is unknown.
+        If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
     """
-    raw = _checked(frames, flags, flagged)
-    dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
-    result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
-    bad = ~usable(flags)
-    for source, target in zip(_each(raw), _each(result), strict=True):
-        formula(source, target)
-        if flagged == "nan":
-            target[bad] = np.nan
-        elif flagged == "replace":
-            replace_bad(target, bad)
-    return result
+    with naming_memory("correcting"):
+        raw = _checked(frames, flags, flagged)
+        depth.refuse_type(raw.dtype)
+        dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
+        result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
+        bad = ~usable(flags)
+        for source, target in zip(_each(raw), _each(result), strict=True):
+            depth.refuse_above(float(np.fmax.reduce(source, axis=None)), raw.dtype)
+            formula(source, target)
+            if flagged == "nan":
+                target[bad] = np.nan
+            elif flagged == "replace":
+                replace_bad(target, bad)
+        return result
 
 
 def apply_polynomial(
     frames: ArrayLike,
-    coefficients: NDArray[Any],
+    coefficients: Callable[[], NDArray[Any]],
     *,
+    sources: tuple[NDArray[Any], ...] | None,
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any]:
     """Σ c_j y^j of each value y by Horner's scheme, and the values of flagged pixels.
 
     Frames of 8 or 16 bits and float32 are corrected in float32 by the compiled part; `out` may
     then be of whole numbers, which are rounded half to even and limited to the range of the type.
-    Others are corrected in float64. The other parameters are those of `apply`.
+    Others are corrected in float64. `coefficients` makes the coefficients, once for the arrays
+    `sources` of a result, the flags last. The other parameters are those of `apply`.
     """
-    fast = _fast(frames, coefficients, flags=flags, flagged=flagged, out=out)
+    # A copy is no array of the result.
+    known = (flags.copy(),) if sources is None else sources
+    fast = _fast(frames, known, coefficients, flagged=flagged, out=out, depth=depth)
     if fast is not None:
         return fast
+    planes = coefficients()
 
     def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
         total = np.zeros(frame.shape)
         with np.errstate(invalid="ignore"):  # a dead pixel has infinite coefficients
-            for coefficient in coefficients[::-1]:
+            for coefficient in planes[::-1]:
                 total *= frame
                 total += coefficient
         corrected[...] = total
 
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
 
 
 def apply_gain(
@@ -101,52 +114,80 @@ def apply_gain(
     *,
     gain: NDArray[Any],
     dark: FrameStatistics | ArrayLike | None,
+    stored: NDArray[Any] | None,
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any]:
     """(frame − dark) / gain of each value, and the values of flagged pixels.
 
     The parameters are those of `equipix.Calibration.correct`; frames and results of some types go
-    to the compiled part, as in `apply_polynomial`.
+    to the compiled part, as in `apply_polynomial`. Coefficients are prepared once for no dark and
+    for the `stored` one of the result; another may change between two calls.
     """
-    offset = np.zeros((), np.float32) if dark is None else dark_frame(dark, gain.shape)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
-        coefficients = np.stack([-offset / gain, 1 / gain])
-    fast = _fast(frames, coefficients, flags=flags, flagged=flagged, out=out)
+    offset = None if dark is None else dark_frame(dark, gain.shape)
+    sources: tuple[NDArray[Any], ...] = (gain, flags)
+    if dark is stored and stored is not None:
+        sources = (gain, stored, flags)
+    elif offset is not None:
+        sources = (gain, offset.copy(), flags)  # a copy is no array of the result
+
+    def coefficients() -> NDArray[Any]:
+        return gain_coefficients(gain, offset)
+
+    fast = _fast(frames, sources, coefficients, flagged=flagged, out=out, depth=depth)
     if fast is not None:
         return fast
+    dark_level = np.zeros((), np.float32) if offset is None else offset
 
     def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
-        np.subtract(frame, offset, out=corrected, dtype=corrected.dtype, casting="same_kind")
+        np.subtract(frame, dark_level, out=corrected, dtype=corrected.dtype, casting="same_kind")
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(corrected, gain, out=corrected, casting="same_kind")
 
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
+
+
+def gain_coefficients(gain: NDArray[Any], dark: NDArray[Any] | None) -> NDArray[Any]:
+    """Coefficients c_0 = −dark/gain, 0 without a dark, and c_1 = 1/gain; NaN where gain is."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have gain 0
+        inverse = 1 / gain.astype(np.float64)
+        offset = np.zeros_like(inverse) if dark is None else -dark * inverse
+    offset[np.isnan(inverse)] = np.nan
+    return np.stack([offset, inverse])
 
 
 def _fast(
     frames: ArrayLike,
-    coefficients: NDArray[Any],
+    sources: tuple[NDArray[Any], ...],
+    coefficients: Callable[[], NDArray[Any]],
     *,
-    flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any] | None:
-    """Correct frames by the compiled part; None where it does not take their types."""
-    raw = _checked(frames, flags, flagged)
-    if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
-        return None
-    result = np.empty(raw.shape, np.float32) if out is None else out
-    run(native(coefficients, flags, flagged), raw, result, largest_of(result.dtype), None)
-    return result
+    """Correct frames by the compiled part; None where it does not take their types.
+
+    `sources` are the arrays that `coefficients` makes coefficients of, the flags last.
+    """
+    with naming_memory("correcting"):
+        raw = _checked(frames, sources[-1], flagged)
+        if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
+            return None
+        depth.refuse_type(raw.dtype)
+        result = np.empty(raw.shape, np.float32) if out is None else out
+        if raw.size:
+            prepared = kept(sources, flagged, coefficients)
+            counts = run(prepared, raw, result, largest_of(result.dtype), None)
+            depth.refuse_above(counts.highest, raw.dtype)
+        return result
 
 
 def _is_plain(out: NDArray[Any], raw: NDArray[Any]) -> bool:
     """Whether the compiled part can write to an array."""
     fits = isinstance(out, np.ndarray) and out.dtype in FAST and out.shape == raw.shape
-    free = fits and out.flags.c_contiguous and out.flags.writeable
-    return bool(free and not np.may_share_memory(out, raw))
+    return bool(fits and out.flags.carray and not np.may_share_memory(out, raw))
 
 
 def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArray[Any]:
@@ -156,6 +197,22 @@ def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArra
         raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
     check_flagged(flagged)
     return raw
+
+
+def dark_or_stored(
+    dark: str | FrameStatistics | ArrayLike | None, stored: NDArray[Any] | None
+) -> FrameStatistics | ArrayLike | None:
+    """Return the dark given, or the stored one of a calibration where it is "stored"."""
+    if not isinstance(dark, str):
+        return dark
+    if dark != "stored":
+        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+    if stored is None:
+        raise InputError(
+            "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if it "
+            "is already subtracted"
+        )
+    return stored
 
 
 def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:

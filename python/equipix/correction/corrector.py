@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any, get_args
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix import _native
-from equipix._check import as_array, positive_workers
-from equipix._types import Flagged
+from equipix._check import as_array, naming_memory, positive_workers
+from equipix.correction.apply import dark_frame
+from equipix.correction.depth import depth_of
+from equipix.correction.kernel import (
+    FAST,
+    check_flagged,
+    largest_value,
+    native,
+    output_dtype,
+    run,
+)
+from equipix.correction.protocol import check_sensor, takes_dark
 from equipix.errors import InputError
 from equipix.flags import usable
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, DTypeLike
 
-    from equipix._types import Array
+    from equipix._types import Array, Flagged
     from equipix.correction.protocol import Correction
+    from equipix.frames import FrameStatistics
 
-FAST = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
-"""Types of frames, and of corrected frames, that the compiled part takes."""
+    Dark = Literal["stored"] | FrameStatistics | ArrayLike | None
 
 
 class Corrector:
-    """A correction prepared for many frames: whole numbers in and out, no allocation per frame.
+    """A correction prepared for many frames: whole numbers in and out, no array made per frame.
 
     Parameters
     ----------
@@ -38,23 +48,37 @@ class Corrector:
     flagged : {"replace", "nan", "keep"}
         The value of pixels flagged ``DO_NOT_USE``: the mean of the nearest good pixels around, in
         the same pass; NaN, which is 0 in whole numbers; or the value that the formula gives.
+    dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+        The dark frame to subtract, as for the correction's own ``correct``. A calibration that
+        holds none needs one, or None for frames whose dark is already subtracted.
+    sensor : str, optional
+        Name of the sensor that gives the frames, to be compared with that of the correction.
     workers : int, optional
-        Number of threads; by default one for each processor. It changes no bit of the result.
+        Number of threads; by default one for each processor. It changes no bit of the result. Up to
+        2²⁰ values the calling thread works alone; of larger stacks each thread takes whole frames,
+        and of frames of more than 2²⁰ pixels parts.
 
     Attributes
     ----------
     clipped : int
         Values of whole numbers so far that had to be limited to the range from 0 to the largest
         value, or were not a number.
+    extrapolated : int or None
+        Values so far that were corrected to below the lowest or above the highest level that the
+        response of their pixel was fitted to, to the rounding of float32. None where a correction
+        has no range of levels, such as a calibration.
     frames : int
         Frames corrected so far.
     replaced : int
-        Pixels that are replaced in each frame.
+        Pixels that are replaced in each frame; 0 where no pixel is good.
 
     Raises
     ------
     InputError
-        If an argument has a wrong value, or the correction has more than four coefficients.
+        If an argument has a wrong value, the correction has more than four coefficients, or needs
+        a dark frame, or is of another sensor.
+    InsufficientMemoryError
+        If the memory for the coefficients cannot be had.
 
     Notes
     -----
@@ -85,18 +109,25 @@ class Corrector:
         *,
         bit_depth: int | None = None,
         flagged: Flagged = "replace",
+        dark: Dark = "stored",
+        sensor: str | None = None,
         workers: int | None = None,
     ) -> None:
         self.shape = correction.shape
         self.dtype = output_dtype(dtype)
-        self._saturation: float | None = getattr(correction, "saturation", None)
+        self._depth = depth_of(correction)
         self._largest = largest_value(self.dtype, bit_depth)
         self._workers = positive_workers(workers)
         check_flagged(flagged)
-        self._native = native(correction.coefficients, correction.flags, flagged)
-        bad = int(np.count_nonzero(~usable(correction.flags)))
-        self.replaced = bad if flagged == "replace" else 0
+        check_sensor(correction, sensor)
+        levels = levels_of(correction)
+        with naming_memory("preparing a correction"):
+            coefficients = coefficients_of(correction, dark)
+            self._native = native(coefficients, correction.flags, flagged, levels)
+        good = int(np.count_nonzero(usable(correction.flags)))
+        self.replaced = correction.flags.size - good if flagged == "replace" and good else 0
         self.clipped = self.frames = 0
+        self.extrapolated = None if levels is None else 0
         self._counting = threading.Lock()
 
     def __repr__(self) -> str:
@@ -122,9 +153,26 @@ class Corrector:
         Raises
         ------
         InputError
-            If a shape or dtype does not fit, or whole numbers have fewer bits than the correction.
+            If a shape or dtype does not fit, whole numbers have fewer bits than those of the
+            correction, or a value is above what these hold: `out` is then of no use.
+        InsufficientMemoryError
+            If the memory for the result cannot be had.
         """
-        raw = as_array("frames", frames, ndim=(2, 3))
+        with naming_memory("correcting"):
+            raw = as_array("frames", frames, ndim=(2, 3))
+            self._check(raw)
+            result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
+            counts = run(self._native, raw, result, self._largest, self._workers)
+        self._depth.refuse_above(counts.highest, raw.dtype)
+        with self._counting:
+            self.clipped += counts.limited
+            self.frames += 1 if raw.ndim == 2 else len(raw)
+            if self.extrapolated is not None:
+                self.extrapolated += counts.extrapolated
+        return result
+
+    def _check(self, raw: Array) -> None:
+        """Refuse frames of another shape, type or bit depth."""
         if raw.shape[-2:] != self.shape:
             raise InputError(f"'frames' has shape {raw.shape}, the sensor {self.shape}")
         if raw.dtype not in FAST:
@@ -132,13 +180,7 @@ class Corrector:
                 f"'frames' is {raw.dtype}, expected uint8, uint16 or float32: convert them, or use "
                 "the correction's own correct()"
             )
-        check_depth(raw.dtype, self._saturation)
-        result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
-        clipped = run(self._native, raw, result, self._largest, self._workers)
-        with self._counting:
-            self.clipped += clipped
-            self.frames += 1 if raw.ndim == 2 else len(raw)
-        return result
+        self._depth.refuse_type(raw.dtype)
 
     def _checked(self, out: Array, raw: Array) -> Array:
         """Refuse an array that the result cannot be written to."""
@@ -146,65 +188,37 @@ class Corrector:
         if not array or out.dtype != self.dtype or out.shape != raw.shape:
             got = f"{getattr(out, 'dtype', type(out).__name__)} of shape {np.shape(out)}"
             raise InputError(f"'out' is {got}, expected {self.dtype} of shape {raw.shape}")
-        if not (out.flags.c_contiguous and out.flags.writeable):
-            raise InputError("'out' is not contiguous or read-only: give a writeable C-order array")
+        if not (out.flags.carray):
+            raise InputError(
+                "'out' is not contiguous, not aligned or read-only: give a writeable C-order array"
+            )
         if np.may_share_memory(out, raw):
             raise InputError("'out' overlaps 'frames': neighbours of replaced pixels must stay raw")
         return out
 
 
-def native(coefficients: Array, flags: Array, flagged: Flagged) -> _native.Corrector:
-    """Prepare coefficients of shape (n, rows, cols) for the compiled part."""
-    planes = np.ascontiguousarray(coefficients, dtype=np.float32)
-    return _native.Corrector(planes, np.ascontiguousarray(~usable(flags)), flagged)
+def levels_of(correction: Correction) -> Array | None:
+    """Lowest and highest level of each pixel, of a correction that was measured at several."""
+    limits: Array | None = getattr(correction, "limits", None)
+    if limits is None or not (limits[1] > limits[0]).any():
+        return None
+    return limits
 
 
-def run(
-    corrector: _native.Corrector, raw: Array, result: Array, largest: float, workers: int | None
-) -> int:
-    """Correct frames into an array; gives the number of values that had to be limited."""
-    shape = (-1, *raw.shape[-2:])
-    return corrector.apply(raw.reshape(shape), result.reshape(shape), largest, workers=workers)
-
-
-def check_flagged(flagged: str) -> None:
-    """Refuse an unknown treatment of flagged pixels."""
-    if flagged not in get_args(Flagged):
-        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
-
-
-def check_depth(dtype: np.dtype[Any], saturation: float | None) -> None:
-    """Refuse whole numbers of fewer bits than a sensor that saturates at this level gives."""
-    if saturation is None or dtype.kind != "u" or np.iinfo(dtype).max >= saturation / 2:
-        return
-    raise InputError(
-        f"'frames' is {dtype}, but the levels saturate at {saturation:g} DN: frames of another bit "
-        "depth"
-    )
-
-
-def largest_of(dtype: np.dtype[Any]) -> float:
-    """Return the largest value of a dtype of whole numbers; 0, which is not used, of others."""
-    return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
-
-
-def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
-    """Return a type that corrected frames may have, and refuse others."""
-    try:
-        found = np.dtype(dtype)
-    except TypeError as error:
-        raise InputError(f"'dtype' is {dtype!r}, expected uint8, uint16 or float32") from error
-    if found not in FAST:
-        raise InputError(f"'dtype' is {found}, expected uint8, uint16 or float32")
-    return found
-
-
-def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
-    """Return the largest value of whole numbers of so many bits."""
-    if bit_depth is None:
-        return largest_of(dtype)
-    bits = 8 * dtype.itemsize
-    if dtype.kind != "u" or isinstance(bit_depth, bool) or bit_depth not in range(8, bits + 1):
-        wanted = f"8 to {bits}" if dtype.kind == "u" else "None for float32"
-        raise InputError(f"'bit_depth' is {bit_depth!r}, expected {wanted}")
-    return float(2**bit_depth - 1)
+def coefficients_of(correction: Correction, dark: Dark) -> Array:
+    """Coefficients with this dark frame in place of that stored, by the rules of ``correct``."""
+    stored = isinstance(dark, str) and dark == "stored"
+    if not takes_dark(correction):
+        if stored:
+            return correction.coefficients
+        raise InputError(
+            "'dark' is given, but the offsets of this correction are part of it and no dark frame "
+            "can replace them: expected 'stored'"
+        )
+    # Of no frames it refuses a dark that it would refuse of any.
+    correction.correct(np.empty((0, *correction.shape), np.float32), dark=dark)
+    if stored:
+        return correction.coefficients
+    offset = None if dark is None else dark_frame(dark, correction.shape)
+    changed: Any = replace(correction, dark=offset)  # type: ignore[type-var]
+    return np.asarray(changed.coefficients)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from equipix._types import Flagged, Progress
-from equipix.correction.whole import Conversion
+from equipix._types import Display, Flagged, OutputType, Progress
+from equipix.correction.corrector import Corrector
+from equipix.correction.kernel import FAST, output_dtype
+from equipix.correction.protocol import takes_dark
+from equipix.correction.tone import picture
 from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
 from equipix.frames import average, refuse_subtracted
 from equipix.io import (
@@ -25,25 +27,45 @@ from equipix.io import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
-    from typing import TypeGuard
 
     from numpy.typing import NDArray
 
-    from equipix.correction.protocol import Correction, DarkCorrection
+    from equipix.correction.corrector import Dark
+    from equipix.correction.protocol import Correction
 
+_MARKED = (".tif", ".tiff", ".png")
+"""Formats that this module writes."""
 
 _MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
 detected."""
 
 
-class Done(NamedTuple):
-    """What was written."""
+class Corrected(NamedTuple):
+    """What was written.
 
+    Attributes
+    ----------
+    dtype : str
+        Type of the values.
+    frames : int
+        Number of frames.
+    limited : int
+        Values that had to be limited to the range of whole numbers, or were not a number.
+    extrapolated : int or None
+        Values corrected to outside of the levels of their pixel's response; None where the
+        correction has none.
+    replaced : int
+        Pixels that were replaced in each frame.
+    """
+
+    dtype: str
     frames: int
-    clipped: int
+    limited: int
+    extrapolated: int | None
+    replaced: int
 
 
 def correct_files(
@@ -53,12 +75,16 @@ def correct_files(
     *,
     dark: str = "stored",
     flagged: Flagged = "nan",
-    conversion: Conversion | None = None,
+    dtype: OutputType | None = None,
+    bit_depth: int | None = None,
+    display: Display | None = None,
+    sensor: str | None = None,
+    workers: int | None = None,
     origin: str = "",
     force: bool = False,
     progress: Progress | None = None,
-) -> Done:
-    """Correct the frames of files, a few at a time.
+) -> Corrected:
+    """Correct the frames of files, a few at a time, with one `Corrector`.
 
     Parameters
     ----------
@@ -74,8 +100,16 @@ def correct_files(
         correction that subtracts a dark frame takes another than "stored".
     flagged : {"nan", "keep", "replace"}
         What becomes of flagged pixels; NaN is 0 in whole numbers.
-    conversion : Conversion, optional
-        Type of the output; float32 unless given.
+    dtype : {"float32", "uint16", "uint8"}, optional
+        Type of the output; float32 unless given, and uint16 for a .png.
+    bit_depth : int, optional
+        Significant bits of whole numbers, 8 to 16; by default all of the type.
+    display : {"linear", "histogram"}, optional
+        Make pictures of 8 bits by a tone law, see `equipix.correction.tone.picture`.
+    sensor : str, optional
+        Name of the sensor that gave the frames, to be compared with that of the correction.
+    workers : int, optional
+        Number of threads, as for `Corrector`.
     origin : str
         ASCII text that names the correction, such as its hash: it is stored in each file.
     force : bool
@@ -85,8 +119,8 @@ def correct_files(
 
     Returns
     -------
-    Done
-        Number of frames, and of values that had to be limited to the range of whole numbers.
+    Corrected
+        What was written, and what was counted. For pictures nothing is limited.
 
     Raises
     ------
@@ -102,38 +136,68 @@ def correct_files(
     AlreadyCorrectedWarning
         If files were written by this function.
     """
-    conversion = conversion or Conversion(display=None)
+    wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
     counts = {file: _count(file, correction) for file in files}
-    _refuse_pictures(output, sum(counts.values()), conversion)
-    _warn_of_corrected(files)
-    correct = _with_dark(correction, dark)
     total, done = sum(counts.values()), 0
+    _refuse_pictures(output, total, wanted)
+    _warn_of_corrected(files, origin)
+    corrector = Corrector(
+        correction,
+        "float32" if display else wanted,
+        bit_depth=bit_depth,
+        flagged=flagged,
+        dark=_dark(correction, dark),
+        sensor=sensor,
+        workers=workers,
+    )
 
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
         nonlocal done
         for _, frames in stream_frames(inputs):
-            yield from map(conversion.of, correct(frames, flagged=flagged))
+            for frame in corrector.apply(_taken(frames)):
+                yield picture(frame, display) if display else frame
             done += len(frames)
             if progress is not None:
                 progress(done, total, "correcting")
 
-    frame_bytes = conversion.dtype.itemsize * correction.shape[0] * correction.shape[1]
+    frame_bytes = wanted.itemsize * correction.shape[0] * correction.shape[1]
     mark = f"{_MARK}{origin and f', {origin}'}"
     if not is_folder(output):
         with write_whole(output, force=force) as temporary:
             _write(temporary, corrected(files), nbytes=total * frame_bytes, mark=mark)
-        return Done(total, conversion.clipped)
-    with folder_beside(output) as folder:
-        for file, path in zip(files, outputs, strict=True):
-            nbytes = counts[file] * frame_bytes
-            _write(folder / path.name, corrected([file]), nbytes=nbytes, mark=mark)
-        output.mkdir(exist_ok=True)
-        for path in outputs:
-            (folder / path.name).replace(path)
-    return Done(total, conversion.clipped)
+    else:
+        with folder_beside(output) as folder:
+            for file, path in zip(files, outputs, strict=True):
+                nbytes = counts[file] * frame_bytes
+                _write(folder / path.name, corrected([file]), nbytes=nbytes, mark=mark)
+            output.mkdir(exist_ok=True)
+            for path in outputs:
+                (folder / path.name).replace(path)
+    limited, extrapolated = corrector.clipped, corrector.extrapolated
+    return Corrected(wanted.name, total, limited, extrapolated, corrector.replaced)
+
+
+def _dtype(
+    output: Path, dtype: OutputType | None, bit_depth: int | None, display: Display | None
+) -> np.dtype[Any]:
+    """Type of the output, by its name unless it is given."""
+    if display is None:
+        return output_dtype(dtype or ("uint16" if is_picture(output) else "float32"))
+    if dtype not in (None, "uint8") or bit_depth is not None:
+        raise InputError(
+            f"'display' makes pictures of 8 bits, but 'dtype' is '{dtype}' and 'bit_depth' is "
+            f"{bit_depth}: leave both out"
+        )
+    return np.dtype(np.uint8)
+
+
+def _taken(frames: NDArray[Any]) -> NDArray[Any]:
+    """Frames in a type that is corrected; in single precision like the corrected values."""
+    native = frames.dtype.newbyteorder("=")
+    return frames.astype(native if native in FAST else np.float32, copy=False)
 
 
 def _write(path: Path, frames: Iterator[NDArray[Any]], *, nbytes: int, mark: str) -> None:
@@ -150,7 +214,7 @@ def is_picture(output: Path) -> bool:
     return output.suffix.lower() == ".png"
 
 
-def _refuse_pictures(output: Path, total: int, conversion: Conversion) -> None:
+def _refuse_pictures(output: Path, total: int, dtype: np.dtype[Any]) -> None:
     """Refuse several frames, or floating-point numbers, in a PNG."""
     if not is_picture(output):
         return
@@ -159,7 +223,7 @@ def _refuse_pictures(output: Path, total: int, conversion: Conversion) -> None:
             f"'{output}' holds one frame, but {total} are to be corrected: name a .tif of all, or "
             "a folder"
         )
-    if conversion.dtype.kind != "u":
+    if dtype.kind != "u":
         raise InputError(f"'{output}' holds whole numbers: expected 'dtype' uint8 or uint16")
 
 
@@ -178,16 +242,20 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def _warn_of_corrected(files: list[Path]) -> None:
+def _warn_of_corrected(files: list[Path], origin: str) -> None:
     """Warn of files that this module has written."""
-    tiffs = [file for file in files if file.suffix.lower() in (".tif", ".tiff")]
-    if corrected := [file for file in tiffs if description(file).startswith(_MARK)]:
-        others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
-        warn(
-            f"{corrected[0]}{others}: corrected already; a second correction divides by the "
-            "sensitivity twice: give the raw frames",
-            AlreadyCorrectedWarning,
-        )
+    marks = {file: description(file) for file in files if file.suffix.lower() in _MARKED}
+    corrected = [file for file, mark in marks.items() if mark.startswith(_MARK)]
+    if not corrected:
+        return
+    others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
+    same = bool(origin) and marks[corrected[0]].endswith(origin)
+    by = "by this correction" if same else "by another correction"
+    warn(
+        f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
+        "the raw frames",
+        AlreadyCorrectedWarning,
+    )
 
 
 def _count(file: Path, correction: Correction) -> int:
@@ -201,24 +269,17 @@ def _count(file: Path, correction: Correction) -> int:
     return count
 
 
-def _with_dark(correction: Correction, dark: str) -> Callable[..., NDArray[Any]]:
-    """Give the method that corrects frames, with this dark frame in place of that stored."""
+def _dark(correction: Correction, dark: str) -> Dark:
+    """Give the dark frame that an option names, for the argument of `Corrector`."""
     if dark == "stored":
-        return correction.correct
-    if not _takes_dark(correction):
+        return "stored"
+    if not takes_dark(correction):
         raise InputError(
             f"'dark' is '{dark}', but the offsets of this correction are part of it and no dark "
             "frame can replace them: expected 'stored'"
         )
-    return partial(correction.correct, dark=None if dark == "none" else _dark_frame(dark))
-
-
-def _takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
-    return hasattr(correction, "dark")
-
-
-def _dark_frame(source: str) -> NDArray[Any]:
-    """Read the mean of dark frames, averaged already or not."""
-    dark = average(source)
-    refuse_subtracted(dark, source)
-    return dark.mean.astype(np.float32)
+    if dark == "none":
+        return None
+    statistics = average(dark)
+    refuse_subtracted(statistics, dark)
+    return statistics

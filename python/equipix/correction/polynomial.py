@@ -9,6 +9,8 @@ import numpy as np
 
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
+from equipix.correction.depth import depth_of
+from equipix.correction.protocol import sensor_of
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
 
@@ -38,6 +40,8 @@ class Polynomial(ReadOnly):
         Bits of `equipix.Flag`.
     metadata : dict
         Origin, as JSON values.
+    saturation : float or None
+        Level of saturation of the raw values in DN, where it is known.
 
     Raises
     ------
@@ -48,6 +52,7 @@ class Polynomial(ReadOnly):
     coefficients: Array
     flags: Array
     metadata: dict[str, Any] = field(default_factory=dict)
+    saturation: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -93,10 +98,16 @@ class Polynomial(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, or `flagged` is unknown.
+            If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
         """
         return apply_polynomial(
-            frames, self.coefficients, flags=self.flags, flagged=flagged, out=out
+            frames,
+            lambda: self.coefficients,
+            sources=(self.coefficients, self.flags),
+            flags=self.flags,
+            flagged=flagged,
+            out=out,
+            depth=depth_of(self),
         )
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
@@ -115,7 +126,12 @@ class Polynomial(ReadOnly):
             If the file exists and `force` is not set, or it cannot be written.
         """
         pages = {"coefficients": self.coefficients, "flags": self.flags}
-        content = {"format": _FORMAT, "kind": _KIND, "metadata": self.metadata}
+        content = {
+            "format": _FORMAT,
+            "kind": _KIND,
+            "saturation": self.saturation,
+            "metadata": self.metadata,
+        }
         save_pages(path, pages, content, force=force)
 
 
@@ -125,7 +141,13 @@ def read_polynomial(
     """Make a correction of the arrays and metadata of the file that `Polynomial.save` wrote."""
     check_format(path, content, _KIND, _FORMAT)
     check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
-    return Polynomial(pages["coefficients"], pages["flags"], content["metadata"])
+    level = content.get("saturation")
+    return Polynomial(
+        pages["coefficients"],
+        pages["flags"],
+        content["metadata"],
+        None if level is None else float(level),
+    )
 
 
 def combine(first: Correction, then: Correction) -> Polynomial:
@@ -143,7 +165,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     Returns
     -------
     Polynomial
-        Of the order of `first`, with the flags of both; `metadata` holds that of both.
+        Of the order of `first`, with its level of saturation and the flags of both; `metadata`
+        holds that of both, and the sensor.
 
     Raises
     ------
@@ -163,7 +186,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     """
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
-    one, other = _sensor(first), _sensor(then)
+    one, other = sensor_of(first), sensor_of(then)
     if one and other and one != other:
         raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
     dark = getattr(then, "dark", None)
@@ -181,11 +204,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     gain = after[1] if len(after) == 2 else 0.0
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
-    metadata = {"first": first.metadata, "then": then.metadata}
-    return Polynomial(coefficients, first.flags | then.flags, metadata)
-
-
-def _sensor(correction: Correction) -> str:
-    """Return the name of the sensor in the metadata, if there is one."""
-    sensor = correction.metadata.get("sensor")
-    return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""
+    metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
+    if one or other:
+        metadata["sensor"] = (first if one else then).metadata["sensor"]
+    level: float | None = getattr(first, "saturation", None)
+    return Polynomial(coefficients, first.flags | then.flags, metadata, level)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
+from equipix.errors import InputError
+
 if TYPE_CHECKING:
     from os import PathLike
+    from typing import TypeGuard
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -50,7 +53,7 @@ class Correction(Protocol):
 
 
 class DarkCorrection(Correction, Protocol):
-    """A correction that subtracts a dark frame, which may be replaced by another."""
+    """A dataclass of a correction that subtracts a dark frame, which another may replace."""
 
     @property
     def dark(self) -> NDArray[Any] | None:
@@ -65,3 +68,28 @@ class DarkCorrection(Correction, Protocol):
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
         """Frames as `Correction.correct` gives them, after `dark` is subtracted."""
+
+
+def takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
+    """Whether another dark frame can take the place of that stored."""
+    return hasattr(correction, "dark")
+
+
+def sensor_of(correction: Correction) -> str:
+    """Return the name of the sensor in the metadata; empty where there is none."""
+    sensor = correction.metadata.get("sensor")
+    return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""
+
+
+def check_sensor(correction: Correction, sensor: str | None) -> None:
+    """Refuse frames of a sensor of another name than that of the correction."""
+    if sensor is None:
+        return
+    own = sensor_of(correction)
+    if not own:
+        raise InputError(
+            f"'sensor' is '{sensor}', but this correction names no sensor to compare it with: "
+            "leave it out"
+        )
+    if own != sensor:
+        raise InputError(f"'sensor' is '{sensor}', but the correction is of '{own}'")

@@ -13,7 +13,7 @@ from equipix.experiment.manifest import find_files, read_level_manifest
 from equipix.experiment.mask import excluded_pixels
 from equipix.experiment.provenance import sha256_of
 from equipix.experiment.repeats import refuse_repeats
-from equipix.exposures.averaged import Averaged
+from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, union
 from equipix.frames import average, refuse_subtracted
 from equipix.io import as_path
@@ -158,6 +158,7 @@ class LevelExperiment:
             gain=sensor.gain_dn_per_e,
             saturation=sensor.saturation_level,
             saturation_key=sensor.saturation_key,
+            words=Words("[[level]]", "level"),
         )
         with naming_memory("averaging"):
             dark = self._dark(workers, progress)
@@ -166,8 +167,7 @@ class LevelExperiment:
                 try:
                     averaged.add(frames, name)
                 except InputError as error:
-                    text = str(error).replace("'frames': exposure", "level")
-                    raise FileError(f"{self.path}: {text}") from error
+                    raise FileError(f"{self.path}: {error}") from error
         return averaged
 
     def _dark(self, workers: int | None, progress: Progress | None) -> FrameStatistics | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,20 @@ if TYPE_CHECKING:
     from equipix.frames import FrameStatistics
 
 
+class Words(NamedTuple):
+    """What messages call the argument of the measurements, and one of them."""
+
+    argument: str = "'frames'"
+    one: str = "exposure"
+
+    def place(self, number: int, name: str = "") -> str:
+        """Name one of the measurements."""
+        return f"{self.argument}: {self.one} {number}{f' ({name!r})' if name else ''}"
+
+
+EXPOSURES = Words()
+
+
 class Averaged:
     """The part of the `FrameStatistics` of each exposure that a calibration needs.
 
@@ -42,6 +57,10 @@ class Averaged:
         Gain of the camera where it is known, in DN per electron.
     saturation : float, optional
         Level that was averaged with, in DN, where it is known; for messages.
+    saturation_key : str
+        What messages call that level.
+    words : Words
+        What messages call the frames.
 
     Attributes
     ----------
@@ -53,7 +72,7 @@ class Averaged:
     dark : FrameStatistics or None
         The dark frames that were subtracted.
     pedestal : float
-        Value from which noise models count the signal, in DN: 0 unless `count_from_lowest` sets it.
+        Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
     """
 
     def __init__(
@@ -64,7 +83,9 @@ class Averaged:
         gain: float | None = None,
         saturation: float | None = None,
         saturation_key: str = "saturation",
+        words: Words = EXPOSURES,
     ) -> None:
+        self._words = words
         self.count, self.gain, self.saturation = count, gain, saturation
         self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
@@ -77,9 +98,9 @@ class Averaged:
         self.raw = True
 
     @classmethod
-    def of(cls, frames: Sequence[FrameStatistics]) -> Self:
+    def of(cls, frames: Sequence[FrameStatistics], *, words: Words = EXPOSURES) -> Self:
         """Reduce the statistics of all exposures."""
-        averaged = cls(len(frames))
+        averaged = cls(len(frames), words=words)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -103,15 +124,16 @@ class Averaged:
             self.dark = frames.dark
         if shape != self.saturated.shape:
             raise InputError(
-                f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
+                f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
+                "expected one"
             )
         if not same_statistics(frames.dark, self.dark):
             raise InputError(
-                f"'frames': exposure {exposure} has another dark than the first: average all with "
+                f"{self._words.place(exposure)} has another dark than the first: average all with "
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        which = f"'frames': exposure {exposure}{f' ({name!r})' if name else ''}"
+        which = self._words.place(exposure, name)
         _refuse_no_variance(which, frames)
         self._refuse_saturated(which, frames)
         clipped = clipping_of(frames)
@@ -128,12 +150,15 @@ class Averaged:
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
-    def count_from_lowest(self) -> None:
-        """Let noise models count the signal from the lowest of several exposures.
+    def counted_from_lowest(self) -> Self:
+        """Return a copy whose noise models count the signal from the lowest of several exposures.
 
         Raw values contain the level without light, which adds no photon noise.
         """
-        self.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+        counted = copy.copy(self)
+        vars(counted).pop("noise", None)
+        counted.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+        return counted
 
     @cached_property
     def noise(self) -> NoiseModel | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix import _native
 from equipix.errors import FileError, UnsupportedFileError
-from equipix.io import tiff
+from equipix.io import png, tiff
 from equipix.io.names import find_files
 
 if TYPE_CHECKING:
@@ -22,6 +22,13 @@ if TYPE_CHECKING:
 
 _AT_ONCE = 2**27
 """Most bytes of a file of several frames that are read at once."""
+
+
+def description(path: Path) -> str:
+    """Text stored with a TIFF or PNG; empty where there is none."""
+    if path.suffix.lower() == ".png":
+        return png.description(path)
+    return tiff.description(path)
 
 
 def read_frames(

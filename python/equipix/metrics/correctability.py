@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array
+from equipix._check import as_array, naming_memory
 from equipix.errors import InputError
-from equipix.metrics.moments import signed_root, stack_of
+from equipix.metrics.moments import signed_root, stack_of, temporal_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
+    from equipix._types import Bools
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Correctability:
     frames: int
 
 
+@naming_memory("correctability")
 def correctability(
     frames: ArrayLike, *, mask: ArrayLike | None = None, confidence: float = 0.95
 ) -> Correctability:
@@ -102,24 +105,15 @@ def correctability(
     stack = stack_of("frames", frames)
     if not 0 < confidence < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
-    used = np.isfinite(stack).all(axis=0)
-    if mask is not None:
-        given = as_array("mask", mask, ndim=2)
-        if given.dtype != np.bool_ or given.shape != used.shape:
-            raise InputError(
-                f"'mask' is {given.dtype} of shape {given.shape}, expected bool of {used.shape}"
-            )
-        used &= ~given
-    values = stack[:, used]
-    n, pixels = values.shape
+    found = temporal_of(stack, _as_mask(mask, stack.shape[1:]))
+    n, pixels = found.frames, int(np.count_nonzero(found.used))
     if pixels < 2:
         raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")
-    values -= values.mean(axis=1, keepdims=True)
     # A frame's own mean takes one of N degrees of freedom.
-    temporal = float(values.var(axis=0, ddof=1).mean()) * pixels / (pixels - 1)
+    temporal = float(found.variance[found.used].mean()) * pixels / (pixels - 1)
     if temporal <= 0:
         raise InputError("'frames' are all equal: they show no temporal noise")
-    spatial = float(values.mean(axis=0).var(ddof=1)) - temporal / n
+    spatial = float(found.mean[found.used].var(ddof=1)) - temporal / n
     ratio = n * spatial / temporal + 1
     degrees = pixels - 1, (pixels - 1) * (n - 1)
     tail = (1 - confidence) / 2
@@ -172,6 +166,18 @@ def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
         return float(when[0])
     share = (1 - values[first - 1]) / (values[first] - values[first - 1])
     return float(when[first - 1] + share * (when[first] - when[first - 1]))
+
+
+def _as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+    """Mask of one sensor, checked."""
+    if mask is None:
+        return None
+    given = as_array("mask", mask, ndim=2)
+    if given.dtype != np.bool_ or given.shape != shape:
+        raise InputError(
+            f"'mask' is {given.dtype} of shape {given.shape}, expected bool of {shape}"
+        )
+    return given
 
 
 def _fisher_quantile(probability: float, first: int, second: int) -> float:

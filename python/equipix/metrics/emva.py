@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix._check import naming_memory
 from equipix.errors import InputError
 from equipix.metrics.moments import Moments, moments, signed_root
 
@@ -51,6 +52,7 @@ class EmvaSpatial:
     bright_mean: float
 
 
+@naming_memory("EMVA 1288 non-uniformity")
 def emva_spatial(
     dark: ArrayLike | FrameStatistics,
     bright: ArrayLike | FrameStatistics,
@@ -73,7 +75,7 @@ def emva_spatial(
     -------
     EmvaSpatial
         Each number has the sign of its variance estimate, so it is never NaN: a part that is
-        smaller than its noise may be negative.
+        smaller than its noise, or than the bias below, may be negative.
 
     Raises
     ------
@@ -94,6 +96,14 @@ def emva_spatial(
     DSNU = s_dark/K; PRNU = √(s²_bright − s²_dark)/(μ_bright − μ_dark). The high-pass subtracts
     running means over 7×7, then 11×11, then 3×3 binomial weights; borders are reflected. The noise
     of the filtered image is taken as that of the unfiltered one: its variance is 1.1 % smaller.
+
+    The parts are the standard's, and not without bias. Where rows, columns and pixels are drawn
+    with variances r, c and p, the expectation of s²_pix is lower than p by
+
+    .. math:: RC [r (C - 1) + c (R - 1)] / [D (RC - 1)] \approx r/R + c/C ,
+
+    which makes it negative where lines or stripes prevail; that of s²_col is higher than c by about
+    r/R², that of s²_row than r by about c/C². `three_d_noise` has no such bias.
 
     References
     ----------

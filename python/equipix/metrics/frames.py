@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array
+from equipix._check import as_array, naming_memory
 from equipix.errors import InputError
-from equipix.metrics.moments import stack_of
+from equipix.metrics.moments import stack_of, temporal_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from equipix._types import Floats
 
 
+@naming_memory("NETD")
 def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     """Noise-equivalent temperature difference of each pixel.
 
@@ -53,17 +54,14 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     low, high = stack_of("cold", cold), stack_of("hot", hot)
     if low.shape[1:] != high.shape[1:]:
         raise InputError(f"'hot' has shape {high.shape}, expected frames of {low.shape[1:]}")
-    variances = []
-    for stack in (low, high):
-        # A bad pixel, which corrected frames hold as NaN, has no part in the drift of the others.
-        known = np.isfinite(stack).all(axis=0)
-        means = np.mean(stack, axis=(1, 2), keepdims=True, where=known)
-        variances.append((stack - (means - means.mean())).var(axis=0, ddof=1))
-    rise = np.abs(high.mean(axis=0) - low.mean(axis=0))
+    # A bad pixel, which corrected frames hold as NaN, has no part in the drift of the others.
+    first, second = temporal_of(low), temporal_of(high)
+    rise = np.abs(second.mean - first.mean)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(delta_t * np.sqrt((variances[0] + variances[1]) / 2) / rise)
+        return np.asarray(delta_t * np.sqrt((first.variance + second.variance) / 2) / rise)
 
 
+@naming_memory("roughness")
 def roughness(frame: ArrayLike) -> float:
     """Roughness of a frame: differences of neighbours over values.
 

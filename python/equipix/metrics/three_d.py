@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix._check import naming_memory
 from equipix.errors import InputError
-from equipix.metrics.moments import stack_of
+from equipix.metrics.moments import refuse_missing, stack_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Floats
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class ThreeDNoise:
         return self.t + self.v + self.h + self.tv + self.th + self.vh + self.tvh
 
 
+@naming_memory("three-dimensional noise")
 def three_d_noise(frames: ArrayLike) -> ThreeDNoise:
     r"""Noise of frames of an even scene by time (t), rows (v) and columns (h).
 
@@ -94,19 +98,15 @@ def three_d_noise(frames: ArrayLike) -> ThreeDNoise:
     (1.0, 4)
     """
     y = stack_of("frames", frames)
-    if min(y.shape) < 2 or not np.isfinite(y).all():
-        lost = np.count_nonzero(~np.isfinite(y))
-        raise InputError(
-            f"'frames' has shape {y.shape} and {lost} values that are not finite, expected two or "
-            "more along each axis, all finite"
-        )
+    if min(y.shape) < 2:
+        raise InputError(f"'frames' has shape {y.shape}, expected two or more along each axis")
+    refuse_missing("frames", y)
     sizes = np.array(y.shape)
-    effects = _effects(y - y.mean())
     mean_squares = {}
-    for axes, effect in effects.items():
+    for axes, squares in _squares(y).items():
         degrees = np.prod([sizes[axis] - 1 for axis in axes])
         repeats = np.prod([sizes[axis] for axis in range(3) if axis not in axes])
-        mean_squares[axes] = float(np.sum(effect**2) * repeats / degrees)
+        mean_squares[axes] = float(squares * repeats / degrees)
     found: dict[tuple[int, ...], float] = {}
     for axes in sorted(mean_squares, key=len, reverse=True):
         above = sum(
@@ -120,15 +120,26 @@ def three_d_noise(frames: ArrayLike) -> ThreeDNoise:
     return ThreeDNoise(**names)
 
 
-def _effects(y: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Means over the other axes of each set of axes, less those of its subsets."""
-    sets = [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)]
-    effects: dict[tuple[int, ...], np.ndarray] = {}
-    for axes in sets:
-        others = tuple(axis for axis in range(3) if axis not in axes)
-        effect = y.mean(axis=others, keepdims=True) if others else y
-        for smaller, value in effects.items():
-            if set(smaller) < set(axes):
-                effect = effect - value
-        effects[axes] = effect
-    return effects
+def _squares(y: Array) -> dict[tuple[int, ...], float]:
+    """Sum of the squared effects of each set of axes: means over the others, less the subsets'.
+
+    Two passes over the frames: one for the means, one for what they leave.
+    """
+    count, rows, cols = y.shape
+    whole = float(np.mean([frame.mean(dtype=np.float64) for frame in y]))
+    of_rows, of_cols = np.empty((count, rows)), np.empty((count, cols))
+    image: Floats = np.zeros((rows, cols))
+    for index, frame in enumerate(y):
+        free = frame.astype(np.float64) - whole
+        image += free / count
+        of_rows[index], of_cols[index] = free.mean(axis=1), free.mean(axis=0)
+    t, v, h = of_rows.mean(axis=1), image.mean(axis=1), image.mean(axis=0)
+    tv, th = of_rows - t[:, None] - v, of_cols - t[:, None] - h
+    vh = image - v[:, None] - h
+    rest = 0.0
+    for index, frame in enumerate(y):
+        lines = t[index] + v + tv[index]
+        free = frame.astype(np.float64) - whole
+        rest += float(np.sum((free - lines[:, None] - (h + th[index]) - vh) ** 2))
+    effects = {(0,): t, (1,): v, (2,): h, (0, 1): tv, (0, 2): th, (1, 2): vh}
+    return {axes: float(np.sum(effect**2)) for axes, effect in effects.items()} | {(0, 1, 2): rest}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array
+from equipix._check import as_array, naming_memory
 from equipix.errors import InputError
 from equipix.metrics.moments import moments, signed_root
 
@@ -55,6 +55,7 @@ class EmvaTransfer:
     linearity_error: float
 
 
+@naming_memory("photon transfer")
 def emva_transfer(
     dark: Sequence[ArrayLike | FrameStatistics],
     bright: Sequence[ArrayLike | FrameStatistics],
@@ -78,7 +79,8 @@ def emva_transfer(
     Raises
     ------
     InputError
-        If the numbers of levels do not fit, or too few levels lie below saturation.
+        If the numbers of levels do not fit, values are not finite, too few levels lie below
+        saturation, or their light does not differ.
 
     Notes
     -----
@@ -97,6 +99,9 @@ def emva_transfer(
             f"'bright' has {len(bright)} levels and 'dark' {len(dark)}, expected {len(levels)} as "
             "'light', of 'dark' also 1"
         )
+    if not (np.isfinite(levels).all() and (levels >= 0).all()):
+        wrong = levels[~(np.isfinite(levels) & (levels >= 0))][0]
+        raise InputError(f"'light' holds {wrong:g}, expected finite numbers not below 0")
     off = np.array([_mean_and_variance("dark", each) for each in dark])
     on = np.array([_mean_and_variance("bright", each) for each in bright])
     signal, variance = (on - off).T
@@ -109,6 +114,13 @@ def emva_transfer(
             f"'bright': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
             f"{saturation:.6g} DN, expected three or more"
         )
+    if not np.ptp(levels[linear]) > 0:
+        raise InputError(
+            f"'light' is {levels[linear][0]:g} at all levels between 5 and 95 % of saturation, "
+            "expected values that rise with the signal"
+        )
+    if not levels[below].any():
+        raise InputError("'light' is 0 at all levels up to 70 % of saturation, expected light")
     gain = _slope(signal[below], variance[below])
     responsivity = _slope(levels[below], signal[below])
     if not gain > 0:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.errors import InverseWarning, warn
 from equipix.nuc.curve import polynomial, response_at, slope_at
 
 if TYPE_CHECKING:
@@ -16,6 +17,12 @@ _NODES = 4
 
 _CHECKED = 17
 """Places at which they are compared: two between extremes of the difference, which has four."""
+
+_SHARE = 0.3
+"""Largest difference, over the noise of a frame, that passes: it adds 4 % to the noise."""
+
+_MOST_BEYOND = 1e-3
+"""Largest share of the usable pixels that may differ by more, without a warning."""
 
 _NEWTON = 60
 """Most steps of the exact inverse: bisection alone halves the range so often."""
@@ -93,6 +100,34 @@ def horner_inverse(deviation: Array, limits: Array) -> tuple[Floats, Floats]:
             inverted = polynomial(coefficients, response_at(deviation, mean))
             difference = np.maximum(difference, np.abs(inverted - mean))
     return coefficients, difference
+
+
+def inverse_verdict(difference: Array, noise: float | None) -> dict[str, float | int | None]:
+    """Compare the error of the cubic with the noise of a frame, and warn where it is large.
+
+    Parameters
+    ----------
+    difference : ndarray, shape (pixels,)
+        Largest difference to the exact inverse of usable pixels, in DN.
+    noise : float, optional
+        Noise of a frame, in DN, where it is known.
+
+    Returns
+    -------
+    dict
+        The largest difference, the noise, and the number of pixels beyond the limit, for metadata.
+    """
+    largest = float(np.max(difference, initial=0.0))
+    beyond = 0 if noise is None else int(np.count_nonzero(difference > _SHARE * noise))
+    if beyond > _MOST_BEYOND * difference.size:
+        warn(
+            f"the cubic that inverts the curves differs from their inverse by up to {largest:.2g} "
+            f"DN, and in {beyond} of {difference.size} pixels by more than {_SHARE:g} of the noise "
+            f"of a frame, {noise:.2g} DN: correct(exact=True), or fit a lower order or a smaller "
+            "range of levels",
+            InverseWarning,
+        )
+    return {"largest_error_dn": largest, "noise_dn": noise, "pixels_beyond": beyond}
 
 
 def _line(deviation: Array) -> Floats:

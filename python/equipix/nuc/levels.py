@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,20 +12,22 @@ from equipix import _native
 from equipix._readonly import ReadOnly
 from equipix.defects import SIGMAS, Findings, response_outliers
 from equipix.errors import InputError, SaturationWarning, warn
-from equipix.exposures.averaged import Averaged
+from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.clipping import clipping_advice
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from typing import Self
 
     from numpy.typing import ArrayLike
 
     from equipix._types import Array, Bools, Floats
     from equipix.exposures.front import Measured
+
+_LEVELS = Words("'levels'", "level")
 
 FEWEST_VALID = 0.5
 """Least share of the pixels that must have a value at every level."""
@@ -69,6 +70,9 @@ class Levels(ReadOnly):
         Whether they are averages of whole numbers from which no dark was subtracted.
     saturation : float or None
         Level of saturation in DN, where it is known.
+    frame_noise : float or None
+        Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
+        given; None if it is unknown.
     """
 
     values: Array
@@ -80,6 +84,7 @@ class Levels(ReadOnly):
     dark_variance: Floats | None = None
     raw: bool = False
     saturation: float | None = None
+    frame_noise: float | None = None
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -142,12 +147,12 @@ def levels_of(
     saturation: float | None = None,
 ) -> Levels:
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
-    with _naming_levels():
-        averaged = _averaged(levels)
-        if averaged is not None and averaged.raw and averaged.count > 1:
-            averaged.count_from_lowest()
-        measured = measured_of(levels if averaged is None else averaged, variance, saturation)
-        given = None if mask is None else as_mask(mask, measured.values.shape)
+    averaged = _averaged(levels)
+    if averaged is not None and averaged.raw and averaged.count > 1:
+        averaged = averaged.counted_from_lowest()
+    source = levels if averaged is None else averaged
+    measured = measured_of(source, variance, saturation, words=_LEVELS)
+    given = None if mask is None else as_mask(mask, measured.values.shape)
     if measured.clipped is not None:
         warn(clipping_advice(measured.clipped), SaturationWarning)
     pedestal = 0.0 if averaged is None else averaged.pedestal
@@ -166,7 +171,19 @@ def levels_of(
         dark_variance=measured.dark_variance,
         raw=measured.raw,
         saturation=_saturation_of(levels, saturation),
+        frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
     )
+
+
+def _frame_noise(
+    averaged: Averaged | None, noise: tuple[LevelNoise, ...] | None, references: Floats
+) -> float | None:
+    """Noise of one frame at the lowest level; of a value that is given where no more is known."""
+    lowest = int(np.argmin(references))
+    if averaged is not None and averaged.noise is not None:
+        signal = references[lowest] - averaged.pedestal
+        return float(np.sqrt(averaged.noise.variance(signal)))
+    return None if noise is None else float(np.sqrt(noise[lowest].variance(references[lowest])))
 
 
 def _saturation_of(levels: object, given: float | None) -> float | None:
@@ -187,20 +204,10 @@ def _averaged(levels: object) -> Averaged | None:
         return None
     if not all(isinstance(each, FrameStatistics) for each in levels):
         return None
-    averaged = Averaged(len(levels), saturation=_saturation_of(levels, None))
+    averaged = Averaged(len(levels), saturation=_saturation_of(levels, None), words=_LEVELS)
     for each in levels:
         averaged.add(each)
     return averaged
-
-
-@contextmanager
-def _naming_levels() -> Iterator[None]:
-    """Name the argument 'levels' in messages of the common checks, which call it 'frames'."""
-    try:
-        yield
-    except InputError as error:
-        text = str(error).replace("'frames'", "'levels'").replace("exposure ", "level ")
-        raise InputError(text.replace("one exposure", "one level")) from error
 
 
 def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | None:

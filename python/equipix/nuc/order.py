@@ -38,9 +38,9 @@ def check_order(order: object, by: object) -> None:
         raise InputError(f"'order' is {order!r}, expected one of {get_args(Order)}")
     if by not in get_args(By):
         raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
-    if by == "gain" and order not in (0, "auto"):
+    if by == "gain" and order != 0:
         raise InputError(
-            f"'by' is 'gain', but order {order} corrects offset and gain: expected order=0"
+            f"'by' is 'gain', but order {order!r} corrects offset and gain: expected order=0"
         )
 
 
@@ -59,7 +59,12 @@ def check_count(levels: Levels, order: int) -> None:
 
 
 def check_gain(levels: Levels) -> None:
-    """Refuse levels without signal for a correction by gain, which is a ratio."""
+    """Refuse levels with a dark level, or without signal, for a correction by gain: a ratio."""
+    if levels.raw:
+        raise InputError(
+            "'levels' are averages of raw frames, whose dark level would enter the ratio of "
+            "by='gain': average them with dark=, or take order=1, which finds the offsets"
+        )
     sigma = np.sqrt(levels.variances) if levels.noise else np.zeros(len(levels))
     if not np.any(levels.references > 6 * sigma):
         raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 from equipix._check import as_array
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply, apply_polynomial, dark_frame
-from equipix.correction.corrector import check_depth
+from equipix.correction.depth import depth_of
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.nuc.curve import counted_from, response_at
@@ -50,6 +50,8 @@ class Response(ReadOnly):
         Goodness of fit: mean square residual per degree of freedom, in units of the variance of a
         value; 1 on average where the noise is right. Where no noise was known, in DN². NaN with as
         many levels as coefficients.
+    used : ndarray, shape (rows, cols), uint32
+        Number of levels at which the pixel has a value.
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`. ``DEAD`` rises by less than half as much as its neighbours, ``HOT``
         by more than twice as much; the dark and the noise set them as in `equipix.calibrate`.
@@ -78,6 +80,7 @@ class Response(ReadOnly):
     inverse_error: Floats
     limits: Floats
     reduced_chi2: Floats
+    used: Array
     flags: Array
     levels: Floats
     dark: Array | None = None
@@ -95,6 +98,13 @@ class Response(ReadOnly):
     def order(self) -> int:
         """Highest power of V̄ in the deviation; 1 also for one point by gain."""
         return len(self.deviation) - 1
+
+    @property
+    def freedom(self) -> Array:
+        """Degrees of freedom of each pixel's fit: levels used less coefficients, 0 or more."""
+        by_gain = self.metadata.get("options", {}).get("order") == 0
+        terms = 1 if by_gain else len(self.deviation)
+        return np.maximum(self.used.astype(np.int64) - terms, 0)
 
     @property
     def valid_range(self) -> Floats:
@@ -163,20 +173,27 @@ class Response(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, `flagged` is unknown, values exceed the saturation level, or a
+            If a shape does not fit, `flagged` is unknown, frames are of another bit depth, or a
             dark is given to a response without one.
         """
-        self._check_depth(frames)
-        offset = self._offset(dark)
+        offset, depth = self._offset(dark), depth_of(self)
         if not exact:
-            inverse = self.inverse if offset is None else counted_from(self.inverse, offset)
-            return apply_polynomial(frames, inverse, flags=self.flags, flagged=flagged, out=out)
+            own = () if self.dark is None or offset is None else (self.dark,)
+            return apply_polynomial(
+                frames,
+                lambda: self.inverse if offset is None else counted_from(self.inverse, offset),
+                sources=(self.inverse, *own, self.flags) if offset is self.dark else None,
+                flags=self.flags,
+                flagged=flagged,
+                out=out,
+                depth=depth,
+            )
         zero = np.zeros(self.shape) if offset is None else offset
 
         def formula(frame: Array, corrected: Array) -> None:
             corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
 
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
+        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, depth=depth)
 
     def extrapolated(
         self,
@@ -275,16 +292,3 @@ class Response(ReadOnly):
                 "fitted to levels from which no dark was subtracted"
             )
         return dark_frame(dark, self.shape)
-
-    def _check_depth(self, frames: ArrayLike) -> None:
-        """Refuse whole numbers that the sensor of the levels cannot have given."""
-        level, dtype = self.saturation, getattr(frames, "dtype", None)
-        if level is None or dtype is None or dtype.kind not in "iu" or np.size(frames) == 0:
-            return
-        largest = int(np.max(frames))
-        if largest > level:
-            raise InputError(
-                f"'frames' holds {largest}, above the saturation level {level:g} DN of the levels: "
-                "frames of another sensor or bit depth"
-            )
-        check_depth(dtype, level)

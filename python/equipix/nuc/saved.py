@@ -24,6 +24,7 @@ _MAPS: dict[str, type] = {
     "flags": np.uint32,
     "inverse_error": np.float64,
     "reduced_chi2": np.float64,
+    "used": np.uint32,
 }
 _STACKS: dict[str, type] = dict.fromkeys(
     ("deviation", "variances", "inverse", "limits"), np.float64

@@ -25,6 +25,12 @@ _REFERENCE_K = 300.0
 _SLOWEST_HZ, _FASTEST_HZ, _WAVES = 1e-6, 1e-2, 9
 """Frequencies of the drift, equally many in each decade, which is a spectrum of 1/f."""
 
+_NOT_BELOW_0 = ("sensitivity", "area", "dark_e", "amplification", "read_noise_e", "drift_dn")
+"""Causes that cannot be below 0."""
+
+_STEEPEST = 0.5
+"""Curvature at which the response stops rising when the well is full."""
+
 _MAPS = (
     "sensitivity",
     "area",
@@ -56,7 +62,7 @@ class StaringArray:
         Electrons of the dark current in one frame.
     curvature : array_like
         Share of the signal that is missing when the well is full: n electrons become
-        n·(1 − curvature·n/well).
+        n·(1 − curvature·n/well). At most 1/2, where the response no longer rises at a full well.
     cutoff_um : array_like
         Cut-off wavelength in µm: the spectrum that the pixel sees of a black body.
     band_start_um : float
@@ -136,6 +142,21 @@ class StaringArray:
                 raise InputError(
                     f"'{name}' has shape {values.shape}, expected one number or {self.shape}"
                 )
+            self._check_values(name, values)
+
+    def _check_values(self, name: str, values: NDArray[Any]) -> None:
+        """Refuse values of a map that no array has."""
+        low, high, wanted = -np.inf, np.inf, "finite numbers"
+        if name in _NOT_BELOW_0:
+            low, wanted = 0.0, "finite numbers not below 0"
+        elif name == "curvature":
+            high, wanted = _STEEPEST, f"finite numbers up to {_STEEPEST}"
+        elif name == "cutoff_um":
+            low = float(np.nextafter(self.band_start_um, np.inf))
+            wanted = f"finite numbers above 'band_start_um', {self.band_start_um:g}"
+        wrong = values[~(np.isfinite(values) & (values >= low) & (values <= high))]
+        if wrong.size:
+            raise InputError(f"'{name}' holds {wrong.flat[0]:g}, expected {wanted}")
 
     @classmethod
     def of(cls, material: str, shape: tuple[int, int], *, rng: Rng) -> Self:
@@ -231,9 +252,18 @@ class StaringArray:
         -------
         ndarray, shape (rows, cols), float64
             Of light and dark current, at most a full well.
+
+        Raises
+        ------
+        InputError
+            If light is not finite or below 0.
         """
+        light = np.asarray(light_e, np.float64)
+        wrong = light[~(np.isfinite(light) & (light >= 0))]
+        if wrong.size:
+            raise InputError(f"'light_e' holds {wrong.flat[0]:g}, expected finite numbers from 0")
         dark = self._maps["dark_e"] * 2 ** (warmer_k / self.doubling_k)
-        collected = self._maps["area"] * (self._maps["sensitivity"] * np.asarray(light_e) + dark)
+        collected = self._maps["area"] * (self._maps["sensitivity"] * light + dark)
         return np.asarray(np.clip(collected, 0, self.well_e))
 
     def mean(

@@ -13,7 +13,8 @@
 //! The product and the sum are rounded one by one, not fused: the same bytes come out on every
 //! processor.
 
-use std::sync::{Mutex, PoisonError};
+use std::cell::RefCell;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 
 use crate::control::Control;
 use crate::error::{Error, Result};
@@ -24,7 +25,8 @@ use crate::parallel::Workers;
 const BLOCK: usize = 1 << 15;
 
 /// Most pixels that the calling thread corrects alone: a quarter of a millisecond, in which other
-/// threads would hardly have started.
+/// threads would hardly have started. Of larger stacks each thread takes whole frames, and of larger
+/// frames blocks.
 const ALONE: usize = 1 << 20;
 
 /// Largest number of coefficients: those of a cubic.
@@ -94,6 +96,90 @@ pub enum Unusable {
     Replaced,
 }
 
+/// What was found in frames while they were corrected.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Counts {
+    /// Values that had to be limited to 0 and the largest.
+    pub limited: u64,
+    /// Values that were corrected to below the lowest or above the highest level of their pixel.
+    pub extrapolated: u64,
+    /// The largest raw value; 0 where none is above 0.
+    pub highest: f32,
+}
+
+/// Counts to which several threads add.
+#[derive(Debug, Default)]
+struct Tally {
+    limited: AtomicU64,
+    extrapolated: AtomicU64,
+    /// Bits of a number that is not negative: their order is that of the numbers.
+    highest: AtomicU32,
+}
+
+impl Tally {
+    fn add(&self, counts: Counts) {
+        self.limited.fetch_add(counts.limited, Ordering::Relaxed);
+        self.extrapolated.fetch_add(counts.extrapolated, Ordering::Relaxed);
+        self.highest.fetch_max(counts.highest.to_bits(), Ordering::Relaxed);
+    }
+
+    fn counts(self) -> Counts {
+        Counts {
+            limited: self.limited.into_inner(),
+            extrapolated: self.extrapolated.into_inner(),
+            highest: f32::from_bits(self.highest.into_inner()),
+        }
+    }
+}
+
+/// Lowest and highest level that a correction was measured at.
+#[derive(Debug)]
+struct Range {
+    /// Of the pixel with the most levels.
+    widest: [f32; 2],
+    /// Pixels with fewer levels, and their own.
+    narrower: Vec<(u32, [f32; 2])>,
+}
+
+impl Range {
+    const EVERYTHING: Self =
+        Self { widest: [f32::NEG_INFINITY, f32::INFINITY], narrower: Vec::new() };
+
+    /// From the levels of each pixel, all lowest ones first; what is not a number has no range.
+    fn of(levels: &[f32], size: usize) -> Self {
+        let (low, high) = levels.split_at(size);
+        let each = || low.iter().zip(high).map(|(&low, &high)| widened([low, high]));
+        let union = |[low, high]: [f32; 2], [l, h]: [f32; 2]| [low.min(l), high.max(h)];
+        let widest = each().fold([f32::INFINITY, f32::NEG_INFINITY], union);
+        let own = (0..).zip(each()).filter(|(_, range)| *range != widest && range[0] <= range[1]);
+        Self { widest, narrower: own.collect() }
+    }
+}
+
+/// A range with the roundings of a polynomial in single precision, so that a value at a level is in it.
+fn widened([low, high]: [f32; 2]) -> [f32; 2] {
+    let rounding = 8.0 * f32::EPSILON * low.abs().max(high.abs());
+    [low - rounding, high + rounding]
+}
+
+/// Whether a value is outside; what is not a number is not.
+#[inline(always)]
+fn is_outside(value: f32, [low, high]: [f32; 2]) -> bool {
+    (value < low) | (value > high)
+}
+
+/// Bits of a number, which for numbers from 0 on have their order and for others are not above 0; what
+/// is not a number is 0. A maximum of them is found in vector registers, one of numbers is not.
+#[inline(always)]
+fn order_of(value: f32) -> i32 {
+    if value.is_nan() { 0 } else { value.to_bits().cast_signed() }
+}
+
+thread_local! {
+    /// Values of replaced pixels of the frame at hand, kept so that no frame allocates.
+    static REPAIRED: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
+
 /// A correction prepared for many frames.
 #[derive(Debug)]
 pub struct Corrector {
@@ -101,8 +187,7 @@ pub struct Corrector {
     coefficients: Vec<f32>,
     planes: usize,
     repairs: Repairs,
-    /// Values of replaced pixels of the frame at hand, kept so that no frame allocates.
-    repaired: Mutex<Vec<f32>>,
+    range: Range,
 }
 
 impl Corrector {
@@ -126,15 +211,29 @@ impl Corrector {
         };
         if then != Unusable::Kept {
             for pixel in (0..shape.len()).filter(|&pixel| unusable[pixel]) {
-                set(&mut coefficients, shape, pixel, f32::NAN);
+                coefficients.iter_mut().skip(pixel).step_by(shape.len()).for_each(|each| {
+                    *each = f32::NAN;
+                });
             }
         }
-        for &pixel in &repairs.pixels {
-            // So the first pass counts no value of theirs as limited.
-            set(&mut coefficients, shape, pixel as usize, 0.0);
+        Ok(Self { shape, coefficients, planes, repairs, range: Range::EVERYTHING })
+    }
+
+    /// Counts values that are corrected to outside of these levels: the lowest of each pixel, then
+    /// the highest of each.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if `levels` is of another size.
+    pub fn with_levels(self, levels: Stack<'_, f32>) -> Result<Self> {
+        if levels.count() != 2 || levels.shape() != self.shape {
+            let shape = levels.shape();
+            return Err(Error::Shape {
+                argument: "levels",
+                got: format!("({}, {}, {})", levels.count(), shape.rows, shape.cols),
+                wanted: format!("(2, {}, {})", self.shape.rows, self.shape.cols),
+            });
         }
-        let repaired = Mutex::new(vec![0.0; repairs.pixels.len()]);
-        Ok(Self { shape, coefficients, planes, repairs, repaired })
+        Ok(Self { range: Range::of(levels.data(), self.shape.len()), ..self })
     }
 
     /// Sizes of a frame.
@@ -143,21 +242,22 @@ impl Corrector {
         self.shape
     }
 
-    /// Corrects a frame into `out`; gives the number of values that had to be limited to 0 and
-    /// `largest`, which is an odd number.
+    /// Corrects frames into `out`; `largest`, to which values are limited, is an odd number.
     ///
     /// # Errors
-    /// [`Error::Shape`] if an array is of another size than the sensor; [`Error::Cancelled`].
+    /// [`Error::Shape`] if an array holds no whole number of frames, or the two differ in size;
+    /// [`Error::Cancelled`].
     pub fn apply<I: Raw, O: Corrected>(
         &self,
-        frame: &[I],
+        frames: &[I],
         out: &mut [O],
         largest: f32,
         workers: &Workers,
         control: &Control,
-    ) -> Result<u64> {
-        for (argument, length) in [("frames", frame.len()), ("out", out.len())] {
-            if length != self.shape.len() {
+    ) -> Result<Counts> {
+        let size = self.shape.len();
+        for (argument, length) in [("frames", frames.len()), ("out", out.len())] {
+            if !length.is_multiple_of(size) || length != frames.len() {
                 return Err(Error::Shape {
                     argument,
                     got: format!("{length} values"),
@@ -165,17 +265,31 @@ impl Corrector {
                 });
             }
         }
-        let correct = |index: usize, block: &mut [O]| {
-            control.check()?;
-            let at = index * BLOCK;
-            Ok(self.correct_block(at, &frame[at..at + block.len()], block, largest))
+        let tally = Tally::default();
+        let correct = |index: usize, frame: &[I], block: &mut [O]| {
+            if !control.is_cancelled() {
+                let (at, length) = (index * BLOCK, block.len());
+                tally.add(self.correct_block(at, &frame[at..at + length], block, largest));
+            }
         };
-        let limited: Result<u64> = if out.len() <= ALONE {
-            out.chunks_mut(BLOCK).enumerate().map(|(index, block)| correct(index, block)).sum()
+        let alone = |frame: &[I], out: &mut [O]| {
+            out.chunks_mut(BLOCK).enumerate().for_each(|(index, part)| correct(index, frame, part));
+            self.finish(frame, out, largest, &tally);
+        };
+        let each = frames.chunks(size).zip(out.chunks_mut(size));
+        // Threads give back results of no size, for which nothing is allocated.
+        if frames.len() <= ALONE {
+            each.for_each(|(frame, out)| alone(frame, out));
+        } else if size <= ALONE {
+            workers.map_blocks(out, size, |index, out| alone(&frames[index * size..][..size], out));
         } else {
-            workers.map_blocks(out, BLOCK, correct).into_iter().sum()
-        };
-        Ok(limited? + self.repair(frame, out, largest))
+            for (frame, out) in each {
+                workers.map_blocks(out, BLOCK, |index, part| correct(index, frame, part));
+                self.finish(frame, out, largest, &tally);
+            }
+        }
+        control.check()?;
+        Ok(tally.counts())
     }
 
     /// Coefficients of power `power` from pixel `at` on.
@@ -189,19 +303,19 @@ impl Corrector {
         frame: &[I],
         out: &mut [O],
         largest: f32,
-    ) -> u64 {
+    ) -> Counts {
         let plane = |power| self.plane(power, at, frame.len());
-        let arch = pulp::Arch::new();
+        let (arch, range) = (pulp::Arch::new(), self.range.widest);
         match self.planes {
-            1 => arch.dispatch(Block { frame, planes: [plane(0)], out, largest }),
-            2 => arch.dispatch(Block { frame, planes: [plane(0), plane(1)], out, largest }),
+            1 => arch.dispatch(Block { frame, planes: [plane(0)], out, largest, range }),
+            2 => arch.dispatch(Block { frame, planes: [plane(0), plane(1)], out, largest, range }),
             3 => {
                 let planes = [plane(0), plane(1), plane(2)];
-                arch.dispatch(Block { frame, planes, out, largest })
+                arch.dispatch(Block { frame, planes, out, largest, range })
             }
             _ => {
                 let planes = [plane(0), plane(1), plane(2), plane(3)];
-                arch.dispatch(Block { frame, planes, out, largest })
+                arch.dispatch(Block { frame, planes, out, largest, range })
             }
         }
     }
@@ -214,35 +328,57 @@ impl Corrector {
             .fold(0.0, |sum, power| sum * y + self.coefficients[power * self.shape.len() + pixel])
     }
 
+    /// Replaces pixels of a frame whose blocks are corrected, and counts what the blocks cannot.
+    fn finish<I: Raw, O: Corrected>(
+        &self,
+        frame: &[I],
+        out: &mut [O],
+        largest: f32,
+        tally: &Tally,
+    ) {
+        let narrower = self.range.narrower.iter().filter(|(pixel, range)| {
+            let value = self.value(frame, *pixel as usize);
+            is_outside(value, *range) && !is_outside(value, self.range.widest)
+        });
+        tally.extrapolated.fetch_add(narrower.count() as u64, Ordering::Relaxed);
+        tally.limited.fetch_add(self.repair(frame, out, largest), Ordering::Relaxed);
+        // Their coefficients are not numbers, and so were their values in the blocks.
+        let before = u64::from(O::of(f32::NAN, largest).1) * self.repairs.pixels.len() as u64;
+        tally.limited.fetch_sub(before, Ordering::Relaxed);
+    }
+
     /// Replaces pixels by the means of their sources; gives the number of values limited.
     fn repair<I: Raw, O: Corrected>(&self, frame: &[I], out: &mut [O], largest: f32) -> u64 {
-        let mut repaired = self.repaired.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut limited = 0;
-        for (index, &pixel) in self.repairs.pixels.iter().enumerate() {
-            // A value that is not a number counts in no mean, so it does not spread.
-            let (mut sum, mut count) = (0.0, 0_u32);
-            for source in self.repairs.sources(index) {
-                let value = match *source {
-                    Source::Pixel(pixel) => self.value(frame, pixel as usize),
-                    Source::Repaired(before) => repaired[before as usize],
-                };
-                if !value.is_nan() {
-                    sum += value;
-                    count += 1;
-                }
+        REPAIRED.with_borrow_mut(|repaired| {
+            repaired.clear();
+            let mut limited = 0;
+            for (index, &pixel) in self.repairs.pixels.iter().enumerate() {
+                let mean = self.mean_of(self.repairs.sources(index), frame, repaired);
+                repaired.push(mean);
+                let (value, changed) = O::of(mean, largest);
+                out[pixel as usize] = value;
+                limited += u64::from(changed);
             }
-            repaired[index] = sum / count as f32;
-            let (value, changed) = O::of(repaired[index], largest);
-            out[pixel as usize] = value;
-            limited += u64::from(changed);
-        }
-        limited
+            limited
+        })
     }
-}
 
-/// Gives a pixel one value for all its coefficients.
-fn set(coefficients: &mut [f32], shape: Shape, pixel: usize, value: f32) {
-    coefficients.iter_mut().skip(pixel).step_by(shape.len()).for_each(|each| *each = value);
+    /// Mean of the sources of a pixel. A value that is not a number does not count, so it does not
+    /// spread.
+    fn mean_of<I: Raw>(&self, sources: &[Source], frame: &[I], repaired: &[f32]) -> f32 {
+        let (mut sum, mut count) = (0.0, 0_u32);
+        for source in sources {
+            let value = match *source {
+                Source::Pixel(pixel) => self.value(frame, pixel as usize),
+                Source::Repaired(before) => repaired[before as usize],
+            };
+            if !value.is_nan() {
+                sum += value;
+                count += 1;
+            }
+        }
+        sum / count as f32
+    }
 }
 
 /// Pixels of one block, with their coefficients.
@@ -251,14 +387,15 @@ struct Block<'s, I, O, const N: usize> {
     planes: [&'s [f32]; N],
     out: &'s mut [O],
     largest: f32,
+    range: [f32; 2],
 }
 
 impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, O, N> {
-    type Output = u64;
+    type Output = Counts;
 
     #[inline(always)]
-    fn call(self) -> u64 {
-        let mut limited = 0_u32;
+    fn call(self) -> Counts {
+        let (mut limited, mut extrapolated, mut highest) = (0_u32, 0_u32, 0);
         let length = self.out.len();
         let (frame, planes) = (&self.frame[..length], self.planes.map(|plane| &plane[..length]));
         for (i, out) in self.out.iter_mut().enumerate() {
@@ -270,8 +407,14 @@ impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, 
             let (value, changed) = O::of(sum, self.largest);
             *out = value;
             limited += u32::from(changed);
+            extrapolated += u32::from(is_outside(sum, self.range));
+            highest = highest.max(order_of(y));
         }
-        u64::from(limited)
+        Counts {
+            limited: limited.into(),
+            extrapolated: extrapolated.into(),
+            highest: f32::from_bits(highest.cast_unsigned()),
+        }
     }
 }
 

@@ -4,12 +4,12 @@
 //! |---|---|---|---|
 //! | coefficients | float32, 3 | `Stack<f32>` | copy, kept |
 //! | unusable | bool, 2 | `&[bool]` | view |
+//! | levels | float32, 3 | `Stack<f32>` | those of pixels with fewer levels than others are kept |
 //! | frames, out | uint8, uint16 or float32, 3 | `&[T]`, `&mut [T]` | view |
 
 use std::num::NonZeroUsize;
 
-use equipix_core::apply::{Corrected, Corrector, Raw, Unusable};
-use equipix_core::control::Control;
+use equipix_core::apply::{Corrected, Corrector, Counts, Raw, Unusable};
 use equipix_core::{Error, Shape, Stack, Workers};
 use numpy::{
     Element, PyReadonlyArray2, PyReadonlyArray3, PyReadwriteArray3, PyUntypedArrayMethods,
@@ -49,17 +49,23 @@ impl PyCorrector {
         coefficients: PyReadonlyArray3<'_, f32>,
         unusable: PyReadonlyArray2<'_, bool>,
         flagged: &str,
+        levels: Option<PyReadonlyArray3<'_, f32>>,
     ) -> PyResult<Self> {
-        let [planes, rows, cols] = [0, 1, 2].map(|axis| coefficients.shape()[axis]);
-        let made =
-            Stack::new("coefficients", coefficients.as_slice()?, planes, Shape::new(rows, cols))
-                .and_then(|stack| {
-                    Corrector::new(stack, unusable.as_slice().unwrap_or(&[]), then(flagged)?)
-                });
+        let unusable = unusable.as_slice()?;
+        let made = stack("coefficients", &coefficients)?
+            .and_then(|planes| Corrector::new(planes, unusable, then(flagged)?));
+        let made = match &levels {
+            Some(levels) => {
+                let levels = stack("levels", levels)?;
+                made.and_then(|corrector| corrector.with_levels(levels?))
+            }
+            None => made,
+        };
         made.map(Self).map_err(|error| errors::exception(py, &error))
     }
 
-    /// Corrects frames into `out`; gives the number of values limited to 0 and `largest`.
+    /// Corrects frames into `out`; gives the numbers of values limited to 0 and `largest` and of
+    /// those outside of the levels, and the largest raw value.
     #[pyo3(signature = (frames, out, largest, *, workers))]
     fn apply(
         &self,
@@ -68,13 +74,14 @@ impl PyCorrector {
         out: PyOut<'_>,
         largest: f32,
         workers: Option<NonZeroUsize>,
-    ) -> PyResult<u64> {
+    ) -> PyResult<(u64, u64, f32)> {
         let job = Job { corrector: &self.0, largest, workers };
-        match frames {
+        let counts = match frames {
             PyRaw::U8(frames) => job.of(py, &frames, out),
             PyRaw::U16(frames) => job.of(py, &frames, out),
             PyRaw::F32(frames) => job.of(py, &frames, out),
-        }
+        }?;
+        Ok((counts.limited, counts.extrapolated, counts.highest))
     }
 }
 
@@ -91,32 +98,36 @@ impl Job<'_> {
         py: Python<'_>,
         frames: &PyReadonlyArray3<'_, I>,
         out: PyOut<'_>,
-    ) -> PyResult<u64> {
+    ) -> PyResult<Counts> {
         match out {
-            PyOut::U8(mut out) => self.into(py, frames.as_slice()?, out.as_slice_mut()?),
-            PyOut::U16(mut out) => self.into(py, frames.as_slice()?, out.as_slice_mut()?),
-            PyOut::F32(mut out) => self.into(py, frames.as_slice()?, out.as_slice_mut()?),
+            PyOut::U8(mut out) => self.write(py, frames.as_slice()?, out.as_slice_mut()?),
+            PyOut::U16(mut out) => self.write(py, frames.as_slice()?, out.as_slice_mut()?),
+            PyOut::F32(mut out) => self.write(py, frames.as_slice()?, out.as_slice_mut()?),
         }
     }
 
-    fn into<I: Raw, O: Corrected>(
+    fn write<I: Raw, O: Corrected>(
         &self,
         py: Python<'_>,
         frames: &[I],
         out: &mut [O],
-    ) -> PyResult<u64> {
-        let size = self.corrector.shape().len();
+    ) -> PyResult<Counts> {
         let brief = frames.len() <= BRIEF;
-        let work = |control: &Control| {
+        let work = |control: &_| {
             let workers = Workers::new(self.workers)?;
-            let mut limited = 0;
-            for (frame, out) in frames.chunks(size).zip(out.chunks_mut(size)) {
-                limited += self.corrector.apply(frame, out, self.largest, &workers, control)?;
-            }
-            Ok(limited)
+            self.corrector.apply(frames, out, self.largest, &workers, control)
         };
         if brief { run::brief(py, work) } else { run::interruptible(py, None, work) }
     }
+}
+
+/// Images of an array of the shape (n, rows, cols).
+fn stack<'a>(
+    name: &'static str,
+    array: &'a PyReadonlyArray3<'_, f32>,
+) -> PyResult<equipix_core::Result<Stack<'a, f32>>> {
+    let [count, rows, cols] = [0, 1, 2].map(|axis| array.shape()[axis]);
+    Ok(Stack::new(name, array.as_slice()?, count, Shape::new(rows, cols)))
 }
 
 fn then(flagged: &str) -> equipix_core::Result<Unusable> {

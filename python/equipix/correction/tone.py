@@ -1,13 +1,10 @@
-"""Corrected frames as whole numbers: rounded and limited, or as a picture by a tone law."""
+"""Corrected frames as pictures of 8 bits, by a tone law."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from equipix.correction.corrector import largest_value, output_dtype
-from equipix.errors import InputError
 
 if TYPE_CHECKING:
     from equipix._types import Array, Display
@@ -20,52 +17,6 @@ _BINS = 4096
 
 _PLATEAU = 4.0
 """Most pixels that count of a bin, over the mean of the bins that are not empty."""
-
-
-class Conversion:
-    """How corrected frames are written, and the number of values that had to be limited.
-
-    Parameters
-    ----------
-    dtype : {"float32", "uint16", "uint8"}
-        Type of the output.
-    bit_depth : int, optional
-        Significant bits of whole numbers, 8 to 16; by default all of the type.
-    display : {"linear", "histogram"}, optional
-        Make pictures of 8 bits by a tone law, see `picture`.
-
-    Attributes
-    ----------
-    dtype : dtype
-        Type of the output.
-    clipped : int
-        Values so far that had to be limited, or were not a number; always 0 for pictures.
-    """
-
-    def __init__(
-        self, dtype: str = "float32", *, bit_depth: int | None = None, display: Display | None
-    ) -> None:
-        if display is not None and (dtype != "uint8" or bit_depth is not None):
-            raise InputError(
-                f"'display' makes pictures of 8 bits, but 'dtype' is '{dtype}' and 'bit_depth' is "
-                f"{bit_depth}: leave both out"
-            )
-        self.dtype = output_dtype(dtype)
-        self._largest = largest_value(self.dtype, bit_depth)
-        self._display = display
-        self.clipped = 0
-
-    def of(self, frame: Array) -> Array:
-        """Convert one corrected frame of shape (rows, cols)."""
-        if self._display is not None:
-            return picture(frame, self._display)
-        if self.dtype.kind != "u":
-            return frame.astype(self.dtype, copy=False)
-        rounded = np.rint(frame)
-        inside = (rounded >= 0) & (rounded <= self._largest)
-        self.clipped += int(rounded.size - np.count_nonzero(inside))
-        limited = np.clip(np.nan_to_num(rounded, nan=0.0), 0, self._largest)
-        return np.asarray(limited, dtype=self.dtype)
 
 
 def picture(frame: Array, display: Display) -> Array:
