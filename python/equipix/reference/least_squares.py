@@ -90,11 +90,11 @@ def prior_rows(
     Parameters
     ----------
     weights : ndarray, shape (rows, cols)
-        λ.
+        Weights λ of the prior.
     pieces : ndarray of int, shape (rows, cols)
         Component of each pixel, over which μ is the mean of M.
     sensitivity : ndarray, shape (rows, cols)
-        M.
+        Sensitivity M.
 
     Returns
     -------
@@ -142,7 +142,7 @@ def gradient(
     data : Problem
         The measurements.
     sensitivity : ndarray, shape (rows, cols)
-        M.
+        Sensitivity M.
     beam : ndarray, shape of the padded grid
         L.
 

@@ -42,15 +42,17 @@ def weak_light_prior(
 
     Parameters
     ----------
-    frames, shifts, variance, mask, flux, rotation : array_like
+    frames, shifts : array_like
         As for `equipix.reference.model.problem`.
     unit : float
-        σ², the variance of a measurement of weight 1.
+        Variance σ² of a measurement of weight 1.
+    variance, mask, flux, rotation : array_like
+        As for `equipix.reference.model.problem`.
 
     Returns
     -------
     ndarray, shape (rows, cols)
-        λ; 0 from D = D₀ on, and in pixels without a measurement.
+        Weights λ; 0 from D = D₀ on, and in pixels without a measurement.
     """
     data = problem(frames, shifts, variance=variance, mask=mask, flux=flux, rotation=rotation)
     beam = np.nan_to_num(best_beam(data, np.ones(data.values.shape[1:])))

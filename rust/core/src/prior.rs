@@ -30,6 +30,8 @@ const RELIABLE: f64 = 625.0;
 const WEAK: f64 = 16.0;
 /// The share of lit pixels that is fainter than a bright one: a few brighter ones do not count.
 const BRIGHT: f64 = 0.9;
+/// Degrees of freedom, as a share of the measurements, of which residuals determine the noise.
+const LEAST_FREEDOM: f64 = 0.1;
 /// Fewer lit pixels are chance.
 const FEWEST: usize = 16;
 
@@ -74,10 +76,18 @@ pub(crate) fn range(information: &[f64]) -> [f64; 2] {
     [seen().fold(f64::INFINITY, f64::min), seen().fold(0.0, f64::max)]
 }
 
-/// The variance of a measurement of weight 1 from squares of residuals: their median, which a few false ones do
-/// not move.
-pub(crate) fn variance(mut squares: Vec<f64>) -> f64 {
-    median(&mut squares, f64::total_cmp).unwrap_or(0.0) / MEDIAN_OF_SQUARES
+/// The variance of a measurement of weight 1 from squares of some residuals of `used` measurements: their median,
+/// which a few false ones do not move. `None` if without a prior, which leaves `freed` unknowns open, so few
+/// degrees of freedom are left that it says little.
+pub(crate) fn variance(
+    mut squares: Vec<f64>,
+    used: usize,
+    freedom: f64,
+    freed: f64,
+) -> Option<f64> {
+    let square = median(&mut squares, f64::total_cmp).unwrap_or(0.0) / MEDIAN_OF_SQUARES;
+    let used = used as f64;
+    (freedom >= LEAST_FREEDOM * used).then(|| square * used / (freedom + freed))
 }
 
 /// The pixels that have a prior, or light so weak beside others' that M is not reliable; D is that where the

@@ -34,8 +34,8 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// The variance of a measurement of weight 1 from a sample of residuals, with so many degrees of
-    /// freedom; `None` with none.
-    pub(crate) fn variance(&self, freedom: f64) -> Option<f64> {
+    /// freedom and `freed` unknowns left to a prior; `None` with nearly none.
+    pub(crate) fn variance(&self, freedom: f64, freed: f64) -> Option<f64> {
         let Shape { rows, cols } = self.pass.exposures.sensor();
         let count = self.pass.exposures.count();
         let (mut squares, mut scratch) = (Vec::new(), vec![0.0; cols]);
@@ -59,8 +59,7 @@ impl<T: Real> System<'_, '_, T> {
                 }
             }
         }
-        let used = self.pass.exposures.used() as f64;
-        (freedom >= 1.0).then(|| prior::variance(squares) * used / freedom)
+        prior::variance(squares, self.pass.exposures.used(), freedom, freed)
     }
 
     /// Takes the mean of M over lit pixels as that of the prior, which in a joint fit is held between steps;

@@ -110,21 +110,21 @@ impl WeakLight {
         control: &Control,
     ) -> Result<bool> {
         let exposures = search.reduced.exposures;
-        let unknown = self.unknown(exposures, control)?;
-        self.hears(exposures, estimate.variance(unknown));
+        let pixels = self.count(exposures, control)?;
+        self.hears(exposures, estimate.variance(pixels, self.freed));
         let [least, bright] = search.reduced.information_range();
         let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
         Ok(least < CHANGE * LIT * variance)
     }
 
-    /// How many unknown M the data determine.
-    fn unknown<T: Real>(&mut self, exposures: &Exposures<'_, T>, control: &Control) -> Result<f64> {
+    /// How many pixels have a measurement.
+    fn count<T: Real>(&mut self, exposures: &Exposures<'_, T>, control: &Control) -> Result<usize> {
         let pixels = match self.pixels {
             Some(pixels) => pixels,
             None => exposures.measured_pixels(control)?,
         };
         self.pixels = Some(pixels);
-        Ok(pixels as f64 - self.freed)
+        Ok(pixels)
     }
 
     /// Gives an estimate, whose beam is up to date, the prior that follows from it; whether it has changed.
@@ -135,8 +135,8 @@ impl WeakLight {
         control: &Control,
     ) -> Result<bool> {
         let exposures = search.reduced.exposures;
-        let unknown = self.unknown(exposures, control)?;
-        if !self.hears(exposures, estimate.variance(unknown)) {
+        let pixels = self.count(exposures, control)?;
+        if !self.hears(exposures, estimate.variance(pixels, self.freed)) {
             return Ok(false);
         }
         if search.reduced.range == [0.0; 2] {
@@ -161,7 +161,7 @@ impl WeakLight {
         control: &Control,
     ) -> Result<bool> {
         let exposures = system.pass.exposures;
-        let noise = system.variance(joint::freedom(system) + self.freed);
+        let noise = system.variance(joint::freedom(system), self.freed);
         if !self.hears(exposures, noise) {
             return Ok(false);
         }

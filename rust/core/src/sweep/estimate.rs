@@ -219,9 +219,9 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         Ok(found)
     }
 
-    /// The variance of a measurement of weight 1 from a sample of residuals, with this number of unknown M;
-    /// `None` if there are as many unknowns as measurements.
-    pub(crate) fn variance(&self, pixels: f64) -> Option<f64> {
+    /// The variance of a measurement of weight 1 from a sample of residuals, with this number of unknown M, of
+    /// which `freed` are left to a prior; `None` if there are nearly as many unknowns as measurements.
+    pub(crate) fn variance(&self, pixels: usize, freed: f64) -> Option<f64> {
         let Shape { rows, cols } = self.exposures.sensor();
         let geometry = self.exposures.geometry();
         let mut squares = Vec::new();
@@ -246,9 +246,8 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
             }
         }
         let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
-        let used = self.exposures.used() as f64;
-        let freedom = used - pixels - cells as f64;
-        (freedom >= 1.0).then(|| prior::variance(squares) * used / freedom)
+        let used = self.exposures.used();
+        prior::variance(squares, used, used as f64 - (pixels + cells) as f64, freed)
     }
 
     /// Takes M as given; what is not a number becomes 1.
