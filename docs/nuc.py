@@ -94,7 +94,8 @@ def draw_orders(axes: Axes) -> None:
     axes.plot(lights / 1e6, noise, "--", color="0.5", label="temporal noise")
     axes.set_yscale("symlog", linthresh=0.1)
     axes.set(title="HgCdTe, by order", xlabel="light, 10⁶ electrons", ylabel="residual, DN")
-    axes.legend()
+    axes.set_ylim(0, 5000)
+    axes.legend(fontsize="small", ncols=2, loc="upper center")
 
 
 def draw_time(axes: Axes) -> None:
