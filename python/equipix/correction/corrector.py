@@ -19,7 +19,7 @@ from equipix.correction.kernel import (
     output_dtype,
     run,
 )
-from equipix.correction.protocol import check_sensor, takes_dark
+from equipix.correction.protocol import check_correction, check_sensor, takes_dark
 from equipix.errors import InputError
 from equipix.flags import usable
 
@@ -113,6 +113,7 @@ class Corrector:
         sensor: str | None = None,
         workers: int | None = None,
     ) -> None:
+        check_correction("correction", correction)
         self.shape = correction.shape
         self.dtype = output_dtype(dtype)
         self._depth = depth_of(correction)

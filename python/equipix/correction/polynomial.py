@@ -10,7 +10,7 @@ import numpy as np
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.depth import depth_of
-from equipix.correction.protocol import sensor_of
+from equipix.correction.protocol import check_correction, sensor_of
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
 
@@ -184,6 +184,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     >>> bool(np.allclose(twice.coefficients[1], response.coefficients[1] ** 2))
     True
     """
+    check_correction("first", first)
+    check_correction("then", then)
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
     one, other = sensor_of(first), sensor_of(then)
