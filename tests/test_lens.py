@@ -229,6 +229,27 @@ class TestCombine:
         assert "order 3" in repr(loaded)
         assert equipix.Corrector(loaded).replaced == 1
 
+    @pytest.mark.parametrize("order", [0, 1, 2])
+    def test_a_gain_after_raw_levels_is_refused(self, order, tmp_path):
+        array = simulate.StaringArray.of("InSb", SHAPE, rng=1)
+        frames = [list(array.frames(e, 2, rng=k)) for k, e in enumerate((0, 4e6, 8e6, 12e6))]
+        falloff = lens.fit_falloff(flat()).correction()
+        raw = nuc.fit([equipix.average(each) for each in frames[1:]], order=order)
+        raw.save(tmp_path / "raw.npz")
+        same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
+        for first in (raw, equipix.load(tmp_path / "raw.npz"), equipix.combine(raw, same)):
+            with pytest.raises(
+                errors.InputError, match="'first' is a response to raw levels.*dark"
+            ):
+                equipix.combine(first, falloff)
+        # An offset of 'then' can take away the one that 'first' leaves.
+        offset = float(np.mean(frames[0]))
+        less = equipix.Polynomial(np.stack([np.full(SHAPE, -offset), np.ones(SHAPE)]), raw.flags)
+        equipix.combine(equipix.combine(raw, less), falloff)
+        dark = equipix.average(frames[0])
+        levels = [equipix.average(each, dark=dark) for each in frames[1:]]
+        equipix.combine(nuc.fit(levels, order=order), falloff)
+
     def test_what_does_not_combine_is_refused(self):
         response = nuc.fit(self.levels(), order=2)
         with pytest.raises(errors.InputError, match="'then' has order 3"):
