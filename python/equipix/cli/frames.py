@@ -145,6 +145,8 @@ def _counts(done: Corrected, *, whole: bool) -> dict[str, Any]:
         counts["extrapolated_values"] = done.extrapolated
     if done.replaced:
         counts["replaced_pixels"] = done.replaced
+    if done.flagged:
+        counts["unusable_pixels"] = done.flagged
     return counts
 
 

@@ -62,7 +62,7 @@ class Corrector:
     ----------
     clipped : int
         Values of whole numbers so far that had to be limited to the range from 0 to the largest
-        value, or were not a number.
+        value, or were not a number, such as those of flagged pixels with ``flagged="nan"``.
     extrapolated : int or None
         Values so far that were corrected to below the lowest or above the highest level that the
         response of their pixel was fitted to, to the rounding of float32. None where a correction
