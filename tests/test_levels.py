@@ -253,6 +253,15 @@ class TestDefectsAndQuality:
         assert (status, out) == (1, "")
         assert "'array 8', but the correction is of 'array 7'" in err
 
+    @pytest.mark.parametrize("command", ["defects", "quality"])
+    def test_corrected_frames_are_noticed(self, run, saved, folder, tmp_path, command):
+        frames, once = folder / "level2.tif", tmp_path / "once.tif"
+        assert run("correct", saved[1], frames, "-o", once)[0] == 0
+        assert "corrected already" not in run("nuc", command, saved[1], frames)[2]
+        status, _, err = run("nuc", command, saved[1], once)
+        assert status == 0
+        assert f"{once}: corrected already, by this correction; what both remove is" in err
+
     def test_files_of_another_kind_are_refused(self, run, saved, folder):
         status, _, err = run("nuc", "quality", saved[1], saved[1])
         assert (status, "expected raw frames" in err) == (1, True)

@@ -150,7 +150,7 @@ def correct_files(
     counts = {file: _count(file, correction) for file in files}
     total, done = sum(counts.values()), 0
     _refuse_pictures(output, total, wanted)
-    _warn_of_corrected(files, origin)
+    warn_of_corrected(files, origin)
     corrector = Corrector(
         correction,
         "float32" if display else wanted,
@@ -251,8 +251,8 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def _warn_of_corrected(files: list[Path], origin: str) -> None:
-    """Warn of files that this module has written."""
+def warn_of_corrected(files: list[Path], origin: str) -> None:
+    """Warn of files that this module has written; `origin` as for `correct_files`."""
     marks = {file: description(file) for file in files if file.suffix.lower() in _MARKED}
     corrected = [file for file, mark in marks.items() if mark.startswith(_MARK)]
     if not corrected:
