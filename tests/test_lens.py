@@ -161,6 +161,24 @@ class TestCorrection:
         assert not flagged[light > 0.101].any()
         assert (light < 0.099).any()
 
+    def test_corrected_frames_are_linear_in_light_only_where_the_mean_curve_is(self):
+        shape, light = (100, 120), np.array([0.5e6, 2e6, 5e6, 8e6, 11e6, 14e6, 16e6])
+        array = simulate.StaringArray.of("HgCdTe", shape, rng=1)
+        dark = equipix.average(array.frames(0, 16, rng=50))
+        levels = [
+            equipix.average(array.frames(e, 8, rng=k), dark=dark) for k, e in enumerate(light)
+        ]
+        response = nuc.fit(levels, order=2)
+        fall = lens.cos4(squared(shape, (48.0, 63.0)), 150.0)
+        frames = np.stack(list(array.frames(14e6 * fall, 16, rng=4)))
+        corrected = response.correct(frames).mean(axis=0)
+        bent = lens.fit_falloff(corrected)
+        assert bent.focal_length == pytest.approx(152.0, abs=0.05)  # as docs/nuc.md says
+        assert bent.focal_length - 150 > 100 * bent.std["focal_length"]
+        linear = np.polynomial.Polynomial.fit(response.levels, light, 3)
+        straight = lens.fit_falloff(linear(corrected))
+        assert abs(straight.focal_length - 150) < 5 * straight.std["focal_length"]
+
     def test_the_example_prints_the_corner_of_the_source(self, capsys):
         path = Path(__file__).parents[1] / "examples/lens_falloff.py"
         runpy.run_path(str(path), run_name="__main__")
