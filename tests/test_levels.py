@@ -367,12 +367,21 @@ class TestCorrectedFiles:
 
     def test_a_picture_has_no_other_type(self, corrected, folder, tmp_path):
         response, _ = corrected
-        with pytest.raises(errors.InputError, match="'display' makes pictures of 8 bits"):
+        message = "'display' makes pictures of 8 bits, but 'dtype' .* is 'uint16': leave out one"
+        with pytest.raises(errors.InputError, match=message):
             correct_files(
                 response,
                 [str(folder / "level2.tif")],
                 tmp_path / "out.tif",
                 dtype="uint16",
+                display="linear",
+            )
+        with pytest.raises(errors.InputError, match="but 'bit_depth' .* is 12: leave out one"):
+            correct_files(
+                response,
+                [str(folder / "level2.tif")],
+                tmp_path / "out.tif",
+                bit_depth=12,
                 display="linear",
             )
 

@@ -88,11 +88,15 @@ def defects(
         typer.Option("--output", "-o", help="The response with the flags found: .tif or .npz."),
     ] = None,
     response_limit: Annotated[
-        float, typer.Option(help="Least response over the mean one (GB/T 17444-2013).")
+        float,
+        typer.Option(
+            help="Least response over that of the neighbours (GB/T 17444-2013: the mean)."
+        ),
     ] = DefectLimits.response,
     gain_limit: Annotated[float, typer.Option(help="Largest 1/(1 + K).")] = DefectLimits.gain,
     noise_limit: Annotated[
-        float, typer.Option(help="Largest noise over the mean one (GB/T 17444-2013).")
+        float,
+        typer.Option(help="Largest noise over that of its signal (GB/T 17444-2013: the mean)."),
     ] = DefectLimits.noise,
     correlation_limit: Annotated[
         float, typer.Option(help="Least deviation of von Neumann's ratio for flicker, in sigmas.")

@@ -195,10 +195,14 @@ def _dtype(
     """Type of the output, by its name unless it is given."""
     if display is None:
         return output_dtype(dtype or ("uint16" if is_picture(output) else "float32"))
-    if dtype not in (None, "uint8") or bit_depth is not None:
+    if dtype not in (None, "uint8"):
         raise InputError(
-            f"'display' makes pictures of 8 bits, but 'dtype' is '{dtype}' and 'bit_depth' is "
-            f"{bit_depth}: leave both out"
+            f"'display' makes pictures of 8 bits, but 'dtype' (--dtype) is '{dtype}': leave out one"
+        )
+    if bit_depth is not None:
+        raise InputError(
+            "'display' makes pictures of 8 bits, but 'bit_depth' (--bit-depth) is "
+            f"{bit_depth}: leave out one"
         )
     return np.dtype(np.uint8)
 
