@@ -423,6 +423,31 @@ class TestRefusals:
         with pytest.warns(errors.SaturationWarning, match="exactly 3500"):
             nuc.fit(clipped, order=1)
 
+    @pytest.mark.parametrize("form", ["float64", "uint16", "averages", "less a dark"])
+    def test_a_whole_level_at_one_value_is_refused(self, levels, form):
+        bright = np.rint(levels[[0, 3, 7]])
+        bright[:, 3, 4] = 310  # a dead pixel is not saturated
+        # The lowest value of the last level is far above 2500; dead ones are left.
+        given = np.minimum(bright, 2500).astype("uint16" if form == "uint16" else "float64")
+        if form in ("averages", "less a dark"):
+            dark = None if form == "averages" else equipix.average(np.full((2, *SHAPE), 60.0))
+            frames = [np.minimum(each + [[[-1]], [[1]]], 2500) for each in bright]
+            given = [equipix.average(each, dark=dark) for each in frames]
+        with pytest.raises(errors.InputError, match=r"100.0% .* of level 2 are exactly 2500,"):
+            nuc.fit(given, order=1)
+
+    def test_most_of_a_level_at_one_value_is_named(self, levels):
+        clipped = np.minimum(levels[[0, 3, 7]], np.quantile(levels[7], 0.2))
+        with pytest.warns(errors.SaturationWarning, match=r"80.0% .* of level 2 .*levels.toml"):
+            nuc.fit(clipped, order=1)
+
+    def test_even_levels_of_an_even_array_do_not_saturate(self, levels):
+        even = np.broadcast_to(levels.mean(axis=(1, 2), keepdims=True), levels.shape)
+        assert (nuc.fit(even, order=1).flags == 0).all()
+        even = np.where(np.arange(len(levels))[:, None, None] == 7, 4095.0, even)
+        with pytest.raises(errors.InputError, match="level 7 are exactly 4095"):
+            nuc.fit(even, order=1)
+
     @pytest.mark.parametrize(
         ("given", "message"),
         [

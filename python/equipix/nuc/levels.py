@@ -11,12 +11,12 @@ import numpy as np
 from equipix import _native
 from equipix._readonly import ReadOnly
 from equipix.defects import SIGMAS, Findings, response_outliers
-from equipix.errors import InputError, SaturationWarning, warn
+from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged, Words
-from equipix.exposures.clipping import clipping_advice
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
+from equipix.nuc.saturation import check_saturation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -153,8 +153,7 @@ def levels_of(
     source = levels if averaged is None else averaged
     measured = measured_of(source, variance, saturation, words=_LEVELS)
     given = None if mask is None else as_mask(mask, measured.values.shape)
-    if measured.clipped is not None:
-        warn(clipping_advice(measured.clipped), SaturationWarning)
+    check_saturation(measured)
     pedestal = 0.0 if averaged is None else averaged.pedestal
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
