@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import Flag, NoiseModel, errors, nuc, reference
 from equipix.exposures.averaged import Averaged
+from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
 LEVELS = np.linspace(300.0, 3500.0, 8)
@@ -239,6 +240,30 @@ class TestOrder:
     def test_auto_takes_the_lowest_order_that_exact_levels_have(self):
         response = nuc.fit(curves(truth(1, np.random.default_rng(1))), order="auto")
         assert response.order == 1
+
+    def test_one_pixel_does_not_decide_on_the_order(self):
+        errors = []
+        for times in (1, 1.9, 3):
+            sensitivity = np.ones(SHAPE)
+            sensitivity[20, 20] = times
+            array = StaringArray.of("PtSi", SHAPE, rng=1)
+            array = array.with_causes(sensitivity=array.sensitivity * sensitivity)
+            lights = (2e6, 5e6, 8e6, 11e6, 14e6)
+            levels = [
+                equipix.average(array.frames(each, 8, rng=k)) for k, each in enumerate(lights)
+            ]
+            response = nuc.fit(levels, order="auto")
+            assert response.order == 1
+            errors.append(response.metadata["options"]["prediction_errors"])
+        # Five standard errors of the mean of 3072 squares.
+        np.testing.assert_allclose(errors[1:], errors[:1] * 2, rtol=5 * np.sqrt(2 / 3072))
+
+    def test_many_pixels_decide_on_the_order(self):
+        rng = np.random.default_rng(15)
+        deviation = truth(2, rng)
+        deviation[2] = np.where(rng.random(SHAPE) < 0.1, 4e-5, 0.0)
+        levels = noisy(curves(deviation), rng)
+        assert nuc.fit(levels, order="auto", variance=NOISE).order == 2
 
     def test_auto_needs_a_level_to_leave_out(self):
         levels = curves(truth(1, np.random.default_rng(1)), LEVELS[:2])

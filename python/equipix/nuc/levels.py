@@ -107,6 +107,12 @@ class Levels(ReadOnly):
             noise=None if self.noise is None else tuple(self.noise[level] for level in which),
         )
 
+    def without(self, odd: Bools) -> Self:
+        """Return the levels with references from which some of the usable pixels are left out."""
+        usable = self.usable.copy()
+        usable[self.usable] = ~odd
+        return dataclasses.replace(self, usable=usable, references=_references(self.values, usable))
+
     def limits(self) -> Floats:
         """Lowest and highest V̄ at which each pixel has a value, shape (2, rows, cols)."""
         low, high = np.full((2, *self.usable.shape), np.nan)
@@ -159,7 +165,7 @@ def levels_of(
     values = _used(measured, given)
     findings = _with_odd_responses(values, noise, measured.findings)
     usable = _usable(values, findings, given)
-    references = np.array([each[usable].mean(dtype=np.float64) for each in values])
+    references = _references(values, usable)
     return Levels(
         values=values,
         references=references,
@@ -172,6 +178,11 @@ def levels_of(
         saturation=_saturation_of(levels, saturation),
         frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
     )
+
+
+def _references(values: Array, usable: Bools) -> Floats:
+    """Mean V̄ of each level over usable pixels."""
+    return np.array([each[usable].mean(dtype=np.float64) for each in values])
 
 
 def _frame_noise(
