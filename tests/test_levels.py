@@ -178,6 +178,17 @@ class TestCommands:
         assert (response.deviation[0] == 0).all()
         assert response.deviation[1].std() > 0.01
 
+    def test_a_level_that_saturates_without_a_level_given_is_refused(self, run, folder, tmp_path):
+        frames = np.full((4, *SHAPE), 16383, np.uint16)
+        io.write_frames(tmp_path / "bright.tif", iter(frames), nbytes=1)
+        levels = "".join(f'[[level]]\nframes = "{folder}/level{k}.tif"\n' for k in (1, 2))
+        levels += '[[level]]\nframes = "bright.tif"\n'
+        (tmp_path / "levels.toml").write_text(levels, encoding="utf-8")
+        output = tmp_path / "response.tif"
+        status, _, err = run("nuc", "fit", tmp_path / "levels.toml", "-o", output)
+        assert (status, output.exists()) == (1, False)
+        assert "100.0% of the values of level 2 are exactly 16383" in err
+
     def test_errors_are_one_line(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"
         assert run("nuc", "fit", folder / "levels.toml", "-o", output, "--order", "5")[0] == 2

@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import Flag, NoiseModel, errors, nuc, reference
 from equipix.exposures.averaged import Averaged
+from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
 LEVELS = np.linspace(300.0, 3500.0, 8)
@@ -240,6 +241,30 @@ class TestOrder:
         response = nuc.fit(curves(truth(1, np.random.default_rng(1))), order="auto")
         assert response.order == 1
 
+    def test_one_pixel_does_not_decide_on_the_order(self):
+        errors = []
+        for times in (1, 1.9, 3):
+            sensitivity = np.ones(SHAPE)
+            sensitivity[20, 20] = times
+            array = StaringArray.of("PtSi", SHAPE, rng=1)
+            array = array.with_causes(sensitivity=array.sensitivity * sensitivity)
+            lights = (2e6, 5e6, 8e6, 11e6, 14e6)
+            levels = [
+                equipix.average(array.frames(each, 8, rng=k)) for k, each in enumerate(lights)
+            ]
+            response = nuc.fit(levels, order="auto")
+            assert response.order == 1
+            errors.append(response.metadata["options"]["prediction_errors"])
+        # Five standard errors of the mean of 3072 squares.
+        np.testing.assert_allclose(errors[1:], errors[:1] * 2, rtol=5 * np.sqrt(2 / 3072))
+
+    def test_many_pixels_decide_on_the_order(self):
+        rng = np.random.default_rng(15)
+        deviation = truth(2, rng)
+        deviation[2] = np.where(rng.random(SHAPE) < 0.1, 4e-5, 0.0)
+        levels = noisy(curves(deviation), rng)
+        assert nuc.fit(levels, order="auto", variance=NOISE).order == 2
+
     def test_auto_needs_a_level_to_leave_out(self):
         levels = curves(truth(1, np.random.default_rng(1)), LEVELS[:2])
         with pytest.raises(errors.InputError, match="2 of 2 differ: give three"):
@@ -422,6 +447,31 @@ class TestRefusals:
         clipped = np.minimum(np.rint(levels), 3500).astype(np.float32)
         with pytest.warns(errors.SaturationWarning, match="exactly 3500"):
             nuc.fit(clipped, order=1)
+
+    @pytest.mark.parametrize("form", ["float64", "uint16", "averages", "less a dark"])
+    def test_a_whole_level_at_one_value_is_refused(self, levels, form):
+        bright = np.rint(levels[[0, 3, 7]])
+        bright[:, 3, 4] = 310  # a dead pixel is not saturated
+        # The lowest value of the last level is far above 2500; dead ones are left.
+        given = np.minimum(bright, 2500).astype("uint16" if form == "uint16" else "float64")
+        if form in ("averages", "less a dark"):
+            dark = None if form == "averages" else equipix.average(np.full((2, *SHAPE), 60.0))
+            frames = [np.minimum(each + [[[-1]], [[1]]], 2500) for each in bright]
+            given = [equipix.average(each, dark=dark) for each in frames]
+        with pytest.raises(errors.InputError, match=r"100.0% .* of level 2 are exactly 2500,"):
+            nuc.fit(given, order=1)
+
+    def test_most_of_a_level_at_one_value_is_named(self, levels):
+        clipped = np.minimum(levels[[0, 3, 7]], np.quantile(levels[7], 0.2))
+        with pytest.warns(errors.SaturationWarning, match=r"80.0% .* of level 2 .*levels.toml"):
+            nuc.fit(clipped, order=1)
+
+    def test_even_levels_of_an_even_array_do_not_saturate(self, levels):
+        even = np.broadcast_to(levels.mean(axis=(1, 2), keepdims=True), levels.shape)
+        assert (nuc.fit(even, order=1).flags == 0).all()
+        even = np.where(np.arange(len(levels))[:, None, None] == 7, 4095.0, even)
+        with pytest.raises(errors.InputError, match="level 7 are exactly 4095"):
+            nuc.fit(even, order=1)
 
     @pytest.mark.parametrize(
         ("given", "message"),

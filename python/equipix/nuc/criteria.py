@@ -11,7 +11,7 @@ from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.frames import FrameStatistics
 from equipix.metrics.moments import stack_of, temporal_of
-from equipix.noise import NoiseModel, photon_transfer, scatter_limit
+from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
 from equipix.nuc.curve import response_at
 
 if TYPE_CHECKING:
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.nuc.limits import DefectLimits
     from equipix.nuc.response import Response
-
-_MEDIAN_SQUARE = 0.4549
-"""Median of the square of a standard normal variable."""
 
 
 def mean_slope(response: Response) -> Floats:
@@ -111,7 +108,7 @@ def _dead(response: Response, slope: Floats, least: float) -> Bools:
 def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
     """Pixels whose curve fits worse than noise, and the misfit of the array, explain."""
     found = np.zeros(response.shape, bool)
-    common = sigmas**2 * max(0.0, misfit - 1) / _MEDIAN_SQUARE
+    common = sigmas**2 * max(0.0, misfit - 1) / MEDIAN_SQUARE
     for freedom in np.unique(response.freedom[response.freedom > 0]):
         limit = scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
         found |= (response.freedom == freedom) & (response.reduced_chi2 > limit)

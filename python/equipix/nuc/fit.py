@@ -72,14 +72,15 @@ def fit(
     ------
     InputError
         If levels are too few, do not differ by more than noise, or saturate in half of the
-        pixels; or an argument has a wrong shape or value.
+        pixels; if a level has one value, the highest, in nearly all pixels, whether a saturation
+        level was given or not; or an argument has a wrong shape or value.
     InsufficientMemoryError
         If there is not enough memory.
 
     Warns
     -----
     SaturationWarning
-        If many values are exactly the highest one, and no saturation level was given.
+        If many values are exactly the highest one, and no saturation level was given for it.
     InverseWarning
         If the cubic of orders 2 and 3 differs from the exact inverse by more than 0.3 of the noise
         of a frame at the lowest level, which adds 4 % to it, in more than 0.1 % of the usable

@@ -11,12 +11,12 @@ import numpy as np
 from equipix import _native
 from equipix._readonly import ReadOnly
 from equipix.defects import SIGMAS, Findings, response_outliers
-from equipix.errors import InputError, SaturationWarning, warn
+from equipix.errors import InputError
 from equipix.exposures.averaged import Averaged, Words
-from equipix.exposures.clipping import clipping_advice
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
+from equipix.nuc.saturation import check_saturation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -107,6 +107,12 @@ class Levels(ReadOnly):
             noise=None if self.noise is None else tuple(self.noise[level] for level in which),
         )
 
+    def without(self, odd: Bools) -> Self:
+        """Return the levels with references from which some of the usable pixels are left out."""
+        usable = self.usable.copy()
+        usable[self.usable] = ~odd
+        return dataclasses.replace(self, usable=usable, references=_references(self.values, usable))
+
     def limits(self) -> Floats:
         """Lowest and highest V̄ at which each pixel has a value, shape (2, rows, cols)."""
         low, high = np.full((2, *self.usable.shape), np.nan)
@@ -153,14 +159,13 @@ def levels_of(
     source = levels if averaged is None else averaged
     measured = measured_of(source, variance, saturation, words=_LEVELS)
     given = None if mask is None else as_mask(mask, measured.values.shape)
-    if measured.clipped is not None:
-        warn(clipping_advice(measured.clipped), SaturationWarning)
+    check_saturation(measured)
     pedestal = 0.0 if averaged is None else averaged.pedestal
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
     findings = _with_odd_responses(values, noise, measured.findings)
     usable = _usable(values, findings, given)
-    references = np.array([each[usable].mean(dtype=np.float64) for each in values])
+    references = _references(values, usable)
     return Levels(
         values=values,
         references=references,
@@ -173,6 +178,11 @@ def levels_of(
         saturation=_saturation_of(levels, saturation),
         frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
     )
+
+
+def _references(values: Array, usable: Bools) -> Floats:
+    """Mean V̄ of each level over usable pixels."""
+    return np.array([each[usable].mean(dtype=np.float64) for each in values])
 
 
 def _frame_noise(
