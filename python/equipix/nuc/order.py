@@ -89,7 +89,7 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     deviations of the level where noise is known, mean square over usable pixels and levels. The
     lowest order within 0.1 % of the smallest error is taken.
 
-    A pixel that deviates from the others at some order counts at none, nor in V̄: its mean square is above 36
+    A pixel that deviates from the others at some order counts at none: its mean square is above 36
     times the variance of the normal variable whose square has the median of the array. These are
     the same pixels for all orders, and one in twenty at most: more are a part of the array, which
     the order must fit.
