@@ -23,6 +23,7 @@ figures: $(BIN)/.built-release
 	$(BIN)/python docs/spectrum.py
 	$(BIN)/python docs/estimate.py
 	$(BIN)/python docs/joint.py
+	$(BIN)/python docs/nuc.py
 	$(BIN)/python docs/drift.py
 	$(BIN)/python docs/plan.py
 	$(BIN)/python docs/section3.py

@@ -12,11 +12,13 @@ import sys
 import time
 from pathlib import Path
 
+import applying
 import averaging
 import cargo
 import large
 import multiscale
 import numpy as np
+import response
 import subpixel
 import uncertainty
 from peers import table as peers
@@ -40,6 +42,8 @@ def main(*, smoke: bool) -> None:
     rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
+    rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
+    rows += applying.rows(shapes=((48, 64), (24, 32)), repetitions=1) if smoke else applying.rows()
     rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
     table = markdown(rows, rates[0]["threads"])
     print(table)

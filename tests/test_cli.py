@@ -386,6 +386,14 @@ def command_line(*arguments):
     return [sys.executable, "-c", "from equipix.cli import main; main()", *map(str, arguments)]
 
 
+def test_the_package_is_a_command(tmp_path):
+    command = [sys.executable, "-m", "equipix", "inspect", tmp_path / "none.tif"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("equipix: error: ")
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_pipe_sees_no_bars(experiment, tmp_path):
     command = command_line("average", experiment.parent / "frames/p0.tif", "-o", tmp_path / "m.tif")
     done = subprocess.run(command, capture_output=True, check=True)

@@ -79,6 +79,13 @@ def horner(correction, frames):
     return total
 
 
+def rounding(correction, frames):
+    """Limit of the roundings of Horner's scheme in float32: two a power, each of half an eps."""
+    planes = np.abs(correction.coefficients.astype(np.float64)).max(axis=(1, 2))
+    largest = np.polynomial.polynomial.polyval(float(frames.max()), planes)
+    return len(planes) * np.finfo(np.float32).eps * largest
+
+
 class TestProtocol:
     def test_both_kinds_meet_it(self, bent, calibration):
         assert isinstance(bent, equipix.Correction)
@@ -134,9 +141,21 @@ class TestFiles:
 
     def test_are_corrected_as_arrays_are(self, bent, images, tmp_path):
         frames, source = images
-        assert correct_files(bent, source, tmp_path / "out.tif", flagged="replace") == 4
-        wanted = bent.correct(frames, flagged="replace")
-        np.testing.assert_array_equal(io.read_frames(tmp_path / "out.tif"), wanted)
+        assert correct_files(bent, source, tmp_path / "out.tif", flagged="replace").frames == 4
+        found = io.read_frames(tmp_path / "out.tif")
+        wanted = equipix.Corrector(bent, "float32").apply(frames)
+        np.testing.assert_array_equal(found, wanted)
+        np.testing.assert_allclose(
+            found, bent.correct(frames, flagged="replace"), rtol=0, atol=rounding(bent, frames)
+        )
+
+    def test_of_other_types_are_corrected_in_single_precision(self, bent, tmp_path):
+        frames = raw_frames(2)
+        for dtype in (np.float64, np.int32, ">u2"):
+            io.write_frames(tmp_path / "raw.tif", frames.astype(dtype), nbytes=1)
+            correct_files(bent, [str(tmp_path / "raw.tif")], tmp_path / "out.tif", force=True)
+            wanted = equipix.Corrector(bent, "float32", flagged="nan").apply(frames)
+            np.testing.assert_array_equal(io.read_frames(tmp_path / "out.tif"), wanted)
 
     @pytest.mark.parametrize("dark", ["none", "dark.tif"])
     def test_another_dark_is_refused_where_there_is_none(self, bent, images, tmp_path, dark):
@@ -162,14 +181,16 @@ class TestLoad:
     def test_refuses_an_unknown_kind_by_name(self, bent, tmp_path, monkeypatch):
         bent.save(tmp_path / "bent.npz")
         monkeypatch.delitem(loading.READERS, "bent response")
-        with pytest.raises(FileError, match="holds bent response, expected calibration that"):
+        with pytest.raises(FileError, match="holds bent response, expected calibration or"):
             equipix.load(tmp_path / "bent.npz")
 
     @pytest.mark.parametrize("content", [{}, {"kind": None}, {"kind": ["calibration"]}, [1], 3])
     def test_refuses_what_has_no_kind(self, tmp_path, content):
         path = tmp_path / "other.npz"
         np.savez(path, metadata=np.array(json.dumps(content)), values=np.ones((3, 3)))
-        with pytest.raises(FileError, match="holds .*, expected calibration that equipix has"):
+        with pytest.raises(
+            FileError, match="holds .*, expected calibration or polynomial or response that"
+        ):
             equipix.load(path)
 
     @pytest.mark.parametrize("suffix", [".tif", ".npz"])
@@ -229,7 +250,8 @@ class TestCommandLine:
         io.tiff.write_frames(tmp_path / "raw.tif", frames, nbytes=frames.nbytes)
         output = tmp_path / "out.tif"
         assert run("correct", saved, tmp_path / "raw.tif", "-o", output)[0] == 0
-        np.testing.assert_array_equal(io.read_frames(output), bent.correct(frames))
+        limit = rounding(bent, frames)
+        np.testing.assert_allclose(io.read_frames(output), bent.correct(frames), rtol=0, atol=limit)
         status, _, err = run(
             "correct", saved, tmp_path / "raw.tif", "-o", output, "--force", "--dark", "none"
         )

@@ -39,6 +39,7 @@ PAGES = (
     "CHANGELOG.md",
     "docs/glossary.md",
     "docs/method.md",
+    "docs/nuc.md",
 )
 MODULES = [module.name for module in pkgutil.walk_packages(equipix.__path__, "equipix.")]
 
@@ -158,7 +159,8 @@ def test_the_readme_names_attributes_that_exist():
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert "sensitivity" in named
-    assert named <= {*equipix.Calibration.__dataclass_fields__, *dir(equipix.Calibration)}
+    results = (equipix.Calibration, equipix.nuc.Response)
+    assert named <= {name for each in results for name in (*each.__dataclass_fields__, *dir(each))}
 
 
 def test_the_readme_describes_every_verdict_and_its_warning():

@@ -34,7 +34,9 @@ def with_findings(**found):
 
 
 def test_every_finding_has_bits_and_all_bits_have_a_finding():
-    assert {*FINDINGS, "contradictory"} == set(BITS)
+    of_responses = {"undetermined", "falling", "nonlinear", "non_responding", "flickering"}
+    of_responses |= {"out_of_range"}
+    assert {*FINDINGS, "contradictory", *of_responses} == set(BITS)
 
 
 def test_only_saturation_leaves_a_pixel_in_use():

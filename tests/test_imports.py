@@ -37,16 +37,17 @@ CORE = ROOT / "rust/core/src"
 BINDING = ROOT / "rust/python/src"
 
 LAYERS = (
+    {"__main__"},
     {"cli"},
     {"pictures"},
     {"demo"},
     {"comparison", "experiment", "loading"},
-    {"calibration"},
+    {"calibration", "nuc"},
     {"exposures", "plan", "simulate"},
-    {"correction", "defects", "uncertainty"},
+    {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
-    {"drift", "flags", "maps", "mending"},
+    {"batches", "drift", "flags", "maps", "mending", "rejection"},
     {"io"},
     {"_check", "_readonly"},
     {"_types"},
@@ -55,7 +56,7 @@ LAYERS = (
 )
 """The Python package from the top down: a module imports from its own layer or from below."""
 
-INNER = {"simulate": ({"rig"}, {"accuracy", "camera", "store"}, {"signal"})}
+INNER = {"simulate": ({"rig"}, {"accuracy", "camera", "staring", "store"}, {"blackbody", "signal"})}
 """Folders whose files have an order of their own, from the top down like LAYERS."""
 
 LIBRARIES = {
@@ -74,6 +75,7 @@ CHAIN = (
     {"fit"},
     {"joint", "reduced"},
     {"beam", "coarse", "convergence", "ritz", "sweep"},
+    {"prior"},
     {"connectivity", "information"},
     {"exposures"},
     {"padded"},
@@ -86,9 +88,11 @@ CHAIN = (
 """The core: a module uses those to its right; none of two in one place uses the other."""
 
 BESIDE = {
+    "apply": set[str](),
     "centroid": {"connectivity"},
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
+    "response": set[str](),
     "statistics": set[str](),
 }
 """Core modules beside the chain: they use these, and what is right of `geometry`."""

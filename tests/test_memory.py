@@ -52,11 +52,36 @@ class TestArraysThatNoMachineHolds:
         with pytest.raises(InsufficientMemoryError, match=r"calibrating: .* PiB"):
             equipix.calibrate(np.ones((5, 8, 9)), CROSS, variance=variance)
 
+    def test_response_curves(self):
+        levels = np.broadcast_to(np.uint8(1), (2, 2**20, 2**29))
+        with pytest.raises(InsufficientMemoryError, match=r"fitting response curves: .* PiB"):
+            equipix.nuc.fit(levels)
+
     @pytest.mark.parametrize("shape", [(2, 2**25, 2**25), (2, 2**31, 2**29)])
     def test_average(self, shape):
         words = r"averaging frames of .* needs .* \(\d{17,} bytes\) .* are available: "
         with pytest.raises(InsufficientMemoryError, match=words):
             equipix.average(np.broadcast_to(np.uint8(1), shape))
+
+
+RESPONSE = """
+import numpy as np, equipix
+from equipix.nuc.levels import levels_of
+levels = levels_of(np.random.default_rng(0).uniform(1, 2, (2, 1500, 1500)) * [[[1]], [[9]]])
+levels.fit("line", workers=1)
+limit(200 * 10**6)
+try:
+    levels.fit("line", workers=1)
+except equipix.errors.InsufficientMemoryError as error:
+    print(error)
+"""
+
+
+def test_response_curves_count_their_bytes():
+    said = run(RESPONSE)
+    assert "fitting response curves of (1500, 1500) needs" in said.stdout
+    # 80 bytes for the polynomial of a pixel, 44 for its planes, and 64 MiB for the allocator.
+    assert f"({124 * 1500**2 + 2**26} bytes)" in said.stdout, said.stdout + said.stderr
 
 
 CHILDREN = f"""
@@ -184,3 +209,56 @@ def test_numpy_takes_little_beside_the_data(options, stacks, masks, images):
         tracemalloc.stop()
     ceiling = stacks * frames.nbytes + masks * frames.size + images * 8 * frames[0].size
     assert peak < ceiling
+
+
+def write_files(folder, shape):
+    """Write 800 frames of 16 bits to eight files, since a small file is read at once."""
+    frames = np.random.default_rng(1).integers(100, 200, (100, *shape), dtype=np.uint16)
+    paths = [folder / f"raw{number}.tif" for number in range(8)]
+    for path in paths:
+        write_frames(path, frames, nbytes=frames.nbytes)
+    return paths
+
+
+QUALITY = """
+from equipix import cli
+from equipix.cli.app import command
+command("nuc")
+limit(190 * 10**6)
+cli.main(["nuc", *sys.argv[1:]])
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "work"), [("quality", "measuring quality"), ("defects", "finding bad pixels")]
+)
+def test_commands_on_frames_of_one_level_name_it(tmp_path, command, work):
+    shape = (250, 250)
+    response = equipix.nuc.fit(np.ones((2, *shape)) * [[[100.0]], [[200.0]]])
+    response.save(tmp_path / "response.tif")
+    # 100 MB of frames, which are held twice while they are joined.
+    said = run(QUALITY, command, tmp_path / "response.tif", *write_files(tmp_path, shape))
+    assert said.returncode == 1, said.stderr
+    assert re.fullmatch(rf"equipix: error: {work}: .*\n", said.stderr), said.stderr
+
+
+CORRECT = """
+from equipix import cli
+from equipix.cli.app import command
+command("correct")
+import equipix.io.tiff
+limit(140 * 10**6)
+cli.main(["correct", *sys.argv[1:], "--workers", "1"])
+"""
+
+
+def test_files_are_corrected_in_constant_memory(tmp_path):
+    shape = (250, 250)
+    planes = np.stack([np.full(shape, -5.0), np.ones(shape)])
+    equipix.Polynomial(planes, np.zeros(shape, np.uint32)).save(tmp_path / "correction.tif")
+    output = tmp_path / "out.tif"
+    # 100 MB of frames, and 200 MB of corrected ones; reading asks for 64 MiB of the allocator's.
+    source = write_files(tmp_path, shape)
+    said = run(CORRECT, tmp_path / "correction.tif", *source, "-o", output)
+    assert said.returncode == 0, said.stderr
+    assert equipix.io.frame_format(output)[0] == (800, *shape)

@@ -162,3 +162,21 @@ def test_what_equipix_saved_is_no_raw_frame(manifest, direct, tmp_path, capsys, 
     ]:
         assert run(*command, "-o", tmp_path / "out.tif") == 1, command
         assert f"error: {file}: holds {kind}, expected raw frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_the_limit_of_rejection_is_kept(tmp_path, capsys, suffix):
+    frames = np.random.default_rng(1).normal(1000, 5, (2, 16, 30, 40))
+    plain, path = equipix.average(frames[0]), tmp_path / f"mean{suffix}"
+    dark = equipix.average(frames[1] - 900, reject=4)
+    mean = equipix.average(frames[0], dark=dark, reject=5.5)
+    assert (plain.reject, mean.reject, dark.reject) == (None, 5.5, 4.0)
+    mean.save(path)
+    read = equipix.FrameStatistics.load(path)
+    assert (read.reject, read.dark.reject) == (5.5, 4.0)
+    assert run("inspect", path, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["rejected_beyond_sigmas"] == 5.5
+    plain.save(path, force=True)
+    assert equipix.FrameStatistics.load(path).reject is None
+    assert run("inspect", path) == 0
+    assert "rejected" not in capsys.readouterr().out

@@ -142,11 +142,13 @@ def test_the_help_says_of_each_command_what_the_command_says():
 
 def test_the_commands_listed_are_all_that_there_are():
     modules = {module for module, _ in COMMANDS.values()}
+    registered = [import_module(f"equipix.cli.{module}").commands for module in modules]
     found = [
         info.name or info.callback.__name__
-        for module in modules
-        for info in import_module(f"equipix.cli.{module}").commands.registered_commands
+        for each in registered
+        for info in each.registered_commands
     ]
+    found += [info.name for each in registered for info in each.registered_groups]
     assert sorted(found) == sorted(COMMANDS)
 
 

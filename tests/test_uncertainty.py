@@ -315,15 +315,21 @@ class TestWhatIsUndetermined:
         error = np.sqrt(np.diag(dense(cal, frames, options))).reshape(cal.shape)
         assert cal.sensitivity_std[7, 8] == pytest.approx(error[7, 8], rel=4 * DRAWS_EXACT_TO)
 
-    def test_a_pixel_of_no_weight_has_a_large_one(self):
+    def test_a_pixel_of_no_weight_has_that_of_the_prior(self):
         frames, options = case(9)
         options["variance"][:, 7, 8] = 1e3
         cal = equipix.calibrate(frames, CROSS, uncertainty=True, **options)
         assert cal.flags[7, 8] & Flag.UNRELIABLE_FLAT
         seen = [cal.beam[7 + row, 8 + col] for row, col in CROSS]
-        # 1/D: what L leaves uncertain is a millionth of it. Single precision.
-        wanted = np.sqrt(1e3) / np.sqrt(np.sum(np.square(options["flux"] * seen)))
-        assert cal.sensitivity_std[7, 8] == pytest.approx(wanted, rel=1e-5)
+        information = np.sum(np.square(options["flux"] * seen)) / 1e3
+        # A power of 2, and no more than 1 since variances are given; they are right to 10 %.
+        prior = reference.weak_light_prior(frames, CROSS, 1.0, **options)
+        assert (prior > 0).sum() == 1
+        # What L leaves uncertain is a millionth of D.
+        wanted = 1 / np.sqrt(information + prior[7, 8])
+        assert cal.sensitivity_std[7, 8] == pytest.approx(wanted, rel=4 * DRAWS_EXACT_TO)
+        # Without the prior it would be 14.5.
+        assert wanted < 0.2
 
     def test_measurements_that_leave_no_freedom_need_a_variance(self):
         frames = np.ones((2, 4, 5))

@@ -153,9 +153,9 @@ def test_inspect_names_the_file(tmp_path, capsys):
 
 def test_a_picture_is_no_folder_of_corrected_frames(manifest, tmp_path, capsys):
     frames = manifest.parent / "frames/p0.tif"
-    assert run("correct", "cal.tif", frames, "-o", tmp_path / "x.png") == 1
+    assert run("correct", "cal.tif", frames, "-o", tmp_path / "x.jpg") == 1
     assert (
-        "x.png' ends in '.png', but corrected frames are written as .tif" in capsys.readouterr().err
+        "x.jpg' ends in '.jpg', but corrected frames are written as .tif" in capsys.readouterr().err
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -1,4 +1,4 @@
-"""Pixel sensitivity of image sensors, measured without a uniform light source.
+"""Pixel sensitivity of image sensors, measured without a uniform light source or with one.
 
 Importing the package loads nothing else; every public name is loaded on first use.
 """
@@ -13,13 +13,16 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, plan, simulate, uncertainty
+    from equipix import errors, lens, metrics, nuc, plan, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
     from equipix.calibration.result import Calibration
     from equipix.comparison import Comparison, compare
+    from equipix.correction.corrector import Corrector
+    from equipix.correction.polynomial import Polynomial, combine
     from equipix.correction.protocol import Correction
+    from equipix.experiment.levels import LevelExperiment
     from equipix.experiment.run import Experiment
     from equipix.flags import Flag
     from equipix.frames import FrameStatistics, average
@@ -31,16 +34,20 @@ _HOMES = {
     "Calibration": "calibration.result",
     "Comparison": "comparison",
     "Correction": "correction.protocol",
+    "Corrector": "correction.corrector",
     "Experiment": "experiment.run",
     "Flag": "flags",
     "FrameStatistics": "frames",
     "History": "calibration.history",
+    "LevelExperiment": "experiment.levels",
     "NoiseModel": "noise",
+    "Polynomial": "correction.polynomial",
     "ShiftMeasurement": "shifts",
     "Spot": "shifts",
     "__version__": "_native",
     "average": "frames",
     "calibrate": "calibration.calibrate",
+    "combine": "correction.polynomial",
     "compare": "comparison",
     "cross_pattern": "shifts",
     "load": "loading",
@@ -48,28 +55,35 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "plan", "simulate", "uncertainty")
+_MODULES = ("errors", "lens", "metrics", "nuc", "plan", "simulate", "uncertainty")
 """Public modules."""
 
 __all__ = [
     "Calibration",
     "Comparison",
     "Correction",
+    "Corrector",
     "Experiment",
     "Flag",
     "FrameStatistics",
     "History",
+    "LevelExperiment",
     "NoiseModel",
+    "Polynomial",
     "ShiftMeasurement",
     "Spot",
     "__version__",
     "average",
     "calibrate",
+    "combine",
     "compare",
     "cross_pattern",
     "errors",
+    "lens",
     "load",
     "measure_shift",
+    "metrics",
+    "nuc",
     "plan",
     "simulate",
     "uncertainty",

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 __all__ = [
     "Accumulator",
     "Beam",
+    "Corrector",
     "Exposures",
     "Fit",
     "Uncertainty",
     "__version__",
     "average_files",
     "file_format",
+    "fit_response",
     "locate_spots",
     "needs_whole_shifts",
     "planned_components",
@@ -48,6 +50,26 @@ def average_files(
 ) -> _Statistics: ...
 def file_format(path: str | PathLike[str]) -> tuple[int, int, int, int]: ...
 def read_file(path: str | PathLike[str], workers: int | None) -> NDArray[Any]: ...
+
+@final
+class Corrector:
+    """A correction prepared for many frames; it keeps a copy of the coefficients."""
+
+    def __new__(
+        cls,
+        coefficients: NDArray[Any],
+        unusable: NDArray[Any],
+        flagged: str,
+        levels: NDArray[Any] | None,
+    ) -> Corrector: ...
+    def apply(
+        self,
+        frames: NDArray[Any],
+        out: NDArray[Any],
+        largest: float,
+        *,
+        workers: int | None,
+    ) -> tuple[int, int, float]: ...
 
 @final
 class Exposures:
@@ -149,6 +171,8 @@ class Fit:
     @property
     def smallest_ritz(self) -> float | None: ...
     @property
+    def prior(self) -> NDArray[Any] | None: ...
+    @property
     def leaves_tilt(self) -> bool: ...
     @property
     def refinement(self) -> str: ...
@@ -189,6 +213,14 @@ class Uncertainty:
     @property
     def incomplete(self) -> int: ...
 
+def fit_response(
+    means: NDArray[Any],
+    references: list[float],
+    *,
+    form: str,
+    noise: Sequence[tuple[float, float, float]] | None,
+    workers: int | None,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]: ...
 def locate_spots(
     before: NDArray[Any],
     after: NDArray[Any],

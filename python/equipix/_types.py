@@ -23,3 +23,14 @@ FluxModel = Literal["fit", "linear"]
 ShiftSign = Literal["confirmed", "contradicted", "undetermined"]
 Flagged = Literal["nan", "keep", "replace"]
 """The values of pixels flagged ``DO_NOT_USE`` in corrected frames."""
+Display = Literal["linear", "histogram"]
+"""Tone laws of pictures."""
+
+OutputType = Literal["float32", "uint16", "uint8"]
+"""Types of corrected frames."""
+
+By = Literal["offset", "gain"]
+"""What a one-point correction changes."""
+
+Order = Literal[0, 1, 2, 3, "auto"]
+"""Order of response curves, or that which predicts a held-out level best."""

@@ -141,7 +141,14 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     return hot
 
 
-def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: NoiseModel) -> Bools:
+def noisy_pixels(
+    means: Array,
+    variances: Array,
+    frames: Sequence[int],
+    noise: NoiseModel,
+    *,
+    times: float = 1.0,
+) -> Bools:
     """Find pixels that scatter between frames by more than the noise explains.
 
     Parameters
@@ -152,6 +159,9 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
         Number of frames of each exposure.
     noise : NoiseModel
         That of one frame of a good pixel.
+    times : float
+        Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
+        is beyond chance.
 
     Returns
     -------
@@ -163,7 +173,7 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
     for mean, variance, count in zip(means, variances, frames, strict=True):
         if count < 2:
             continue
-        limit = scatter_limit(count, sigmas=SIGMAS) * noise.variance(mean)
+        limit = max(scatter_limit(count, sigmas=SIGMAS), times**2) * noise.variance(mean)
         known = np.isfinite(variance) & np.isfinite(mean)
         noisy &= ~known | (variance > limit)
         seen |= known
@@ -171,7 +181,7 @@ def noisy_pixels(means: Array, variances: Array, frames: Sequence[int], noise: N
 
 
 def response_outliers(
-    sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]]
+    sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]], *, least: float = DEAD_RESPONSE
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.
 
@@ -182,6 +192,8 @@ def response_outliers(
     std : callable
         Gives the standard deviations of M, which is asked only if there are suspects: M must be
         beyond the limit by more than chance explains.
+    least : float
+        Sensitivity below which a pixel is dead, over that of its neighbours.
 
     Returns
     -------
@@ -191,10 +203,11 @@ def response_outliers(
     dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
     with np.errstate(invalid="ignore"):
         # Where no pixel is twice as sensitive as another, none is twice its neighbours' median.
-        if not np.nanmin(sensitivity) < DEAD_RESPONSE * np.nanmax(sensitivity):
+        lowest, highest = (f.reduce(sensitivity, axis=None) for f in (np.fmin, np.fmax))
+        if not lowest < max(least, DEAD_RESPONSE) * highest:
             return dead, hot
     usual, deviation = _block_medians(sensitivity), std()
-    for found, sign, limit in ((dead, -1, DEAD_RESPONSE), (hot, 1, 1 / DEAD_RESPONSE)):
+    for found, sign, limit in ((dead, -1, least), (hot, 1, 1 / DEAD_RESPONSE)):
         beyond = sign * (sensitivity - limit * usual).ravel()
         suspects = np.flatnonzero(beyond > 0)
         found.flat[suspects] = beyond[suspects] > SIGMAS * deviation.flat[suspects]

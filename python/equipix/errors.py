@@ -58,6 +58,10 @@ class AlreadyCorrectedWarning(EquipixWarning):
     """Frames to correct have been corrected before."""
 
 
+class LimitedWarning(EquipixWarning):
+    """Most corrected values are outside of the range of the output's type."""
+
+
 class MissingDarkWarning(EquipixWarning):
     """Averages from which no dark was subtracted count as light."""
 
@@ -72,6 +76,10 @@ class SaturationWarning(EquipixWarning):
 
 class MisfitWarning(EquipixWarning):
     """Residuals are larger than the variances given explain."""
+
+
+class InverseWarning(EquipixWarning):
+    """The cubic that inverts response curves differs from their inverse by much of the noise."""
 
 
 def warn(message: str, category: type[EquipixWarning]) -> None:

@@ -22,8 +22,11 @@ class Flag(IntFlag):
     SATURATED = 1 << 1
     DEAD = 1 << 10
     HOT = 1 << 11
+    TELEGRAPH = 1 << 15
+    NONLINEAR = 1 << 16
     NO_FLAT_FIELD = 1 << 18
     UNRELIABLE_FLAT = 1 << 25
+    OTHER_BAD_PIXEL = 1 << 30
 
 
 BITS = {
@@ -32,9 +35,15 @@ BITS = {
     "hot": Flag.HOT | Flag.DO_NOT_USE,
     "noisy": Flag.HOT | Flag.DO_NOT_USE,
     "contradictory": Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE,
+    "undetermined": Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE,
+    "falling": Flag.NONLINEAR | Flag.DO_NOT_USE,
+    "nonlinear": Flag.NONLINEAR | Flag.DO_NOT_USE,
+    "non_responding": Flag.DEAD | Flag.DO_NOT_USE,
+    "flickering": Flag.TELEGRAPH | Flag.DO_NOT_USE,
+    "out_of_range": Flag.OTHER_BAD_PIXEL | Flag.DO_NOT_USE,
 }
 """Bits that each finding sets; a saturated value is left out of its exposure, and the pixel keeps
-the sensitivity that the others determine."""
+the sensitivity that the others determine. The last six are findings on response curves."""
 
 
 def set_bits(flags: Array, finding: str, pixels: Bools | None) -> None:

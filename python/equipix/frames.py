@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,9 @@ from equipix._check import (
     positive_workers,
 )
 from equipix._readonly import ReadOnly
+from equipix.batches import batches, sum_dtype, unmasked
 from equipix.errors import FileError, InputError, UnsupportedFileError
+from equipix.rejection import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -31,8 +34,6 @@ if TYPE_CHECKING:
 
     from equipix._types import Progress
 
-_BATCH = 16  # frames handed over at once
-_BATCH_BYTES = 2**26
 _FORMAT = 1  # of saved statistics; files with a larger number are refused
 _KIND = "frame statistics"
 _PAGES = {
@@ -44,7 +45,6 @@ _PAGES = {
 }
 _COUNTS = ("count", "saturated")
 _DARK = "dark_"  # before the names of the dark's pages
-_SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +70,9 @@ class FrameStatistics(ReadOnly):
         The level that samples were compared with, in DN; None if there was none.
     raw : bool
         Whether no dark was subtracted from whole numbers, as cameras write them.
+    reject : float or None
+        The deviation, in standard deviations, beyond which samples were left out; None where all
+        count.
     """
 
     mean: NDArray[Any]
@@ -80,6 +83,7 @@ class FrameStatistics(ReadOnly):
     dark: FrameStatistics | None = None
     saturation: float | None = None
     raw: bool = False
+    reject: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
@@ -140,6 +144,7 @@ def average(
     dark: FrameStatistics | ArrayLike | None = None,
     saturation: float | None = None,
     mask: ArrayLike | None = None,
+    reject: float | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> FrameStatistics:
@@ -161,6 +166,10 @@ def average(
         are not tested then.
     mask : array_like of bool, shape (rows, cols), optional
         True = do not use: mean and variances of the pixel become NaN, its counts 0.
+    reject : float, optional
+        Leave out samples that deviate by more than so many standard deviations from the others of
+        their pixel, such as cosmic rays: 5 is usual. They count nowhere, not even as saturated. It
+        takes nine frames of one steady scene or more, and holds the first nine of them.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
     progress : callable, optional
@@ -191,6 +200,11 @@ def average(
     merged by Chan's formula [1]_, with a relative error of some ``n/16 + 16`` roundings at most.
     Samples that are not finite do not count; saturated ones do, and are counted apart.
 
+    With `reject` a sample is compared with the mean of those before, and with a noise that pixels
+    of similar signal have in common, or with its pixel's own where that is larger:
+    `equipix.rejection.Rejection`, which states the bias that is left. The variance is divided by
+    that of a normal distribution cut at so many standard deviations.
+
     References
     ----------
     .. [1] T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance",
@@ -206,15 +220,19 @@ def average(
     (array([[2., 2.]]), array([[2., 0.]]))
     """
     workers = positive_workers(workers)
-    level = as_level(saturation)
+    level, rejection = as_level(saturation), None if reject is None else Rejection(reject)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     frames = _paths_or_frames(source)
     with naming_memory("averaging"):
         if isinstance(frames, list):
-            statistics = _average_files(frames, level, workers, progress)
+            statistics = _average_files(frames, level, workers, progress, rejection)
         else:
-            batches = _batches(frames)
-            statistics = _average_batches(batches, level, workers, progress, _length(source))
+            given = batches(frames)
+            statistics = _average_batches(
+                given, level, workers, progress, _length(source), rejection
+            )
+        if reject is not None:
+            statistics = dataclasses.replace(statistics, reject=float(reject))
         return _masked(_subtract(statistics, offset), mask)
 
 
@@ -224,10 +242,10 @@ def save_statistics(
     """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content |= {"saturation": statistics.saturation, "raw": statistics.raw}
+    content |= {name: getattr(statistics, name) for name in ("saturation", "raw", "reject")}
     if dark is not None:
         pages |= {_DARK + name: values for name, values in dark.maps.items()}
-        content[_DARK + "saturation"] = dark.saturation
+        content |= {_DARK + "saturation": dark.saturation, _DARK + "reject": dark.reject}
     io.save_pages(path, pages, content, force=force)
 
 
@@ -254,8 +272,10 @@ def _of_pages(
     pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
 ) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    level = content.get(before + "saturation")
-    return FrameStatistics(mean, variance, of_mean, count, saturated, saturation=level)
+    level, reject = (content.get(before + name) for name in ("saturation", "reject"))
+    return FrameStatistics(
+        mean, variance, of_mean, count, saturated, saturation=level, reject=reject
+    )
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:
@@ -295,22 +315,23 @@ def _average_files(
     level: float | None,
     workers: int | None,
     progress: Progress | None,
+    rejection: Rejection | None,
 ) -> FrameStatistics:
     paths = io.find_files(names)
     if any(path.suffix.lower() == ".npz" for path in paths):
-        return _saved(paths, level)
-    try:
-        maps = _native.average_files(paths, level, workers, progress)
-        return _statistics(maps, io.frame_format(paths[0])[1], level)
-    except UnsupportedFileError:
-        if any(saved_shape(path) for path in paths):
-            return _saved(paths, level)
-        stream = io.stream_frames(paths, workers=workers)
-        batches = _batches(frame for _, frames in stream for frame in frames)
-        return _average_batches(batches, level, workers, progress, len(paths))
+        return _saved(paths, level, rejection)
+    if rejection is None:
+        with suppress(UnsupportedFileError):
+            maps = _native.average_files(paths, level, workers, progress)
+            return _statistics(maps, io.frame_format(paths[0])[1], level)
+    if any(saved_shape(path) for path in paths):
+        return _saved(paths, level, rejection)
+    stream = io.stream_frames(paths, workers=workers)
+    given = batches(frame for _, frames in stream for frame in frames)
+    return _average_batches(given, level, workers, progress, len(paths), rejection)
 
 
-def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
+def _saved(paths: list[Path], level: float | None, rejection: Rejection | None) -> FrameStatistics:
     """Read the one average that is given in the place of frames."""
     path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
     if others:
@@ -318,6 +339,8 @@ def _saved(paths: list[Path], level: float | None) -> FrameStatistics:
             f"{path}: holds averaged frames, which cannot be averaged with other files: name one "
             "saved average alone, or the frames of all"
         )
+    if rejection is not None:
+        raise InputError(f"{path}: holds averaged frames, from which 'reject' cannot leave out any")
     statistics = load_statistics(path)
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
@@ -349,88 +372,30 @@ def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
     return level
 
 
-def _batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
-    """Give the frames a few at a time: views of an array, copies of what an iterator gives."""
-    if isinstance(frames, np.ndarray):
-        if frames.ndim != 3 or 0 in frames.shape:
-            raise InputError(
-                f"'source' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
-            )
-        size = _batch_size(frames[0])
-        yield from (frames[start : start + size] for start in range(0, len(frames), size))
-        return
-    first = _frame(0, next(frames))
-    empty = np.ma.empty if isinstance(first, np.ma.MaskedArray) else np.empty
-    batch = empty((_batch_size(first), *first.shape), first.dtype)
-    filled = 0
-    for index, item in enumerate(itertools.chain([first], frames)):
-        frame = _frame(index, item)
-        if type(frame) is not type(first):
-            raise InputError(
-                f"'source[{index}]' is a {type(frame).__name__}, expected a {type(first).__name__}"
-                " like the first: give all frames as masked arrays, or none"
-            )
-        if frame.shape != first.shape or frame.dtype != first.dtype:
-            raise InputError(
-                f"'source[{index}]' is {frame.dtype} of shape {frame.shape}, expected"
-                f" {first.dtype} of shape {first.shape} like the first"
-            )
-        batch[filled] = frame
-        filled += 1
-        if filled == len(batch):
-            yield batch
-            filled = 0
-    if filled:
-        yield batch[:filled]
-
-
-def _frame(index: int, item: Any) -> NDArray[Any]:
-    """Check one frame of an iterable; a masked array stays one."""
-    name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
-    frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
-    return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
-
-
-def _batch_size(frame: NDArray[Any]) -> int:
-    return max(1, min(_BATCH, _BATCH_BYTES // max(1, frame.nbytes)))
-
-
 def _average_batches(
-    batches: Iterator[NDArray[Any]],
+    given: Iterator[NDArray[Any]],
     level: float | None,
     workers: int | None,
     progress: Progress | None,
     total: int,
+    rejection: Rejection | None,
 ) -> FrameStatistics:
-    first = next(batches)
-    dtype, level = _sum_dtype(first), _level_of(first.dtype, level)
+    first = next(given)
+    dtype, level = sum_dtype(first), _level_of(first.dtype, level)
+    everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
+    if rejection is not None:
+        dtype, everything = np.dtype(np.float64), rejection.cleaned(everything)
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, workers)
     done = 0
-    for batch in itertools.chain([first], batches):
-        sums.add(np.ascontiguousarray(_unmasked(batch, dtype), dtype=dtype))
+    for batch in everything:
+        sums.add(np.ascontiguousarray(unmasked(batch, dtype), dtype=dtype))
         done += len(batch)
         if progress is not None:
             progress(done, max(done, total), "average")
-    return _statistics(sums.finish(), first.dtype, level)
-
-
-def _sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
-    """Choose the dtype that frames are summed in: their own, or float64.
-
-    Masked samples are summed as NaN, which does not count, so whole numbers need float64.
-    """
-    dtype = frames.dtype
-    if dtype.kind not in "buif":
-        raise InputError(f"'source' has dtype {dtype}, expected real numbers")
-    masked = isinstance(frames, np.ma.MaskedArray) and dtype.kind != "f"
-    return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
-
-
-def _unmasked(batch: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return a batch with NaN in the place of masked samples."""
-    if not isinstance(batch, np.ma.MaskedArray):
-        return batch
-    return np.where(np.ma.getmaskarray(batch), dtype.type(np.nan), np.ma.getdata(batch))
+    maps = sums.finish()
+    if rejection is not None:
+        maps = (maps[0], maps[1] / rejection.variance_kept, *maps[2:])
+    return _statistics(maps, first.dtype, level)
 
 
 def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatistics:

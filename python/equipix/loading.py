@@ -14,10 +14,13 @@ if TYPE_CHECKING:
 
     from equipix.calibration.result import Calibration
     from equipix.correction.protocol import Correction
+    from equipix.nuc.response import Response
 
 READERS = {
     "calibration": ("equipix.calibration.reading", "read_calibration"),
     "frame statistics": ("equipix.frames", "read_statistics"),
+    "polynomial": ("equipix.correction.polynomial", "read_polynomial"),
+    "response": ("equipix.nuc.reading", "read_response"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes
 the content of ``(path, pages, metadata)``."""
@@ -40,7 +43,8 @@ def load(path: str | PathLike[str]) -> Correction:
     Returns
     -------
     Correction
-        As it was saved, bit by bit: from a file that `Calibration.save` wrote a `Calibration`.
+        As it was saved, bit by bit: a `Calibration` from a file that `Calibration.save` wrote, a
+        `nuc.Response` from one that `Response.save` wrote.
 
     Raises
     ------
@@ -65,6 +69,15 @@ def load_calibration(path: str | PathLike[str]) -> Calibration:
     """
     calibration: Calibration = _load(path, {"calibration": READERS["calibration"]})
     return calibration
+
+
+def load_response(path: str | PathLike[str]) -> Response:
+    """Read a response from the file that `Response.save` wrote, and refuse other corrections.
+
+    The parameters and errors are those of `load`.
+    """
+    response: Response = _load(path, {"response": READERS["response"]})
+    return response
 
 
 def _load(path: str | PathLike[str], readers: Mapping[str, tuple[str, str]]) -> Any:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+MEDIAN_SQUARE = 0.4549
+"""Median of the square of a standard normal variable."""
 
 _BINS = 64
 

@@ -105,6 +105,9 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
                 values[k, b] -= fit.offset[part]
     if exposures.mask is not None:
         values[np.broadcast_to(exposures.mask[..., rows, :], shape)] = np.nan
+    if fit.prior is not None:
+        # There M follows its prior, so residuals are no test of the model.
+        values[:, fit.prior[rows] > 0] = np.nan
     variance = exposures.variance
     if variance is not None:
         deep = variance[:, rows] if variance.ndim == 3 else variance[:, None, None, None]

@@ -16,7 +16,8 @@ from equipix.calibration.history import History
 from equipix.calibration.prediction import places_of, signal_at, subtract_signals
 from equipix.calibration.saved import save_fields
 from equipix.calibration.unchanged import check_unchanged
-from equipix.correction.apply import apply_gain
+from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficients
+from equipix.correction.depth import depth_of
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
 from equipix.flags import determined
@@ -341,7 +342,7 @@ class Calibration(ReadOnly):
             The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
         out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64.
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
 
         Returns
         -------
@@ -351,20 +352,18 @@ class Calibration(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, `dark` is "stored" and none is stored, or `flagged` is
-            unknown.
+            If a shape does not fit, `dark` is "stored" and none is stored, `flagged` is unknown, or
+            frames are whole numbers of another bit depth than the sensor in `metadata`.
         """
-        if isinstance(dark, str):
-            if dark != "stored":
-                raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
-            if self.dark is None:
-                raise InputError(
-                    "'dark' is 'stored' but this calibration holds no dark frame: give one, or "
-                    "None if it is already subtracted"
-                )
-            dark = self.dark
         return apply_gain(
-            frames, gain=self.sensitivity, dark=dark, flags=self.flags, flagged=flagged, out=out
+            frames,
+            gain=self.sensitivity,
+            dark=dark_or_stored(dark, self.dark),
+            stored=self.dark,
+            flags=self.flags,
+            flagged=flagged,
+            out=out,
+            depth=depth_of(self),
         )
 
     @property
@@ -374,11 +373,7 @@ class Calibration(ReadOnly):
         c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
         Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
         """
-        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
-            gain = 1 / self.sensitivity
-            offset = np.zeros_like(gain) if self.dark is None else -self.dark * gain
-        offset[np.isnan(gain)] = np.nan
-        return np.stack([offset, gain]).astype(self.sensitivity.dtype)
+        return gain_coefficients(self.sensitivity, self.dark).astype(self.sensitivity.dtype)
 
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).

@@ -16,10 +16,11 @@ from equipix.errors import EquipixError, EquipixWarning
 
 COMMANDS = {
     "calibrate": ("calibrate", "Calibrate a sensor from the images of an experiment."),
-    "inspect": ("calibrate", "Show what a calibration file, or a file of averaged frames, holds."),
+    "inspect": ("calibrate", "Show what a file of a correction, or of averaged frames, holds."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
-    "correct": ("frames", "Divide frames by the sensitivity, their dark level subtracted."),
+    "correct": ("frames", "Correct frames by a calibration or by response curves."),
+    "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
     "simulate": (
         "simulate",
         "Write the images of an experiment with a virtual camera, and its truth.",

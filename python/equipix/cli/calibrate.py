@@ -104,10 +104,10 @@ def _refuse_partial(calibration: Calibration, output: Path) -> None:
 
 @commands.command(epilog="Example: equipix inspect cal.tif")
 def inspect(
-    file: Annotated[Path, typer.Argument(help="A calibration or an average: .tif or .npz.")],
+    file: Annotated[Path, typer.Argument(help="A correction or an average: .tif or .npz.")],
     as_json: Json = False,
 ) -> None:
-    """Show what a calibration file, or a file of averaged frames, holds."""
+    """Show what a file of a correction, or of averaged frames, holds."""
     content = load_any(file)
     result = {"file": str(file), **summary(content)}
     if as_json and hasattr(content, "metadata"):

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from equipix._types import Flagged
-from equipix.cli.options import Force, Json, Mask, Saturation, Workers, naming_mask
+from equipix._types import Display, Flagged, OutputType
+from equipix.cli.options import Force, Json, Mask, Saturation, Sensor, Workers, naming_mask
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
-from equipix.correction.files import correct_files, is_folder
+from equipix.correction.files import Corrected, correct_files, is_folder
 from equipix.errors import InputError
+from equipix.experiment.provenance import origin_of
 from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
-from equipix.frames import refuse_subtracted
+from equipix.frames import refuse_subtracted, saved_shape
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
 commands = typer.Typer()
 
-_OTHER_FORMATS = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
+_OTHER_FORMATS = (".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
 """Formats of images that `correct` does not write."""
 
 
@@ -34,6 +35,10 @@ def average(
     ] = None,
     saturation: Saturation = None,
     mask: Mask = None,
+    reject: Annotated[
+        float | None,
+        typer.Option(help="Leave out samples by so many standard deviations: cosmic rays, 5."),
+    ] = None,
     workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
@@ -47,13 +52,21 @@ def average(
     with progress_bars() as progress, naming_mask(mask):
         offset = None
         if dark:
-            offset = average_frames(dark, saturation=saturation, workers=workers, progress=progress)
+            averaged = any(saved_shape(file) for file in offsets)
+            offset = average_frames(
+                dark,
+                saturation=saturation,
+                reject=None if averaged else reject,
+                workers=workers,
+                progress=progress,
+            )
             refuse_subtracted(offset, " ".join(dark))
         frames = average_frames(
             source,
             dark=offset,
             saturation=saturation,
             mask=excluded,
+            reject=reject,
             workers=workers,
             progress=progress,
         )
@@ -64,33 +77,77 @@ def average(
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
 def correct(
-    calibration: Annotated[Path, typer.Argument(help="A calibration: .tif or .npz.")],
+    correction: Annotated[Path, typer.Argument(help="A calibration or a response: .tif or .npz.")],
     frames: Annotated[list[str], typer.Argument(help="Image files or globs.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="A .tif of all frames, or a folder of files.")
+        Path,
+        typer.Option(
+            "--output", "-o", help="A .tif of all frames, a .png of one, or a folder of files."
+        ),
     ],
     dark: Annotated[
         str, typer.Option(help="'stored', 'none', or a file: dark frames or their average.")
     ] = "stored",
-    flagged: Annotated[Flagged, typer.Option(help="What flagged pixels become.")] = "nan",
+    flagged: Annotated[
+        Flagged, typer.Option(help="What flagged pixels become; 'nan' is 0 in whole numbers.")
+    ] = "nan",
+    dtype: Annotated[
+        OutputType | None,
+        typer.Option(
+            help="Type of the result: whole numbers are rounded half to even, and values that had "
+            "to be limited are counted. float32 unless given; uint16 for a .png."
+        ),
+    ] = None,
+    bit_depth: Annotated[
+        int | None, typer.Option(help="Significant bits of whole numbers, 8 to 16.")
+    ] = None,
+    display: Annotated[
+        Display | None,
+        typer.Option(
+            help="8-bit pictures: 'linear' between the percentiles 0.5 and 99.5 of each frame, or "
+            "by its 'histogram' with a plateau of 4 times the mean of its bins."
+        ),
+    ] = None,
+    sensor: Sensor = None,
+    workers: Workers = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Divide frames by the sensitivity, their dark level subtracted."""
+    """Correct frames by a calibration or by response curves."""
     _refuse_image(output)
     check_output(output, force=force, folder=is_folder(output))
-    refuse_inputs([output], [calibration])
+    refuse_inputs([output], [correction])
     with progress_bars() as progress:
         done = correct_files(
-            load(calibration),
+            load(correction),
             frames,
             output,
             dark=dark,
             flagged=flagged,
+            dtype=dtype,
+            bit_depth=bit_depth,
+            display=display,
+            sensor=sensor,
+            workers=workers,
+            origin=origin_of(correction),
             force=force,
             progress=progress,
         )
-    show_result({"output": str(output), "frames": done}, as_json=as_json)
+    counts = _counts(done, whole=done.dtype != "float32" and display is None)
+    result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
+    show_result(result, as_json=as_json)
+
+
+def _counts(done: Corrected, *, whole: bool) -> dict[str, Any]:
+    """Collect what was counted, as far as it can differ from 0."""
+    counts = {"limited_values": done.limited} if whole else {}
+    if done.extrapolated is not None:
+        counts["extrapolated_values"] = done.extrapolated
+    if done.replaced:
+        counts["replaced_pixels"] = done.replaced
+    if done.flagged:
+        counts["unusable_pixels"] = done.flagged
+    return counts
 
 
 def _refuse_image(output: Path) -> None:
@@ -98,5 +155,5 @@ def _refuse_image(output: Path) -> None:
     if output.suffix.lower() in _OTHER_FORMATS and not output.is_dir():
         raise InputError(
             f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif: name "
-            "a .tif file, or a folder for a .tif of each input"
+            "a .tif file, a .png, or a folder for a .tif of each input"
         )

@@ -30,6 +30,14 @@ Mask = Annotated[
 ]
 
 
+Sensor = Annotated[
+    str | None,
+    typer.Option(
+        help="Name of the sensor that gave the frames: another than the file's is refused."
+    ),
+]
+
+
 @contextmanager
 def naming_mask(file: Path | None) -> Iterator[None]:
     """Name the file in messages on the mask that was read from it."""

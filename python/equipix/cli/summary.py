@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix.calibration.result import Calibration
-from equipix.flags import Flag
+from equipix.flags import Flag, usable
 from equipix.frames import FrameStatistics
+from equipix.nuc.response import Response
 
 if TYPE_CHECKING:
     from equipix._types import Array
@@ -22,10 +23,34 @@ def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
         return of_statistics(content)
     if isinstance(content, Calibration):
         return of_calibration(content)
+    if isinstance(content, Response):
+        return of_response(content)
     return {
         "shape": list(content.shape),
         "order": len(content.coefficients) - 1,
         "flagged_pixels": flagged(content),
+    }
+
+
+def of_response(response: Response) -> dict[str, Any]:
+    """Collect the main figures of response curves."""
+    good = usable(response.flags)
+    options = response.metadata.get("options", {})
+    spread = {
+        f"spread_of_{name}": float(np.std(plane[good]))
+        for name, plane in zip("aKce", response.deviation, strict=False)
+    }
+    prediction = options.get("prediction_errors")
+    chi2 = response.reduced_chi2[good]
+    return {
+        "shape": list(response.shape),
+        "order": response.order,
+        "levels": [float(f"{level:.6g}") for level in response.levels],
+        **spread,
+        _misfit_name(options): float(np.mean(chi2)) if chi2.size else float("nan"),
+        "largest_inverse_error": response.largest_inverse_error,
+        **({} if prediction is None else {"prediction_errors": prediction}),
+        "flagged_pixels": flagged(response),
     }
 
 
@@ -39,6 +64,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
         "saturation": frames.saturation,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
+        **({} if frames.reject is None else {"rejected_beyond_sigmas": frames.reject}),
         "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
     }
 

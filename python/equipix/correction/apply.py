@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix._check import as_array
-from equipix._types import Flagged
+from equipix._check import as_array, naming_memory
+from equipix.correction.depth import UNKNOWN, Depth
+from equipix.correction.kernel import FAST, check_flagged, kept, largest_of, run
 from equipix.errors import InputError
-from equipix.flags import Flag
+from equipix.flags import usable
 from equipix.frames import FrameStatistics, refuse_subtracted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import ArrayLike, NDArray
+
+    from equipix._types import Flagged
 
 
 def apply(
@@ -25,6 +28,7 @@ def apply(
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth = UNKNOWN,
 ) -> NDArray[Any]:
     """Correct frames by a formula, and treat flagged pixels as `flagged` requires.
 
@@ -41,6 +45,8 @@ def apply(
         What becomes of pixels flagged ``DO_NOT_USE``.
     out : ndarray or None
         Array for the result, of the frames' shape, float32 or float64.
+    depth : Depth
+        Bits of the sensor.
 
     Returns
     -------
@@ -50,23 +56,57 @@ def apply(
     Raises
     ------
     InputError
-        If a shape does not fit, or `flagged` is unknown.
+        If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
     """
-    raw = as_array("frames", frames, ndim=(2, 3))
-    if raw.shape[-2:] != flags.shape:
-        raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
-    if flagged not in get_args(Flagged):
-        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
-    dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
-    result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
-    bad = (flags & Flag.DO_NOT_USE) != 0
-    for source, target in zip(_each(raw), _each(result), strict=True):
-        formula(source, target)
-        if flagged == "nan":
-            target[bad] = np.nan
-        elif flagged == "replace":
-            replace_bad(target, bad)
-    return result
+    with naming_memory("correcting"):
+        raw = _checked(frames, flags, flagged)
+        depth.refuse_type(raw.dtype)
+        dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
+        result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
+        bad = ~usable(flags)
+        for source, target in zip(_each(raw), _each(result), strict=True):
+            depth.refuse_above(float(np.fmax.reduce(source, axis=None)), raw.dtype)
+            formula(source, target)
+            if flagged == "nan":
+                target[bad] = np.nan
+            elif flagged == "replace":
+                replace_bad(target, bad)
+        return result
+
+
+def apply_polynomial(
+    frames: ArrayLike,
+    coefficients: Callable[[], NDArray[Any]],
+    *,
+    sources: tuple[NDArray[Any], ...] | None,
+    flags: NDArray[Any],
+    flagged: Flagged,
+    out: NDArray[Any] | None,
+    depth: Depth,
+) -> NDArray[Any]:
+    """Σ c_j y^j of each value y by Horner's scheme, and the values of flagged pixels.
+
+    Frames of 8 or 16 bits and float32 are corrected in float32 by the compiled part; `out` may
+    then be of whole numbers, which are rounded half to even and limited to the range of the type.
+    Others are corrected in float64. `coefficients` makes the coefficients, once for the arrays
+    `sources` of a result, the flags last. The other parameters are those of `apply`.
+    """
+    # A copy is no array of the result.
+    known = (flags.copy(),) if sources is None else sources
+    fast = _fast(frames, known, coefficients, flagged=flagged, out=out, depth=depth)
+    if fast is not None:
+        return fast
+    planes = coefficients()
+
+    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
+        total = np.zeros(frame.shape)
+        with np.errstate(invalid="ignore"):  # a dead pixel has infinite coefficients
+            for coefficient in planes[::-1]:
+                total *= frame
+                total += coefficient
+        corrected[...] = total
+
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
 
 
 def apply_gain(
@@ -74,40 +114,130 @@ def apply_gain(
     *,
     gain: NDArray[Any],
     dark: FrameStatistics | ArrayLike | None,
+    stored: NDArray[Any] | None,
     flags: NDArray[Any],
     flagged: Flagged,
     out: NDArray[Any] | None,
+    depth: Depth,
 ) -> NDArray[Any]:
-    """(frame − dark) / gain, frame by frame, and the values of flagged pixels.
+    """(frame − dark) / gain of each value, and the values of flagged pixels.
 
-    The parameters are those of `equipix.Calibration.correct`.
+    The parameters are those of `equipix.Calibration.correct`; frames and results of some types go
+    to the compiled part, as in `apply_polynomial`. Coefficients are prepared once for no dark and
+    for the `stored` one of the result; another may change between two calls.
     """
+    offset = None if dark is None else dark_frame(dark, gain.shape)
+    sources: tuple[NDArray[Any], ...] = (gain, flags)
+    if dark is stored and stored is not None:
+        sources = (gain, stored, flags)
+    elif offset is not None:
+        sources = (gain, offset.copy(), flags)  # a copy is no array of the result
+
+    def coefficients() -> NDArray[Any]:
+        return gain_coefficients(gain, offset)
+
+    fast = _fast(frames, sources, coefficients, flagged=flagged, out=out, depth=depth)
+    if fast is not None:
+        return fast
+    dark_level = np.zeros((), np.float32) if offset is None else offset
+
+    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
+        np.subtract(frame, dark_level, out=corrected, dtype=corrected.dtype, casting="same_kind")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            np.divide(corrected, gain, out=corrected, casting="same_kind")
+
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
+
+
+def gain_coefficients(gain: NDArray[Any], dark: NDArray[Any] | None) -> NDArray[Any]:
+    """Coefficients c_0 = −dark/gain, 0 without a dark, and c_1 = 1/gain; NaN where gain is."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have gain 0
+        inverse = 1 / gain.astype(np.float64)
+        offset = np.zeros_like(inverse) if dark is None else -dark * inverse
+    offset[np.isnan(inverse)] = np.nan
+    return np.stack([offset, inverse])
+
+
+def _fast(
+    frames: ArrayLike,
+    sources: tuple[NDArray[Any], ...],
+    coefficients: Callable[[], NDArray[Any]],
+    *,
+    flagged: Flagged,
+    out: NDArray[Any] | None,
+    depth: Depth,
+) -> NDArray[Any] | None:
+    """Correct frames by the compiled part; None where it does not take their types.
+
+    `sources` are the arrays that `coefficients` makes coefficients of, the flags last.
+    """
+    with naming_memory("correcting"):
+        raw = _checked(frames, sources[-1], flagged)
+        if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
+            return None
+        depth.refuse_type(raw.dtype)
+        result = np.empty(raw.shape, np.float32) if out is None else out
+        if raw.size:
+            prepared = kept(sources, flagged, coefficients)
+            counts = run(prepared, raw, result, largest_of(result.dtype), None)
+            depth.refuse_above(counts.highest, raw.dtype)
+        return result
+
+
+def _is_plain(out: NDArray[Any], raw: NDArray[Any]) -> bool:
+    """Whether the compiled part can write to an array."""
+    fits = isinstance(out, np.ndarray) and out.dtype in FAST and out.shape == raw.shape
+    return bool(fits and out.flags.carray and not np.may_share_memory(out, raw))
+
+
+def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArray[Any]:
+    """Refuse frames of another shape than the sensor, and unknown treatments."""
+    raw = as_array("frames", frames, ndim=(2, 3))
+    if raw.shape[-2:] != flags.shape:
+        raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
+    check_flagged(flagged)
+    return raw
+
+
+def dark_or_stored(
+    dark: str | FrameStatistics | ArrayLike | None, stored: NDArray[Any] | None
+) -> FrameStatistics | ArrayLike | None:
+    """Return the dark given, or the stored one of a calibration where it is "stored"."""
+    if not isinstance(dark, str):
+        return dark
+    if dark != "stored":
+        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+    if stored is None:
+        raise InputError(
+            "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if it "
+            "is already subtracted"
+        )
+    return stored
+
+
+def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Check a dark frame that is to be subtracted; of averages it is the mean."""
     if isinstance(dark, FrameStatistics):
         refuse_subtracted(dark)
         dark = dark.mean
-    offset = np.zeros((), np.float32) if dark is None else as_array("dark", dark, ndim=2)
-    if dark is not None and offset.shape != gain.shape:
-        raise InputError(f"'dark' has shape {offset.shape}, the sensor {gain.shape}")
-
-    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
-        np.subtract(frame, offset, out=corrected, dtype=corrected.dtype, casting="same_kind")
-        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel has gain 0
-            np.divide(corrected, gain, out=corrected, casting="same_kind")
-
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out)
+    offset = as_array("dark", dark, ndim=2)
+    if offset.shape != shape:
+        raise InputError(f"'dark' has shape {offset.shape}, the sensor {shape}")
+    return offset
 
 
 def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> None:
     """Put the mean of the nearest good pixels in place of each bad one.
 
     The good ones of the eight neighbours count; where there are none, those that were filled in
-    the round before. An image without any good pixel becomes NaN.
+    the round before. A value that is NaN counts in no mean. An image without any good pixel
+    becomes NaN.
     """
     rows, cols = image.shape
     good = np.zeros((rows + 2, cols + 2), bool)
-    good[1:-1, 1:-1] = ~bad
+    good[1:-1, 1:-1] = ~bad & ~np.isnan(image)
     values = np.zeros(good.shape)
-    values[1:-1, 1:-1] = np.where(bad, 0, image)
+    values[1:-1, 1:-1] = np.where(good[1:-1, 1:-1], image, 0)
     todo = np.argwhere(bad) + 1
     around = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
     while len(todo):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from equipix._types import Flagged, Progress
-from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
+from equipix._types import Display, Flagged, OutputType, Progress
+from equipix.correction.corrector import Corrector
+from equipix.correction.kernel import FAST, output_dtype
+from equipix.correction.protocol import takes_dark
+from equipix.correction.tone import picture
+from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, LimitedWarning, warn
+from equipix.flags import usable
 from equipix.frames import average, refuse_subtracted
 from equipix.io import (
     description,
@@ -19,21 +23,54 @@ from equipix.io import (
     refuse_saved,
     stream_frames,
     write_frames,
+    write_png,
     write_whole,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
-    from typing import TypeGuard
 
     from numpy.typing import NDArray
 
-    from equipix.correction.protocol import Correction, DarkCorrection
+    from equipix.correction.corrector import Dark
+    from equipix.correction.protocol import Correction
 
+_MARKED = (".tif", ".tiff", ".png")
+"""Formats that this module writes."""
 
 _MARK = "corrected by equipix"
-"""Description of what `correct_files` writes, so that a second correction is detected."""
+"""Beginning of the description of what `correct_files` writes, so that a second correction is
+detected."""
+
+
+class Corrected(NamedTuple):
+    """What was written.
+
+    Attributes
+    ----------
+    dtype : str
+        Type of the values.
+    frames : int
+        Number of frames.
+    limited : int
+        Values of pixels in use that had to be limited to the range of whole numbers, or were not a
+        number.
+    extrapolated : int or None
+        Values corrected to outside of the levels of their pixel's response; None where the
+        correction has none.
+    replaced : int
+        Pixels that were replaced in each frame.
+    flagged : int
+        Pixels flagged ``DO_NOT_USE`` that became NaN in each frame, 0 in whole numbers.
+    """
+
+    dtype: str
+    frames: int
+    limited: int
+    extrapolated: int | None
+    replaced: int
+    flagged: int
 
 
 def correct_files(
@@ -43,10 +80,16 @@ def correct_files(
     *,
     dark: str = "stored",
     flagged: Flagged = "nan",
+    dtype: OutputType | None = None,
+    bit_depth: int | None = None,
+    display: Display | None = None,
+    sensor: str | None = None,
+    workers: int | None = None,
+    origin: str = "",
     force: bool = False,
     progress: Progress | None = None,
-) -> int:
-    """Correct the frames of files, a few at a time.
+) -> Corrected:
+    """Correct the frames of files, a few at a time, with one `Corrector`.
 
     Parameters
     ----------
@@ -55,13 +98,25 @@ def correct_files(
     source : list of str
         Image files or globs.
     output : Path
-        A name that ends in .tif: one file of all frames. Another: a folder to make, with a TIFF
-        for each input file.
+        A name that ends in .tif: one file of all frames; in .png: the only frame, as whole numbers.
+        Another: a folder to make, with a TIFF for each input file.
     dark : str
         "stored", "none", a file or glob of dark frames, or one of their saved statistics. Only a
         correction that subtracts a dark frame takes another than "stored".
     flagged : {"nan", "keep", "replace"}
-        What becomes of flagged pixels.
+        What becomes of flagged pixels; NaN is 0 in whole numbers.
+    dtype : {"float32", "uint16", "uint8"}, optional
+        Type of the output; float32 unless given, and uint16 for a .png.
+    bit_depth : int, optional
+        Significant bits of whole numbers, 8 to 16; by default all of the type.
+    display : {"linear", "histogram"}, optional
+        Make pictures of 8 bits by a tone law, see `equipix.correction.tone.picture`.
+    sensor : str, optional
+        Name of the sensor that gave the frames, to be compared with that of the correction.
+    workers : int, optional
+        Number of threads, as for `Corrector`.
+    origin : str
+        ASCII text that names the correction, such as its hash: it is stored in each file.
     force : bool
         Whether an existing file may be replaced; of a folder, the files of the same names.
     progress : callable, optional
@@ -69,8 +124,8 @@ def correct_files(
 
     Returns
     -------
-    int
-        Number of frames.
+    Corrected
+        What was written, and what was counted. For pictures nothing is limited.
 
     Raises
     ------
@@ -78,47 +133,116 @@ def correct_files(
         If a file cannot be read or written, two outputs would have the same name, or one would
         replace an input.
     InputError
-        If the frames have another shape than the correction, or it takes no other dark frame.
+        If the frames have another shape than the correction, it takes no other dark frame, or more
+        than one frame would go to a .png, or floating-point numbers.
 
     Warns
     -----
     AlreadyCorrectedWarning
         If files were written by this function.
+    LimitedWarning
+        If most values had to be limited to the range of whole numbers.
     """
+    wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
     counts = {file: _count(file, correction) for file in files}
-    _warn_of_corrected(files)
-    correct = _with_dark(correction, dark)
     total, done = sum(counts.values()), 0
+    _refuse_pictures(output, total, wanted)
+    warn_of_corrected(files, origin)
+    corrector = Corrector(
+        correction,
+        "float32" if display else wanted,
+        bit_depth=bit_depth,
+        flagged=flagged,
+        dark=_dark(correction, dark),
+        sensor=sensor,
+        workers=workers,
+    )
 
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
         nonlocal done
         for _, frames in stream_frames(inputs):
-            yield from correct(frames, flagged=flagged)
+            for frame in corrector.apply(_taken(frames)):
+                yield picture(frame, display) if display else frame
             done += len(frames)
             if progress is not None:
                 progress(done, total, "correcting")
 
-    frame_bytes = 4 * correction.shape[0] * correction.shape[1]
+    frame_bytes = wanted.itemsize * correction.shape[0] * correction.shape[1]
+    mark = f"{_MARK}{origin and f', {origin}'}"
     if not is_folder(output):
         with write_whole(output, force=force) as temporary:
-            write_frames(temporary, corrected(files), nbytes=total * frame_bytes, description=_MARK)
-        return total
-    with folder_beside(output) as folder:
-        for file, path in zip(files, outputs, strict=True):
-            nbytes = counts[file] * frame_bytes
-            write_frames(folder / path.name, corrected([file]), nbytes=nbytes, description=_MARK)
-        output.mkdir(exist_ok=True)
-        for path in outputs:
-            (folder / path.name).replace(path)
-    return total
+            _write(temporary, corrected(files), nbytes=total * frame_bytes, mark=mark)
+    else:
+        with folder_beside(output) as folder:
+            for file, path in zip(files, outputs, strict=True):
+                nbytes = counts[file] * frame_bytes
+                _write(folder / path.name, corrected([file]), nbytes=nbytes, mark=mark)
+            output.mkdir(exist_ok=True)
+            for path in outputs:
+                (folder / path.name).replace(path)
+    bad = int(np.count_nonzero(~usable(correction.flags))) if flagged == "nan" else 0
+    limited = max(0, corrector.clipped - bad * total)  # NaN is limited in whole numbers alone
+    _warn_of_limited(limited, total * (correction.flags.size - bad), wanted)
+    return Corrected(wanted.name, total, limited, corrector.extrapolated, corrector.replaced, bad)
+
+
+def _dtype(
+    output: Path, dtype: OutputType | None, bit_depth: int | None, display: Display | None
+) -> np.dtype[Any]:
+    """Type of the output, by its name unless it is given."""
+    if display is None:
+        return output_dtype(dtype or ("uint16" if is_picture(output) else "float32"))
+    if dtype not in (None, "uint8"):
+        raise InputError(
+            f"'display' makes pictures of 8 bits, but 'dtype' (--dtype) is '{dtype}': leave out one"
+        )
+    if bit_depth is not None:
+        raise InputError(
+            "'display' makes pictures of 8 bits, but 'bit_depth' (--bit-depth) is "
+            f"{bit_depth}: leave out one"
+        )
+    return np.dtype(np.uint8)
+
+
+def _taken(frames: NDArray[Any]) -> NDArray[Any]:
+    """Frames in a type that is corrected; in single precision like the corrected values."""
+    native = frames.dtype.newbyteorder("=")
+    return frames.astype(native if native in FAST else np.float32, copy=False)
+
+
+def _write(path: Path, frames: Iterator[NDArray[Any]], *, nbytes: int, mark: str) -> None:
+    """Write frames to a TIFF, or the only one to a PNG."""
+    if is_picture(path):
+        for frame in frames:
+            write_png(path, frame, description=mark)
+    else:
+        write_frames(path, frames, nbytes=nbytes, description=mark)
+
+
+def is_picture(output: Path) -> bool:
+    """Whether an output is a PNG, by its name."""
+    return output.suffix.lower() == ".png"
+
+
+def _refuse_pictures(output: Path, total: int, dtype: np.dtype[Any]) -> None:
+    """Refuse several frames, or floating-point numbers, in a PNG."""
+    if not is_picture(output):
+        return
+    if total != 1:
+        raise InputError(
+            f"'{output}' holds one frame, but {total} are to be corrected: name a .tif of all, or "
+            "a folder"
+        )
+    if dtype.kind != "u":
+        raise InputError(f"'{output}' holds whole numbers: expected 'dtype' uint8 or uint16")
 
 
 def is_folder(output: Path) -> bool:
     """Whether an output is a folder of files, by its name."""
-    return output.suffix.lower() not in (".tif", ".tiff")
+    return output.suffix.lower() not in (".tif", ".tiff", ".png")
 
 
 def _outputs(output: Path, files: list[Path]) -> list[Path]:
@@ -131,16 +255,34 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def _warn_of_corrected(files: list[Path]) -> None:
-    """Warn of files that this module has written: cameras write no floating-point numbers."""
-    floats = [file for file in files if frame_format(file)[1].kind == "f"]
-    if corrected := [file for file in floats if description(file) == _MARK]:
-        others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
-        warn(
-            f"{corrected[0]}{others}: corrected already; a second correction divides by the "
-            "sensitivity twice: give the raw frames",
-            AlreadyCorrectedWarning,
-        )
+def warn_of_corrected(files: list[Path], origin: str) -> None:
+    """Warn of files that this module has written; `origin` as for `correct_files`."""
+    marks = {file: description(file) for file in files if file.suffix.lower() in _MARKED}
+    corrected = [file for file, mark in marks.items() if mark.startswith(_MARK)]
+    if not corrected:
+        return
+    others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
+    same = bool(origin) and marks[corrected[0]].endswith(origin)
+    by = "by this correction" if same else "by another correction"
+    warn(
+        f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
+        "the raw frames",
+        AlreadyCorrectedWarning,
+    )
+
+
+def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
+    """Warn where most values of pixels in use are outside of the range of the output."""
+    if limited <= values / 2:
+        return
+    remedy = "float32, or more bits in 'bit_depth' (--bit-depth)"
+    if dtype == np.uint8:
+        remedy = "uint16; or 'display' (--display linear), which scales frames to 8 bits"
+    warn(
+        f"{limited / values:.0%} of the corrected values were limited to the range of {dtype}: "
+        f"choose 'dtype' (--dtype) {remedy}",
+        LimitedWarning,
+    )
 
 
 def _count(file: Path, correction: Correction) -> int:
@@ -154,24 +296,17 @@ def _count(file: Path, correction: Correction) -> int:
     return count
 
 
-def _with_dark(correction: Correction, dark: str) -> Callable[..., NDArray[Any]]:
-    """Give the method that corrects frames, with this dark frame in place of that stored."""
+def _dark(correction: Correction, dark: str) -> Dark:
+    """Give the dark frame that an option names, for the argument of `Corrector`."""
     if dark == "stored":
-        return correction.correct
-    if not _takes_dark(correction):
+        return "stored"
+    if not takes_dark(correction):
         raise InputError(
             f"'dark' is '{dark}', but the offsets of this correction are part of it and no dark "
             "frame can replace them: expected 'stored'"
         )
-    return partial(correction.correct, dark=None if dark == "none" else _dark_frame(dark))
-
-
-def _takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
-    return hasattr(correction, "dark")
-
-
-def _dark_frame(source: str) -> NDArray[Any]:
-    """Read the mean of dark frames, averaged already or not."""
-    dark = average(source)
-    refuse_subtracted(dark, source)
-    return dark.mean.astype(np.float32)
+    if dark == "none":
+        return None
+    statistics = average(dark)
+    refuse_subtracted(statistics, dark)
+    return statistics

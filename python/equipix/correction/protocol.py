@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
+from equipix.errors import InputError
+
 if TYPE_CHECKING:
-    from os import PathLike
+    from typing import TypeGuard
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -50,7 +53,7 @@ class Correction(Protocol):
 
 
 class DarkCorrection(Correction, Protocol):
-    """A correction that subtracts a dark frame, which may be replaced by another."""
+    """A dataclass of a correction that subtracts a dark frame, which another may replace."""
 
     @property
     def dark(self) -> NDArray[Any] | None:
@@ -65,3 +68,41 @@ class DarkCorrection(Correction, Protocol):
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
         """Frames as `Correction.correct` gives them, after `dark` is subtracted."""
+
+
+def check_correction(name: str, given: object) -> None:
+    """Refuse what is no correction, such as the name of its file."""
+    needed = ("shape", "flags", "metadata", "coefficients")
+    # Of the class first: a property of the object may be costly.
+    if all(hasattr(type(given), each) or hasattr(given, each) for each in needed):
+        return
+    plain = given is None or isinstance(given, str | PathLike)
+    raise InputError(
+        f"'{name}' is {repr(given) if plain else f'of type {type(given).__name__}'}, expected a "
+        "correction: equipix.load(path), or the result of equipix.calibrate or equipix.nuc.fit"
+    )
+
+
+def takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
+    """Whether another dark frame can take the place of that stored."""
+    return hasattr(correction, "dark")
+
+
+def sensor_of(correction: Correction) -> str:
+    """Return the name of the sensor in the metadata; empty where there is none."""
+    sensor = correction.metadata.get("sensor")
+    return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""
+
+
+def check_sensor(correction: Correction, sensor: str | None) -> None:
+    """Refuse frames of a sensor of another name than that of the correction."""
+    if sensor is None:
+        return
+    own = sensor_of(correction)
+    if not own:
+        raise InputError(
+            f"'sensor' is '{sensor}', but this correction names no sensor to compare it with: "
+            "leave it out"
+        )
+    if own != sensor:
+        raise InputError(f"'sensor' is '{sensor}', but the correction is of '{own}'")

@@ -1,10 +1,10 @@
-"""The content of experiment.toml, checked: errors contain the value and its place."""
+"""The content of experiment.toml and levels.toml, checked: errors name the value and its place."""
 
 from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -30,6 +30,9 @@ _WANTED = {
     "outside": "true or false",
     "dark": "a table",
     "exposure": "two or more tables [[exposure]]",
+    "level": "one or more tables [[level]]",
+    "value": "a number",
+    "unit": "a text",
     "name": "a text",
     "frames": "a file, a glob or a list of them",
     "aperture_before": "a file, a glob or a list of them",
@@ -47,6 +50,9 @@ Text = Annotated[str, Field(min_length=1)]
 Files = Text | Annotated[list[Text], Field(min_length=1)]
 Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
+
+
+_Content = TypeVar("_Content", bound=BaseModel)
 
 
 class _Table(BaseModel):
@@ -146,8 +152,40 @@ class Exposure(_Table):
         return self
 
 
+class Level(_Table):
+    """One ``[[level]]``: frames of a uniform source, and what the source was set to."""
+
+    frames: Files
+    name: str = ""
+    value: FiniteFloat | None = None
+    unit: Text | None = None
+
+    @model_validator(mode="after")
+    def _unit_of_a_value(self) -> Self:
+        if self.unit is not None and self.value is None:
+            raise _problem("'unit' is given without 'value'")
+        return self
+
+
+class LevelManifest(_Table):
+    """The whole levels.toml."""
+
+    format: Literal[1] = 1
+    sensor: Sensor = Sensor()
+    dark: Dark | None = None
+    level: Annotated[list[Level], Field(min_length=1)]
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each level: its own, its value, or its number."""
+        return [
+            each.name or (f"{index}" if each.value is None else f"{each.value:g}{each.unit or ''}")
+            for index, each in enumerate(self.level)
+        ]
+
+
 class Manifest(_Table):
-    """The whole file."""
+    """The whole experiment.toml."""
 
     format: Literal[1] = 1
     sensor: Sensor = Sensor()
@@ -178,7 +216,16 @@ class Manifest(_Table):
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read and check the file `path`."""
+    """Read and check the experiment.toml `path`."""
+    return _read(path, Manifest)
+
+
+def read_level_manifest(path: Path) -> LevelManifest:
+    """Read and check the levels.toml `path`."""
+    return _read(path, LevelManifest)
+
+
+def _read(path: Path, model: type[_Content]) -> _Content:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -188,7 +235,7 @@ def read_manifest(path: Path) -> Manifest:
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
     try:
-        return Manifest.model_validate(content)
+        return model.model_validate(content)
     except ValidationError as error:
         raise FileError(f"{path}: {'; '.join(_problems(error.errors(), content))}") from None
 
@@ -227,8 +274,8 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     """One of pydantic's findings in the terms of the file."""
     location = detail["loc"]
     match location:
-        case ["exposure", int(index), *_]:
-            place = f" in exposure {index}{_name(content['exposure'][index])}"
+        case ["exposure" | "level" as kind, int(index), *_]:
+            place = f" in {kind} {index}{_name(content[kind][index])}"
         case ["sensor", "region", int(index), *_]:
             place = f" in [[sensor.region]] {index + 1}"
         case [table, _, *_]:
@@ -246,8 +293,8 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
         return f"key '{location[-1]}' is missing{place}"
     key = next(key for key in reversed(location) if key in _WANTED)
     value = detail["input"]
-    if key == "exposure" and isinstance(value, dict):
-        return "[exposure] is one table: write [[exposure]], with two brackets, for each exposure"
+    if key in ("exposure", "level") and isinstance(value, dict):
+        return f"[{key}] is one table: write [[{key}]], with two brackets, for each {key}"
     return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"
 
 

@@ -14,17 +14,19 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from equipix._types import Bools
-    from equipix.experiment.manifest import Manifest, Region
+    from equipix.experiment.manifest import LevelManifest, Manifest, Region
 
 
-def excluded_pixels(path: Path, manifest: Manifest, shape: tuple[int, int]) -> Bools | None:
+def excluded_pixels(
+    path: Path, manifest: Manifest | LevelManifest, shape: tuple[int, int]
+) -> Bools | None:
     """Return the pixels that ``[sensor]`` excludes; None without a mask and regions.
 
     Parameters
     ----------
     path : Path
-        The experiment.toml.
-    manifest : Manifest
+        The experiment.toml or levels.toml.
+    manifest : Manifest or LevelManifest
         Its content.
     shape : tuple of int
         Rows and columns of the sensor.

@@ -6,7 +6,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 from equipix.errors import FileError
-from equipix.experiment.manifest import find_files
+from equipix.experiment.manifest import LevelManifest, find_files
 from equipix.experiment.provenance import sha256_of
 
 if TYPE_CHECKING:
@@ -22,14 +22,15 @@ class Entry(NamedTuple):
     key: str
     exposure: str
     files: list[Path]
+    kind: str = "exposure"
 
     def __str__(self) -> str:
         """Return the words for a message."""
-        return f"'{self.key}' of exposure '{self.exposure}'" if self.exposure else "[dark]"
+        return f"'{self.key}' of {self.kind} '{self.exposure}'" if self.exposure else "[dark]"
 
 
 def refuse_repeats(
-    path: Path, manifest: Manifest, hashes: Mapping[Path, str] | None = None
+    path: Path, manifest: Manifest | LevelManifest, hashes: Mapping[Path, str] | None = None
 ) -> None:
     """Refuse a file that stands for two measurements, by its name or, with `hashes`, its content.
 
@@ -73,9 +74,14 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
             )
 
 
-def _entries(path: Path, manifest: Manifest) -> Iterator[Entry]:
+def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
     """Give the keys that name files of measurements, with the files."""
-    yield Entry("dark", "", find_files(path, manifest.dark.frames))
+    if manifest.dark is not None:
+        yield Entry("dark", "", find_files(path, manifest.dark.frames))
+    if isinstance(manifest, LevelManifest):
+        for name, level in zip(manifest.names, manifest.level, strict=True):
+            yield Entry("frames", name, find_files(path, level.frames), "level")
+        return
     for exposure in manifest.exposure:
         for key in ("frames", "aperture_before", "aperture_after"):
             entry = getattr(exposure, key)

@@ -15,6 +15,7 @@ from equipix.calibration.weights import weighted_fit
 from equipix.defects import hot_pixels
 from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
+from equipix.experiment.formats import check_formats
 from equipix.experiment.manifest import find_files, read_manifest
 from equipix.experiment.mask import excluded_pixels
 from equipix.experiment.provenance import provenance, sha256_of
@@ -22,8 +23,8 @@ from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
-from equipix.frames import average, refuse_subtracted, saved_shape
-from equipix.io import as_path, frame_format
+from equipix.frames import average, refuse_subtracted
+from equipix.io import as_path
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -119,16 +120,7 @@ class Experiment:
         FileError
             If a file cannot be read or differs from the first dark frames.
         """
-        first, *others = self._images()
-        wanted, wanted_dtype = _format(first)
-        for file in others:
-            shape, dtype = _format(file)
-            wanted_dtype = wanted_dtype or dtype
-            if shape != wanted or dtype not in (None, wanted_dtype):
-                raise FileError(
-                    f"{file}: holds {dtype or 'averaged'} frames of shape {shape}, expected "
-                    f"{wanted_dtype or 'averaged'} of shape {wanted} as in {first}"
-                )
+        check_formats(self._images())
 
     def measure_shifts(
         self, calibration: Calibration | None = None
@@ -298,7 +290,7 @@ class Experiment:
 
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:
         """Pixels that the file or the caller excludes."""
-        shape, _ = _format(self._images()[0])
+        shape = check_formats(self._images()[:1])
         given = None
         if mask is not None:
             given = as_mask(mask, (len(self.manifest.exposure), *shape))
@@ -367,12 +359,3 @@ class Experiment:
         """The values of a key that all exposures have, or none."""
         values = [getattr(exposure, key) for exposure in self.manifest.exposure]
         return [value for value in values if value is not None] or None
-
-
-def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
-    """Rows, columns and dtype of the frames of a file; no dtype of frames averaged before."""
-    saved = saved_shape(file)
-    if saved is not None:
-        return saved, None
-    (_, rows, cols), dtype = frame_format(file)
-    return (rows, cols), dtype

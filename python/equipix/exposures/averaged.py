@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,20 @@ if TYPE_CHECKING:
     from equipix.frames import FrameStatistics
 
 
+class Words(NamedTuple):
+    """What messages call the argument of the measurements, and one of them."""
+
+    argument: str = "'frames'"
+    one: str = "exposure"
+
+    def place(self, number: int, name: str = "") -> str:
+        """Name one of the measurements."""
+        return f"{self.argument}: {self.one} {number}{f' ({name!r})' if name else ''}"
+
+
+EXPOSURES = Words()
+
+
 class Averaged:
     """The part of the `FrameStatistics` of each exposure that a calibration needs.
 
@@ -42,6 +57,10 @@ class Averaged:
         Gain of the camera where it is known, in DN per electron.
     saturation : float, optional
         Level that was averaged with, in DN, where it is known; for messages.
+    saturation_key : str
+        What messages call that level.
+    words : Words
+        What messages call the frames.
 
     Attributes
     ----------
@@ -52,6 +71,8 @@ class Averaged:
         Whether no dark was subtracted from averages of whole numbers.
     dark : FrameStatistics or None
         The dark frames that were subtracted.
+    pedestal : float
+        Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
     """
 
     def __init__(
@@ -62,10 +83,13 @@ class Averaged:
         gain: float | None = None,
         saturation: float | None = None,
         saturation_key: str = "saturation",
+        words: Words = EXPOSURES,
     ) -> None:
+        self._words = words
         self.count, self.gain, self.saturation = count, gain, saturation
         self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
+        self.pedestal = 0.0
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
         self._of_dark: list[float] = []
@@ -74,9 +98,9 @@ class Averaged:
         self.raw = True
 
     @classmethod
-    def of(cls, frames: Sequence[FrameStatistics]) -> Self:
+    def of(cls, frames: Sequence[FrameStatistics], *, words: Words = EXPOSURES) -> Self:
         """Reduce the statistics of all exposures."""
-        averaged = cls(len(frames))
+        averaged = cls(len(frames), words=words)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -100,15 +124,16 @@ class Averaged:
             self.dark = frames.dark
         if shape != self.saturated.shape:
             raise InputError(
-                f"'frames' holds means of shapes {self.saturated.shape} and {shape}, expected one"
+                f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
+                "expected one"
             )
         if not same_statistics(frames.dark, self.dark):
             raise InputError(
-                f"'frames': exposure {exposure} has another dark than the first: average all with "
+                f"{self._words.place(exposure)} has another dark than the first: average all with "
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        which = f"'frames': exposure {exposure}{f' ({name!r})' if name else ''}"
+        which = self._words.place(exposure, name)
         _refuse_no_variance(which, frames)
         self._refuse_saturated(which, frames)
         clipped = clipping_of(frames)
@@ -125,10 +150,20 @@ class Averaged:
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
 
+    def counted_from_lowest(self) -> Self:
+        """Return a copy whose noise models count the signal from the lowest of several exposures.
+
+        Raw values contain the level without light, which adds no photon noise.
+        """
+        counted = copy.copy(self)
+        vars(counted).pop("noise", None)
+        counted.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+        return counted
+
     @cached_property
     def noise(self) -> NoiseModel | None:
         """Noise model of one frame, fitted over all pixels of all frames; None without scatter."""
-        points = list(self._points)
+        points = [each - (self.pedestal, 0, 0) for each in self._points]
         known = any(map(len, points))
         if self.dark is not None:
             points.append(_dark_points(self.dark))
@@ -158,7 +193,7 @@ class Averaged:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
-            noisy = noisy_pixels(self.values, self.variances, self._frames, noise)
+            noisy = noisy_pixels(self._signals, self.variances, self._frames, noise)
         hot = np.zeros(self.saturated.shape, bool)
         if self.dark is not None:
             hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
@@ -175,8 +210,13 @@ class Averaged:
         """Pixels that are dead in every exposure in which they do not saturate."""
         models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
-        dead: Bools = dead_pixels(self.values, models) & measured
+        dead: Bools = dead_pixels(self._signals, models) & measured
         return dead
+
+    @property
+    def _signals(self) -> Array:
+        """Values above the pedestal."""
+        return self.values - self.pedestal if self.pedestal else self.values
 
     def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
         """Noise model of each mean frame less the dark, for one exposure by itself."""

@@ -65,7 +65,7 @@ def clipping(values: Array, crowded: float = _CROWDED) -> Clipping | None:
     if count <= crowded * np.count_nonzero(below >= top - width):
         return None
     level = float(np.rint(top)) if abs(top - np.rint(top)) <= rounding else top
-    return Clipping(level, count) if 2 * count < known.size or _is_of_bits(level) else None
+    return Clipping(level, count) if 2 * count < known.size or is_of_bits(level) else None
 
 
 def clipping_of(frames: FrameStatistics) -> Clipping | None:
@@ -105,13 +105,15 @@ def _raw(frames: FrameStatistics) -> Array:
     return frames.mean if frames.dark is None else frames.mean + frames.dark.mean
 
 
-def clipping_advice(clipped: Clipping) -> str:
-    """Say what was found and what to write."""
+def clipping_advice(
+    clipped: Clipping, file: str = "experiment.toml", function: str = "calibrate"
+) -> str:
+    """Say what was found and what to write, in a file or to a function of arrays."""
     level = f"{clipped.level:.10g}"
     return (
         f"{clipped.values} values are exactly {level}, the highest one: they probably saturate and "
-        f"count as valid. Write saturation = {level} in [sensor] of experiment.toml, or give it as "
-        "'saturation' to equipix.average or, of arrays, to calibrate"
+        f"count as valid. Write saturation = {level} in [sensor] of {file}, or give it as "
+        f"'saturation' to equipix.average or, of arrays, to {function}"
     )
 
 
@@ -124,7 +126,7 @@ def highest(found: Iterable[Clipping | None]) -> Clipping | None:
     return Clipping(level, sum(each.values for each in levels if each.level == level))
 
 
-def _is_of_bits(level: float) -> bool:
+def is_of_bits(level: float) -> bool:
     """Whether a level is 2^bits − 1."""
     bits = np.log2(level + 1)
     return bool(bits >= _FEWEST_BITS and bits == np.rint(bits))

@@ -10,7 +10,7 @@ import numpy as np
 from equipix._check import as_array, as_floats, as_level, check_count, naming_memory
 from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
-from equipix.exposures.averaged import Averaged
+from equipix.exposures.averaged import EXPOSURES, Averaged, Words
 from equipix.exposures.clipping import Clipping, clipping, highest
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
@@ -116,24 +116,27 @@ def measured_of(
     frames: ArrayLike | Sequence[FrameStatistics] | Averaged,
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
     saturation: float | None = None,
+    *,
+    words: Words = EXPOSURES,
 ) -> Measured:
-    """Check frames and what is known of their noise."""
-    averaged = frames if isinstance(frames, Averaged) else _averaged(frames)
+    """Check frames and what is known of their noise; `words` are what messages call them."""
+    averaged = frames if isinstance(frames, Averaged) else _averaged(frames, words)
     if averaged is None:
-        return _of_arrays(cast("ArrayLike", frames), variance, saturation)
-    return _of_averaged(averaged, variance, saturation)
+        return _of_arrays(cast("ArrayLike", frames), variance, saturation, words)
+    return _of_averaged(averaged, variance, saturation, words)
 
 
 def _of_averaged(
     averaged: Averaged,
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
     saturation: float | None,
+    words: Words,
 ) -> Measured:
     """Averaged frames: their noise model, or the variances that the caller gives."""
     if saturation is not None:
         raise InputError(
-            "'saturation' is for arrays, but 'frames' are averages: their saturated samples are "
-            "counted where equipix.average is given the level"
+            f"'saturation' is for arrays, but {words.argument} are averages: their saturated "
+            "samples are counted where equipix.average is given the level"
         )
     noise = averaged.noise if variance is None else variance
     models = as_models(noise, averaged.count)
@@ -162,12 +165,14 @@ def _of_arrays(
     frames: ArrayLike,
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
     saturation: float | None,
+    words: Words,
 ) -> Measured:
     """Arrays: only what the caller gives is known of them."""
-    values = as_floats("frames", frames, ndim=3)
+    values = as_floats(words.argument.strip("'"), frames, ndim=3)
     if 0 in values.shape:
         raise InputError(
-            f"'frames' has shape {values.shape}, expected at least one exposure and one pixel"
+            f"{words.argument} has shape {values.shape}, expected at least one {words.one} and one "
+            "pixel"
         )
     models = as_models(variance, len(values))
     variances = None
@@ -177,7 +182,7 @@ def _of_arrays(
     if level is None:
         clipped = highest(clipping(each) for each in values)
         return Measured(values, None, variances, models, Findings(), clipped=clipped)
-    saturated = _saturated(values, level)
+    saturated = _saturated(values, level, words)
     clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
     if saturation is None and not saturated.any():
         return Measured(values, None, variances, models, Findings(), clipped=clipped)
@@ -193,14 +198,14 @@ def _largest(frames: ArrayLike) -> float | None:
     return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
 
 
-def _averaged(frames: object) -> Averaged | None:
+def _averaged(frames: object, words: Words) -> Averaged | None:
     """Statistics of all exposures, reduced; None for arrays."""
     if not isinstance(frames, list | tuple):
         return None
     statistics = [each for each in frames if isinstance(each, FrameStatistics)]
     if statistics and len(statistics) != len(frames):
-        raise InputError("'frames' mixes FrameStatistics and arrays, expected either")
-    return Averaged.of(statistics) if statistics else None
+        raise InputError(f"{words.argument} mixes FrameStatistics and arrays, expected either")
+    return Averaged.of(statistics, words=words) if statistics else None
 
 
 def as_models(variance: object, count: int) -> list[NoiseModel]:
@@ -217,11 +222,11 @@ def as_models(variance: object, count: int) -> list[NoiseModel]:
     return models
 
 
-def _saturated(values: Array, level: float) -> Bools:
+def _saturated(values: Array, level: float, words: Words) -> Bools:
     """Which values reach the saturation level."""
     saturated: Bools = values >= level
     for k, each in enumerate(saturated):
-        refuse_saturated(f"'frames': exposure {k}", values[k], each, level)
+        refuse_saturated(words.place(k), values[k], each, level)
     return saturated
 
 

@@ -1,6 +1,6 @@
 """Frames, arrays and metadata to and from files."""
 
-from equipix.io.images import frame_format, read_frames, stream_frames
+from equipix.io.images import description, frame_format, read_frames, stream_frames
 from equipix.io.masks import read_mask
 from equipix.io.names import as_path, find_files, refuse_inputs
 from equipix.io.pages import (
@@ -12,7 +12,8 @@ from equipix.io.pages import (
     save_pages,
     saved_kind,
 )
-from equipix.io.tiff import description, write_frames
+from equipix.io.png import write_png
+from equipix.io.tiff import write_frames
 from equipix.io.whole import folder_beside, replace_folder, write_whole
 
 __all__ = [
@@ -34,5 +35,6 @@ __all__ = [
     "saved_kind",
     "stream_frames",
     "write_frames",
+    "write_png",
     "write_whole",
 ]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix import _native
 from equipix.errors import FileError, UnsupportedFileError
-from equipix.io import tiff
+from equipix.io import png, tiff
 from equipix.io.names import find_files
 
 if TYPE_CHECKING:
@@ -17,6 +18,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+
+_AT_ONCE = 2**27
+"""Most bytes of a file of several frames that are read at once."""
+
+
+def description(path: Path) -> str:
+    """Text stored with a TIFF or PNG; empty where there is none."""
+    if path.suffix.lower() == ".png":
+        return png.description(path)
+    return tiff.description(path)
 
 
 def read_frames(
@@ -95,10 +107,12 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
 
 
 def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
-    try:
-        yield _native.read_file(path, workers)
-    except UnsupportedFileError:
-        yield from tiff.stream_frames(path)
+    with suppress(UnsupportedFileError):
+        count, rows, cols, bits = _native.file_format(path)
+        if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:
+            yield _native.read_file(path, workers)
+            return
+    yield from tiff.stream_frames(path)
 
 
 def _format(frames: NDArray[Any]) -> str:

@@ -152,7 +152,7 @@ def _image_or_stack(path: Path, name: str, images: Sequence[Any]) -> NDArray[Any
 
 
 def description(path: Path) -> str:
-    """Text stored with the first page of a file; empty where there is none."""
+    """Text stored with the first page of a TIFF; empty where there is none."""
     with reading(path), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         return str(page.description)

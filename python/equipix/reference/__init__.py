@@ -11,7 +11,9 @@ from equipix.reference.joint import JointSolution, joint
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
 from equipix.reference.multiscale import MultiscaleSolution, multiscale
+from equipix.reference.response import inverse, response
 from equipix.reference.uncertainty import covariance
+from equipix.reference.weak_light import weak_light_prior
 
 __all__ = [
     "JointSolution",
@@ -23,8 +25,11 @@ __all__ = [
     "covariance",
     "exposures",
     "grid_cells",
+    "inverse",
     "joint",
     "multiscale",
     "objective",
+    "response",
     "solve_dense",
+    "weak_light_prior",
 ]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.reference.least_squares import gradient
+from equipix.reference.least_squares import gradient, prior_rows
 from equipix.reference.model import problem
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ def covariance(
     mask: ArrayLike | None = None,
     flux: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
+    prior: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
     """Covariance of M in the gauge mean 1: the Cramér-Rao bound for Gaussian noise.
 
@@ -36,6 +37,9 @@ def covariance(
         L.
     variance, mask, flux, rotation : array_like, optional
         As for `equipix.reference.model.problem`.
+    prior : ndarray, shape (rows, cols), optional
+        Weights λ of a prior of M, as for `equipix.reference.solve_dense`: each counts as a
+        measurement.
 
     Returns
     -------
@@ -52,6 +56,10 @@ def covariance(
     known = np.isfinite(sensitivity).ravel()
     rows, _, _ = gradient(data, np.nan_to_num(sensitivity), np.nan_to_num(beam))
     rows = rows[rows[:, : known.size][:, known].any(axis=1)]
+    if prior is not None:
+        pieces = np.where(known, 0, -1).reshape(sensitivity.shape)
+        of_prior, _ = prior_rows(prior, pieces, sensitivity)
+        rows = np.vstack([rows, np.pad(of_prior, ((0, 0), (0, beam.size)))])
     normal = np.linalg.pinv(rows.T @ rows, rcond=1e-11, hermitian=True)
     project = np.eye(known.size) - np.outer(np.nan_to_num(sensitivity), known) / known.sum()
     result = project @ normal[: known.size, : known.size] @ project.T

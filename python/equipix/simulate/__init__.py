@@ -1,6 +1,7 @@
 """Virtual sensors, beams and cameras: experiments whose truth is known."""
 
 from equipix.maps import block_means, relative_error
+from equipix.simulate import blackbody
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
 from equipix.simulate.rig import Truth, VirtualExperiment, experiment
@@ -14,12 +15,15 @@ from equipix.simulate.signal import (
     tilted_beam,
     wavy_beam,
 )
+from equipix.simulate.staring import StaringArray
 
 __all__ = [
     "Beam",
     "Camera",
+    "StaringArray",
     "Truth",
     "VirtualExperiment",
+    "blackbody",
     "block_means",
     "cosine_sensitivity",
     "experiment",

@@ -189,6 +189,40 @@ impl Components {
     }
 }
 
+impl Components {
+    /// Gives loosely tied pixels that belong to no component, and cells that they alone see, the label of the
+    /// largest one in their piece, `pieces` being those of all pixels however they are tied.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
+    pub(crate) fn adopt<T: Real>(
+        &mut self,
+        exposures: &Exposures<'_, T>,
+        pieces: &[i32],
+        ties: &[Tie],
+        control: &Control,
+    ) -> Result<()> {
+        let count = pieces.iter().max().map_or(0, |&last| (last + 1) as usize);
+        let mut largest = vec![NONE; count];
+        for (&piece, &label) in pieces.iter().zip(&self.pixels).filter(|(_, label)| **label != NONE)
+        {
+            let known = &mut largest[piece as usize];
+            *known = if *known == NONE { label } else { label.min(*known) };
+        }
+        let pixels = self.pixels.iter_mut().zip(pieces).zip(ties);
+        for ((label, &piece), _) in pixels.filter(|(_, tie)| **tie == Tie::Loose) {
+            if let (NONE, Ok(piece)) = (*label, usize::try_from(piece)) {
+                *label = largest[piece];
+            }
+        }
+        exposures.for_each_used(control, |pixel, cell| {
+            if ties[pixel] == Tie::Loose && self.cells[cell] == NONE {
+                self.cells[cell] = self.pixels[pixel];
+            }
+        })
+    }
+}
+
 /// What finding components holds at its fullest: sets and labels of 4 bytes and a byte of use for
 /// each pixel and cell, sizes and the labels of roots of 4 bytes each for each pixel.
 fn bytes_needed(geometry: &Geometry) -> u64 {

@@ -1,5 +1,7 @@
 //! What a calibration found.
 
+use std::sync::Arc;
+
 use crate::beam::Beam;
 use crate::connectivity::Components;
 use crate::control::Control;
@@ -75,6 +77,8 @@ pub struct Fit {
     /// The smallest Ritz value of a joint fit: near 0 where the measurements barely constrain some
     /// pattern.
     pub smallest_ritz: Option<f64>,
+    /// The weights of the prior M = mean(M) on pixels in weak light, row by row, if there are such.
+    pub prior: Option<Arc<[f64]>>,
 }
 
 impl Fit {
@@ -90,6 +94,7 @@ impl Fit {
             refinement: self.refinement,
             joint: self.is_joint(),
             unit: self.unit(),
+            prior: self.prior.clone(),
         }
     }
 
@@ -166,6 +171,8 @@ pub struct Solution<'s> {
     pub joint: bool,
     /// The variance of a measurement of weight 1.
     pub unit: f64,
+    /// The weights of the prior of M.
+    pub prior: Option<Arc<[f64]>>,
 }
 
 impl Solution<'_> {

@@ -45,7 +45,7 @@ pub(crate) fn of_pixel<T: Real>(
 }
 
 /// Adds w c² L² of the measurements of exposure `k` from a pixel on along its row.
-fn add<T: Real>(
+pub(crate) fn add<T: Real>(
     exposures: &Exposures<'_, T>,
     k: usize,
     [row, col]: [usize; 2],

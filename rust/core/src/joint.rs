@@ -36,6 +36,7 @@ mod tests;
 mod tiles;
 mod unknowns;
 mod waves;
+mod weak;
 mod wide;
 mod workspace;
 
@@ -51,5 +52,5 @@ pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
 pub(crate) use shift_information::Directions;
 pub(crate) use system::System;
-pub(crate) use unknowns::{ShiftPrior, State};
+pub(crate) use unknowns::{Prior, ShiftPrior, State};
 pub(crate) use workspace::Workspace;

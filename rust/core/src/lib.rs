@@ -139,8 +139,10 @@
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
 //!
+//! response        response curves from levels of a uniform source  (uses parallel and below)
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
+//! apply           corrections applied to frames                 (uses parallel and below)
 //! centroid        a spot's centroid with its standard error     (uses connectivity)
 //! parts           the parts of a multiscale step, for a bench   (uses solve and below)
 //! ```
@@ -173,6 +175,7 @@
 //! - T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance", The
 //!   American Statistician 37 (1983) 242–247: merging of partial sums.
 
+pub mod apply;
 pub mod beam;
 pub mod centroid;
 mod coarse;
@@ -196,8 +199,10 @@ mod padded;
 pub mod parallel;
 #[doc(hidden)]
 pub mod parts;
+mod prior;
 mod random;
 mod reduced;
+pub mod response;
 mod ritz;
 pub mod solve;
 pub mod statistics;

@@ -36,7 +36,7 @@ impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub fn assemble(&mut self, estimate: &Estimate<'_, '_, T>, control: &Control) -> Result<()> {
-        self.reduced.linearise(&estimate.sensitivity, estimate.beams(), control)
+        self.reduced.linearise(&estimate.sensitivity, estimate.beams(), None, control)
     }
 
     /// Assembles and factorises the coarse matrix.

@@ -28,6 +28,14 @@ pub(crate) fn signs(stream: u64) -> impl FnMut() -> f64 {
 /// The first stream of what all exposures have in common; those of single exposures lie below.
 const COMMON: u64 = 1 << 63;
 
+/// The first stream of what a prior draws.
+const PRIOR: u64 = 1 << 62;
+
+/// The signs of a row of pixels of the prior of M in a draw.
+pub(crate) fn signs_of_prior(draw: u64, row: usize, rows: usize) -> impl FnMut() -> f64 {
+    signs(PRIOR + Streams::new(1, rows).number(draw, 0, row))
+}
+
 /// The signs of a row of pixels that all exposures of a draw have in common.
 pub(crate) fn signs_in_common(draw: u64, row: usize, rows: usize) -> impl FnMut() -> f64 {
     signs(COMMON + Streams::new(1, rows).number(draw, 0, row))

@@ -27,6 +27,8 @@ mod operator;
 mod smallest;
 mod two_level;
 mod two_level_kernel;
+mod weak;
+mod weak_operator;
 
 pub(crate) use conjugate_gradients::{ConjugateGradients, bytes_needed};
 pub(crate) use operator::{Draw, Reduced, Scale};

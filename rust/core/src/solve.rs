@@ -8,6 +8,7 @@
 //! multiscale   Gauss-Newton steps on all scales at once, with the beam eliminated
 //! joint        Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated
 //! response     pixels that do not respond to light
+//! weak         pixels in weak light, and the prior of their M
 //! ```
 
 mod calibrate;
@@ -20,6 +21,7 @@ mod options;
 mod refuse;
 mod response;
 mod start;
+mod weak;
 mod whole;
 
 pub use calibrate::calibrate;

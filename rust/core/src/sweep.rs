@@ -20,3 +20,4 @@ mod kernel;
 mod lines;
 
 pub use estimate::Estimate;
+pub(crate) use kernel::{Difference, Logarithmic, Plain};

@@ -108,7 +108,7 @@ fn few<'a, T>(values: &'a Option<PyVariance<'_>>) -> PyResult<Variance<'a, T>> {
     }
 }
 
-fn stack<'a, T: Element + Real>(
+pub(crate) fn stack<'a, T: Element + Real>(
     argument: &'static str,
     array: &'a PyReadonlyArray3<'_, T>,
 ) -> PyResult<Stack<'a, T>> {

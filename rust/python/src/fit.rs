@@ -138,10 +138,19 @@ pub(crate) struct PyFit {
     refinement: Refinement,
     #[pyo3(get)]
     is_joint: bool,
+    /// The weights of the prior of M on pixels in weak light.
+    prior: Option<Arc<[f64]>>,
 }
 
 #[pymethods]
 impl PyFit {
+    /// The weights λ of the prior of M on pixels in weak light, if there are such.
+    #[getter]
+    fn prior(&self, py: Python<'_>) -> PyResult<Option<Py<PyArray2<f64>>>> {
+        let weights = self.prior.as_ref().map(|weights| weights.to_vec());
+        weights.map(|weights| image(py, weights, self.data.checked.sensor())).transpose()
+    }
+
     /// What became of shifts that were to be refined.
     #[getter]
     const fn refinement(&self) -> &'static str {
@@ -228,6 +237,7 @@ impl PyFit {
             leaves_tilt: fit.leaves_tilt,
             refinement: fit.refinement,
             is_joint,
+            prior: fit.prior,
         })
     }
 
@@ -262,6 +272,7 @@ impl BorrowedFit<'_> {
             refinement: self.fit.refinement,
             joint: self.fit.is_joint,
             unit: self.fit.unit,
+            prior: self.fit.prior.clone(),
         })
     }
 }

@@ -6,6 +6,7 @@
 //!
 //! Callers must not change an array from another thread while a call reads it.
 
+mod apply;
 mod arrays;
 mod average;
 mod centroid;
@@ -14,6 +15,7 @@ mod errors;
 mod exposures;
 mod fit;
 mod plan;
+mod response;
 mod run;
 
 use pyo3::prelude::*;
@@ -25,6 +27,8 @@ mod _native {
     use pyo3::prelude::*;
 
     #[pymodule_export]
+    use crate::apply::PyCorrector;
+    #[pymodule_export]
     use crate::average::{Accumulator, average_files, file_format, read_file};
     #[pymodule_export]
     use crate::centroid::locate_spots;
@@ -34,6 +38,8 @@ mod _native {
     use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
     #[pymodule_export]
     use crate::plan::planned_components;
+    #[pymodule_export]
+    use crate::response::fit_response;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -62,6 +62,19 @@ pub(crate) fn interruptible<R: Send>(
     })
 }
 
+/// Runs `work` of a few milliseconds without the GIL, on this thread: to start another one takes as
+/// long as to correct a small frame.
+pub(crate) fn brief<R: Send>(
+    py: Python<'_>,
+    work: impl FnOnce(&Control) -> Result<R> + Send,
+) -> PyResult<R> {
+    let control = Control::new();
+    match py.detach(|| catch_unwind(AssertUnwindSafe(|| work(&control)))) {
+        Ok(outcome) => outcome.map_err(|error| errors::exception(py, &error)),
+        Err(panic) => Err(errors::internal(py, panic_message(&*panic))),
+    }
+}
+
 /// Calls `progress(done, total, stage)` with what the work reported last.
 fn show(control: &Control, progress: Option<&Bound<'_, PyAny>>) -> PyResult<()> {
     if let (Some(callback), Some(state)) = (progress, control.progress()) {

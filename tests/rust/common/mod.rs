@@ -117,6 +117,8 @@ pub(crate) struct Answer {
     /// F of the measurements alone.
     pub(crate) misfit: f64,
     pub(crate) degrees_of_freedom: i64,
+    /// The weights of the prior of M; empty without one.
+    pub(crate) prior: Vec<f64>,
     pub(crate) history: Vec<Look>,
     pub(crate) converged: bool,
 }
@@ -289,6 +291,7 @@ fn ask<R>(
         refinement: answer.refinement,
         joint: answer.is_joint(),
         unit: variance_of_weight_1(experiment, answer),
+        prior: (!answer.prior.is_empty()).then(|| answer.prior.clone().into()),
     };
     with_exposures(experiment, &workers, |exposures| {
         let bars = Uncertainty::new(exposures, &solution, &workers, &control)?;
@@ -323,6 +326,7 @@ fn answer(fit: Fit) -> Answer {
         labels: [fit.components.pixels, fit.components.cells],
         misfit: fit.misfit,
         degrees_of_freedom: fit.degrees_of_freedom,
+        prior: fit.prior.map(|prior| prior.to_vec()).unwrap_or_default(),
         converged: fit.history.ended == Ended::Converged,
         history: looks.map(look).collect(),
         sensitivity: fit.sensitivity,

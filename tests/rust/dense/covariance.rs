@@ -37,12 +37,13 @@ impl Covariance {
         let columns = Columns::whole(&at_answer);
         let mut dense = Dense::new(&at_answer, columns, answer.refined);
         dense.unit = unit;
+        dense.prior.clone_from(&answer.prior);
         let coefficients = answer.coefficients.as_ref().unwrap_or(&answer.beam);
         let x = dense.unknowns(answer, coefficients);
         let normal = dense.normal(&x);
         let factor = dense.factorised(&normal, &x)?;
         let pixels = dense.pixels();
-        let gauge = Gauge::new(&at_answer, &x[..pixels]);
+        let gauge = Gauge::new(&at_answer, &x[..pixels]).without(&answer.flags);
         let whole = columns_of(&factor, pixels);
         let alone = alone(&dense, &normal.matrix, answer.is_joint());
         let mut of_gain = gauge.on_both_sides(&whole);

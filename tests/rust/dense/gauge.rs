@@ -5,10 +5,15 @@ use super::linear::Symmetric;
 use crate::common::{Experiment, Lamp};
 use crate::simulation::place;
 
+/// The bit of pixels in weak light.
+const UNRELIABLE: u32 = 1 << 25;
+
 /// A change of M brought to the gauge of the result: mean(M) = 1, and where the fluxes leave a tilt of ln M
 /// undetermined, no slope of ln M there.
 pub(crate) struct Gauge {
     sensitivity: Vec<f64>,
+    /// The pixels whose mean M is 1.
+    counted: Vec<bool>,
     /// Where each pixel lies in the beam, unless nothing is measured there.
     places: Vec<Option<[f64; 2]>>,
     /// Directions in the beam, of length 1, along which the tilt is undetermined.
@@ -28,7 +33,15 @@ impl Gauge {
             _ => Vec::new(),
         };
         let places = sensitivity.iter().enumerate().map(place).collect();
-        Self { sensitivity: sensitivity.to_vec(), places, open }
+        let counted = sensitivity.iter().map(|m| *m != 0.0).collect();
+        Self { sensitivity: sensitivity.to_vec(), counted, places, open }
+    }
+
+    /// The same without the pixels in weak light in the mean.
+    pub(crate) fn without(mut self, flags: &[u32]) -> Self {
+        let flagged = self.counted.iter_mut().zip(flags).filter(|(_, f)| **f & UNRELIABLE > 0);
+        flagged.for_each(|(counted, _)| *counted = false);
+        self
     }
 
     /// The least-squares slope of an image over the beam.
@@ -57,9 +70,10 @@ impl Gauge {
             }
         }
         found.iter_mut().zip(&self.sensitivity).for_each(|(change, m)| *change *= m);
-        let count = self.places.iter().flatten().count() as f64;
-        let mean = found.iter().sum::<f64>() / count;
-        let level = self.sensitivity.iter().sum::<f64>() / count;
+        let sum = |image: &[f64]| -> f64 {
+            image.iter().zip(&self.counted).filter(|(_, counted)| **counted).map(|(x, _)| x).sum()
+        };
+        let (mean, level) = (sum(&found), sum(&self.sensitivity));
         found.iter_mut().zip(&self.sensitivity).for_each(|(change, m)| *change -= mean * m / level);
         found
     }

@@ -36,6 +36,7 @@ impl Minimum {
     pub(crate) fn beside(experiment: &Experiment, answer: &Answer, tolerance: f64) -> Option<Self> {
         let (sought, coefficients) = without_gauge(experiment, answer);
         let mut dense = Dense::new(experiment, Columns::sought(experiment), answer.refined);
+        dense.prior.clone_from(&answer.prior);
         let mut unit_is_off = 0.0;
         let third = answer.history.get(SETTLING - 1).or(answer.history.last())?;
         if let Noise::Unknown = experiment.noise {

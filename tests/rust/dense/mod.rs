@@ -50,6 +50,8 @@ pub(crate) struct Dense<'e> {
     pub(crate) layout: Layout,
     /// The variance of a measurement of weight 1.
     pub(crate) unit: f64,
+    /// The weights λ of the prior of M, where L and M alone are sought; empty without one.
+    pub(crate) prior: Vec<f64>,
     measurements: Vec<Measurement>,
     columns: Columns,
     /// Standard deviations of the shifts that are sought.
@@ -77,6 +79,7 @@ impl<'e> Dense<'e> {
             experiment,
             layout: Layout { offsets: pixels, cells, fluxes, shifts: first_shift, end },
             unit: 1.0,
+            prior: Vec::new(),
             measurements: measurements(experiment),
             columns,
             shift_std,

@@ -58,6 +58,7 @@ impl Dense<'_> {
         }
         normal.misfit = normal.objective;
         self.add_priors(&mut normal, x);
+        self.add_prior_of_gain(&mut normal, x);
         if self.is_spline {
             self.add_penalty(&mut normal, x, &weights);
         }
@@ -118,6 +119,19 @@ impl Dense<'_> {
                 let moves = self.moves(k, axis).into_iter();
                 add(&moves.map(|(at, z)| (at, z / std)).collect::<Vec<_>>());
             }
+        }
+    }
+
+    /// Σ λ (M/μ − 1)², the mean μ being that of the pixels with measurements: row of λ of M_p/μ.
+    fn add_prior_of_gain(&self, normal: &mut Normal, x: &[f64]) {
+        let m = &x[..self.pixels()];
+        let seen: Vec<usize> = (0..m.len()).filter(|&p| normal.matrix.at(p, p) > 0.0).collect();
+        let mean = seen.iter().map(|&p| m[p]).sum::<f64>() / seen.len() as f64;
+        for (pixel, &weight) in self.prior.iter().enumerate().filter(|(_, weight)| **weight > 0.0) {
+            let of_mean = m[pixel] / (mean * mean * seen.len() as f64);
+            let own = |p: usize| if p == pixel { 1.0 / mean } else { 0.0 };
+            let row: Vec<_> = seen.iter().map(|&p| (p, own(p) - of_mean)).collect();
+            normal.add(weight, &row, 1.0 - m[pixel] / mean, 1.0);
         }
     }
 

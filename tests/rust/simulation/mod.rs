@@ -200,6 +200,11 @@ pub(crate) fn rolling([row, col]: [f64; 2]) -> f64 {
     even([row, col]) * smooth([row, col])
 }
 
+/// A narrow beam: a thousandth of the light and less at the sides.
+pub(crate) fn narrow([row, col]: [f64; 2]) -> f64 {
+    (-((row - 4.0).powi(2) + (col - 5.0).powi(2)) / 4.0).exp()
+}
+
 /// A beam without structure.
 pub(crate) fn smooth([row, col]: [f64; 2]) -> f64 {
     (-((row - 4.0).powi(2) + (col - 5.0).powi(2)) / 900.0).exp()

@@ -36,10 +36,11 @@ pub(crate) struct Coarse {
 }
 
 impl Coarse {
-    /// The matrix of the hats and other unknowns, whose own diagonal elements are `others`, summed
-    /// over blocks: what each exposure sees of them there.
+    /// The matrix of the hats, with `own` on their diagonal unless it is empty, and other unknowns, whose own
+    /// diagonal elements are `others`, summed over blocks: what each exposure sees of them there.
     pub(crate) fn of_blocks(
         hats: &Hats,
+        own: &[f64],
         others: &[f64],
         blocks: impl Iterator<Item = Vec<Entry>>,
         control: &Control,
@@ -51,8 +52,10 @@ impl Coarse {
             }
             matrix.add_block(&entries);
         }
-        for (index, &value) in others.iter().enumerate() {
-            let place = hats.count() + index;
+        let of_hats = own.iter().enumerate();
+        let of_others =
+            others.iter().enumerate().map(|(index, value)| (hats.count() + index, value));
+        for (place, &value) in of_hats.chain(of_others) {
             matrix.add(place, place, value);
             matrix.masses[place] += value;
         }

@@ -189,6 +189,22 @@ impl<'a, T: Real> Exposures<'a, T> {
         self.checked.tallies.iter().map(|tally| tally.used).sum()
     }
 
+    /// Number of pixels with a measurement.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] if `control` asks to stop.
+    pub(crate) fn measured_pixels(&self, control: &Control) -> Result<usize> {
+        let Shape { rows, cols } = self.sensor();
+        if self.used() == self.count() * rows * cols {
+            return Ok(rows * cols);
+        }
+        let mut is_measured = vec![false; rows * cols];
+        self.for_each_stretch(control, |_, row, columns| {
+            is_measured[row * cols..][columns].fill(true);
+        })?;
+        Ok(is_measured.into_iter().filter(|is_measured| *is_measured).count())
+    }
+
     /// Whether the variance of the values is known.
     #[must_use]
     pub const fn variance_is_known(&self) -> bool {
@@ -206,6 +222,13 @@ impl<'a, T: Real> Exposures<'a, T> {
     pub fn exposure_weights(&self) -> Vec<f64> {
         let tallies = self.checked.tallies.iter().zip(self.flux());
         tallies.map(|(tally, c)| tally.weight * c * c).collect()
+    }
+
+    /// The share of each exposure in all weights.
+    pub(crate) fn shares(&self) -> Vec<f64> {
+        let weights = self.exposure_weights();
+        let total: f64 = weights.iter().sum();
+        weights.iter().map(|weight| weight / total).collect()
     }
 
     /// Calls `visit(pixel, cell)` for each used measurement.

@@ -46,7 +46,7 @@ impl ConjugateGradients {
             (self.direction, self.product) = (zeros(), zeros());
         }
         control.check()?;
-        preconditioner.apply(system, &slope, &mut self.direction);
+        preconditioner.apply(system, &slope, &mut self.direction, control)?;
         self.square = system.pass.workers.dot(&slope, &self.direction);
         self.residual = slope;
         self.keep = 0.0;
@@ -68,21 +68,28 @@ impl ConjugateGradients {
     }
 
     /// A step along the direction, and a new direction; `false` if there was none to go.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled): on a large sensor each of these sums takes long.
     pub(crate) fn step<T: Real>(
         &mut self,
         system: &System<'_, '_, T>,
         preconditioner: &Preconditioner,
-    ) -> bool {
+        control: &Control,
+    ) -> Result<bool> {
         let workers = system.pass.workers;
         let step = self.square / workers.dot(&self.direction, &self.product);
         if !(step > 0.0 && step.is_finite()) {
-            return false;
+            return Ok(false);
         }
         self.energy += step * self.square;
         workers.add_multiple(&mut self.x, step, &self.direction);
+        control.check()?;
         workers.add_multiple(&mut self.residual, -step, &self.product);
-        preconditioner.apply(system, &self.residual, &mut self.product);
+        control.check()?;
+        preconditioner.apply(system, &self.residual, &mut self.product, control)?;
         let square = workers.dot(&self.residual, &self.product);
+        control.check()?;
         self.keep = square / self.square;
         workers.add_multiple(&mut self.product, self.keep, &self.direction);
         std::mem::swap(&mut self.direction, &mut self.product);
@@ -90,6 +97,6 @@ impl ConjugateGradients {
         self.square = square;
         self.lowest.push(self.ritz.smallest());
         self.iterations += 1;
-        square > 0.0
+        Ok(square > 0.0)
     }
 }

@@ -134,7 +134,7 @@ impl<'s> Row<'s> {
 /// [Σ w e   Σ w  ] [O] = [Σ w y  ],   e = c L
 /// ```
 ///
-/// Without an offset O = 0 and M = Σ w e y / Σ w e².
+/// Without an offset O = 0 and M = Σ w e y / Σ w e². A prior of M is one more measurement of it.
 pub(crate) struct Eliminate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
@@ -145,6 +145,9 @@ pub(crate) struct Eliminate<'s> {
     pub(crate) sums: &'s mut [Vec<f64>; 4],
     /// What rounding leaves of a determinant.
     pub(crate) singular: f64,
+    /// The weights of the prior of M, and its mean; empty without one.
+    pub(crate) prior: &'s [f64],
+    pub(crate) mean: f64,
 }
 
 impl pulp::NullaryFnOnce for Eliminate<'_> {
@@ -174,6 +177,10 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                     alone[col] += weights[col] * values[col];
                 }
             }
+        }
+        for (col, &weight) in self.prior.iter().enumerate() {
+            inverse[col] += weight;
+            along[col] += weight * self.mean;
         }
         for col in 0..cols {
             let (ee, ey) = (inverse[col], along[col]);

@@ -27,4 +27,12 @@ impl<T: Real> System<'_, '_, T> {
         });
         sum / f64::from(count.max(1))
     }
+
+    /// How many pixels have a measurement.
+    pub(crate) fn measured(&self) -> usize {
+        let mut count = 0;
+        self.pass
+            .for_rows(|[_, inverse, ..]| count += inverse.iter().filter(|i| **i > 0.0).count());
+        count
+    }
 }

@@ -98,7 +98,8 @@ impl Preconditioner {
                 }
             }
         }
-        let coarse = Coarse::of_blocks(&hats, &own, entries, control)?;
+        let of_prior = prior_of_hats(system, &hats);
+        let coarse = Coarse::of_blocks(&hats, &of_prior, &own, entries, control)?;
         control.check()?;
         let waves = Waves::new(system, &blocks, seen);
         let rim = Rim::new(system, control)?;
@@ -120,15 +121,29 @@ impl Preconditioner {
     }
 
     /// z = P⁻¹ r.
-    pub(crate) fn apply<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64], z: &mut Vec<f64>) {
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn apply<T: Real>(
+        &self,
+        system: &System<'_, '_, T>,
+        r: &[f64],
+        z: &mut Vec<f64>,
+        control: &Control,
+    ) -> Result<()> {
         let (workers, cols) = (system.pass.workers, system.pass.grid.geometry.beam.cols);
         let (of_cells, of_params) = r.split_at(self.inverse.len());
         let mut heights = self.wide.gather(of_cells, workers);
         heights.extend_from_slice(of_params);
         self.coarse.correct(&mut heights, DAMPING);
+        control.check()?;
         let lines = self.waves.correct(&self.wide, of_cells, workers);
+        control.check()?;
         z.resize(of_cells.len(), 0.0);
         workers.map_blocks(z, BAND * cols, |band, part| {
+            if control.is_cancelled() {
+                return;
+            }
             let first = band * BAND;
             if self.filters {
                 self.filter(of_cells, first, part);
@@ -139,6 +154,7 @@ impl Preconditioner {
             self.wide.spread(&heights, first, part);
             self.waves.spread(&self.wide, &lines, first, part);
         });
+        control.check()?;
         self.rim.add(of_cells, z, workers);
         let coarse = &heights[self.wide.hats.count()..];
         let params = of_params.iter().zip(&self.params).zip(coarse);
@@ -149,6 +165,7 @@ impl Preconditioner {
         let shifts = &mut z[self.inverse.len() + system.fluxes.columns.len()..];
         let moves = system.centred(shifts);
         shifts.copy_from_slice(moves.as_flattened());
+        Ok(())
     }
 
     /// The part of waves of P⁻¹ r.
@@ -196,6 +213,28 @@ impl Preconditioner {
             }
         }
     }
+}
+
+/// What the prior of M adds to the hats' own elements, M² D λ/(D + λ) of each pixel in the middle of the cells
+/// that it sees; empty without one.
+fn prior_of_hats<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<f64> {
+    let Some(prior) = &system.prior else { return Vec::new() };
+    let (cols, count) = (system.pass.exposures.sensor().cols, system.pass.exposures.count());
+    let origin = system.pass.grid.geometry.origin;
+    let (mut own, information) = (vec![0.0; hats.count()], system.information());
+    let [sensitivity, _] = system.pixels();
+    let weak = prior.weights.iter().enumerate().filter(|(_, weight)| **weight > 0.0);
+    for (pixel, weight) in weak {
+        let d = information[pixel];
+        let share = sensitivity[pixel].powi(2) * d * weight / (d + weight) / count as f64;
+        for k in 0..count {
+            let place = system.pass.grid.place(k, [pixel / cols, pixel % cols].map(|x| x as f64));
+            let [row, col] =
+                [0, 1].map(|i| place[i] + system.state.shifts[k][i] + origin[i] as f64);
+            hats.over(row, col).into_iter().for_each(|(hat, height)| own[hat] += share * height);
+        }
+    }
+    own
 }
 
 /// As many rows of cells as the filter takes.

@@ -20,7 +20,7 @@ use super::kernel::{Eliminate, Propagate};
 use super::layout::Grid;
 use super::pass::Pass;
 use super::penalty::{Penalty, SMOOTHING};
-use super::unknowns::{ShiftPrior, State};
+use super::unknowns::{Prior, ShiftPrior, State};
 use super::workspace::Sums;
 use crate::control::Control;
 use crate::error::Result;
@@ -49,7 +49,7 @@ pub(crate) struct System<'m, 'a, T> {
     /// Σ w c² M² of the pixels that see a cell, by their factors.
     pub(crate) weights: Vec<f64>,
     /// D a/(aᵀD a) with these weights D and the coefficients a.
-    scale: Vec<f64>,
+    pub(super) scale: Vec<f64>,
     pub(crate) penalty: Option<Penalty>,
     /// A faster product where it serves, and whether it is of the state last linearised.
     fused: Option<Fused>,
@@ -61,6 +61,9 @@ pub(crate) struct System<'m, 'a, T> {
     is_weighed_anew: bool,
     /// Whether the penalty counts more cells than at the state linearised before.
     pub(crate) sees_more: bool,
+    /// The prior of M in weak light, and R there.
+    pub(crate) prior: Option<Prior>,
+    of_prior: f64,
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
@@ -89,6 +92,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             allows_single: true,
             is_weighed_anew: false,
             sees_more: false,
+            prior: None,
+            of_prior: 0.0,
             state,
         }
     }
@@ -97,13 +102,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     pub(crate) fn seek_shifts(&mut self, prior: Option<ShiftPrior>) -> Option<ShiftPrior> {
         self.pass.with_shifts = prior.is_some();
         std::mem::replace(&mut self.shift_prior, prior)
-    }
-
-    /// The share of each exposure in all weights.
-    pub(super) fn shares_of_exposures(&self) -> Vec<f64> {
-        let weights = self.pass.exposures.exposure_weights();
-        let total: f64 = weights.iter().sum();
-        weights.iter().map(|weight| weight / total).collect()
     }
 
     /// Whether shifts are sought.
@@ -164,6 +162,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let found = found?;
         self.append(&found, &mut pull);
         (self.misfit, self.pull) = (found.objective, pull);
+        self.of_prior = self.misfit_of_prior();
         self.mean = self.mean_sensitivity();
         // Cells come into sight where shifts move.
         if self.weights.is_empty() || self.shift_prior.is_some() {
@@ -190,6 +189,12 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         control: &Control,
     ) -> Result<Sums> {
         let views = self.pass.views_of(beam);
+        let cols = self.pass.exposures.sensor().cols;
+        let of_row = |row: usize| {
+            let weights = self.prior.as_ref().map(|prior| &prior.weights[row * cols..][..cols]);
+            weights.unwrap_or_default()
+        };
+        let mean = self.prior.as_ref().map_or(1.0, |prior| prior.mean);
         self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
             workspace.values().clear();
             pass.see(&views, row_index, workspace);
@@ -204,7 +209,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see_slopes(&views, row_index, workspace);
             let (weights, values, sums) = workspace.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
-            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular };
+            let prior = of_row(row_index);
+            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular, prior, mean };
             found.objective += pulp::Arch::new().dispatch(eliminate);
         })
     }
@@ -229,10 +235,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         }
         let mut slope = self.pass.workers.filled(self.pull.len(), 0.0, control);
         slope.copy_from_slice(&self.pull);
-        let mut objective = self.misfit + self.pull_by_priors(&mut slope);
+        let mut objective = self.misfit + self.of_prior + self.pull_by_priors(&mut slope);
         if let Some(penalty) = &self.penalty {
             objective += penalty.pull(&mut slope[..self.state.beam.len()], self.pass.workers);
         }
+        self.balance(&mut slope[..self.state.beam.len()]);
         control.check()?;
         Ok((objective, slope))
     }
@@ -274,14 +281,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         objective
     }
 
-    /// How many pixels have a measurement.
-    pub(crate) fn measured(&self) -> usize {
-        let mut count = 0;
-        self.pass
-            .for_rows(|[_, inverse, ..]| count += inverse.iter().filter(|i| **i > 0.0).count());
-        count
-    }
-
     /// The pixels whose measurements do not distinguish an offset from a gain, where one is sought.
     pub(crate) fn without_offset(&self) -> Vec<usize> {
         let (mut undetermined, mut first) = (Vec::new(), 0);
@@ -305,10 +304,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
-        if self.is_single() {
-            return self.multiply_single(x, product, share, control);
-        }
-        self.multiply_double(x, product, share, control)
+        let largest = if self.is_single() {
+            self.multiply_single(x, product, share, control)?
+        } else {
+            self.multiply_double(x, product, share, control)?
+        };
+        self.balance(&mut product[..self.state.beam.len()]);
+        Ok(largest)
     }
 
     /// [`multiply`](Self::multiply) in double precision.

@@ -97,3 +97,10 @@ impl ShiftPrior {
         self.precisions.iter().map(|p| [p[0] / sum[0], p[1] / sum[1]]).collect()
     }
 }
+
+/// The prior of M, M = mean ± 1/√weight, in the pixels in weak light.
+pub(crate) struct Prior {
+    /// Row by row; 0 elsewhere.
+    pub(crate) weights: Vec<f64>,
+    pub(crate) mean: f64,
+}

@@ -37,7 +37,9 @@ impl Waves {
         let spacing = spacing_of_waves(system.pass.exposures.geometry());
         let hats = Hats::new(grid.beam, spacing);
         let is_turned = grid.views.iter().any(|view| view.rotation != Rotation::None);
-        let seen = if is_turned { Vec::new() } else { seen(system, &hats) };
+        // What a prior holds is no wave.
+        let without = is_turned || system.prior.is_some();
+        let seen = if without { Vec::new() } else { seen(system, &hats) };
         let spots = |(index, blocks): (usize, &[Block])| {
             let lit = blocks.iter().enumerate().filter(|(_, block)| block.weight > 0.0);
             let spot = |(exposure, block): (usize, &Block)| {

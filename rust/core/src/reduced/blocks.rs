@@ -31,10 +31,12 @@ pub(super) fn coarse_spaces<T: Real>(
         .chunks_exact(geometry.placements.len())
         .enumerate()
         .map(|(block, weights)| blocks.entries(block, weights, hats, geometry));
-    let coarse = Coarse::of_blocks(hats, &[], entries, control)?;
+    let coarse = Coarse::of_blocks(hats, &reduced.prior_of_hats(hats), &[], entries, control)?;
     control.check()?;
     let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
-    let seen = seen(reduced.exposures, &finer);
+    // What a prior holds is no wave.
+    let without = reduced.weak.is_some();
+    let seen = if without { Vec::new() } else { seen(reduced.exposures, &finer) };
     let spots: Vec<Vec<Spot>> = match &seen[..] {
         [] => Vec::new(),
         _ => weights
@@ -60,10 +62,7 @@ fn seen<T: Real>(exposures: &Exposures<'_, T>, hats: &Hats) -> Vec<SeenWave> {
         return Vec::new();
     }
     let places = Places(&exposures.geometry().placements);
-    let weights = exposures.exposure_weights();
-    let weighed = weights.iter().zip(exposures.flux()).map(|(weight, c)| weight * c * c);
-    let total: f64 = weighed.clone().sum();
-    let shares: Vec<f64> = weighed.map(|weight| weight / total).collect();
+    let shares = exposures.shares();
     let reach = [0, 1].map(|axis| {
         let along = places.0.iter().map(|place| [place.row, place.col][axis]);
         along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)

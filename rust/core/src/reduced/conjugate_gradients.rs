@@ -14,6 +14,7 @@ use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::padded::Padding;
 use crate::parallel::Workers;
+use crate::prior::Prior;
 use crate::ritz::Ritz;
 
 /// Values that a thread takes at a time.
@@ -21,6 +22,9 @@ const BLOCK: usize = 1 << 16;
 /// No eigenvalue that matters is smaller than 1/this: single precision cannot distinguish it from 0.
 const LONGEST_STEP: f64 = 1e6;
 
+/// The share of r · P⁻¹ r at the start that single precision does not resolve: Ritz values from there on are
+/// those of rounding.
+const UNRESOLVED: f64 = 4e-12;
 /// A relative error that is rounding alone.
 const ROUNDING: f64 = 4.0 * f64::EPSILON;
 
@@ -51,8 +55,9 @@ pub(crate) struct ConjugateGradients<'m, 'a, T> {
     pub(crate) x: Vec<f32>,
     direction: Vec<f32>,
     product: Vec<f32>,
-    /// r · P⁻¹ r.
+    /// r · P⁻¹ r, and that at the start.
     square: f64,
+    first_square: f64,
     /// The largest size of P⁻¹ r, in the units of M.
     largest: f64,
     /// x · b, which rises to b · S⁻¹ b: the sum of a r · P⁻¹ r over the steps.
@@ -79,6 +84,7 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
             direction,
             product,
             square: 0.0,
+            first_square: 0.0,
             largest: 0.0,
             energy: 0.0,
             ritz: Ritz::default(),
@@ -94,9 +100,10 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         &mut self,
         sensitivity: &[f64],
         beams: &[Vec<f64>],
+        prior: Option<&Prior>,
         control: &Control,
     ) -> Result<()> {
-        self.linearise(sensitivity, beams, control)?;
+        self.linearise(sensitivity, beams, prior, control)?;
         self.begin(control)
     }
 
@@ -108,10 +115,45 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         &mut self,
         sensitivity: &[f64],
         beams: &[Vec<f64>],
+        prior: Option<&Prior>,
         control: &Control,
     ) -> Result<()> {
-        self.reduced.linearise(sensitivity, beams, control)?;
+        self.reduced.linearise(sensitivity, beams, prior, control)?;
         self.two_level.prepare(&self.reduced, control)
+    }
+
+    pub(crate) const fn workers(&self) -> &'m Workers {
+        self.workers
+    }
+
+    /// Forgets the preconditioner, since the prior is another.
+    pub(crate) fn renew(&mut self) {
+        self.two_level.forget();
+    }
+
+    /// x ← D⁻¹ b, what a sweep of coordinate descent adds to M.
+    pub(crate) fn sweep_step(&mut self) {
+        let inverse = &self.reduced.inverse_diagonal;
+        let terms = self.x.iter_mut().zip(&self.residual).zip(inverse);
+        terms.for_each(|((x, b), inverse)| *x = b * inverse);
+    }
+
+    /// Takes out of the right-hand side what lies along the gauge direction M, in which S is 0, for the whole sensor:
+    /// b is orthogonal to M but for differences that do not add up. Where the sensor is in pieces that is
+    /// approximate.
+    pub(crate) fn take_gauge_out(&mut self) {
+        let Reduced { sensitivity, inverse_diagonal, .. } = &self.reduced;
+        let places = self.residual.iter().zip(sensitivity).zip(inverse_diagonal);
+        let [mut along, mut weight] = [0.0; 2];
+        for ((&b, &m), &inverse) in places.filter(|(_, inverse)| **inverse > 0.0) {
+            along += f64::from(b) * f64::from(m);
+            weight += f64::from(m).powi(2) / f64::from(inverse);
+        }
+        let share = (along / weight) as f32;
+        let places = self.residual.iter_mut().zip(sensitivity).zip(inverse_diagonal);
+        for ((b, m), inverse) in places.filter(|(_, inverse)| **inverse > 0.0) {
+            *b -= share * m / inverse;
+        }
     }
 
     /// Starts from x = 0, where the residual is b, with the S that there is.
@@ -121,10 +163,10 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
     pub(crate) fn begin(&mut self, control: &Control) -> Result<()> {
         self.workers.fill(&mut self.x, 0.0, control);
         self.workers.fill(&mut self.direction, 0.0, control);
-        self.reduced.settle(&mut self.residual);
         self.ritz = Ritz::default();
         self.energy = 0.0;
         self.square = self.descend(0.0);
+        self.first_square = self.square;
         control.check()?;
         self.largest = self.turn(0.0, 0.0);
         Ok(())
@@ -165,6 +207,11 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         if known { size / self.reduced.mean } else { f64::INFINITY }
     }
 
+    /// Whether an iteration more would resolve nothing.
+    pub(crate) fn is_exhausted(&self) -> bool {
+        self.square <= UNRESOLVED * self.first_square
+    }
+
     /// Whether what is left is rounding alone.
     pub(crate) fn is_settled(&self) -> bool {
         self.largest() < ROUNDING
@@ -187,11 +234,6 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         let size = |largest: f32, value: &f32| largest.max(value.abs());
         let tops = self.workers.map(blocks.len(), |index| blocks[index].iter().fold(0.0, size));
         self.relative(f64::from(tops.into_iter().fold(0.0, f32::max)))
-    }
-
-    /// The pixels that have left the system, with the step to the closed form of their M.
-    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
-        self.reduced.left_out()
     }
 
     /// The root mean square of the relative size of P⁻¹ r, weighted by D.

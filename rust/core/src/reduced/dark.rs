@@ -4,10 +4,8 @@
 pub(crate) struct Dark {
     /// The standard deviation of e.
     pub(super) std: Vec<f32>,
-    /// a; 0 in pixels without measurement and in those that have left the system.
+    /// a; 0 in pixels without measurement.
     pub(super) propagation: Vec<f32>,
-    /// Σ w c L.
-    pub(super) sums: Vec<f32>,
     /// 1/c of each exposure.
     pub(super) factors: Vec<f32>,
 }

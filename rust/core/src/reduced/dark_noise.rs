@@ -37,7 +37,7 @@ impl<T: Real> Reduced<'_, '_, T> {
         self.common(&factors, &no_response, |_| &one, &mut sums, control)?;
         let pairs = sums.iter().zip(&self.inverse_diagonal);
         let propagation = pairs.map(|(sum, inverse)| sum * inverse).collect();
-        self.dark = Some(Dark { std, propagation, sums, factors });
+        self.dark = Some(Dark { std, propagation, factors });
         Ok(())
     }
 
@@ -120,12 +120,5 @@ impl<T: Real> Reduced<'_, '_, T> {
         for (value, std) in values.iter_mut().zip(std).take(sensor.cols) {
             *value = sign() as f32 * std;
         }
-    }
-
-    /// The standard deviation that the dark alone gives a pixel that has left the system, of this 1/D.
-    pub(crate) fn left_out_by_dark(&self, pixel: usize, inverse: f64) -> f64 {
-        let cols = self.exposures.sensor().cols;
-        let at = |image: &[f32]| f64::from(self.padding.row(image, pixel / cols)[pixel % cols]);
-        self.dark.as_ref().map_or(0.0, |dark| inverse * at(&dark.sums) * at(&dark.std))
     }
 }

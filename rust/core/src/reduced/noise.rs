@@ -133,11 +133,14 @@ impl<T: Real> Reduced<'_, '_, T> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::exposures::{Exposures, Flux, Mask, Measurements, Positions, Variance};
     use crate::frames::Stack;
     use crate::geometry::{Rotation, View};
     use crate::parallel::Workers;
+    use crate::prior::Prior;
     use crate::reduced::ConjugateGradients;
     use crate::testing::{SENSOR, assert_unit_and_independent};
 
@@ -152,7 +155,8 @@ mod tests {
 
     #[test]
     fn draws_have_the_covariance_of_the_problem_and_are_independent() {
-        for turned in [Rotation::None, Rotation::Quarter] {
+        let turns = [Rotation::None, Rotation::Quarter].into_iter();
+        for (turned, held) in turns.flat_map(|turned| [(turned, false), (turned, true)]) {
             let (workers, control) = (Workers::new(None).unwrap(), Control::new());
             let frames = vec![1.0; SHIFTS.len() * SENSOR.len()];
             let measurements = Measurements {
@@ -174,7 +178,13 @@ mod tests {
                 cells.map(wave).collect()
             };
             let beams: Vec<Vec<f64>> = exposures.geometry().views.iter().map(seen).collect();
-            solver.linearise(&sensitivity, &beams, &control).unwrap();
+            // As large as D, some 2e6, in every third pixel.
+            let weight = |i: usize| if i.is_multiple_of(3) { 1e6 * (1.0 + wave(i)) } else { 0.0 };
+            let weights: Arc<[f64]> = (0..SENSOR.len()).map(weight).collect();
+            let mut prior = Prior::new(weights, vec![0; SENSOR.len()].into());
+            prior.at(&sensitivity);
+            let prior = held.then_some(&prior);
+            solver.linearise(&sensitivity, &beams, prior, &control).unwrap();
             let (reduced, padding) = (&mut solver.reduced, solver.residual.len());
             let (mut b, mut product) = (vec![0.0; padding], vec![0.0; padding]);
             for frequency in [0.3, 1.1, 2.9] {
@@ -186,6 +196,7 @@ mod tests {
                 let heights: Vec<f64> = (0..DRAWS)
                     .map(|draw| {
                         reduced.draw(Draw::Measurements(draw), &mut b, &control).unwrap();
+                        reduced.draw_prior(draw, &mut b);
                         dot(&x, &b) / energy.sqrt()
                     })
                     .collect();

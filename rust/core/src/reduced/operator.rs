@@ -2,19 +2,20 @@
 
 use super::dark::Dark;
 use super::kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
+use super::weak::Weak;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::geometry::{Placement, View};
-use crate::median::median;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
+use crate::prior::Prior;
 
-/// A pixel whose weight D is less than this share of the median does not constrain the others.
-const LEAST_WEIGHT: f64 = 1e-6;
-/// Pixels that the median is taken from.
+/// Pixels whose D is sampled.
 const SAMPLES: usize = 1024;
+/// The share of them that is fainter than a bright one: a few brighter ones do not count.
+const BRIGHT: f64 = 0.9;
 
 /// The largest squared light and weight, in units of an ordinary one: products of several stay within
 /// single precision. Beyond, S is softer than it is, and steps are shortened.
@@ -24,19 +25,22 @@ const FAINTEST: f32 = 1e-30;
 
 /// The operator S at one M and L, scaled so that its elements are of order 1.
 pub(crate) struct Reduced<'m, 'a, T> {
-    pub(super) exposures: &'m Exposures<'a, T>,
+    pub(crate) exposures: &'m Exposures<'a, T>,
     pub(super) workers: &'m Workers,
     pub(crate) scale: Scale,
     pub(crate) padding: Padding,
     /// M.
     pub(crate) sensitivity: Vec<f32>,
-    /// 1/D; 0 at pixels without measurement and at those that have left the system.
+    /// 1/D, the prior's weight included; 0 at pixels without measurement.
     pub(crate) inverse_diagonal: Vec<f32>,
     /// Σ D over all pixels.
     pub(crate) trace: f64,
     /// The mean of M over the pixels of the system.
     pub(crate) mean: f64,
-    left_out: Vec<LeftOut>,
+    /// The least D above 0 and that of a bright pixel, without the prior.
+    pub(crate) range: [f64; 2],
+    /// The prior of M, where light is weak.
+    pub(crate) weak: Option<Weak>,
     /// (L/scale)² in each view; 0 where unobserved.
     pub(super) light: Vec<Vec<f32>>,
     /// h in each view: a buffer for the first half of a product.
@@ -45,23 +49,13 @@ pub(crate) struct Reduced<'m, 'a, T> {
     pub(super) dark: Option<Dark>,
 }
 
-/// A pixel that its measurements leave almost no weight.
-#[derive(Clone, Copy, Debug)]
-struct LeftOut {
-    /// Where it lies in an image, from the first row on.
-    place: usize,
-    /// 1/D.
-    inverse: f32,
-    /// The step to the closed form of its M.
-    step: f32,
-}
-
-/// The median of a sample of the values above 0: a few bright pixels do not move it.
-fn typical(values: &[f32]) -> f64 {
+/// D of a bright pixel of a sample of them.
+fn bright(values: &[f32]) -> f64 {
     let step = values.len().div_ceil(SAMPLES);
     let mut sample: Vec<f32> =
         values.iter().copied().step_by(step | 1).filter(|&value| value > 0.0).collect();
-    median(&mut sample, f32::total_cmp).map_or(0.0, f64::from)
+    sample.sort_unstable_by(f32::total_cmp);
+    sample.get((sample.len() as f64 * BRIGHT) as usize).copied().map_or(0.0, f64::from)
 }
 
 /// The units of the linear problem.
@@ -114,7 +108,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             inverse_diagonal: of_sensor(),
             trace: 0.0,
             mean: 1.0,
-            left_out: Vec::new(),
+            range: [0.0; 2],
+            weak: None,
             light: of_views(),
             eliminated: of_views(),
             dark: None,
@@ -129,6 +124,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         &mut self,
         sensitivity: &[f64],
         beams: &[Vec<f64>],
+        prior: Option<&Prior>,
         control: &Control,
     ) -> Result<()> {
         let Self { exposures, workers, padding, scale, .. } = *self;
@@ -140,6 +136,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             padding.copy(beam, view.shape.cols, workers, light, square);
             control.check()?;
         }
+        self.weak = prior.map(|prior| self.weigh_prior(prior, sensitivity));
         self.invert_diagonal(control)
     }
 
@@ -177,7 +174,13 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         );
         debug_assert!(bands.len() == rows.div_ceil(BAND));
         control.check()?;
-        Ok(bands.into_iter().sum())
+        let of_prior = self.add_prior(x, product);
+        Ok(bands.into_iter().sum::<f64>() + of_prior)
+    }
+
+    /// The least D above 0 and that of a bright pixel, without the prior, where the mean of M is 1.
+    pub(crate) fn information_range(&self) -> [f64; 2] {
+        self.range.map(|d| d * self.mean * self.mean)
     }
 
     /// The first half of a product: h, in each view, of an input.
@@ -254,7 +257,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         }
     }
 
-    /// Finds 1/D, and takes pixels of negligible weight out of the system.
+    /// Finds 1/D, and how D ranges.
     fn invert_diagonal(&mut self, control: &Control) -> Result<()> {
         let (padding, cols) = (self.padding, self.exposures.sensor().cols);
         let mut diagonal = std::mem::take(&mut self.inverse_diagonal);
@@ -275,58 +278,38 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         });
         control.check()?;
         self.trace = bands.into_iter().sum();
-        let least = ((LEAST_WEIGHT * typical(body)) as f32).max(FAINTEST);
+        let bright = bright(body);
         let sensitivity = padding.body_mut(&mut self.sensitivity);
+        let prior = self.weak.as_ref().map(|weak| padding.body(&weak.weights));
         let size = BAND * padding.width;
         let bands =
             self.workers.map_pairs(sensitivity, body, [size; 2], |band, sensitivity, rows| {
-                let (mut sum, mut count, mut left_out) = (0.0, 0_usize, Vec::new());
+                let (mut sum, mut count, mut least) = (0.0, 0_usize, f32::INFINITY);
                 for (index, (m, d)) in sensitivity.iter().zip(rows).enumerate() {
-                    if *d > least {
+                    if *d > FAINTEST {
+                        least = least.min(*d);
+                    }
+                    *d += prior.map_or(0.0, |prior| prior[band * size + index]);
+                    if *d > FAINTEST {
                         *d = 1.0 / *d;
                         sum += f64::from(*m);
                         count += 1;
-                    } else if *d > 0.0 {
-                        let inverse = if *d > FAINTEST { 1.0 / *d } else { 0.0 };
-                        left_out.push(LeftOut { place: band * size + index, inverse, step: 0.0 });
+                    } else {
                         *d = 0.0;
                     }
                 }
-                (sum, count, left_out)
+                (sum, count, least)
             });
-        self.left_out.clear();
-        let (mut sum, mut count) = (0.0, 0);
-        for (of_band, in_band, left_out) in bands {
+        let (mut sum, mut count, mut least) = (0.0, 0, f32::INFINITY);
+        for (of_band, in_band, of_faintest) in bands {
             sum += of_band;
             count += in_band;
-            self.left_out.extend(left_out);
+            least = least.min(of_faintest);
         }
         self.mean = sum / count as f64;
+        self.range = [f64::from(least), bright].map(|d| d / self.scale.slope());
         self.inverse_diagonal = diagonal;
         Ok(())
-    }
-
-    /// Takes the pixels that have left the system out of the right-hand side.
-    pub(crate) fn settle(&mut self, residual: &mut [f32]) {
-        let residual = self.padding.body_mut(residual);
-        for out in &mut self.left_out {
-            out.step = residual[out.place] * out.inverse;
-            residual[out.place] = 0.0;
-        }
-    }
-
-    /// The pixels that have left the system, each with its 1/D; 0 where that is none.
-    pub(crate) fn left_out_variances(&self) -> impl Iterator<Item = (usize, f64)> {
-        let (width, cols) = (self.padding.width, self.exposures.sensor().cols);
-        let pixel = move |place: usize| place / width * cols + place % width;
-        self.left_out.iter().map(move |out| (pixel(out.place), f64::from(out.inverse)))
-    }
-
-    /// The pixels that have left the system, with the step to the closed form of their M.
-    pub(crate) fn left_out(&self) -> impl Iterator<Item = (usize, f64)> {
-        let (width, cols) = (self.padding.width, self.exposures.sensor().cols);
-        let pixel = move |place: usize| place / width * cols + place % width;
-        self.left_out.iter().map(move |out| (pixel(out.place), f64::from(out.step)))
     }
 
     /// Adds ω = w c² L² M² of one exposure along a row of cells of its view to `sums`.

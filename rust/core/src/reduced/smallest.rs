@@ -3,6 +3,7 @@
 use super::conjugate_gradients::ConjugateGradients;
 use crate::coarse::DAMPING;
 use crate::control::Control;
+use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::ritz::Lowest;
@@ -32,6 +33,11 @@ impl Smallest {
         search: &mut ConjugateGradients<'_, '_, T>,
         control: &Control,
     ) -> Result<bool> {
+        if search.is_exhausted() && !search.ritz.is_empty() {
+            // All eigenvalues were found: tiny problems have few.
+            self.iterations = self.iterations.max(FEWEST_ITERATIONS);
+            return Ok(false);
+        }
         let went = search.iterate(control)?;
         if went {
             self.iterations += 1;

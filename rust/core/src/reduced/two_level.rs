@@ -83,6 +83,11 @@ impl<'m> TwoLevel<'m> {
         Ok(())
     }
 
+    /// Has it made anew.
+    pub(crate) fn forget(&mut self) {
+        (self.coarse, self.waves) = (None, None);
+    }
+
     /// Whether large scales are in it: without a factor of the coarse matrix nothing sees them.
     pub(crate) fn sees_large_scales(&self) -> bool {
         self.coarse.as_ref().is_some_and(Coarse::is_factorised)

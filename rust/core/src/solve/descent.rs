@@ -1,6 +1,7 @@
 //! Coordinate descent: sweeps until M has converged.
 
 use super::options::Options;
+use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::convergence::{Ended, FEWEST_ITERATIONS, History, Look};
 use crate::error::Result;
@@ -9,7 +10,7 @@ use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
 use crate::reduced::{ConjugateGradients, Scale, Smallest};
-use crate::sweep::Estimate;
+use crate::sweep::{Estimate, Plain};
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
@@ -19,8 +20,7 @@ const MOST_SWEEPS: u64 = 1_000_000;
 const TINY_ERROR: f64 = 1e-9;
 
 /// Sweeps until the estimated error of M is at most the tolerance, the sweeps are used up, or the
-/// estimate no longer falls. Returns the pixels too that their measurements leave almost no weight, and
-/// F at the result.
+/// estimate no longer falls. Returns what is known of weak light too, and F + R at the result.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
@@ -31,7 +31,7 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     start: Option<&Solution<'_>>,
     workers: &'m Workers,
     control: &Control,
-) -> Result<(Estimate<'m, 'a, T>, History, Vec<usize>, f64)> {
+) -> Result<(Estimate<'m, 'a, T>, History, WeakLight, f64)> {
     let limit = options.limit(MOST_SWEEPS)?;
     let mut estimate = Estimate::new(exposures, workers, control);
     if let Some(start) = start {
@@ -39,16 +39,23 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     }
     let (scale, mut search) =
         (Scale::of(exposures), ConjugateGradients::new(exposures, workers, control));
+    let mut weak = WeakLight::new();
     let mut looks: Vec<Look> = Vec::new();
+    // Sweeps without a prior would fit noise.
+    estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
+    weak.update(&mut estimate, &mut search, control)?;
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
     loop {
-        let objective = estimate.sweep(control)?;
+        let mut objective = weak::sweep(&mut estimate, &mut search, control)?;
         sweep += 1;
         if sweep < next_look {
             continue;
         }
-        let (misfit, error) = look(&mut estimate, scale, &mut search, control)?;
+        let (found, error) = look(&mut estimate, scale, &mut weak, &mut search, control)?;
+        if estimate.prior.is_some() {
+            objective = found;
+        }
         looks.push(Look { sweep, objective, error });
         let ended = if error <= options.tolerance {
             Ended::Converged
@@ -64,21 +71,24 @@ pub(super) fn minimise<'m, 'a, T: Real>(
             next_look = limit.min(sweep + wait);
             continue;
         };
-        let left_out = search.left_out().map(|(pixel, _)| pixel).collect();
-        return Ok((estimate, History { looks, ended }, left_out, misfit));
+        return Ok((estimate, History { looks, ended }, weak, found));
     }
 }
 
-/// F with L at its closed form for the M of a sweep, which is that of the result, and the estimated
+/// F + R with L at its closed form for the M of a sweep, which is that of the result, and the estimated
 /// error.
 fn look<T: Real>(
     estimate: &mut Estimate<'_, '_, T>,
     scale: Scale,
+    weak: &mut WeakLight,
     search: &mut ConjugateGradients<'_, '_, T>,
     control: &Control,
 ) -> Result<(f64, f64)> {
-    let misfit = estimate.slopes(scale.slope(), &mut search.residual, control)?;
-    search.start(&estimate.sensitivity, estimate.beams(), control)?;
+    let mut misfit = estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
+    if weak.update(estimate, search, control)? {
+        misfit = estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
+    }
+    search.start(&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref(), control)?;
     let mut smallest = Smallest::default();
     while smallest.iterations < FEWEST_ITERATIONS && smallest.iterate(search, control)? {}
     Ok((misfit, smallest.error(search)))

@@ -9,8 +9,8 @@ use crate::parallel::Workers;
 /// A minimum in any gauge, without flags.
 pub(super) struct Found {
     pub(super) fit: Fit,
-    /// Pixels whose M carries too little weight.
-    pub(super) left_out: Vec<usize>,
+    /// Pixels that the prior of M holds more than their measurements.
+    pub(super) held: Vec<usize>,
     /// Pixels that do not respond to light.
     pub(super) dead: Vec<usize>,
     /// Pixels whose measurements do not distinguish offset and gain, where an offset is sought.
@@ -21,21 +21,21 @@ pub(super) struct Found {
 
 impl Found {
     /// The result: the pixels' flags, then M in its gauge, of mean 1 in each component; the `unreliable`
-    /// pixels are flagged and not in the mean, like those left out.
+    /// pixels are flagged and not in the mean, like those that the prior holds.
     pub(super) fn into_fit(self, unreliable: &[usize], workers: &Workers) -> Fit {
-        let Self { mut fit, mut left_out, dead, without_offset, fluxes } = self;
-        left_out.extend(unreliable);
-        left_out.sort_unstable();
-        left_out.dedup();
+        let Self { mut fit, mut held, dead, without_offset, fluxes } = self;
+        held.extend(unreliable);
+        held.sort_unstable();
+        held.dedup();
         fit.flags = flags(&fit.components);
         let mark = |flags: &mut [u32], pixels: &[usize], flag: u32| {
             pixels.iter().for_each(|&pixel| flags[pixel] |= flag | flag::DO_NOT_USE);
         };
-        mark(&mut fit.flags, &left_out, flag::UNRELIABLE_FLAT);
+        mark(&mut fit.flags, &held, flag::UNRELIABLE_FLAT);
         mark(&mut fit.flags, &dead, flag::DEAD);
         mark(&mut fit.flags, &without_offset, flag::NO_FLAT_FIELD);
         fluxes.iter().for_each(|fluxes| gauge::fix_fluxes(&mut fit, fluxes));
-        gauge::fix_means(&mut fit, &left_out, workers);
+        gauge::fix_means(&mut fit, &held, workers);
         for pixel in without_offset {
             fit.sensitivity[pixel] = f64::NAN;
             fit.offset.iter_mut().for_each(|offset| offset[pixel] = f64::NAN);

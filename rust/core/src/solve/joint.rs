@@ -4,6 +4,7 @@ use super::course::Course;
 use super::found::Found;
 use super::options::Options;
 use super::start;
+use super::weak::WeakLight;
 use crate::beam::Beam;
 use crate::connectivity::NONE;
 use crate::control::Control;
@@ -83,6 +84,8 @@ struct Steps<'m, 'a, T> {
     /// Whether a step raised F at any length.
     stuck: bool,
     preconditioner: Option<Preconditioner>,
+    /// The prior of M in weak light.
+    weak: WeakLight,
     /// What is known of shifts that are refined later.
     shift_prior: Option<ShiftPrior>,
     refinement: Refinement,
@@ -100,6 +103,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     ) -> Result<Self> {
         let limit = options.limit(MOST_PRODUCTS)?;
         let (mut system, swept) = start::system(exposures, start, workers, control)?;
+        let weak = WeakLight::new();
         let mut shift_prior = ShiftPrior::of(exposures.positions());
         let mut refinement =
             shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
@@ -122,6 +126,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             halvings: 0,
             stuck: false,
             preconditioner: None,
+            weak,
             shift_prior,
             refinement,
             course: None,
@@ -130,7 +135,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
 
     /// One step, or a shorter last one; says why the search has ended, if it has.
     fn next(&mut self, control: &Control) -> Result<Option<Ended>> {
-        let linear = self.system.linearise(control)?;
+        let mut linear = self.system.linearise(control)?;
         // Where shifts still move, cells come into the penalty, and F is not one function.
         let moving =
             self.system.seeks_shifts() && (self.looks.len() <= SETTLING || self.system.sees_more);
@@ -142,6 +147,12 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         if self.corrects_length(&linear.1) {
             return Ok(None);
+        }
+        let is_weighed_anew = self.weak.update_joint(&mut self.system, control)?;
+        if is_weighed_anew || (self.looks.len() < SETTLING && self.system.prior.is_some()) {
+            self.system.renew_mean();
+            linear = self.system.linearise(control)?;
+            self.preconditioner = None;
         }
         let (objective, slope) = self.settled(linear, control)?;
         let preconditioner = match self.preconditioner.take() {
@@ -194,7 +205,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             return Ok(linear);
         }
         if !self.system.pass.exposures.variance_is_known() {
-            self.system.unit = self.system.misfit / joint::freedom(&self.system);
+            let freedom = joint::freedom(&self.system) + self.weak.freed;
+            self.system.unit = self.system.misfit / freedom;
         }
         self.system.renew(control)
     }
@@ -232,7 +244,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         while self.products() + A_LOOK < self.limit {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
-            if !self.search.step(&self.system, preconditioner) {
+            if !self.search.step(&self.system, preconditioner, control)? {
                 break;
             }
             control.check()?;
@@ -300,7 +312,13 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let history = History { looks: self.looks, ended };
         let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
-        fit.degrees_of_freedom = degrees_of_freedom(system, &fit, without_offset.len());
+        let (held, freed) = system.prior.as_ref().map_or((Vec::new(), 0.0), |prior| {
+            let square = prior.mean * prior.mean;
+            let weights: Vec<f64> = prior.weights.iter().map(|weight| weight * square).collect();
+            self.weak.held(&weights, system.information(), &fit.sensitivity, prior.mean)
+        });
+        fit.degrees_of_freedom =
+            degrees_of_freedom(system, &fit, without_offset.len()) + freed.round() as i64;
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
         let theta = system.state.theta.first().copied().unwrap_or_default();
         let fluxes = fitted.then(|| FluxGauge {
@@ -309,8 +327,10 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             rotation: exposures.positions().rotations[0],
             sensor: exposures.sensor(),
         });
-        let left_out = without_offset.clone();
-        Ok(Found { fit, left_out, dead: Vec::new(), without_offset, fluxes })
+        let mut held = [held, without_offset.clone()].concat();
+        held.sort_unstable();
+        held.dedup();
+        Ok(Found { fit, held, dead: Vec::new(), without_offset, fluxes })
     }
 }
 
@@ -345,6 +365,9 @@ fn fit<T: Real>(
         degrees_of_freedom: 0,
         variance_is_known: exposures.variance_is_known(),
         history,
+        prior: system.prior.as_ref().map(|prior| {
+            prior.weights.iter().map(|weight| weight * prior.mean * prior.mean).collect()
+        }),
     })
 }
 

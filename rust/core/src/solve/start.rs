@@ -1,5 +1,6 @@
 //! Where the loops start: at equal pixels, or at another fit.
 
+use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -7,12 +8,13 @@ use crate::fit::Solution;
 use crate::frames::Real;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
 use crate::parallel::Workers;
-use crate::sweep::Estimate;
+use crate::reduced::ConjugateGradients;
+use crate::sweep::{Estimate, Plain};
 
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
 
-/// M of another fit, or equal pixels but for bright ones.
+/// M of another fit, or equal pixels but for those that stand out.
 pub(super) fn estimate<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
     start: Option<&Solution<'_>>,
@@ -22,7 +24,7 @@ pub(super) fn estimate<'m, 'a, T: Real>(
     let mut estimate = Estimate::new(exposures, workers, control);
     match start {
         Some(start) => estimate = estimate.at(start.sensitivity),
-        None => estimate.start_bright(control)?,
+        None => estimate.start(control)?,
     }
     Ok(estimate)
 }
@@ -55,9 +57,13 @@ fn swept<T: Real>(
     control: &Control,
 ) -> Result<State> {
     let mut estimate = estimate(exposures, None, workers, control)?;
+    let mut search = ConjugateGradients::new(exposures, workers, control);
+    estimate.slopes::<Plain>(1.0, &mut search.residual, control)?;
+    WeakLight::new().update(&mut estimate, &mut search, control)?;
     for _ in 0..FIRST_SWEEPS {
-        estimate.sweep(control)?;
+        weak::sweep(&mut estimate, &mut search, control)?;
     }
+    drop(search);
     let geometry = exposures.geometry();
     let (known, places) = (&estimate.beams()[0], geometry.views[0].places);
     let value = |row, col| known[places.at(row, col)];

@@ -6,6 +6,7 @@ use super::kernel::{Line, STRETCH, Scratch};
 use crate::exposures::{Exposures, Stretch};
 use crate::frames::Real;
 use crate::geometry::Placement;
+use crate::median::median;
 
 /// The least y/c of each pixel of a row; infinite without measurement.
 pub(super) fn darkest<T: Real>(
@@ -30,6 +31,33 @@ pub(super) fn darkest<T: Real>(
         }
     }
     least
+}
+
+/// Whether a pixel `differs` from those of a stretch of its row, their median, in each exposure: an edge of the
+/// beam makes pixels differ in some exposures only.
+pub(super) fn stands_out<T: Real>(
+    exposures: &Exposures<'_, T>,
+    [row, col]: [usize; 2],
+    around: &Range<usize>,
+    differs: impl Fn(f64, f64) -> bool,
+) -> bool {
+    let mut scratch = vec![0.0; around.len()];
+    (0..exposures.count()).all(|exposure| {
+        let mut found: Vec<f64> =
+            match exposures.stretch(exposure, row, around.clone(), &mut scratch) {
+                Stretch::Uniform(values, _) => values.iter().map(|value| value.to_f64()).collect(),
+                // A measurement that is not used may have any value, or none.
+                Stretch::Weighted(values, weights) => {
+                    let used = |(value, weight): (&T, &f64)| {
+                        if *weight > 0.0 { value.to_f64() } else { f64::NAN }
+                    };
+                    values.iter().zip(weights).map(used).collect()
+                }
+            };
+        let own = found[col - around.start];
+        found.retain(|value| value.is_finite());
+        !own.is_finite() || median(&mut found, f64::total_cmp).is_none_or(|m| differs(own, m))
+    })
 }
 
 /// The exposures along a stretch of a row of pixels, with the beam that they see.

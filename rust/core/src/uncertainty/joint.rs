@@ -32,7 +32,7 @@ use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::{Refinement, Solution};
-use crate::frames::Real;
+use crate::frames::{Real, flag};
 use crate::joint::{
     self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
 };
@@ -94,10 +94,18 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (refined, considered) = parted(solution.refinement, prior);
         system.seek_shifts(refined);
         system.allows_single = false;
+        system.prior = solution.prior.as_ref().map(|weights| {
+            let (weights, mean) = (weights.to_vec(), 1.0);
+            joint::Prior { weights, mean }
+        });
         system.linearise(control)?;
         let preconditioner = Preconditioner::new(&mut system, control)?;
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
-        let (valid, scale) = valid(&system, &determined);
+        let pixels = determined.iter().zip(solution.flags);
+        let counted: Vec<bool> = pixels
+            .map(|(determined, flags)| *determined && flags & flag::UNRELIABLE_FLAT == 0)
+            .collect();
+        let (valid, scale) = valid(&system, &counted);
         Ok(Self {
             tilts: Tilts::of(&system, solution, &valid),
             system,
@@ -394,7 +402,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
-            let goes_on = search.step(system, preconditioner);
+            let goes_on = search.step(system, preconditioner, control)?;
             let left = search.square / search.lowest.found();
             if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
                 return Ok(());

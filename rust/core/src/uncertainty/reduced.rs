@@ -20,18 +20,22 @@
 //! variance of a e is known; r and its product with a e are sampled, in the same draws. To a functional
 //! it adds Σ_p v (Σ_k h_k)², h_k = w c L (x − M h) being the influence of measurement k with S x = g.
 
+use std::sync::Arc;
+
 use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
 use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
+use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
-use crate::frames::Real;
+use crate::frames::{Real, flag};
 use crate::geometry::View;
 use crate::memory;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
+use crate::prior::Prior;
 use crate::reduced::{self, ConjugateGradients, Draw, Smallest};
 
 /// The covariance at a fit of M and L alone, of its linear problem at the solution.
@@ -78,7 +82,15 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             finite(&places.map(|place| beam[place]).collect::<Vec<_>>())
         };
         let beams: Vec<Vec<f64>> = exposures.geometry().views.iter().map(turned).collect();
-        search.linearise(&finite(sensitivity), &beams, control)?;
+        let known = finite(sensitivity);
+        let prior = solution.prior.as_ref().map(|weights| {
+            let piece = |m: &f64| if m.is_finite() { 0 } else { NONE };
+            let mut prior =
+                Prior::new(Arc::clone(weights), sensitivity.iter().map(piece).collect());
+            prior.at(&known);
+            prior
+        });
+        search.linearise(&known, &beams, prior.as_ref(), control)?;
         let padding = search.reduced.padding;
         let undetermined: Vec<bool> = sensitivity.iter().map(|m| !m.is_finite()).collect();
         let mut valid = padding.zeros(exposures.sensor().rows, workers, control);
@@ -86,11 +98,16 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         let diagonal = padding.body(&search.reduced.inverse_diagonal);
         let rows = padding.body_mut(&mut valid).chunks_exact_mut(padding.width);
         let mut count = 0.0;
-        for ((row, diagonal), undetermined) in
-            rows.zip(diagonal.chunks_exact(padding.width)).zip(undetermined.chunks_exact(cols))
+        let skipped: Vec<bool> = undetermined
+            .iter()
+            .zip(solution.flags)
+            .map(|(undetermined, flags)| *undetermined || flags & flag::UNRELIABLE_FLAT != 0)
+            .collect();
+        for ((row, diagonal), skipped) in
+            rows.zip(diagonal.chunks_exact(padding.width)).zip(skipped.chunks_exact(cols))
         {
-            for ((valid, &d), &undetermined) in row.iter_mut().zip(diagonal).zip(undetermined) {
-                if d > 0.0 && !undetermined {
+            for ((valid, &d), &skipped) in row.iter_mut().zip(diagonal).zip(skipped) {
+                if d > 0.0 && !skipped {
                     *valid = 1.0;
                     count += 1.0;
                 }
@@ -239,21 +256,17 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         self.workers.map_blocks(&mut std, BAND * cols, |band, rows| {
             for (index, row) in rows.chunks_exact_mut(cols).enumerate() {
                 let row_of_sensor = band * BAND + index;
-                let [known, squares, valid] = [&sampled.known, &sampled.squares, &self.valid]
+                let inverse = &reduced.inverse_diagonal;
+                let [known, squares, inverse] = [&sampled.known, &sampled.squares, inverse]
                     .map(|image| padding.row(image, row_of_sensor));
                 for (col, std) in row.iter_mut().enumerate() {
-                    if valid[col] > 0.0 {
+                    if inverse[col] > 0.0 && !self.undetermined[row_of_sensor * cols + col] {
                         let drawn = f64::from(squares[col]) / sampled.draws as f64;
                         *std = scale * (f64::from(known[col]) + drawn).sqrt();
                     }
                 }
             }
         });
-        for (pixel, inverse) in reduced.left_out_variances() {
-            if inverse > 0.0 && !self.undetermined[pixel] {
-                std[pixel] = scale * inverse.sqrt().hypot(reduced.left_out_by_dark(pixel, inverse));
-            }
-        }
         std
     }
 }
@@ -296,6 +309,7 @@ impl<T: Real> Drawn for ReducedCovariance<'_, '_, T> {
     fn add_draw(&mut self, draw: u64, squares: &mut [f32], control: &Control) -> Result<()> {
         let Self { search, slope, .. } = self;
         search.reduced.draw(Draw::Measurements(draw), slope, control)?;
+        search.reduced.draw_prior(draw, slope);
         if search.reduced.has_dark() {
             search.reduced.draw(Draw::Dark(draw), &mut search.residual, control)?;
             search.residual.iter_mut().zip(&*slope).for_each(|(b, of_noise)| *b += of_noise);

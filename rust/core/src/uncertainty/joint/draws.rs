@@ -6,7 +6,7 @@ use crate::error::Result;
 use crate::frames::Real;
 use crate::joint::Propagate;
 use crate::random::{self, Streams};
-use crate::uncertainty::joint_pulls::{pull_by, variance_by_cells};
+use crate::uncertainty::joint_pulls::{pull_by, pull_of, variance_by_cells};
 use crate::uncertainty::sampling::{Drawn, LACK_OF_DRAW};
 use crate::uncertainty::smoothed::{Change, Smooth};
 
@@ -40,6 +40,7 @@ impl<T: Real> JointCovariance<'_, '_, T> {
     /// A b of covariance S: Jᵀ w Q ε + √τ Pᵀ Gᵀ s + √π s for noise ε of variance 1/w and signs s.
     pub(super) fn draw(&mut self, draw: u64, control: &Control) -> Result<Vec<f64>> {
         let mut slope = self.pulls_of_noise(draw, true, control)?;
+        self.add_draw_of_prior(draw, &mut slope, control)?;
         let mut of_penalty = self.other_signs(draw, Other::Penalty);
         let mut of_priors = self.other_signs(draw, Other::Priors);
         let system = &mut self.system;
@@ -55,6 +56,22 @@ impl<T: Real> JointCovariance<'_, '_, T> {
         let priors = pulls.iter().chain(of_shifts.as_flattened());
         slope[cells..].iter_mut().zip(priors).for_each(|(slope, pull)| *slope += pull);
         Ok(slope)
+    }
+
+    /// Adds what a draw of the prior of M pulls at the other unknowns.
+    fn add_draw_of_prior(&mut self, draw: u64, slope: &mut [f64], control: &Control) -> Result<()> {
+        let Some(prior) = &self.system.prior else { return Ok(()) };
+        let sensor = self.system.pass.exposures.sensor();
+        let rows = prior.weights.chunks_exact(sensor.cols).enumerate();
+        let gain = rows.flat_map(|(row, weights)| {
+            let mut sign = random::signs_of_prior(draw, row, sensor.rows);
+            weights.iter().map(move |weight| weight.sqrt() * sign())
+        });
+        let gain: Vec<f64> = gain.collect();
+        let none = vec![0.0; gain.len()];
+        let pulls = pull_of(&mut self.system, &gain, &none, control)?;
+        slope.iter_mut().zip(pulls).for_each(|(slope, pull)| *slope += pull);
+        Ok(())
     }
 
     /// Jᵀ w Q of noise ε of variance 1/w, if that is drawn, and of the dark's noise.

@@ -26,14 +26,16 @@ struct Case {
     offset: bool,
     shift_std: Option<f64>,
     refined: bool,
+    /// Whether some pixels have a prior.
+    held: bool,
 }
 
 impl Case {
     const fn of(kind: FluxKind) -> Self {
-        Self { kind, turned: false, offset: false, shift_std: None, refined: false }
+        Self { kind, turned: false, offset: false, shift_std: None, refined: false, held: false }
     }
 
-    fn all() -> [Self; 6] {
+    fn all() -> [Self; 7] {
         let known = Self::of(FluxKind::Known);
         let prior = FluxKind::Prior(vec![1e-3, 2e-4, 5e-4, 1e-3, 3e-4]);
         [
@@ -42,7 +44,8 @@ impl Case {
             Self::of(FluxKind::Linear(vec![0.0, 3.0, 1.0, 4.0, 2.0])),
             Self { offset: true, ..known.clone() },
             Self { shift_std: Some(2e-3), refined: true, ..known.clone() },
-            Self { shift_std: Some(2e-3), ..known },
+            Self { shift_std: Some(2e-3), ..known.clone() },
+            Self { held: true, ..known },
         ]
     }
 
@@ -64,7 +67,11 @@ impl Case {
         let options = crate::Options::default();
         let fit = crate::calibrate(&exposures, &options, None, &workers, &control).unwrap();
         let refinement = if self.refined { Refinement::Done } else { Refinement::Undetermined };
-        let solution = Solution { refinement, unit: UNIT, ..fit.solution() };
+        // Of the size of D, some 5e5.
+        let weight =
+            |i: usize| if i.is_multiple_of(3) { 3e5 * (1.5 + random_number(i)) } else { 0.0 };
+        let prior = self.held.then(|| (0..SENSOR.len()).map(weight).collect());
+        let solution = Solution { refinement, unit: UNIT, prior, ..fit.solution() };
         let covariance = JointCovariance::new(&exposures, &solution, &workers, &control);
         visit(&mut covariance.unwrap(), &control);
     }
@@ -138,7 +145,12 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
         case.visit(|covariance, control| {
             let (pixels, size) = (covariance.valid.len(), covariance.system.size());
             let shifts = covariance.considered_variances().len();
-            let (x, gain) = (random_vector(size, 11), random_vector(pixels, 12));
+            let (mut x, gain) = (random_vector(size, 11), random_vector(pixels, 12));
+            // A prior holds the multiple of the beam, so that no solution contains it.
+            let cells = covariance.system.state.beam.len();
+            if case.held {
+                covariance.system.take_scale_out(&mut x[..cells]);
+            }
             let wrong: Vec<f64> = random_vector(shifts, 13).iter().map(|z| 0.1 * z).collect();
             // b = S x + S_d δ, which x solves.
             let whole = [&x[..], &wrong].concat();

@@ -1,0 +1,182 @@
+"""Commands about corrections with a uniform source: nuc fit, nuc defects, nuc quality."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from equipix._check import naming_memory
+from equipix._types import By
+from equipix.cli.options import Force, Json, Mask, Sensor, Workers, naming_mask
+from equipix.cli.summary import flagged as flag_counts
+from equipix.cli.summary import summary
+from equipix.cli.terminal import check_output, progress_bars, show_result
+from equipix.correction.files import warn_of_corrected
+from equipix.correction.protocol import check_sensor
+from equipix.experiment.levels import LevelExperiment
+from equipix.experiment.provenance import origin_of
+from equipix.io import SUFFIXES, find_files, read_frames, read_mask, refuse_inputs, refuse_saved
+from equipix.loading import load, load_response
+from equipix.metrics import correctability, roughness, three_d_noise
+from equipix.nuc.bad_pixels import find_defects
+from equipix.nuc.limits import DefectLimits
+
+if TYPE_CHECKING:
+    from equipix._types import Array
+    from equipix.correction.protocol import Correction
+
+commands = typer.Typer()
+nuc = typer.Typer(
+    no_args_is_help=True,
+    help="Uniform source: fit response curves, find bad pixels, measure quality.",
+)
+commands.add_typer(nuc, name="nuc")
+
+_ORDERS = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
+
+
+@commands.callback()
+def _group() -> None: ...
+
+
+@nuc.callback()
+def _nuc() -> None: ...
+
+
+@nuc.command(epilog="Example: equipix nuc fit levels.toml -o response.tif --order auto")
+def fit(
+    levels: Annotated[Path, typer.Argument(help="The levels.toml.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Response: .tif or .npz.")],
+    order: Annotated[
+        Literal["0", "1", "2", "3", "auto"],
+        typer.Option(help="0 one-point, 1 two-point, 2 quadratic, 3 cubic; or by held-out levels."),
+    ] = "1",
+    by: Annotated[By, typer.Option(help="What a one-point correction changes.")] = "offset",
+    mask: Mask = None,
+    workers: Workers = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Fit the response curves of all pixels to levels of a uniform source."""
+    check_output(output, force=force, suffixes=SUFFIXES)
+    loaded = LevelExperiment.load(levels)
+    refuse_inputs([output], [levels, *loaded.files(), *([mask] if mask else [])])
+    with progress_bars() as progress, naming_mask(mask):
+        response = loaded.run(
+            order=_ORDERS[order],  # type: ignore[arg-type]
+            by=by,
+            mask=None if mask is None else read_mask(mask),
+            workers=workers,
+            progress=progress,
+        )
+    response.save(output, force=force)
+    show_result({"output": str(output), **summary(response)}, as_json=as_json)
+
+
+@nuc.command(epilog="Example: equipix nuc defects response.tif level/*.tif -o flagged.tif")
+def defects(
+    response: Annotated[Path, typer.Argument(help="A response: .tif or .npz.")],
+    frames: Annotated[
+        list[str] | None,
+        typer.Argument(help="Raw frames of one steady level: noise and flicker."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The response with the flags found: .tif or .npz."),
+    ] = None,
+    response_limit: Annotated[
+        float,
+        typer.Option(
+            help="Least response over that of the neighbours (GB/T 17444-2013: the mean)."
+        ),
+    ] = DefectLimits.response,
+    gain_limit: Annotated[float, typer.Option(help="Largest 1/(1 + K).")] = DefectLimits.gain,
+    noise_limit: Annotated[
+        float,
+        typer.Option(help="Largest noise over that of its signal (GB/T 17444-2013: the mean)."),
+    ] = DefectLimits.noise,
+    correlation_limit: Annotated[
+        float, typer.Option(help="Least deviation of von Neumann's ratio for flicker, in sigmas.")
+    ] = DefectLimits.correlation,
+    range_limit: Annotated[
+        float, typer.Option(help="Least share of the range of levels with values.")
+    ] = DefectLimits.range,
+    misfit_limit: Annotated[
+        float, typer.Option(help="Largest deviation of reduced chi2, in sigmas.")
+    ] = DefectLimits.misfit,
+    sensor: Sensor = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Find bad pixels by response curves and by frames of one level."""
+    if output is not None:
+        check_output(output, force=force, suffixes=SUFFIXES)
+        refuse_inputs([output], [response])
+    limits = DefectLimits(
+        response=response_limit,
+        gain=gain_limit,
+        noise=noise_limit,
+        correlation=correlation_limit,
+        range=range_limit,
+        misfit=misfit_limit,
+    )
+    curves = load_response(response)
+    check_sensor(curves, sensor)
+    with naming_memory("finding bad pixels"):
+        found = find_defects(curves, None if not frames else _raw(frames, response), limits=limits)
+    flagged = curves.with_flags(found.flags)
+    if output is not None:
+        flagged.save(output, force=force)
+    result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
+    result |= {"percentiles_of_K": found.gain_percentiles, "flagged_pixels": flag_counts(flagged)}
+    show_result(result, as_json=as_json)
+
+
+@nuc.command(epilog="Example: equipix nuc quality response.tif level/*.tif")
+def quality(
+    correction: Annotated[Path, typer.Argument(help="A response or a calibration: .tif or .npz.")],
+    frames: Annotated[list[str], typer.Argument(help="Raw frames of one steady even level.")],
+    confidence: Annotated[
+        float, typer.Option(help="Probability of the confidence interval.")
+    ] = 0.95,
+    sensor: Sensor = None,
+    as_json: Json = False,
+) -> None:
+    """Show spatial over temporal noise of corrected frames, and its parts."""
+    loaded = load(correction)
+    check_sensor(loaded, sensor)
+    with naming_memory("measuring quality"):
+        result = _quality(loaded, _raw(frames, correction), confidence)
+    show_result(result, as_json=as_json)
+
+
+def _quality(correction: Correction, raw: Array, confidence: float) -> dict[str, Any]:
+    """Measure spatial over temporal noise of corrected frames, and its parts."""
+    good = correctability(correction.correct(raw), confidence=confidence)
+    every = correctability(correction.correct(raw, flagged="keep"), confidence=confidence)
+    replaced = correction.correct(raw, flagged="replace")
+    noise = asdict(three_d_noise(replaced))
+    return {
+        "frames": good.frames,
+        "pixels": good.pixels,
+        "C": good.ratio,
+        "C_from": good.low,
+        "C_to": good.high,
+        "C_with_flagged_pixels": every.ratio,
+        "spatial_variance": good.spatial_variance,
+        "temporal_variance": good.temporal_variance,
+        "noise_variances": noise,
+        "roughness": roughness(replaced.mean(axis=0)),
+    }
+
+
+def _raw(source: list[str], correction: Path) -> Array:
+    """Read raw frames, refuse files that equipix has saved, and warn of corrected ones."""
+    files = find_files(source)
+    for file in files:
+        refuse_saved(file)
+    warn_of_corrected(files, origin_of(correction))
+    return read_frames(files)

@@ -1,0 +1,231 @@
+"""A correction that is its coefficients, and the combination of two corrections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._readonly import ReadOnly
+from equipix.correction.apply import apply_polynomial
+from equipix.correction.depth import depth_of
+from equipix.correction.protocol import check_correction, sensor_of
+from equipix.errors import InputError
+from equipix.io import check_format, check_pages, save_pages
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from os import PathLike
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Flagged
+    from equipix.correction.protocol import Correction
+
+_KIND, _FORMAT = "polynomial", 1
+_MOST = 4
+"""Most coefficients that the compiled part applies."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Polynomial(ReadOnly):
+    """A correction Σ c_j y^j of raw values y, such as two corrections combined.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (order + 1, rows, cols)
+        Coefficients c for y in DN, lowest power first, order 1 to 3; NaN where undetermined.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`.
+    metadata : dict
+        Origin, as JSON values. Of two corrections combined, ``"raw"`` is true where corrected
+        frames hold the mean offset of raw levels.
+    saturation : float or None
+        Level of saturation of the raw values in DN, where it is known.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not fit.
+    """
+
+    coefficients: Array
+    flags: Array
+    metadata: dict[str, Any] = field(default_factory=dict)
+    saturation: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
+        ReadOnly.__post_init__(self)
+        planes, shape = self.coefficients.shape[:1], self.coefficients.shape[1:]
+        if shape != self.flags.shape or not 2 <= planes[0] <= _MOST or len(shape) != 2:
+            raise InputError(
+                f"'coefficients' has shape {self.coefficients.shape} and 'flags' "
+                f"{self.flags.shape}, expected (2 to {_MOST}, rows, cols) and (rows, cols)"
+            )
+
+    def __repr__(self) -> str:
+        """Short form: sizes and order."""
+        rows, cols = self.shape
+        return f"<Polynomial of {rows} x {cols} pixels, order {len(self.coefficients) - 1}>"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.flags.shape
+        return rows, cols
+
+    def correct(
+        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
+    ) -> Array:
+        """Frames as a sensor of equal pixels would have given them.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames, in DN.
+        flagged : {"nan", "keep", "replace"}
+            The value of pixels flagged ``DO_NOT_USE``: NaN, that of the formula, or the mean of the
+            nearest good pixels around.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of dtype float64 for float64 frames, else float32; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
+        """
+        return apply_polynomial(
+            frames,
+            lambda: self.coefficients,
+            sources=(self.coefficients, self.flags),
+            flags=self.flags,
+            flagged=flagged,
+            out=out,
+            depth=depth_of(self),
+        )
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        pages = {"coefficients": self.coefficients, "flags": self.flags}
+        content = {
+            "format": _FORMAT,
+            "kind": _KIND,
+            "saturation": self.saturation,
+            "metadata": self.metadata,
+        }
+        save_pages(path, pages, content, force=force)
+
+
+def read_polynomial(
+    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
+) -> Polynomial:
+    """Make a correction of the arrays and metadata of the file that `Polynomial.save` wrote."""
+    check_format(path, content, _KIND, _FORMAT)
+    check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
+    level = content.get("saturation")
+    return Polynomial(
+        pages["coefficients"],
+        pages["flags"],
+        content["metadata"],
+        None if level is None else float(level),
+    )
+
+
+def combine(first: Correction, then: Correction) -> Polynomial:
+    """Correction that does what two do one after the other.
+
+    Parameters
+    ----------
+    first : Correction
+        Applied to raw frames: such as response curves, or a lens fall-off.
+    then : Correction
+        Applied to the result, so measured on frames that `first` has corrected: offset and gain,
+        such as a lens fall-off, or a shift calibration of corrected exposures. One of raw exposures
+        holds the gain that `first` takes away already, which would be taken away twice. A gain
+        needs a `first` that leaves no offset.
+
+    Returns
+    -------
+    Polynomial
+        Of the order of `first`, with its level of saturation and the flags of both; `metadata`
+        holds that of both, and the sensor.
+
+    Raises
+    ------
+    InputError
+        If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
+        order above 1 or subtracts a dark frame; or `then` is a gain alone, and `first` a response
+        to averages of raw levels: the mean offset stays in frames that it has corrected, and the
+        gain would multiply it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> gain = np.array([[0.9, 1.0, 1.1]])
+    >>> response = equipix.nuc.fit([100 * gain, 1000 * gain], order=1)
+    >>> twice = equipix.combine(response, response)
+    >>> bool(np.allclose(twice.coefficients[1], response.coefficients[1] ** 2))
+    True
+    """
+    check_correction("first", first)
+    check_correction("then", then)
+    if first.shape != then.shape:
+        raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
+    one, other = sensor_of(first), sensor_of(then)
+    if one and other and one != other:
+        raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
+    dark = getattr(then, "dark", None)
+    if dark is not None:
+        raise InputError(
+            f"'then' subtracts a dark frame of {np.nanmean(dark):.4g} DN in the mean, which frames "
+            "that 'first' has corrected do not hold: expected a correction without one"
+        )
+    after = np.asarray(then.coefficients, np.float64)
+    if len(after) > 2:
+        raise InputError(
+            f"'then' has order {len(after) - 1}, expected offset and gain: combine in the other "
+            "order, or correct frames twice"
+        )
+    gain = after[1] if len(after) == 2 else 0.0
+    raw = _leaves_offset(first) and not np.nan_to_num(after[0]).any()
+    if raw and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
+        raise InputError(
+            "'first' is a response to raw levels, which leaves the mean offset in corrected "
+            "frames, and the gain of 'then' would multiply it: average the levels with a dark, "
+            "equipix.average(frames, dark=dark), and fit the response again"
+        )
+    coefficients = np.asarray(first.coefficients, np.float64) * gain
+    coefficients[0] += after[0]
+    metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
+    if one or other:
+        metadata["sensor"] = (first if one else then).metadata["sensor"]
+    if raw:
+        metadata["raw"] = True
+    level: float | None = getattr(first, "saturation", None)
+    return Polynomial(coefficients, first.flags | then.flags, metadata, level)
+
+
+def _leaves_offset(correction: Correction) -> bool:
+    """Whether corrected frames hold the mean offset of the raw levels that it was fitted to."""
+    return bool(getattr(correction, "raw", False) or correction.metadata.get("raw", False))

@@ -1,0 +1,210 @@
+"""Levels of a uniform source on disk, as levels.toml describes them, and their evaluation."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+from equipix._check import naming_memory
+from equipix.errors import FileError, InputError
+from equipix.experiment.formats import check_formats
+from equipix.experiment.manifest import find_files, read_level_manifest
+from equipix.experiment.mask import excluded_pixels
+from equipix.experiment.provenance import sha256_of
+from equipix.experiment.repeats import refuse_repeats
+from equipix.exposures.averaged import Averaged, Words
+from equipix.exposures.front import as_mask, union
+from equipix.frames import average, refuse_subtracted
+from equipix.io import as_path
+from equipix.nuc.fit import fitted
+from equipix.nuc.levels import levels_of
+from equipix.nuc.order import check_order
+
+if TYPE_CHECKING:
+    from os import PathLike
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import By, Order, Progress
+    from equipix.experiment.manifest import LevelManifest
+    from equipix.frames import FrameStatistics
+    from equipix.nuc.response import Response
+
+
+@dataclass(frozen=True)
+class LevelExperiment:
+    """Frames of a uniform source at several levels, as files on disk.
+
+    Attributes
+    ----------
+    path : Path
+        The levels.toml.
+    manifest : LevelManifest
+        Its checked content.
+
+    See Also
+    --------
+    equipix.nuc.fit : The same for averages and arrays in memory.
+
+    Notes
+    -----
+    Frames and dark frames are named relative to the file: one file (a multi-page TIFF holds many
+    frames; a saved average stands for the frames that it was made of), a glob or a list.
+    ``[sensor]`` is that of an experiment.toml. Without ``[dark]`` the level without light is part
+    of the curves.
+    """
+
+    path: Path
+    manifest: LevelManifest
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read and check the description of the levels.
+
+        Parameters
+        ----------
+        path : str or path
+            The levels.toml.
+
+        Returns
+        -------
+        LevelExperiment
+            What `run` evaluates.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, has an unknown key or a wrong value, or names a file that
+            does not exist, or one file for two levels.
+        """
+        file = as_path("path", path)
+        experiment = cls(file, read_level_manifest(file))
+        experiment.files()
+        refuse_repeats(file, experiment.manifest)
+        return experiment
+
+    def files(self) -> list[Path]:
+        """All image files of the levels, each once."""
+        mask = self.manifest.sensor.mask
+        masks = [] if mask is None else find_files(self.path, mask)
+        return list(dict.fromkeys([*self._images(), *masks]))
+
+    def run(
+        self,
+        *,
+        order: Order = 1,
+        by: By = "offset",
+        mask: ArrayLike | None = None,
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> Response:
+        """Fit the response curves to the files.
+
+        Parameters
+        ----------
+        order : {0, 1, 2, 3, "auto"}
+            Highest power of the array's mean, see `equipix.nuc.fit`.
+        by : {"offset", "gain"}
+            What a one-point correction changes.
+        mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+            True = do not use, besides the pixels that the file excludes.
+        workers : int, optional
+            Number of threads; by default one for each processor.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` repeatedly.
+
+        Returns
+        -------
+        Response
+            With the dark frame, if there is one, and in `metadata` the sensor, the levels with
+            their values and units, the noise and the hashes of the files.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read, the images differ in size or depth, a level saturates, or two
+            files have the same content.
+        InputError
+            If an option is out of range, or the levels do not determine the curves.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
+        """
+        check_order(order, by)
+        shape = check_formats(self._images())
+        given = None if mask is None else as_mask(mask, (len(self.manifest.level), *shape))
+        excluded = union(given, excluded_pixels(self.path, self.manifest, shape))
+        hashes = sha256_of([self.path, *self.files()])
+        refuse_repeats(self.path, self.manifest, hashes)
+        averaged = self._average(workers, progress)
+        levels = levels_of(averaged, mask=excluded)
+        origin = self._provenance(averaged, levels.references.tolist(), hashes)
+        return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
+
+    def _images(self) -> list[Path]:
+        """The files of frames, each once, those of the dark first."""
+        dark = self.manifest.dark
+        entries = [] if dark is None else [dark.frames]
+        entries += [level.frames for level in self.manifest.level]
+        found = [find_files(self.path, entry) for entry in entries]
+        return list(dict.fromkeys(file for files in found for file in files))
+
+    def _average(self, workers: int | None, progress: Progress | None) -> Averaged:
+        """Mean of every level; the frames' other statistics are reduced at once."""
+        sensor = self.manifest.sensor
+        averaged = Averaged(
+            len(self.manifest.level),
+            gain=sensor.gain_dn_per_e,
+            saturation=sensor.saturation_level,
+            saturation_key=sensor.saturation_key,
+            words=Words("[[level]]", "level"),
+        )
+        with naming_memory("averaging"):
+            dark = self._dark(workers, progress)
+            for name, level in zip(self.manifest.names, self.manifest.level, strict=True):
+                frames = self._statistics(name, level.frames, dark, workers, progress)
+                try:
+                    averaged.add(frames, name)
+                except InputError as error:
+                    raise FileError(f"{self.path}: {error}") from error
+        return averaged
+
+    def _dark(self, workers: int | None, progress: Progress | None) -> FrameStatistics | None:
+        if self.manifest.dark is None:
+            return None
+        dark = self._statistics("dark", self.manifest.dark.frames, None, workers, progress)
+        refuse_subtracted(dark, f"{self.path}: [dark]")
+        return dark
+
+    def _statistics(
+        self,
+        name: str,
+        entry: str | list[str],
+        dark: FrameStatistics | None,
+        workers: int | None,
+        progress: Progress | None,
+    ) -> FrameStatistics:
+        def report(done: int, total: int, _: str) -> None:
+            if progress is not None:
+                progress(done, total, f"averaging {name}")
+
+        level, files = self.manifest.sensor.saturation_level, find_files(self.path, entry)
+        return average(files, dark=dark, saturation=level, workers=workers, progress=report)
+
+    def _provenance(
+        self, averaged: Averaged, means: list[float], hashes: dict[Path, str]
+    ) -> dict[str, Any]:
+        """Sensor, levels, noise and the hashes of the files, as JSON values."""
+        named = zip(self.manifest.names, self.manifest.level, means, strict=True)
+        folder = self.path.parent
+        return {
+            "experiment": str(self.path),
+            "sensor": self.manifest.sensor.model_dump(),
+            "levels": [
+                {"name": name, "value": level.value, "unit": level.unit, "mean": mean}
+                for name, level, mean in named
+            ],
+            "noise": None if averaged.noise is None else asdict(averaged.noise),
+            "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
+        }

@@ -1,0 +1,190 @@
+"""How good a correction is: spatial over temporal noise, and for how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix._check import as_array, naming_memory
+from equipix.errors import InputError
+from equipix.metrics.moments import signed_root, stack_of, temporal_of
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Bools
+
+
+@dataclass(frozen=True)
+class Correctability:
+    """Spatial noise of corrected frames over their temporal noise, the result of `correctability`.
+
+    Attributes
+    ----------
+    ratio : float
+        C = σ_spatial/σ_temporal; negative where the estimate of the spatial variance is.
+    low, high : float
+        Ends of its confidence interval, with the same sign rule.
+    spatial_variance : float
+        Variance over the pixels, temporal noise removed: an unbiased estimate, which may be
+        negative. In the square of the frames' unit.
+    temporal_variance : float
+        Variance of one frame, drift of the frame mean removed.
+    pixels, frames : int
+        Numbers that count.
+    """
+
+    ratio: float
+    low: float
+    high: float
+    spatial_variance: float
+    temporal_variance: float
+    pixels: int
+    frames: int
+
+
+@naming_memory("correctability")
+def correctability(
+    frames: ArrayLike, *, mask: ArrayLike | None = None, confidence: float = 0.95
+) -> Correctability:
+    r"""Spatial over temporal noise of corrected frames of a uniform source.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n, rows, cols)
+        Corrected frames of one level, two or more. Pixels with a value that is not finite do not
+        count: frames corrected with ``flagged="nan"`` leave out bad pixels.
+    mask : array_like of bool, shape (rows, cols), optional
+        True = do not use.
+    confidence : float
+        Probability of the confidence interval, between 0 and 1.
+
+    Returns
+    -------
+    Correctability
+        C with its interval; C below 1 is the aim of a correction.
+
+    Raises
+    ------
+    InputError
+        If fewer than two frames or pixels are left, or none has noise.
+
+    Notes
+    -----
+    The mean of each frame over the pixels is subtracted, so drift of the source does not count.
+    With N pixels and n frames, σ_t² the mean of the pixels' sample variances and s² the variance of
+    the mean image over the pixels,
+
+    .. math:: \sigma_s^2 = s^2 - \sigma_t^2 / n, \qquad C^2 = \sigma_s^2 / \sigma_t^2 .
+
+    n s²/σ_t² is (1 + n C²) times a value of Fisher's distribution with N − 1 and (N − 1)(n − 1)
+    degrees of freedom where the pattern is normally distributed, which gives the interval; its
+    quantiles are Paulson's [2]_. Few pixels far off, as bad ones are, make it too narrow. The
+    ratio is that of [1]_.
+
+    References
+    ----------
+    .. [1] "Correction of the non-uniformity of parameters of focal plane arrays", in a course on
+       staring infrared systems (in Russian).
+    .. [2] E. Paulson, "An approximate normalization of the analysis of variance distribution",
+       Annals of Mathematical Statistics 13 (1942) 233-235.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from equipix import metrics
+    >>> rng = np.random.default_rng(1)
+    >>> frames = 0.5 * rng.standard_normal((60, 80)) + rng.standard_normal((16, 60, 80))
+    >>> found = metrics.correctability(frames)
+    >>> found.low < 0.5 < found.high
+    True
+    """
+    stack = stack_of("frames", frames)
+    if not 0 < confidence < 1:
+        raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
+    found = temporal_of(stack, _as_mask(mask, stack.shape[1:]))
+    n, pixels = found.frames, int(np.count_nonzero(found.used))
+    if pixels < 2:
+        raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")
+    # A frame's own mean takes one of N degrees of freedom.
+    temporal = float(found.variance[found.used].mean()) * pixels / (pixels - 1)
+    if temporal <= 0:
+        raise InputError("'frames' are all equal: they show no temporal noise")
+    spatial = float(found.mean[found.used].var(ddof=1)) - temporal / n
+    ratio = n * spatial / temporal + 1
+    degrees = pixels - 1, (pixels - 1) * (n - 1)
+    tail = (1 - confidence) / 2
+    low, high = (
+        signed_root((ratio / _fisher_quantile(p, *degrees) - 1) / n) for p in (1 - tail, tail)
+    )
+    return Correctability(signed_root(spatial / temporal), low, high, spatial, temporal, pixels, n)
+
+
+def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
+    """Time at which C first exceeds 1, by linear interpolation.
+
+    Parameters
+    ----------
+    times : array_like, shape (n,)
+        Times since the calibration, rising, in any unit.
+    ratios : array_like, shape (n,)
+        C at these times, as `correctability` gives it; with and without flagged pixels give two
+        intervals.
+
+    Returns
+    -------
+    float
+        In the unit of `times`: the first time if C is above 1 then, infinite if it never is.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ, a value is not finite, or the times do not rise.
+
+    Examples
+    --------
+    >>> from equipix import metrics
+    >>> metrics.validity_interval([0, 10, 20], [0.2, 0.8, 1.2])
+    15.0
+    """
+    when, values = (
+        as_array(name, each, ndim=1).astype(np.float64)
+        for name, each in (("times", times), ("ratios", ratios))
+    )
+    if when.shape != values.shape or not len(when):
+        raise InputError(f"'ratios' has {len(values)} values, expected {len(when)}, one a time")
+    if not (np.isfinite(when).all() and np.isfinite(values).all() and (np.diff(when) > 0).all()):
+        raise InputError("'times' and 'ratios' must be finite, and the times must rise")
+    above = np.flatnonzero(values > 1)
+    if not len(above):
+        return float("inf")
+    first = int(above[0])
+    if first == 0:
+        return float(when[0])
+    share = (1 - values[first - 1]) / (values[first] - values[first - 1])
+    return float(when[first - 1] + share * (when[first] - when[first - 1]))
+
+
+def _as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+    """Mask of one sensor, checked."""
+    if mask is None:
+        return None
+    given = as_array("mask", mask, ndim=2)
+    if given.dtype != np.bool_ or given.shape != shape:
+        raise InputError(
+            f"'mask' is {given.dtype} of shape {given.shape}, expected bool of {shape}"
+        )
+    return given
+
+
+def _fisher_quantile(probability: float, first: int, second: int) -> float:
+    """Quantile of F by Paulson's normal approximation, whose equation in F^(1/3) is quadratic."""
+    z = NormalDist().inv_cdf(probability)
+    a, b = 2 / (9 * first), 2 / (9 * second)
+    # (1 − b)u − (1 − a) = z √(b u² + a)
+    square, middle, rest = (1 - b) ** 2 - z**2 * b, (1 - a) * (1 - b), (1 - a) ** 2 - z**2 * a
+    root = float(np.sqrt(max(0.0, middle**2 - square * rest)))
+    return float(((middle + np.sign(z) * root) / square) ** 3)

@@ -1,0 +1,125 @@
+"""Mean image and temporal variance of frames of a steady even scene, in one pass over them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from equipix._check import as_array
+from equipix.errors import InputError
+from equipix.frames import FrameStatistics, refuse_subtracted
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Bools, Floats
+
+
+class Moments(NamedTuple):
+    """Mean image, temporal variance of one frame in the mean of all pixels, number of frames."""
+
+    mean: Floats
+    variance: float
+    frames: int
+
+
+class Temporal(NamedTuple):
+    """Each pixel over time, the drift of the frame mean removed; NaN where a sample is missing."""
+
+    mean: Floats
+    """Mean image."""
+    variance: Floats
+    """Unbiased variance of one frame."""
+    steps: Floats
+    """Sum of the squared differences of successive frames."""
+    used: Bools
+    """Pixels that are finite in all frames and not masked: the frame means are taken over them."""
+    frames: int
+
+
+def signed_root(square: float) -> float:
+    """Root of a variance estimate; of a negative one the negative root of its size."""
+    return float(np.sign(square) * np.sqrt(abs(square)))
+
+
+def stack_of(name: str, frames: ArrayLike) -> Array:
+    """Return two or more frames of two pixels or more in their own dtype."""
+    stack = as_array(name, frames, ndim=3)
+    if len(stack) < 2 or stack[0].size < 2:
+        raise InputError(
+            f"'{name}' has shape {stack.shape}, expected two or more frames of two or more pixels"
+        )
+    return stack
+
+
+def temporal_of(stack: Array, mask: Bools | None = None) -> Temporal:
+    """Mean, variance and steps of each pixel.
+
+    Parameters
+    ----------
+    stack : ndarray, shape (n, rows, cols)
+        Frames of any real dtype: one frame at a time is converted to float64.
+    mask : ndarray of bool, shape (rows, cols), optional
+        True = does not count in the frame means.
+
+    Returns
+    -------
+    Temporal
+        By Welford's recurrence, of frames less their means.
+    """
+    used = ~mask if mask is not None else np.ones(stack.shape[1:], bool)
+    if stack.dtype.kind == "f":
+        for frame in stack:
+            used &= np.isfinite(frame)
+    mean, squares, steps = (np.zeros(stack.shape[1:]) for _ in range(3))
+    level, before = 0.0, mean
+    with np.errstate(invalid="ignore"):
+        for index, frame in enumerate(stack, start=1):
+            free = frame.astype(np.float64)
+            own = float(free[used].mean()) if used.any() else 0.0
+            free -= own
+            level += (own - level) / index
+            deviation = free - mean
+            mean = mean + deviation / index
+            squares += deviation * (free - mean)
+            if index > 1:
+                steps += (free - before) ** 2
+            before = free
+    return Temporal(mean + level, squares / (len(stack) - 1), steps, used, len(stack))
+
+
+def moments(name: str, frames: ArrayLike | FrameStatistics) -> Moments:
+    """Mean and noise of raw frames of which every pixel counts.
+
+    Notes
+    -----
+    The mean of each frame is subtracted before its noise is taken, so a drift of the light does
+    not count: for two frames the variance is ½⟨(y₀ − y₁)²⟩ − ½(μ₀ − μ₁)², ⟨⟩ over all pixels.
+    Averages do not know the means of their frames, so there a drift counts as noise.
+    """
+    if isinstance(frames, FrameStatistics):
+        return _of_average(name, frames)
+    stack = stack_of(name, frames)
+    refuse_missing(name, stack)
+    found = temporal_of(stack)
+    return Moments(found.mean, float(found.variance.mean()), found.frames)
+
+
+def refuse_missing(name: str, stack: Array) -> None:
+    """Refuse frames with values that are not finite."""
+    lost = sum(int(np.count_nonzero(~np.isfinite(frame))) for frame in stack)
+    if lost:
+        raise InputError(f"'{name}' holds {lost} values that are not finite, expected none")
+
+
+def _of_average(name: str, frames: FrameStatistics) -> Moments:
+    """Mean and noise of an average of as many samples everywhere."""
+    refuse_subtracted(frames, f"'{name}'")
+    count = int(frames.count.min())
+    if count < 2 or int(frames.count.max()) != count:
+        raise InputError(
+            f"'{name}' has {count} to {frames.count.max()} samples a pixel, expected as many "
+            "everywhere, two or more"
+        )
+    return Moments(frames.mean, float(frames.variance.mean()), count)

@@ -1,0 +1,138 @@
+"""Criteria of bad pixels: by response curves, and by frames of one steady level."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.defects import noisy_pixels, response_outliers
+from equipix.errors import InputError
+from equipix.flags import usable
+from equipix.frames import FrameStatistics
+from equipix.metrics.moments import stack_of, temporal_of
+from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
+from equipix.nuc.curve import response_at
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Bools, Floats
+    from equipix.nuc.limits import DefectLimits
+    from equipix.nuc.response import Response
+
+
+def mean_slope(response: Response) -> Floats:
+    """Mean slope 1 + K of each curve between its limits; of one level 1 + K of the fit."""
+    low, high = response.limits
+    if response.order == 0:
+        return np.where(np.isnan(response.deviation[0]), np.nan, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rise = response_at(response.deviation, high) - response_at(response.deviation, low)
+        slope = rise / (high - low)
+    return np.asarray(np.where(high > low, slope, 1 + response.deviation[1]))
+
+
+def common_misfit(response: Response) -> float:
+    """Median over usable pixels of reduced χ², over the median that noise alone has."""
+    if response.metadata.get("options", {}).get("weights") != "variances":
+        return float("nan")
+    judged = usable(response.flags) & (response.freedom > 0)
+    if not judged.any():
+        return float("nan")
+    # The median of χ²/f after Wilson and Hilferty.
+    noise = (1 - 2 / (9 * response.freedom[judged])) ** 3
+    return float(np.median(response.reduced_chi2[judged] / noise))
+
+
+def misfit_advice(response: Response, misfit: float) -> str:
+    """Say what to do about curves of another order."""
+    order, levels = response.order, len(response.levels)
+    higher = f"fit with order={order + 1} or order='auto', " if order < min(3, levels - 2) else ""
+    return (
+        f"curves of order {order} leave half of the pixels a misfit of {misfit:.3g} or more times "
+        f"that of noise: {higher}check that the source was steady and that the noise was as "
+        "stated. Pixels that deviate from the others are flagged, not what all have in common"
+    )
+
+
+def of_response(response: Response, limits: DefectLimits, misfit: float) -> dict[str, Bools]:
+    """Bad pixels by their curves; `misfit` is that of the array."""
+    slope = mean_slope(response)
+    known = np.isfinite(slope)
+    low, high = response.limits
+    whole = float(response.levels.max() - response.levels.min())
+    found = {
+        "dead": _dead(response, slope, limits.response),
+        "non_responding": slope * limits.gain < 1,
+        "out_of_range": known & (high - low < limits.range * whole),
+    }
+    if not np.isnan(misfit):
+        found["nonlinear"] = _nonlinear(response, limits.misfit, misfit)
+    return found
+
+
+def of_frames(
+    frames: ArrayLike | FrameStatistics, good: Bools, limits: DefectLimits
+) -> dict[str, Bools]:
+    """Bad pixels by their noise; `good` are those whose curves are usable."""
+    slow = None
+    if isinstance(frames, FrameStatistics):
+        _check_shape(frames.mean.shape, good.shape)
+        mean, variance, count = frames.mean, frames.variance, int(frames.count.max())
+    else:
+        stack = stack_of("frames", frames)
+        _check_shape(stack.shape[1:], good.shape)
+        over_time = temporal_of(stack, ~good)
+        mean, variance, count = over_time.mean, over_time.variance, over_time.frames
+        slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
+    if count < 2:
+        raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
+    model = _common_noise(mean, variance, good, count)
+    of_level = mean[None], variance[None], [count], model
+    found = {"noisy": noisy_pixels(*of_level, times=limits.noise)}
+    if slow is not None:
+        found["flickering"] = noisy_pixels(*of_level) & slow
+    return found
+
+
+def _dead(response: Response, slope: Floats, least: float) -> Bools:
+    """Pixels that rise less than their neighbours, by more than the error of their slope."""
+    if response.order == 0 or not np.isfinite(slope).any():
+        return np.zeros(slope.shape, bool)
+    # Of a line; that of a higher order at 0, which is larger than that of the mean slope.
+    std = np.sqrt(np.nan_to_num(response.variances[1]))
+    return response_outliers(slope, lambda: std, least=least)[0]
+
+
+def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
+    """Pixels whose curve fits worse than noise, and the misfit of the array, explain."""
+    found = np.zeros(response.shape, bool)
+    common = sigmas**2 * max(0.0, misfit - 1) / MEDIAN_SQUARE
+    for freedom in np.unique(response.freedom[response.freedom > 0]):
+        limit = scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
+        found |= (response.freedom == freedom) & (response.reduced_chi2 > limit)
+    return found
+
+
+def _common_noise(mean: Array, variance: Array, good: Bools, count: int) -> NoiseModel:
+    """Noise that pixels of a signal have in common."""
+    known = good & np.isfinite(mean) & np.isfinite(variance)
+    if not known.any():
+        known = np.isfinite(mean) & np.isfinite(variance)
+    points = photon_transfer(mean, variance, known, count)
+    if not (len(points) and points[:, 1].max() > 0):
+        raise InputError("'frames' are all equal, or hold no value: they show no noise")
+    return NoiseModel.fit(points)
+
+
+def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    if found != shape:
+        raise InputError(f"'frames' has frames of {found}, the sensor {shape}")
+
+
+def _von_neumann(steps: Floats, variance: Floats, count: int) -> Floats:
+    """Von Neumann's ratio of each pixel less 2, in its standard deviations."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = steps / (variance * (count - 1))
+    return np.asarray((ratio - 2) / 2 * np.sqrt((count**2 - 1) / max(1, count - 2)))

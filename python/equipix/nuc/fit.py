@@ -1,0 +1,221 @@
+"""Fit of response curves to levels of a uniform source."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix import _native
+from equipix._check import naming_memory, positive_workers
+from equipix.flags import set_bits, usable
+from equipix.nuc.curve import least_slope
+from equipix.nuc.inverse import horner_inverse, inverse_verdict
+from equipix.nuc.levels import levels_of
+from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
+from equipix.nuc.response import Response
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, By, Floats, Order
+    from equipix.exposures.averaged import Averaged
+    from equipix.frames import FrameStatistics
+    from equipix.noise import NoiseModel
+    from equipix.nuc.levels import Levels
+
+
+def fit(
+    levels: ArrayLike | Sequence[FrameStatistics] | Averaged,
+    *,
+    order: Order = 1,
+    by: By = "offset",
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+    mask: ArrayLike | None = None,
+    saturation: float | None = None,
+    workers: int | None = None,
+) -> Response:
+    r"""Fit the response curve of every pixel to levels of a uniform source.
+
+    Parameters
+    ----------
+    levels : sequence of FrameStatistics, or array_like of shape (n, rows, cols)
+        Mean frames of a uniform source (black body, integrating sphere), one a level, in DN, in any
+        order. Averages bring their noise, dark and bad pixels along; of plain arrays only the
+        values are known. Raw levels are welcome: the offset is part of the curve. NaN in arrays,
+        and saturated values, are not used.
+    order : {0, 1, 2, 3, "auto"}
+        Highest power of the array's mean: 0 one-point, 1 two-point, 2 quadratic, 3 cubic. It needs
+        order + 1 levels that differ. "auto" takes the order that best predicts levels left out.
+    by : {"offset", "gain"}
+        What a one-point correction (``order=0``) changes. "gain" needs levels without dark level:
+        averages of raw frames are refused.
+    variance : NoiseModel, array_like of shape (n,), or sequence of NoiseModel, optional
+        Variance of the values given, in DN²; by default averages give it, and arrays have equal
+        weights.
+    mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+        True = do not use.
+    saturation : float, optional
+        Level of saturation of arrays, in DN; by default the largest value of a whole-number dtype.
+    workers : int, optional
+        Number of threads; by default one for each processor. It changes no bit of the result.
+
+    Returns
+    -------
+    Response
+        The curves, their standard errors, and the correction that inverts them.
+
+    Raises
+    ------
+    InputError
+        If levels are too few, do not differ by more than noise, or saturate in half of the
+        pixels; if a level has one value, the highest, in nearly all pixels, whether a saturation
+        level was given or not; or an argument has a wrong shape or value.
+    InsufficientMemoryError
+        If there is not enough memory.
+
+    Warns
+    -----
+    SaturationWarning
+        If many values are exactly the highest one, and no saturation level was given for it.
+    InverseWarning
+        If the cubic of orders 2 and 3 differs from the exact inverse by more than 0.3 of the noise
+        of a frame at the lowest level, which adds 4 % to it, in more than 0.1 % of the usable
+        pixels.
+
+    Notes
+    -----
+    At every level all pixels see the same light. The deviation of a pixel's mean V from the mean
+    V̄ of the array is fitted as a polynomial of V̄ [1]_,
+
+    .. math:: V - \bar V = a + K \bar V + c \bar V^2 + e \bar V^3
+
+    by least squares with weights 1/σ², the variance at the signal that a first fit expects. V̄ is
+    the mean over good pixels that have a value at every level, so it is nearly free of noise;
+    within the fit it is scaled to [−1, 1]. A pixel is good if it is not hot, noisy or dead by the
+    tests of `equipix.calibrate`, and rises from the lowest to the highest level by half to twice
+    as much as its neighbours.
+
+    The radiation need not be known, only uniform: the fall-off of the source or of a lens enters
+    the coefficients as gain.
+
+    References
+    ----------
+    .. [1] "Correction of the non-uniformity of parameters of focal plane arrays", in a course on
+       staring infrared systems (in Russian); it quotes studies of PtSi, InSb and HgCdTe arrays.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> gain = np.array([[0.9, 1.0, 1.1]])
+    >>> levels = [level * gain + 20 for level in (100.0, 1000.0)]
+    >>> response = equipix.nuc.fit(levels, order=1)
+    >>> response.correct(500 * gain + 20).round(6)
+    array([[520., 520., 520.]])
+    """
+    check_order(order, by)
+    with naming_memory("fitting response curves"):
+        given = levels_of(levels, variance=variance, mask=mask, saturation=saturation)
+    return fitted(given, order=order, by=by, workers=workers)
+
+
+def fitted(
+    given: Levels,
+    *,
+    order: Order,
+    by: By,
+    workers: int | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> Response:
+    """Fit response curves to checked levels; `provenance` is added to the metadata.
+
+    The other parameters and the errors are those of `fit`.
+    """
+    started = datetime.now(UTC)
+    check_order(order, by)
+    workers = positive_workers(workers)
+    with naming_memory("fitting response curves"):
+        options: dict[str, Any] = {"order": order, "by": by}
+        if order == "auto":
+            chosen, options["prediction_errors"] = chosen_order(given, by, workers=workers)
+        else:
+            chosen = int(order)
+        check_count(given, chosen)
+        if chosen == 0 and by == "gain":
+            check_gain(given)
+        options["weights"] = "equal" if given.noise is None else "variances"
+        metadata = {
+            "versions": {"equipix": _native.__version__, "numpy": np.__version__},
+            "options": options,
+            "started": started.isoformat(timespec="seconds"),
+        }
+        return _fitted(given, chosen, by, workers, metadata | (provenance or {}))
+
+
+def _fitted(
+    levels: Levels, order: int, by: By, workers: int | None, metadata: dict[str, Any]
+) -> Response:
+    """Fit one order and invert it."""
+    deviation, variances, misfit, used = levels.fit(form_of(order, by), workers=workers)
+    freedom = used.astype(np.int64) - (order + 1)
+    chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
+    if levels.noise is None:
+        variances = variances * _pooled(misfit, freedom, levels.usable)
+    variances = _with_dark(variances, levels, by if order == 0 else "offset")
+    limits = levels.limits()
+    rising = least_slope(deviation, limits) > 0
+    inverse, difference = horner_inverse(np.where(rising, deviation, np.nan), limits)
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
+    flags = _flags(deviation, levels, rising)
+    metadata["inverse"] = inverse_verdict(difference[usable(flags)], levels.frame_noise)
+    return Response(
+        deviation=deviation,
+        variances=variances,
+        inverse=inverse,
+        inverse_error=difference,
+        limits=limits,
+        reduced_chi2=chi2,
+        used=used,
+        flags=flags,
+        levels=levels.references,
+        dark=levels.dark,
+        raw=levels.raw,
+        saturation=levels.saturation,
+        metadata=metadata | {"finished": finished},
+    )
+
+
+def _pooled(misfit: Floats, freedom: Array, usable: Array) -> float:
+    """Variance of a value from the residuals of all good pixels; NaN without freedom."""
+    total = int(freedom[usable].sum())
+    return float(misfit[usable].sum()) / total if total > 0 else float("nan")
+
+
+def _with_dark(variances: Floats, levels: Levels, by: By) -> Floats:
+    """Add the noise of the dark, which changes all values of a pixel by the same amount."""
+    if levels.dark_variance is None:
+        return variances
+    variances = variances.copy()
+    if by == "offset":
+        variances[0] += levels.dark_variance
+        return variances
+    weighted = levels.references / levels.variances
+    factor = weighted.sum() / (weighted @ levels.references)
+    variances[1] += levels.dark_variance * factor**2
+    return variances
+
+
+def _flags(deviation: Floats, levels: Levels, rising: Array) -> Array:
+    """Bits of `equipix.Flag` of each pixel."""
+    flags = np.zeros(levels.usable.shape, np.uint32)
+    findings, undetermined = levels.findings, np.isnan(deviation[0])
+    for finding, pixels in vars(findings).items():
+        set_bits(flags, finding, pixels)
+    set_bits(flags, "undetermined", undetermined)
+    falling = ~rising & ~undetermined
+    set_bits(flags, "falling", falling if findings.dead is None else falling & ~findings.dead)
+    return flags

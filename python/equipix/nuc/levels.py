@@ -1,0 +1,289 @@
+"""Levels of a uniform source: mean frames, the array's mean of each, and their noise."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from equipix import _native
+from equipix._readonly import ReadOnly
+from equipix.defects import SIGMAS, Findings, response_outliers
+from equipix.errors import InputError
+from equipix.exposures.averaged import Averaged, Words
+from equipix.exposures.front import as_mask, measured_of, union
+from equipix.frames import FrameStatistics
+from equipix.noise import NoiseModel
+from equipix.nuc.saturation import check_saturation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Self
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Bools, Floats
+    from equipix.exposures.front import Measured
+
+_LEVELS = Words("'levels'", "level")
+
+FEWEST_VALID = 0.5
+"""Least share of the pixels that must have a value at every level."""
+
+_ROUNDING = 1e-9
+"""Relative difference below which two means are equal, where no noise is known."""
+
+
+class LevelNoise(NamedTuple):
+    """Variance of a level's mean, in DN²: ``constant + slope · (value − dark)``."""
+
+    constant: float
+    slope: float
+    dark: float
+
+    def variance(self, value: Array | float) -> Floats:
+        """Variance at this value in DN."""
+        return np.asarray(self.constant + self.slope * np.maximum(value - self.dark, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Levels(ReadOnly):
+    """Mean frames of a uniform source at several levels, checked.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, rows, cols)
+        Mean frames in DN; NaN where a value is not to be used.
+    references : ndarray, shape (n,), float64
+        Mean V̄ of each level over the pixels that are good and have a value at every level.
+    usable : ndarray of bool, shape (rows, cols)
+        These pixels.
+    noise : tuple of LevelNoise, or None
+        Noise of the mean frames, without that of the dark; None if it is unknown.
+    findings : Findings
+        Bad pixels.
+    dark, dark_variance : ndarray, shape (rows, cols), or None
+        The dark frame that was subtracted, and the variance of its mean.
+    raw : bool
+        Whether they are averages of whole numbers from which no dark was subtracted.
+    saturation : float or None
+        Level of saturation in DN, where it is known.
+    frame_noise : float or None
+        Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
+        given; None if it is unknown.
+    """
+
+    values: Array
+    references: Floats
+    usable: Bools
+    noise: tuple[LevelNoise, ...] | None
+    findings: Findings
+    dark: Array | None = None
+    dark_variance: Floats | None = None
+    raw: bool = False
+    saturation: float | None = None
+    frame_noise: float | None = None
+
+    def __len__(self) -> int:
+        """Return the number of levels."""
+        return len(self.values)
+
+    @property
+    def variances(self) -> Floats:
+        """Variance of a pixel's value at each level; 1 where no noise is known."""
+        if self.noise is None:
+            return np.ones(len(self))
+        pairs = zip(self.noise, self.references, strict=True)
+        return np.array([float(noise.variance(reference)) for noise, reference in pairs])
+
+    def chosen(self, which: Sequence[int]) -> Self:
+        """Return some of the levels, with their references."""
+        return dataclasses.replace(
+            self,
+            values=self.values[which],
+            references=self.references[which],
+            noise=None if self.noise is None else tuple(self.noise[level] for level in which),
+        )
+
+    def without(self, odd: Bools) -> Self:
+        """Return the levels with references from which some of the usable pixels are left out."""
+        usable = self.usable.copy()
+        usable[self.usable] = ~odd
+        return dataclasses.replace(self, usable=usable, references=_references(self.values, usable))
+
+    def limits(self) -> Floats:
+        """Lowest and highest V̄ at which each pixel has a value, shape (2, rows, cols)."""
+        low, high = np.full((2, *self.usable.shape), np.nan)
+        for value, reference in zip(self.values, self.references, strict=True):
+            known = np.isfinite(value)
+            np.fmin(low, reference, out=low, where=known)
+            np.fmax(high, reference, out=high, where=known)
+        return np.stack([low, high])
+
+    def distinct(self) -> int:
+        """Count the levels whose means differ by more than six standard deviations of a pixel's."""
+        order = np.argsort(self.references)
+        sigma = np.sqrt(self.variances) if self.noise else np.zeros(len(self))
+        count, last = 1, order[0]
+        for level in order[1:]:
+            smallest = SIGMAS * np.hypot(sigma[level], sigma[last])
+            smallest = max(smallest, _ROUNDING * abs(self.references[level]))
+            if self.references[level] - self.references[last] > smallest:
+                count, last = count + 1, level
+        return count
+
+    def fit(self, form: str, *, workers: int | None) -> tuple[Floats, Floats, Floats, Array]:
+        """Fit polynomials of a form: coefficients, variances, misfit, levels used."""
+        return _native.fit_response(
+            self.values,
+            self.references.tolist(),
+            form=form,
+            noise=self.noise,
+            workers=workers,
+        )
+
+
+def levels_of(
+    levels: ArrayLike | Sequence[FrameStatistics] | Averaged,
+    *,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+    mask: ArrayLike | None = None,
+    saturation: float | None = None,
+) -> Levels:
+    """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
+    averaged = _averaged(levels)
+    if averaged is not None and averaged.raw and averaged.count > 1:
+        averaged = averaged.counted_from_lowest()
+    source = levels if averaged is None else averaged
+    measured = measured_of(source, variance, saturation, words=_LEVELS)
+    given = None if mask is None else as_mask(mask, measured.values.shape)
+    check_saturation(measured)
+    pedestal = 0.0 if averaged is None else averaged.pedestal
+    noise = _noise_of(measured, pedestal)
+    values = _used(measured, given)
+    findings = _with_odd_responses(values, noise, measured.findings)
+    usable = _usable(values, findings, given)
+    references = _references(values, usable)
+    return Levels(
+        values=values,
+        references=references,
+        usable=usable,
+        noise=noise,
+        findings=findings,
+        dark=measured.dark,
+        dark_variance=measured.dark_variance,
+        raw=measured.raw,
+        saturation=_saturation_of(levels, saturation),
+        frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
+    )
+
+
+def _references(values: Array, usable: Bools) -> Floats:
+    """Mean V̄ of each level over usable pixels."""
+    return np.array([each[usable].mean(dtype=np.float64) for each in values])
+
+
+def _frame_noise(
+    averaged: Averaged | None, noise: tuple[LevelNoise, ...] | None, references: Floats
+) -> float | None:
+    """Noise of one frame at the lowest level; of a value that is given where no more is known."""
+    lowest = int(np.argmin(references))
+    if averaged is not None and averaged.noise is not None:
+        signal = references[lowest] - averaged.pedestal
+        return float(np.sqrt(averaged.noise.variance(signal)))
+    return None if noise is None else float(np.sqrt(noise[lowest].variance(references[lowest])))
+
+
+def _saturation_of(levels: object, given: float | None) -> float | None:
+    """Return the level of saturation given, or that of averages where all have one."""
+    if isinstance(levels, Averaged):
+        return levels.saturation
+    if given is not None or not isinstance(levels, list | tuple):
+        return given
+    known = {getattr(each, "saturation", None) for each in levels}
+    return known.pop() if len(known) == 1 else None
+
+
+def _averaged(levels: object) -> Averaged | None:
+    """Statistics of all levels, reduced; None for arrays."""
+    if isinstance(levels, Averaged):
+        return levels
+    if not isinstance(levels, list | tuple) or not levels:
+        return None
+    if not all(isinstance(each, FrameStatistics) for each in levels):
+        return None
+    averaged = Averaged(len(levels), saturation=_saturation_of(levels, None), words=_LEVELS)
+    for each in levels:
+        averaged.add(each)
+    return averaged
+
+
+def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | None:
+    """Noise of each mean frame, from noise models or one variance a level."""
+    if measured.models:
+        return tuple(
+            LevelNoise(model.read_noise**2, model.gain, pedestal) for model in measured.models
+        )
+    if measured.variance is None:
+        return None
+    if measured.variance.ndim != 1:
+        raise InputError(
+            f"'variance' has shape {measured.variance.shape}, expected "
+            f"({len(measured.values)},) or a NoiseModel: a pixel's own sample variance makes "
+            "weights noisy"
+        )
+    return tuple(LevelNoise(float(each), 0.0, 0.0) for each in measured.variance)
+
+
+def _used(measured: Measured, mask: Bools | None) -> Array:
+    """Values with NaN where the caller masks them or, of arrays, where they saturate."""
+    saturated = measured.mask if measured.mask is not None and measured.mask.ndim == 3 else None
+    excluded = union(mask, saturated)
+    return measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
+
+
+def _with_odd_responses(
+    values: Array, noise: tuple[LevelNoise, ...] | None, findings: Findings
+) -> Findings:
+    """Add pixels that rise by less than half, or more than twice, as much as their neighbours."""
+    if len(values) < 2 or not np.isfinite(values).any(axis=(1, 2)).all():
+        return findings
+    means = [float(np.nanmedian(each)) for each in values]
+    low, high = int(np.argmin(means)), int(np.argmax(means))
+    rise = means[high] - means[low]
+    variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
+    # A rise within the noise is refused later, with the number of levels that differ.
+    if rise <= SIGMAS * np.sqrt(variance):
+        return findings
+    response = (values[high] - values[low]) / rise
+    std = np.full(response.shape, np.sqrt(variance) / rise)
+    dead, hot = response_outliers(response, lambda: std)
+    return dataclasses.replace(
+        findings, dead=union(findings.dead, dead), hot=union(findings.hot, hot)
+    )
+
+
+def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
+    """Good pixels with a value at every level; refused where they are few."""
+    known = np.isfinite(values)
+    bad = union(findings.dead, findings.hot, findings.noisy)
+    usable = np.asarray(known.all(axis=0))
+    if bad is not None:
+        usable &= ~bad
+    wanted = np.ones_like(usable)
+    if mask is not None:
+        wanted &= ~mask.reshape(-1, *usable.shape).all(axis=0)
+    share = float(usable.sum() / max(1, int(wanted.sum())))
+    if share < FEWEST_VALID or not usable.any():
+        missing = [1 - np.mean(each[wanted]) if wanted.any() else 1.0 for each in known]
+        worst = int(np.argmax(missing))
+        odd = 0.0 if bad is None or not wanted.any() else np.mean(bad[wanted])
+        raise InputError(
+            f"'levels': {share:.1%} of the pixels are good and have a value at every level, "
+            f"expected {FEWEST_VALID:.0%} or more. Level {worst} has no value in "
+            f"{missing[worst]:.1%} (saturated, masked or not finite), and {odd:.1%} are dead, hot "
+            "or noisy: leave out levels that saturate, or expose less"
+        )
+    return usable

@@ -1,0 +1,137 @@
+"""Order of response curves: what the levels allow, and which order predicts a held-out level."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+
+from equipix._types import By, Order
+from equipix.defects import SIGMAS
+from equipix.errors import InputError
+from equipix.noise import MEDIAN_SQUARE
+from equipix.nuc.curve import response_at
+
+if TYPE_CHECKING:
+    from equipix._types import Array, Bools, Floats
+    from equipix.nuc.levels import Levels
+
+FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
+"""Name of the form of each order above 0, whose form is named by what is corrected."""
+
+HELD = 4
+"""Most levels that are held out to choose an order."""
+
+_BETTER = 1e-3
+"""Relative fall of the prediction error that a higher order must bring."""
+
+_FEW = 0.05
+"""Largest share of pixels that are left out because they deviate from the others."""
+
+_ROUNDING = 1e-9
+"""Prediction error of exact data, relative to the largest level."""
+
+
+def form_of(order: int, by: By) -> str:
+    """Name of the form that the core fits."""
+    return FORMS.get(order, by)
+
+
+def check_order(order: object, by: object) -> None:
+    """Refuse an unknown order, an unknown `by`, and a `by` that an order does not have."""
+    whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
+    if not (whole or order == "auto") or order not in get_args(Order):
+        raise InputError(f"'order' is {order!r}, expected one of {get_args(Order)}")
+    if by not in get_args(By):
+        raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
+    if by == "gain" and order != 0:
+        raise InputError(
+            f"'by' is 'gain', but order {order!r} corrects offset and gain: expected order=0"
+        )
+
+
+def check_count(levels: Levels, order: int) -> None:
+    """Refuse fewer levels that differ than an order has coefficients."""
+    distinct = levels.distinct()
+    if distinct > order:
+        return
+    means = ", ".join(f"{reference:.6g}" for reference in levels.references)
+    sigma = f", {np.sqrt(np.median(levels.variances)):.2g} DN" if levels.noise else ""
+    raise InputError(
+        f"'levels': {distinct} of {len(levels)} differ by more than the noise of a pixel's mean"
+        f"{sigma}, but order {order} needs {order + 1}; their means are {means} DN: take more "
+        "levels further apart, or a lower order"
+    )
+
+
+def check_gain(levels: Levels) -> None:
+    """Refuse levels with a dark level, or without signal, for a correction by gain: a ratio."""
+    if levels.raw:
+        raise InputError(
+            "'levels' are averages of raw frames, whose dark level would enter the ratio of "
+            "by='gain': average them with dark=, or take order=1, which finds the offsets"
+        )
+    sigma = np.sqrt(levels.variances) if levels.noise else np.zeros(len(levels))
+    if not np.any(levels.references > 6 * sigma):
+        raise InputError(
+            f"'levels': the largest mean is {levels.references.max():.6g} DN, which is no signal "
+            "for by='gain': give levels with light"
+        )
+
+
+def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, list[float]]:
+    """Find the order that best predicts levels held out, and the mean square error of each order.
+
+    Notes
+    -----
+    Up to four levels between the lowest and the highest are left out, one at a time. The error is
+    the difference of the left-out level to the fit of the others at its reference, in standard
+    deviations of the level where noise is known, mean square over usable pixels and levels. The
+    lowest order within 0.1 % of the smallest error is taken.
+
+    A pixel that deviates from the others at some order counts at none: its mean square is above 36
+    times the variance of the normal variable whose square has the median of the array. These are
+    the same pixels for all orders, and one in twenty at most: more are a part of the array, which
+    the order must fit.
+    """
+    between = np.argsort(levels.references)[1:-1]
+    highest = min(3, levels.distinct() - 2)
+    if highest < 0 or not len(between):
+        raise InputError(
+            f"'order' is 'auto', which leaves out one of the levels between the lowest and the "
+            f"highest, but {levels.distinct()} of {len(levels)} differ: give three, or an order"
+        )
+    places = np.unique(np.linspace(0, len(between) - 1, HELD).round().astype(int))
+    held, orders = between[places], range(highest + 1)
+    squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
+    alike = _alike(squares)
+    if not alike.all():
+        levels = levels.without(~alike)
+        squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
+        alike = _alike(squares)
+    errors = squares[:, alike].mean(axis=1).tolist()
+    enough = min(errors) * (1 + _BETTER) + (_ROUNDING * np.abs(levels.references).max()) ** 2
+    return next(order for order, error in enumerate(errors) if error <= enough), errors
+
+
+def _squares(levels: Levels, held: Array, order: int, by: By, workers: int | None) -> Floats:
+    """Mean square error of each usable pixel, over predictions of each held level by the others."""
+    total = np.zeros(int(levels.usable.sum()))
+    for each in held:
+        others = levels.chosen([level for level in range(len(levels)) if level != each])
+        deviation, *_ = others.fit(form_of(order, by), workers=workers)
+        error = levels.values[each] - response_at(deviation, levels.references[each])
+        total += error[levels.usable] ** 2 / levels.variances[each]
+    return total / len(held)
+
+
+def _alike(squares: Floats) -> Bools:
+    """Pixels that do not deviate from the others at any order; `squares` has a row for each."""
+    limits = SIGMAS**2 / MEDIAN_SQUARE * np.median(squares, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # the median of exact levels may be 0
+        excess = np.nan_to_num(squares / limits[:, None], posinf=0).max(axis=0)
+    most = int(_FEW * excess.size)
+    if not most:
+        return np.ones(excess.size, bool)
+    # Of more than `most`, those that deviate most are left out.
+    return np.asarray(excess <= max(1.0, float(np.partition(excess, -most - 1)[-most - 1])))

@@ -1,0 +1,294 @@
+"""Response curves of pixels and the correction that inverts them: the result of `fit`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from equipix._check import as_array
+from equipix._readonly import ReadOnly
+from equipix.correction.apply import apply, apply_polynomial, dark_frame
+from equipix.correction.depth import depth_of
+from equipix.errors import InputError
+from equipix.flags import usable
+from equipix.nuc.curve import counted_from, response_at
+from equipix.nuc.inverse import exact_inverse
+from equipix.nuc.saved import save_fields
+
+if TYPE_CHECKING:
+    from os import PathLike
+    from typing import Self
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Bools, Flagged, Floats
+    from equipix.frames import FrameStatistics
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Response(ReadOnly):
+    """Response curves of all pixels, the result of `equipix.nuc.fit`; its arrays are read-only.
+
+    Attributes
+    ----------
+    deviation : ndarray, shape (order + 1, rows, cols), float64
+        Coefficients a, K, c, e of V − V̄ = a + K V̄ + c V̄² + e V̄³ for V̄ in DN; NaN where the levels
+        do not determine them. A one-point correction by gain has a = 0 and K.
+    variances : ndarray, shape (order + 1, rows, cols), float64
+        Variances of these coefficients. Where no noise was known they follow from the residuals of
+        all good pixels, and are NaN with as many levels as coefficients.
+    inverse : ndarray, shape (2 or 4, rows, cols), float64
+        Coefficients of the corrected value Σ c_j V^j: the exact inverse up to order 1, a cubic
+        above; NaN where the curve does not rise everywhere in its range.
+    inverse_error : ndarray, shape (rows, cols), float64
+        Largest difference of that cubic to the exact inverse over the valid range, in DN.
+    limits : ndarray, shape (2, rows, cols), float64
+        Array's mean V̄ at the lowest and the highest level with a value of the pixel, in DN.
+    reduced_chi2 : ndarray, shape (rows, cols), float64
+        Goodness of fit: mean square residual per degree of freedom, in units of the variance of a
+        value; 1 on average where the noise is right. Where no noise was known, in DN². NaN with as
+        many levels as coefficients.
+    used : ndarray, shape (rows, cols), uint32
+        Number of levels at which the pixel has a value.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`. ``DEAD`` rises by less than half as much as its neighbours, ``HOT``
+        by more than twice as much; the dark and the noise set them as in `equipix.calibrate`.
+        ``NONLINEAR`` does not rise everywhere, ``NO_FLAT_FIELD`` has too few levels.
+    levels : ndarray, shape (n,), float64
+        Array's mean V̄ of each level, in DN.
+    dark : ndarray, shape (rows, cols), or None
+        The dark frame that was subtracted from the levels; None where the offset is in the curves.
+    raw : bool
+        Whether the levels are known to be raw, so that frames must be raw, too.
+    saturation : float or None
+        Level of saturation in DN, where it is known.
+    metadata : dict
+        Versions, options and times, as JSON values. With ``order="auto"`` the mean square error of
+        prediction of each order.
+
+    Notes
+    -----
+    The corrected value is the mean V̄ that the array has at the light that the pixel sees. K is
+    small for a good pixel. A pixel with K = −1 does not respond, and 1/(1 + K) is without bound.
+    """
+
+    deviation: Floats
+    variances: Floats
+    inverse: Floats
+    inverse_error: Floats
+    limits: Floats
+    reduced_chi2: Floats
+    used: Array
+    flags: Array
+    levels: Floats
+    dark: Array | None = None
+    raw: bool = False
+    saturation: float | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.flags.shape
+        return rows, cols
+
+    @property
+    def order(self) -> int:
+        """Highest power of V̄ in the deviation; 1 also for one point by gain."""
+        return len(self.deviation) - 1
+
+    @property
+    def freedom(self) -> Array:
+        """Degrees of freedom of each pixel's fit: levels used less coefficients, 0 or more."""
+        by_gain = self.metadata.get("options", {}).get("order") == 0
+        terms = 1 if by_gain else len(self.deviation)
+        return np.maximum(self.used.astype(np.int64) - terms, 0)
+
+    @property
+    def valid_range(self) -> Floats:
+        """Lowest and highest raw value that the levels cover, shape (2, rows, cols), in DN.
+
+        The dark, if there is one, is subtracted.
+        """
+        return np.stack([response_at(self.deviation, limit) for limit in self.limits])
+
+    @property
+    def coefficients(self) -> Floats:
+        """Coefficients of the corrected frame Σ c_j y^j of raw y, shape (2 or 4, rows, cols).
+
+        A stored dark is part of them. NaN where the curve is undetermined or does not rise.
+        """
+        return self.inverse.copy() if self.dark is None else counted_from(self.inverse, self.dark)
+
+    @property
+    def largest_inverse_error(self) -> float:
+        """Largest difference of the cubic to the exact inverse over usable pixels, in DN."""
+        errors = self.inverse_error[usable(self.flags)]
+        return float(np.max(errors, initial=0.0))
+
+    def __repr__(self) -> str:
+        """Short form: sizes, order and levels."""
+        rows, cols = self.shape
+        return (
+            f"<Response of {rows} x {cols} pixels, order {self.order}, {len(self.levels)} levels>"
+        )
+
+    def correct(
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
+        flagged: Flagged = "nan",
+        exact: bool = False,
+        out: Array | None = None,
+    ) -> Array:
+        """Frames as a sensor of equal pixels would have given them.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Frames in DN: raw ones if a dark is stored or the levels were raw.
+        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+            The dark frame to subtract, in DN: the stored one if there is one, another, or none
+            where it is already subtracted. A response to raw levels takes none.
+        flagged : {"nan", "keep", "replace"}
+            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives (NaN
+            still where the curve is undetermined), or the mean of the nearest good pixels around.
+        exact : bool
+            Whether to invert orders 2 and 3 exactly, some 20 times slower, with the slope at the
+            end of the valid range beyond it. The cubic differs by at most `inverse_error`.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32 or float64; of frames of 8 or 16
+            bits and float32, unless `exact`, also uint8 or uint16: rounded half to even, and
+            limited to the range of the type (`equipix.Corrector` counts such values).
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of dtype float64 for float64 frames, else float32; or `out`. Values outside the valid
+            range are extrapolated: see `extrapolated`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, `flagged` is unknown, frames are of another bit depth, or a
+            dark is given to a response without one.
+        """
+        offset, depth = self._offset(dark), depth_of(self)
+        if not exact:
+            own = () if self.dark is None or offset is None else (self.dark,)
+            return apply_polynomial(
+                frames,
+                lambda: self.inverse if offset is None else counted_from(self.inverse, offset),
+                sources=(self.inverse, *own, self.flags) if offset is self.dark else None,
+                flags=self.flags,
+                flagged=flagged,
+                out=out,
+                depth=depth,
+            )
+        zero = np.zeros(self.shape) if offset is None else offset
+
+        def formula(frame: Array, corrected: Array) -> None:
+            corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
+
+        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, depth=depth)
+
+    def extrapolated(
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
+    ) -> Bools:
+        """Which values lie outside the range that the levels cover, so their correction is a guess.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Frames in DN, as for `correct`.
+        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+            As for `correct`.
+
+        Returns
+        -------
+        ndarray of bool, of the frames' shape
+            True below the lowest and above the highest level of the pixel, and where there is no
+            value or no curve.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit.
+        """
+        raw = as_array("frames", frames, ndim=(2, 3))
+        if raw.shape[-2:] != self.shape:
+            raise InputError(f"'frames' has shape {raw.shape}, the sensor {self.shape}")
+        offset = self._offset(dark)
+        low, high = self.valid_range if offset is None else self.valid_range + offset
+        return np.asarray(~((raw >= low) & (raw <= high)))
+
+    def with_flags(self, flags: Array) -> Self:
+        """Return a copy with more flags, such as those of `find_defects`.
+
+        Parameters
+        ----------
+        flags : ndarray, shape (rows, cols), of whole numbers
+            Bits of `equipix.Flag`, combined with those that are there by OR.
+
+        Returns
+        -------
+        Response
+            The copy; these flags survive saving.
+
+        Raises
+        ------
+        InputError
+            If the shape or dtype does not fit.
+        """
+        more = as_array("flags", flags, ndim=2)
+        if more.shape != self.shape or more.dtype.kind not in "iu":
+            raise InputError(
+                f"'flags' is {more.dtype} of shape {more.shape}, expected whole numbers of shape "
+                f"{self.shape}"
+            )
+        return replace(self, flags=self.flags | more.astype(np.uint32))
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        InputError
+            If the suffix is unknown.
+        """
+        save_fields(path, vars(self), force=force)
+
+    @property
+    def _rising(self) -> Floats:
+        """Coefficients of the curves that have an inverse, NaN elsewhere."""
+        return np.where(np.isnan(self.inverse[0]), np.nan, self.deviation)
+
+    def _offset(self, dark: Literal["stored"] | FrameStatistics | ArrayLike | None) -> Array | None:
+        """Dark frame to subtract, if any."""
+        if isinstance(dark, str):
+            if dark != "stored":
+                raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+            return self.dark
+        if dark is None:
+            return None
+        if self.raw:
+            raise InputError(
+                "'dark' is given, but the offsets of this response are part of its curves: it was "
+                "fitted to levels from which no dark was subtracted"
+            )
+        return dark_frame(dark, self.shape)

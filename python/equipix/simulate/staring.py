@@ -1,0 +1,403 @@
+"""A virtual staring array: why pixels answer the same light differently, cause by cause."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from equipix._check import as_array, check_shape
+from equipix.errors import InputError
+from equipix.simulate.blackbody import band_photons
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from equipix._types import Floats, Rng
+
+_REFERENCE_K = 300.0
+"""Temperature of a black body at which the mean light is given."""
+
+_SLOWEST_HZ, _FASTEST_HZ, _WAVES = 1e-6, 1e-2, 9
+"""Frequencies of the drift, equally many in each decade, which is a spectrum of 1/f."""
+
+_NOT_BELOW_0 = ("sensitivity", "area", "dark_e", "amplification", "read_noise_e", "drift_dn")
+"""Causes that cannot be below 0."""
+
+_STEEPEST = 0.5
+"""Curvature at which the response stops rising when the well is full."""
+
+_MAPS = (
+    "sensitivity",
+    "area",
+    "dark_e",
+    "curvature",
+    "cutoff_um",
+    "offset_dn",
+    "amplification",
+    "read_noise_e",
+    "drift_dn",
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StaringArray:
+    """A focal plane array whose pixels differ in what they are made of.
+
+    Each cause is a map of shape (rows, cols), or one number for all pixels.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Rows and columns.
+    sensitivity : array_like
+        Relative quantum efficiency.
+    area : array_like
+        Relative light-sensitive area: more light, and more dark current.
+    dark_e : array_like
+        Electrons of the dark current in one frame.
+    curvature : array_like
+        Share of the signal that is missing when the well is full: n electrons become
+        n·(1 − curvature·n/well). At most 1/2, where the response no longer rises at a full well.
+    cutoff_um : array_like
+        Cut-off wavelength in µm: the spectrum that the pixel sees of a black body.
+    band_start_um : float
+        Shortest wavelength that the optics let through, in µm.
+    offset_dn : array_like
+        Offset of the read-out, in DN.
+    amplification : array_like
+        Relative gain of the read-out, such as that of a column's amplifier.
+    read_noise_e : array_like
+        Standard deviation of the read noise, in electrons; large for a noisy pixel.
+    drift_dn : array_like
+        Standard deviation of a slow drift of the offset with a spectrum of 1/f, in DN.
+    doubling_k : float
+        Rise of the detector's temperature that doubles the dark current, in kelvin.
+    well_e : float
+        Electrons that a pixel holds.
+    bit_depth : int
+        Bits of the ADC, 8 to 16; a full well is its largest number, less a tenth of the range.
+    seed : int
+        Of the phases of the drift.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its range, or a map has another shape.
+
+    Notes
+    -----
+    The causes are those that [1]_ names: spread of sensitivity, area, dark current and read-out;
+    non-linear conversion; dependence on the wavelength together with the band of the optics;
+    temperature of the cooler; drift.
+
+    References
+    ----------
+    .. [1] "Correction of the non-uniformity of parameters of focal plane arrays", in a course on
+       staring infrared systems (in Russian).
+
+    Examples
+    --------
+    >>> import equipix
+    >>> from equipix import simulate
+    >>> array = simulate.StaringArray.of("InSb", (24, 32), rng=1)
+    >>> levels = [equipix.average(array.frames(e, 16, rng=k)) for k, e in enumerate((4e6, 16e6))]
+    >>> response = equipix.nuc.fit(levels, order=1)
+    >>> frame = next(array.frames(10e6, 1, rng=9))
+    >>> bool(response.correct(frame).std() < 0.05 * frame.std())
+    True
+    """
+
+    shape: tuple[int, int]
+    sensitivity: ArrayLike = 1.0
+    area: ArrayLike = 1.0
+    dark_e: ArrayLike = 0.0
+    curvature: ArrayLike = 0.0
+    cutoff_um: ArrayLike = 5.0
+    band_start_um: float = 3.0
+    offset_dn: ArrayLike = 200.0
+    amplification: ArrayLike = 1.0
+    read_noise_e: ArrayLike = 500.0
+    drift_dn: ArrayLike = 0.0
+    doubling_k: float = 6.0
+    well_e: float = 2e7
+    bit_depth: int = 14
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_shape(self.shape)
+        if self.bit_depth not in range(8, 17):
+            raise InputError(f"'bit_depth' is {self.bit_depth!r}, expected 8 to 16")
+        for name in ("doubling_k", "well_e", "band_start_um"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
+        for name in _MAPS:
+            values = as_array(name, getattr(self, name), ndim=(0, 1, 2))
+            if values.shape not in ((1,), self.shape):
+                raise InputError(
+                    f"'{name}' has shape {values.shape}, expected one number or {self.shape}"
+                )
+            self._check_values(name, values)
+
+    def _check_values(self, name: str, values: NDArray[Any]) -> None:
+        """Refuse values of a map that no array has."""
+        low, high, wanted = -np.inf, np.inf, "finite numbers"
+        if name in _NOT_BELOW_0:
+            low, wanted = 0.0, "finite numbers not below 0"
+        elif name == "curvature":
+            high, wanted = _STEEPEST, f"finite numbers up to {_STEEPEST}"
+        elif name == "cutoff_um":
+            low = float(np.nextafter(self.band_start_um, np.inf))
+            wanted = f"finite numbers above 'band_start_um', {self.band_start_um:g}"
+        wrong = values[~(np.isfinite(values) & (values >= low) & (values <= high))]
+        if wrong.size:
+            raise InputError(f"'{name}' holds {wrong.flat[0]:g}, expected {wanted}")
+
+    @classmethod
+    def of(cls, material: str, shape: tuple[int, int], *, rng: Rng) -> Self:
+        """Array of a material with typical spreads.
+
+        Parameters
+        ----------
+        material : {"PtSi", "InSb", "HgCdTe"}
+            PtSi and InSb are nearly linear, HgCdTe is curved, and differently in each pixel.
+        shape : tuple of int
+            Rows and columns.
+        rng : numpy.random.Generator or int
+            Source of the random numbers, or its seed.
+
+        Returns
+        -------
+        StaringArray
+            The spreads are choices of this package, not data of a product: their order of size
+            is that of the three materials.
+
+        Raises
+        ------
+        InputError
+            If the material is unknown.
+        """
+        if material not in MATERIALS:
+            raise InputError(f"'material' is {material!r}, expected one of {tuple(MATERIALS)}")
+        rng, (start, spreads) = np.random.default_rng(rng), MATERIALS[material]
+        rows, cols = check_shape(shape)
+        columns = rng.standard_normal(cols)
+        maps: dict[str, Any] = {
+            name: mean + spread * rng.standard_normal((rows, cols))
+            for name, (mean, spread) in spreads.items()
+        }
+        maps["amplification"] = np.broadcast_to(1 + 0.005 * columns, (rows, cols))
+        maps["dark_e"] = np.maximum(maps["dark_e"], 0)
+        seed = int(rng.integers(2**31))
+        return cls(shape=(rows, cols), band_start_um=start, seed=seed, **maps)
+
+    def with_causes(self, **causes: Any) -> Self:
+        """Return a copy with other values of some attributes."""
+        return replace(self, **causes)
+
+    @cached_property
+    def _maps(self) -> dict[str, Floats]:
+        """Each cause as a map of all pixels."""
+        return {
+            name: np.broadcast_to(np.asarray(getattr(self, name), np.float64), self.shape)
+            for name in _MAPS
+        }
+
+    @property
+    def full_scale(self) -> int:
+        """Largest digital number."""
+        return int(2**self.bit_depth - 1)
+
+    @property
+    def gain_dn_per_e(self) -> float:
+        """Digital numbers per electron of a pixel of mean amplification."""
+        return 0.9 * self.full_scale / self.well_e
+
+    def black_body(self, temperature_k: float, *, light_e: float) -> Floats:
+        """Photoelectrons that each pixel of sensitivity and area 1 gets from a black body.
+
+        Parameters
+        ----------
+        temperature_k : float
+            Temperature in kelvin.
+        light_e : float
+            Photoelectrons that a pixel of the mean cut-off gets at 300 K.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols), float64
+            In electrons in one frame: pixels differ by their cut-off wavelengths.
+        """
+        cutoff = self._maps["cutoff_um"]
+        mean = band_photons(self.band_start_um, cutoff.mean(), _REFERENCE_K)
+        photons = band_photons(self.band_start_um, cutoff, temperature_k)
+        return np.asarray(light_e / mean * photons)
+
+    def electrons(self, light_e: ArrayLike, *, warmer_k: float = 0.0) -> Floats:
+        """Mean electrons that each pixel collects in one frame.
+
+        Parameters
+        ----------
+        light_e : array_like, a number or of shape (rows, cols)
+            Photoelectrons of a pixel of sensitivity and area 1.
+        warmer_k : float
+            How much warmer the detector is than the cooler should keep it, in kelvin.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols), float64
+            Of light and dark current, at most a full well.
+
+        Raises
+        ------
+        InputError
+            If light is not finite or below 0.
+        """
+        light = np.asarray(light_e, np.float64)
+        wrong = light[~(np.isfinite(light) & (light >= 0))]
+        if wrong.size:
+            raise InputError(f"'light_e' holds {wrong.flat[0]:g}, expected finite numbers from 0")
+        dark = self._maps["dark_e"] * 2 ** (warmer_k / self.doubling_k)
+        collected = self._maps["area"] * (self._maps["sensitivity"] * light + dark)
+        return np.asarray(np.clip(collected, 0, self.well_e))
+
+    def mean(
+        self, light_e: ArrayLike, *, warmer_k: float = 0.0, time_s: float | None = None
+    ) -> Floats:
+        """Mean of a frame without noise and without rounding.
+
+        Parameters
+        ----------
+        light_e : array_like, a number or of shape (rows, cols)
+            Photoelectrons of a pixel of sensitivity and area 1.
+        warmer_k : float
+            How much warmer the detector is, in kelvin.
+        time_s : float, optional
+            Time in seconds, for the drift; without it there is none.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols), float64
+            In DN.
+        """
+        n = self.electrons(light_e, warmer_k=warmer_k)
+        return self._offset(time_s) + self._converted(n)
+
+    def frames(
+        self,
+        light_e: ArrayLike,
+        count: int,
+        *,
+        rng: Rng,
+        warmer_k: float = 0.0,
+        time_s: float | None = None,
+    ) -> Iterator[NDArray[Any]]:
+        """Make frames of a steady light, one at a time.
+
+        Parameters
+        ----------
+        light_e : array_like, a number or of shape (rows, cols)
+            Photoelectrons of a pixel of sensitivity and area 1.
+        count : int
+            Number of frames.
+        rng : numpy.random.Generator or int
+            Source of the random numbers, or its seed.
+        warmer_k : float
+            How much warmer the detector is, in kelvin.
+        time_s : float, optional
+            Time in seconds, for the drift; without it there is none.
+
+        Yields
+        ------
+        ndarray, shape (rows, cols), uint8 up to 8 bits, else uint16
+            The next frame, in DN.
+
+        Notes
+        -----
+        The numbers of electrons are normally distributed with the variance of a Poisson
+        distribution: wells of infrared arrays hold millions.
+        """
+        rng = np.random.default_rng(rng)
+        n = self.electrons(light_e, warmer_k=warmer_k)
+        sigma, offset = np.hypot(np.sqrt(n), self._maps["read_noise_e"]), self._offset(time_s)
+        for _ in range(count):
+            values = offset + self._converted(n + sigma * rng.standard_normal(self.shape))
+            whole = np.clip(np.rint(values), 0, self.full_scale)
+            yield whole.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+    def temporal_noise(self, light_e: ArrayLike) -> Floats:
+        """Standard deviation of one frame, in DN, rounding included, curvature left out."""
+        n = self.electrons(light_e)
+        variance = n + self._maps["read_noise_e"] ** 2
+        gain = self.gain_dn_per_e * self._maps["amplification"]
+        return np.sqrt(gain**2 * variance + 1 / 12)
+
+    def _converted(self, electrons: Floats) -> Floats:
+        """Electrons as DN without the offset."""
+        linear = self.gain_dn_per_e * self._maps["amplification"] * electrons
+        missing = self._maps["curvature"] * electrons / self.well_e
+        return np.asarray(linear * (1 - missing))
+
+    def _offset(self, time_s: float | None) -> Floats:
+        """Offset of the read-out with its drift, in DN."""
+        offset = self._maps["offset_dn"]
+        if time_s is None or not self._maps["drift_dn"].any():
+            return offset
+        drift = np.zeros(self.shape)
+        for frequency, phase in zip(*self._waves, strict=True):
+            drift += np.cos(2 * np.pi * frequency * time_s + phase)
+        return np.asarray(offset + self._maps["drift_dn"] * np.sqrt(2 / _WAVES) * drift)
+
+    @cached_property
+    def _waves(self) -> tuple[Floats, Floats]:
+        """Frequencies and phases of the waves of the drift in each pixel."""
+        rng, shape = np.random.default_rng(self.seed), (_WAVES, *self.shape)
+        steps = np.arange(_WAVES)[:, None, None] + rng.random(shape)
+        frequencies = _SLOWEST_HZ * (_FASTEST_HZ / _SLOWEST_HZ) ** (steps / _WAVES)
+        return frequencies, rng.uniform(0, 2 * np.pi, shape)
+
+
+MATERIALS: dict[str, tuple[float, dict[str, tuple[float, float]]]] = {
+    "PtSi": (
+        3.0,
+        {
+            "sensitivity": (1.0, 0.005),
+            "area": (1.0, 0.002),
+            "dark_e": (1e5, 2e3),
+            "curvature": (0.002, 0.0002),
+            "cutoff_um": (5.0, 0.0),
+            "offset_dn": (300.0, 20.0),
+            "drift_dn": (0.2, 0.0),
+        },
+    ),
+    "InSb": (
+        3.0,
+        {
+            "sensitivity": (1.0, 0.02),
+            "area": (1.0, 0.005),
+            "dark_e": (2e5, 1e4),
+            "curvature": (0.005, 0.0005),
+            "cutoff_um": (5.3, 0.002),
+            "offset_dn": (300.0, 40.0),
+            "drift_dn": (0.6, 0.0),
+        },
+    ),
+    "HgCdTe": (
+        8.0,
+        {
+            "sensitivity": (1.0, 0.05),
+            "area": (1.0, 0.01),
+            "dark_e": (1e6, 1e5),
+            "curvature": (0.04, 0.008),
+            "cutoff_um": (10.0, 0.03),
+            "offset_dn": (300.0, 60.0),
+            "drift_dn": (2.0, 0.0),
+        },
+    ),
+}
+"""Shortest wavelength in µm, then mean and standard deviation over the pixels of each cause."""

@@ -1,0 +1,489 @@
+//! Corrections applied to frames at the rate of memory.
+//!
+//! A corrected value is a polynomial of the raw value y with coefficients of the pixel's own,
+//!
+//! ```text
+//! c_0 + y (c_1 + y (c_2 + y c_3))
+//! ```
+//!
+//! in single precision, by Horner's scheme. For whole numbers it is rounded, half to even, and limited
+//! to what the type, or the camera's bits, can hold. Of bytes that must move, a frame of 16 bits with
+//! gain and offset has 12 a pixel: two of the frame, two of the result, eight of the coefficients.
+//!
+//! The product and the sum are rounded one by one, not fused: the same bytes come out on every
+//! processor.
+
+use std::cell::RefCell;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+
+use crate::control::Control;
+use crate::error::{Error, Result};
+use crate::frames::{Shape, Stack};
+use crate::parallel::Workers;
+
+/// Pixels that a thread corrects at a time.
+const BLOCK: usize = 1 << 15;
+
+/// Most pixels that the calling thread corrects alone: a quarter of a millisecond, in which other
+/// threads would hardly have started. Of larger stacks each thread takes whole frames, and of larger
+/// frames blocks.
+const ALONE: usize = 1 << 20;
+
+/// Largest number of coefficients: those of a cubic.
+const PLANES: usize = 4;
+
+/// 2²³: a number from 0 to 2²³ added to it keeps its whole part alone, rounded half to even, in the
+/// low bits.
+const WHOLE: f32 = 8_388_608.0;
+
+/// A raw value as a frame has it.
+pub trait Raw: Copy + Send + Sync {
+    /// The value in single precision.
+    fn value(self) -> f32;
+}
+
+/// A corrected value.
+pub trait Corrected: Copy + Send + Sync {
+    /// The value of `corrected`, at most `largest`, and whether it had to be changed for that.
+    fn of(corrected: f32, largest: f32) -> (Self, bool);
+}
+
+macro_rules! whole_numbers {
+    ($($kind:ty),*) => {$(
+        impl Raw for $kind {
+            #[inline(always)]
+            fn value(self) -> f32 {
+                f32::from(self)
+            }
+        }
+
+        impl Corrected for $kind {
+            #[inline(always)]
+            fn of(corrected: f32, largest: f32) -> (Self, bool) {
+                // What is not a number becomes 0 here, and counts as changed.
+                let limited = corrected.max(0.0).min(largest);
+                let held = corrected >= -0.5 && corrected < largest + 0.5;
+                ((limited + WHOLE).to_bits() as $kind, !held)
+            }
+        }
+    )*};
+}
+
+whole_numbers!(u8, u16);
+
+impl Raw for f32 {
+    #[inline(always)]
+    fn value(self) -> f32 {
+        self
+    }
+}
+
+impl Corrected for f32 {
+    #[inline(always)]
+    fn of(corrected: f32, _: f32) -> (Self, bool) {
+        (corrected, false)
+    }
+}
+
+/// What becomes of pixels that must not be used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unusable {
+    /// They are corrected like the others.
+    Kept,
+    /// Not a number; 0 where the result is of whole numbers.
+    Blank,
+    /// The mean of the nearest usable pixels.
+    Replaced,
+}
+
+/// What was found in frames while they were corrected.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Counts {
+    /// Values that had to be limited to 0 and the largest.
+    pub limited: u64,
+    /// Values that were corrected to below the lowest or above the highest level of their pixel.
+    pub extrapolated: u64,
+    /// The largest raw value; 0 where none is above 0.
+    pub highest: f32,
+}
+
+/// Counts to which several threads add.
+#[derive(Debug, Default)]
+struct Tally {
+    limited: AtomicU64,
+    extrapolated: AtomicU64,
+    /// Bits of a number that is not negative: their order is that of the numbers.
+    highest: AtomicU32,
+}
+
+impl Tally {
+    fn add(&self, counts: Counts) {
+        self.limited.fetch_add(counts.limited, Ordering::Relaxed);
+        self.extrapolated.fetch_add(counts.extrapolated, Ordering::Relaxed);
+        self.highest.fetch_max(counts.highest.to_bits(), Ordering::Relaxed);
+    }
+
+    fn counts(self) -> Counts {
+        Counts {
+            limited: self.limited.into_inner(),
+            extrapolated: self.extrapolated.into_inner(),
+            highest: f32::from_bits(self.highest.into_inner()),
+        }
+    }
+}
+
+/// Lowest and highest level that a correction was measured at.
+#[derive(Debug)]
+struct Range {
+    /// Of the pixel with the most levels.
+    widest: [f32; 2],
+    /// Pixels with fewer levels, and their own.
+    narrower: Vec<(u32, [f32; 2])>,
+}
+
+impl Range {
+    const EVERYTHING: Self =
+        Self { widest: [f32::NEG_INFINITY, f32::INFINITY], narrower: Vec::new() };
+
+    /// From the levels of each pixel, all lowest ones first; what is not a number has no range.
+    fn of(levels: &[f32], size: usize) -> Self {
+        let (low, high) = levels.split_at(size);
+        let each = || low.iter().zip(high).map(|(&low, &high)| widened([low, high]));
+        let union = |[low, high]: [f32; 2], [l, h]: [f32; 2]| [low.min(l), high.max(h)];
+        let widest = each().fold([f32::INFINITY, f32::NEG_INFINITY], union);
+        let own = (0..).zip(each()).filter(|(_, range)| *range != widest && range[0] <= range[1]);
+        Self { widest, narrower: own.collect() }
+    }
+}
+
+/// A range with the roundings of a polynomial in single precision, so that a value at a level is in it.
+fn widened([low, high]: [f32; 2]) -> [f32; 2] {
+    let rounding = 8.0 * f32::EPSILON * low.abs().max(high.abs());
+    [low - rounding, high + rounding]
+}
+
+/// Whether a value is outside; what is not a number is not.
+#[inline(always)]
+fn is_outside(value: f32, [low, high]: [f32; 2]) -> bool {
+    (value < low) | (value > high)
+}
+
+/// Bits of a number, which for numbers from 0 on have their order and for others are not above 0; what
+/// is not a number is 0. A maximum of them is found in vector registers, one of numbers is not.
+#[inline(always)]
+fn order_of(value: f32) -> i32 {
+    if value.is_nan() { 0 } else { value.to_bits().cast_signed() }
+}
+
+thread_local! {
+    /// Values of replaced pixels of the frame at hand, kept so that no frame allocates.
+    static REPAIRED: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
+
+/// A correction prepared for many frames.
+#[derive(Debug)]
+pub struct Corrector {
+    shape: Shape,
+    coefficients: Vec<f32>,
+    planes: usize,
+    repairs: Repairs,
+    range: Range,
+}
+
+impl Corrector {
+    /// Prepares coefficients, one plane a power of y, lowest first.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if there are more than four planes or `unusable` is of another size.
+    pub fn new(coefficients: Stack<'_, f32>, unusable: &[bool], then: Unusable) -> Result<Self> {
+        let (shape, planes) = (coefficients.shape(), coefficients.count());
+        if planes == 0 || planes > PLANES || unusable.len() != shape.len() {
+            return Err(Error::Shape {
+                argument: "coefficients",
+                got: format!("({planes}, {}, {})", shape.rows, shape.cols),
+                wanted: format!("(1 to {PLANES}, rows, columns) and a mask of as many pixels"),
+            });
+        }
+        let mut coefficients = coefficients.data().to_vec();
+        let repairs = match then {
+            Unusable::Replaced => Repairs::of(shape, unusable),
+            Unusable::Kept | Unusable::Blank => Repairs::default(),
+        };
+        if then != Unusable::Kept {
+            for pixel in (0..shape.len()).filter(|&pixel| unusable[pixel]) {
+                coefficients.iter_mut().skip(pixel).step_by(shape.len()).for_each(|each| {
+                    *each = f32::NAN;
+                });
+            }
+        }
+        Ok(Self { shape, coefficients, planes, repairs, range: Range::EVERYTHING })
+    }
+
+    /// Counts values that are corrected to outside of these levels: the lowest of each pixel, then
+    /// the highest of each.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if `levels` is of another size.
+    pub fn with_levels(self, levels: Stack<'_, f32>) -> Result<Self> {
+        if levels.count() != 2 || levels.shape() != self.shape {
+            let shape = levels.shape();
+            return Err(Error::Shape {
+                argument: "levels",
+                got: format!("({}, {}, {})", levels.count(), shape.rows, shape.cols),
+                wanted: format!("(2, {}, {})", self.shape.rows, self.shape.cols),
+            });
+        }
+        Ok(Self { range: Range::of(levels.data(), self.shape.len()), ..self })
+    }
+
+    /// Sizes of a frame.
+    #[must_use]
+    pub const fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Corrects frames into `out`; `largest`, to which values are limited, is an odd number.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if an array holds no whole number of frames, or the two differ in size;
+    /// [`Error::Cancelled`].
+    pub fn apply<I: Raw, O: Corrected>(
+        &self,
+        frames: &[I],
+        out: &mut [O],
+        largest: f32,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Counts> {
+        let size = self.shape.len();
+        for (argument, length) in [("frames", frames.len()), ("out", out.len())] {
+            if !length.is_multiple_of(size) || length != frames.len() {
+                return Err(Error::Shape {
+                    argument,
+                    got: format!("{length} values"),
+                    wanted: format!("{}", self.shape),
+                });
+            }
+        }
+        let tally = Tally::default();
+        let correct = |index: usize, frame: &[I], block: &mut [O]| {
+            if !control.is_cancelled() {
+                let (at, length) = (index * BLOCK, block.len());
+                tally.add(self.correct_block(at, &frame[at..at + length], block, largest));
+            }
+        };
+        let alone = |frame: &[I], out: &mut [O]| {
+            out.chunks_mut(BLOCK).enumerate().for_each(|(index, part)| correct(index, frame, part));
+            self.finish(frame, out, largest, &tally);
+        };
+        let each = frames.chunks(size).zip(out.chunks_mut(size));
+        // Threads give back results of no size, for which nothing is allocated.
+        if frames.len() <= ALONE {
+            each.for_each(|(frame, out)| alone(frame, out));
+        } else if size <= ALONE {
+            workers.map_blocks(out, size, |index, out| alone(&frames[index * size..][..size], out));
+        } else {
+            for (frame, out) in each {
+                workers.map_blocks(out, BLOCK, |index, part| correct(index, frame, part));
+                self.finish(frame, out, largest, &tally);
+            }
+        }
+        control.check()?;
+        Ok(tally.counts())
+    }
+
+    /// Coefficients of power `power` from pixel `at` on.
+    fn plane(&self, power: usize, at: usize, length: usize) -> &[f32] {
+        &self.coefficients[power * self.shape.len() + at..][..length]
+    }
+
+    fn correct_block<I: Raw, O: Corrected>(
+        &self,
+        at: usize,
+        frame: &[I],
+        out: &mut [O],
+        largest: f32,
+    ) -> Counts {
+        let plane = |power| self.plane(power, at, frame.len());
+        let (arch, range) = (pulp::Arch::new(), self.range.widest);
+        match self.planes {
+            1 => arch.dispatch(Block { frame, planes: [plane(0)], out, largest, range }),
+            2 => arch.dispatch(Block { frame, planes: [plane(0), plane(1)], out, largest, range }),
+            3 => {
+                let planes = [plane(0), plane(1), plane(2)];
+                arch.dispatch(Block { frame, planes, out, largest, range })
+            }
+            _ => {
+                let planes = [plane(0), plane(1), plane(2), plane(3)];
+                arch.dispatch(Block { frame, planes, out, largest, range })
+            }
+        }
+    }
+
+    /// The corrected value of one pixel.
+    fn value<I: Raw>(&self, frame: &[I], pixel: usize) -> f32 {
+        let y = frame[pixel].value();
+        (0..self.planes)
+            .rev()
+            .fold(0.0, |sum, power| sum * y + self.coefficients[power * self.shape.len() + pixel])
+    }
+
+    /// Replaces pixels of a frame whose blocks are corrected, and counts what the blocks cannot.
+    fn finish<I: Raw, O: Corrected>(
+        &self,
+        frame: &[I],
+        out: &mut [O],
+        largest: f32,
+        tally: &Tally,
+    ) {
+        let narrower = self.range.narrower.iter().filter(|(pixel, range)| {
+            let value = self.value(frame, *pixel as usize);
+            is_outside(value, *range) && !is_outside(value, self.range.widest)
+        });
+        tally.extrapolated.fetch_add(narrower.count() as u64, Ordering::Relaxed);
+        tally.limited.fetch_add(self.repair(frame, out, largest), Ordering::Relaxed);
+        // Their coefficients are not numbers, and so were their values in the blocks.
+        let before = u64::from(O::of(f32::NAN, largest).1) * self.repairs.pixels.len() as u64;
+        tally.limited.fetch_sub(before, Ordering::Relaxed);
+    }
+
+    /// Replaces pixels by the means of their sources; gives the number of values limited.
+    fn repair<I: Raw, O: Corrected>(&self, frame: &[I], out: &mut [O], largest: f32) -> u64 {
+        REPAIRED.with_borrow_mut(|repaired| {
+            repaired.clear();
+            let mut limited = 0;
+            for (index, &pixel) in self.repairs.pixels.iter().enumerate() {
+                let mean = self.mean_of(self.repairs.sources(index), frame, repaired);
+                repaired.push(mean);
+                let (value, changed) = O::of(mean, largest);
+                out[pixel as usize] = value;
+                limited += u64::from(changed);
+            }
+            limited
+        })
+    }
+
+    /// Mean of the sources of a pixel. A value that is not a number does not count, so it does not
+    /// spread.
+    fn mean_of<I: Raw>(&self, sources: &[Source], frame: &[I], repaired: &[f32]) -> f32 {
+        let (mut sum, mut count) = (0.0, 0_u32);
+        for source in sources {
+            let value = match *source {
+                Source::Pixel(pixel) => self.value(frame, pixel as usize),
+                Source::Repaired(before) => repaired[before as usize],
+            };
+            if !value.is_nan() {
+                sum += value;
+                count += 1;
+            }
+        }
+        sum / count as f32
+    }
+}
+
+/// Pixels of one block, with their coefficients.
+struct Block<'s, I, O, const N: usize> {
+    frame: &'s [I],
+    planes: [&'s [f32]; N],
+    out: &'s mut [O],
+    largest: f32,
+    range: [f32; 2],
+}
+
+impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, O, N> {
+    type Output = Counts;
+
+    #[inline(always)]
+    fn call(self) -> Counts {
+        let (mut limited, mut extrapolated, mut highest) = (0_u32, 0_u32, 0);
+        let length = self.out.len();
+        let (frame, planes) = (&self.frame[..length], self.planes.map(|plane| &plane[..length]));
+        for (i, out) in self.out.iter_mut().enumerate() {
+            let y = frame[i].value();
+            let mut sum = planes[N - 1][i];
+            for power in (0..N - 1).rev() {
+                sum = sum * y + planes[power][i];
+            }
+            let (value, changed) = O::of(sum, self.largest);
+            *out = value;
+            limited += u32::from(changed);
+            extrapolated += u32::from(is_outside(sum, self.range));
+            highest = highest.max(order_of(y));
+        }
+        Counts {
+            limited: limited.into(),
+            extrapolated: extrapolated.into(),
+            highest: f32::from_bits(highest.cast_unsigned()),
+        }
+    }
+}
+
+/// What a replaced pixel is the mean of.
+#[derive(Clone, Copy, Debug)]
+enum Source {
+    /// A usable pixel.
+    Pixel(u32),
+    /// A pixel replaced before, by its number among these.
+    Repaired(u32),
+}
+
+/// Pixels to replace, in such an order that each follows those that it needs.
+#[derive(Debug, Default)]
+struct Repairs {
+    pixels: Vec<u32>,
+    /// Where the sources of each begin; one more than pixels.
+    starts: Vec<usize>,
+    all: Vec<Source>,
+}
+
+impl Repairs {
+    fn sources(&self, index: usize) -> &[Source] {
+        &self.all[self.starts[index]..self.starts[index + 1]]
+    }
+
+    /// Round by round: a pixel takes the mean of those of its eight neighbours that are usable, or
+    /// were replaced in a round before.
+    fn of(shape: Shape, unusable: &[bool]) -> Self {
+        const WAITS: u32 = u32::MAX;
+        const USABLE: u32 = u32::MAX - 1;
+        let mut state: Vec<u32> =
+            unusable.iter().map(|&unusable| if unusable { WAITS } else { USABLE }).collect();
+        let mut found = Self { starts: vec![0], ..Self::default() };
+        let mut waiting: Vec<usize> = (0..state.len()).filter(|&p| state[p] == WAITS).collect();
+        loop {
+            let before = found.pixels.len();
+            waiting.retain(|&pixel| {
+                let known = neighbours(shape, pixel).filter(|&q| state[q] != WAITS);
+                let sources = known.map(|q| match state[q] {
+                    USABLE => Source::Pixel(q as u32),
+                    index => Source::Repaired(index),
+                });
+                let start = found.all.len();
+                found.all.extend(sources);
+                let ready = found.all.len() > start;
+                if ready {
+                    found.pixels.push(pixel as u32);
+                    found.starts.push(found.all.len());
+                }
+                !ready
+            });
+            for index in before..found.pixels.len() {
+                state[found.pixels[index] as usize] = index as u32;
+            }
+            if found.pixels.len() == before {
+                return found;
+            }
+        }
+    }
+}
+
+/// The up to eight neighbours of a pixel.
+fn neighbours(shape: Shape, pixel: usize) -> impl Iterator<Item = usize> {
+    let (row, col) = (pixel / shape.cols, pixel % shape.cols);
+    let rows = row.saturating_sub(1)..=(row + 1).min(shape.rows - 1);
+    rows.flat_map(move |r| {
+        let cols = col.saturating_sub(1)..=(col + 1).min(shape.cols - 1);
+        cols.map(move |c| r * shape.cols + c)
+    })
+    .filter(move |&q| q != pixel)
+}

@@ -1,0 +1,229 @@
+"""Bad pixels of a simulated array, each kind by its criterion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Flag, errors, nuc
+from equipix.simulate import StaringArray
+
+SHAPE = (48, 64)
+LIGHT = np.linspace(2e6, 14e6, 6)
+DEAD, WEAK, NOISY, FLICKER, HIGH, BENT = (3, 4), (9, 9), (12, 50), (30, 7), (40, 33), (20, 20)
+LESS_WEAK, LESS_NOISY, LESS_HIGH, LESS_BENT = (9, 40), (25, 50), (40, 10), (20, 50)
+"""Pixels on the good side of a limit: 0.6 of the response, 1.5 times the noise, 0.6 of the range,
+a quarter of the χ² that chance allows."""
+
+
+@pytest.fixture(scope="module")
+def array():
+    rng = np.random.default_rng(1)
+    sensitivity = 1 + 0.02 * rng.standard_normal(SHAPE)
+    sensitivity[DEAD], sensitivity[WEAK], sensitivity[LESS_WEAK] = 0.0, 0.4, 0.6
+    noise = np.full(SHAPE, 500.0)
+    # At 8e6 electrons photons and the ADC make some 2900: 2.5 and 1.5 times as much.
+    noise[NOISY], noise[LESS_NOISY] = 7_000.0, 3_600.0
+    offset = 300 + 30 * rng.standard_normal(SHAPE)
+    # Three and four of the six levels lie below saturation: 0.4 and 0.6 of the range.
+    offset[HIGH], offset[LESS_HIGH] = 10_500.0, 9_000.0
+    curvature = np.full(SHAPE, 0.002)
+    # χ² rises as the square of the difference: 40 and 4, where 13 is the limit.
+    curvature[BENT], curvature[LESS_BENT] = 0.002 + 0.0033, 0.002 + 0.00105
+    return StaringArray(
+        shape=SHAPE,
+        sensitivity=sensitivity,
+        read_noise_e=noise,
+        offset_dn=offset,
+        curvature=curvature,
+    )
+
+
+def frames(array, light, count, rng):
+    """Frames in which one pixel jumps between two levels."""
+    rng = np.random.default_rng(rng)
+    stack = np.stack(list(array.frames(light, count, rng=rng)))
+    state = np.cumsum(rng.random(count) < 0.1) % 2
+    stack[:, FLICKER[0], FLICKER[1]] += (30 * state).astype(np.uint16)
+    return stack
+
+
+@pytest.fixture(scope="module")
+def response(array):
+    levels = [
+        equipix.average(frames(array, light, 32, k), saturation=16383)
+        for k, light in enumerate(LIGHT)
+    ]
+    return nuc.fit(levels, order=1)
+
+
+def places(flags, flag):
+    return {(int(row), int(col)) for row, col in np.argwhere(flags & flag)}
+
+
+class TestKinds:
+    def test_each_bad_pixel_is_found_and_no_good_one(self, array, response):
+        found = nuc.find_defects(response, frames(array, 8e6, 100, 99))
+        assert places(found.flags, Flag.DEAD) == {DEAD, WEAK}
+        # What jumps is noisy, too, and its levels lie on no line.
+        assert places(found.flags, Flag.HOT) == {NOISY, FLICKER}
+        assert places(found.flags, Flag.TELEGRAPH) == {FLICKER}
+        assert places(found.flags, Flag.OTHER_BAD_PIXEL) == {HIGH}
+        assert places(found.flags, Flag.NONLINEAR) == {BENT, FLICKER}
+        bad = {DEAD, WEAK, NOISY, FLICKER, HIGH, BENT}
+        assert places(found.flags, Flag.DO_NOT_USE) == bad
+        assert found.counts["unusable"] == 6
+        assert found.counts["dead"] == 2
+        assert found.counts["non_responding"] == 1
+
+    def test_a_sample_without_a_value_hides_no_bad_pixel(self, array, response):
+        stack = frames(array, 8e6, 100, 99).astype(float)
+        stack[0, 0, 0] = np.nan
+        found = nuc.find_defects(response, stack)
+        assert places(found.flags, Flag.HOT) == {NOISY, FLICKER}
+        assert places(found.flags, Flag.TELEGRAPH) == {FLICKER}
+
+    def test_averages_show_noise_but_no_flicker(self, array, response):
+        average = equipix.average(frames(array, 8e6, 100, 99))
+        found = nuc.find_defects(response, average)
+        assert found.counts["noisy"] == 2
+        assert "flickering" not in found.counts
+
+    def test_without_frames_the_curves_alone_count(self, response):
+        found = nuc.find_defects(response)
+        assert set(found.counts) == {
+            "dead",
+            "non_responding",
+            "out_of_range",
+            "nonlinear",
+            "unusable",
+        }
+
+    def test_good_arrays_raise_no_alarm(self):
+        array = StaringArray.of("InSb", (96, 128), rng=2)
+        levels = [equipix.average(array.frames(light, 16, rng=k)) for k, light in enumerate(LIGHT)]
+        response = nuc.fit(levels, order=2)
+        found = nuc.find_defects(response, np.stack(list(array.frames(8e6, 30, rng=50))))
+        assert found.counts["unusable"] == 0
+
+    def test_the_distribution_of_the_gain_is_reported(self, response):
+        found = nuc.find_defects(response).gain_percentiles
+        assert list(found) == ["0.1", "1", "5", "25", "50", "75", "95", "99", "99.9"]
+        values = list(found.values())
+        assert values == sorted(values)
+        # Normal with a spread of 0.02: the quartiles lie 0.6745 of it from the median.
+        assert found["75"] - found["25"] == pytest.approx(2 * 0.6745 * 0.02, rel=0.1)
+
+
+class TestTheArrayAsReference:
+    """What all pixels have in common is no defect of pixels."""
+
+    @pytest.mark.parametrize("count", [16, 200])
+    def test_an_order_that_is_too_low_makes_no_bad_pixels(self, count):
+        array = StaringArray.of("HgCdTe", SHAPE, rng=1)
+        bent = np.array(array.curvature)
+        # Ten times the spread: more than six, in an array whose own curvature misfits.
+        bent[20, 20] = bent.mean() + 10 * bent.std()
+        array = array.with_causes(curvature=bent)
+        levels = [
+            equipix.average(array.frames(light, count, rng=k)) for k, light in enumerate(LIGHT)
+        ]
+        response = nuc.fit(levels, order=1)
+        with pytest.warns(errors.MisfitWarning, match=r"order 1 .* order=2 or order='auto'"):
+            found = nuc.find_defects(response)
+        assert found.misfit > 10
+        assert places(found.flags, Flag.DO_NOT_USE) == {(20, 20)}
+        better = nuc.find_defects(nuc.fit(levels, order=2))
+        assert better.misfit < 2
+
+    def test_missing_levels_cost_degrees_of_freedom(self):
+        rng = np.random.default_rng(5)
+        shape, lights = (100, 200), np.linspace(300.0, 3500.0, 8)
+        sigma = np.full(8, 4.0)
+        levels = lights[:, None, None] + 2 * rng.standard_normal((8, *shape))
+        levels[3:, :, :80] = np.nan
+        response = nuc.fit(levels, order=1, variance=sigma)
+        assert set(np.unique(response.freedom)) == {1, 6}
+        # Six standard deviations, a chance of 1e-9 each, in 20 000 pixels.
+        assert nuc.find_defects(response).counts["nonlinear"] == 0
+
+    def test_masked_pixels_are_undetermined_and_nothing_else(self, array):
+        levels = [equipix.average(frames(array, light, 8, k)) for k, light in enumerate(LIGHT)]
+        mask = np.zeros(SHAPE, bool)
+        mask[:, 55:] = True
+        found = nuc.find_defects(nuc.fit(levels, order=1, mask=mask))
+        assert set(np.unique(found.flags[mask])) == {Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE}
+
+    def test_a_shaded_source_makes_no_dead_corner_at_either_door(self):
+        rows, cols = np.mgrid[-1:1:96j, -1:1:128j]
+        shade = 1 - 0.375 * (rows**2 + cols**2)
+        assert shade.min() == pytest.approx(0.25)
+        rng = np.random.default_rng(6)
+        lights = np.linspace(500.0, 3500.0, 5)[:, None, None]
+        levels = lights * shade + rng.standard_normal((5, 96, 128))
+        levels[:, 40, 50] = 0.4 * levels[:, 40, 50]
+        response = nuc.fit(levels, order=1, variance=np.ones(5))
+        found = nuc.find_defects(response)
+        assert places(response.flags, Flag.DEAD) == places(found.flags, Flag.DEAD) == {(40, 50)}
+        assert found.counts["dead"] == 1
+
+    def test_noise_is_judged_by_that_of_the_signal(self):
+        """Photon noise of a bright half is no fault of its pixels."""
+        rng = np.random.default_rng(7)
+        signal = np.where(np.arange(64) < 52, 400.0, 6400.0) * np.ones((48, 1))
+        sigma = np.sqrt(signal) / 2
+        sigma[5, 5] *= 2.6
+        stack = signal + sigma * rng.standard_normal((64, 48, 64))
+        levels = np.linspace(0.5, 1.5, 4)[:, None, None] * signal
+        response = nuc.fit(levels, order=1)
+        found = nuc.find_defects(response, stack)
+        assert places(found.flags, Flag.HOT) - places(response.flags, Flag.HOT) == {(5, 5)}
+        assert found.counts["noisy"] == 1
+
+
+class TestLimits:
+    def test_they_are_adjustable(self, response):
+        strict = nuc.find_defects(response, limits=nuc.DefectLimits(response=0.98))
+        # Below 0.98 of the median of 256 neighbours lies what is beyond one spread of a normal
+        # distribution; six standard errors of a slope, which are 0.04 of the spread, make it
+        # 14.9 %, of 3072 pixels ± 20; that of the medians and the two dead ones are less.
+        assert strict.counts["dead"] == pytest.approx(0.149 * 48 * 64, abs=5 * 20)
+        loose = nuc.find_defects(response, limits=nuc.DefectLimits(response=0.2))
+        assert loose.counts["dead"] == 1
+
+    def test_wrong_limits_are_refused(self):
+        with pytest.raises(errors.InputError, match="'noise' is 0"):
+            nuc.DefectLimits(noise=0)
+
+    def test_wrong_frames_are_refused(self, response):
+        with pytest.raises(errors.InputError, match=r"frames of \(4, 5\), the sensor"):
+            nuc.find_defects(response, np.ones((3, 4, 5)))
+        with pytest.raises(errors.InputError, match="holds one frame"):
+            nuc.find_defects(response, equipix.average(np.ones((1, *SHAPE))))
+        with pytest.raises(errors.InputError, match="are all equal"):
+            nuc.find_defects(response, np.ones((3, *SHAPE)))
+
+
+class TestFlags:
+    def test_they_combine_by_or_and_survive_saving(self, array, response, tmp_path):
+        found = nuc.find_defects(response, frames(array, 8e6, 100, 99))
+        flagged = response.with_flags(found.flags)
+        np.testing.assert_array_equal(flagged.flags, response.flags | found.flags)
+        flagged.save(tmp_path / "r.tif")
+        loaded = equipix.load(tmp_path / "r.tif")
+        np.testing.assert_array_equal(loaded.flags, flagged.flags)
+        corrector = equipix.Corrector(loaded)
+        assert corrector.replaced == 6
+        raw = frames(array, 8e6, 2, 5)
+        corrected = corrector.apply(raw)
+        # Bad pixels are the mean of neighbours, so noise alone is left: of a frame, 2 % more by
+        # rounding and by the error of the curves, with 5 standard errors of 3072 values.
+        noise = np.median(frames(array, 8e6, 100, 99).std(axis=0, ddof=1))
+        assert corrected.std(axis=(1, 2)) == pytest.approx(noise, rel=0.02 + 5 / np.sqrt(2 * 3072))
+        assert np.ptp(corrected, axis=(1, 2)).max() < 12 * noise
+        assert np.ptp(raw, axis=(1, 2)).min() > 1000 * noise
+
+    def test_other_flags_are_refused(self, response):
+        with pytest.raises(errors.InputError, match="'flags' is float64"):
+            response.with_flags(np.zeros(SHAPE))

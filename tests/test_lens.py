@@ -1,0 +1,285 @@
+"""Fall-off of a lens: the law, its fit beside a sensor's own gain, the gain that removes it."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import errors, lens, nuc, simulate
+
+SHAPE = (240, 320)
+CENTRE, FOCAL = (125.0, 150.0), 500.0
+
+
+def squared(shape=SHAPE, centre=CENTRE):
+    rows, cols = np.ogrid[: shape[0], : shape[1]]
+    return (rows - centre[0]) ** 2 + (cols - centre[1]) ** 2
+
+
+def flat(rng=None):
+    light = 1000 * lens.cos4(squared(), FOCAL)
+    return light if rng is None else light * simulate.paper_sensitivity(SHAPE, rng=rng)
+
+
+class TestCos4:
+    def test_it_is_the_fourth_power_of_the_cosine(self):
+        for distance in (0.0, 10.0, 300.0):
+            angle = np.arctan(distance / FOCAL)
+            assert float(lens.cos4(distance**2, FOCAL)) == pytest.approx(np.cos(angle) ** 4)
+
+    def test_the_corner_of_the_array_of_the_source(self):
+        # 54 mm behind a lens of 100 mm: r² = 2·27² mm².
+        wanted = np.cos(np.arctan(np.sqrt(2) * 27 / 100)) ** 4
+        assert float(lens.cos4(2 * 27**2, 100.0)) == pytest.approx(wanted)
+
+
+class TestFit:
+    def test_an_exact_flat_gives_centre_and_focal_length(self):
+        found = lens.fit_falloff(flat())
+        # Means over blocks of 5×5 pixels lie below the law at their centres by up to 2/f² times
+        # 2·(5² − 1)/12 pixels² of it: 3e-5.
+        assert found.centre == pytest.approx(CENTRE, abs=0.01)
+        assert found.focal_length == pytest.approx(FOCAL, rel=3e-5)
+        np.testing.assert_allclose(found.illumination(), flat() / 1000, rtol=3e-5)
+
+    def test_errors_beside_the_sensors_own_gain_are_those_stated(self):
+        z = []
+        for seed in range(20):
+            found = lens.fit_falloff(flat(seed))
+            z.append(
+                [
+                    (found.centre[0] - CENTRE[0]) / found.std["row"],
+                    (found.centre[1] - CENTRE[1]) / found.std["col"],
+                    (found.focal_length - FOCAL) / found.std["focal_length"],
+                ]
+            )
+        # 60 normal values: their rms has a standard error of 9.1 %; four of them. The law is
+        # linear in its parameters where their errors are small.
+        assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1, abs=0.36)
+
+    def test_the_sensors_own_gain_can_be_given(self):
+        sensitivity = simulate.cosine_sensitivity(SHAPE, rng=3)
+        biased = lens.fit_falloff(1000 * lens.cos4(squared(), FOCAL) * sensitivity)
+        light = 1000 * lens.cos4(squared(), FOCAL) * sensitivity
+        found = lens.fit_falloff(light, sensitivity=sensitivity)
+        assert found.focal_length == pytest.approx(FOCAL, rel=3e-5)
+        assert abs(biased.focal_length / FOCAL - 1) > 100 * abs(found.focal_length / FOCAL - 1)
+
+    def test_dust_and_masked_corners_are_left_out(self):
+        image = flat(1)
+        wanted = lens.fit_falloff(image)
+        image[100:106, 200:206] *= 0.3
+        image[5, 5] = np.nan
+        mask = np.zeros(SHAPE, bool)
+        mask[:20, :20] = True
+        image[:20, :20] = 0
+        found = lens.fit_falloff(image, mask=mask)
+        assert found.focal_length == pytest.approx(
+            wanted.focal_length, abs=2 * wanted.std["focal_length"]
+        )
+
+    def test_a_radial_law(self):
+        rho = squared() / (np.hypot(*SHAPE) / 2) ** 2
+        image = 500 * (1 - 0.3 * rho + 0.08 * rho**2)
+        found = lens.fit_falloff(image, law="radial")
+        assert found.centre == pytest.approx(CENTRE, abs=0.01)
+        assert found.coefficients == pytest.approx([-0.3, 0.08], abs=1e-4)
+        np.testing.assert_allclose(found.illumination(), image / 500, rtol=1e-4)
+        # cos⁴ is 1 − 2 r²/f² + 3 r⁴/f⁴ − …: the first term follows from the focal length.
+        natural = lens.fit_falloff(flat(), law="radial")
+        first = -2 * (np.hypot(*SHAPE) / 2 / FOCAL) ** 2
+        assert natural.coefficients[0] == pytest.approx(first, rel=0.05)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"law": "cos3"}, "'law' is 'cos3'"),
+            ({"sensitivity": np.ones((2, 2))}, "'sensitivity' has shape"),
+            ({"mask": np.ones(SHAPE, bool)}, "fewer than 100 finite"),
+            ({"mask": np.full(SHAPE, np.nan)}, "'mask' has dtype float64, expected bool"),
+            ({"mask": np.zeros(SHAPE, np.uint8)}, "'mask' has dtype uint8, expected bool"),
+        ],
+    )
+    def test_refusals(self, given, message):
+        with pytest.raises(errors.InputError, match=message):
+            lens.fit_falloff(flat(), **given)
+
+    @pytest.mark.parametrize(("law", "rounds"), [("cos4", 1), ("radial", 0)])
+    def test_a_fit_that_has_not_converged_is_refused(self, law, rounds, monkeypatch):
+        monkeypatch.setattr(lens, "_ROUNDS", rounds)
+        with pytest.raises(errors.InputError, match=f"did not converge in {rounds} steps"):
+            lens.fit_falloff(flat(1), law=law)
+
+    def test_a_flat_without_fall_off_is_refused(self):
+        with pytest.raises(errors.InputError, match="fall-off"):
+            lens.fit_falloff(np.full(SHAPE, 7.0))
+        with pytest.raises(errors.InputError, match="not darker at the edge"):
+            lens.fit_falloff(1 / lens.cos4(squared(), FOCAL))
+
+
+class TestCorrection:
+    def test_it_is_the_gain_that_removes_the_fall_off(self, tmp_path):
+        found = lens.fit_falloff(flat())
+        correction = found.correction()
+        assert isinstance(correction, equipix.Correction)
+        np.testing.assert_allclose(correction.correct(flat()), 1000, rtol=6e-5)
+        correction.save(tmp_path / "lens.tif")
+        loaded = equipix.load(tmp_path / "lens.tif")
+        np.testing.assert_array_equal(loaded.coefficients, correction.coefficients)
+        assert loaded.metadata == correction.metadata
+
+    def test_gains_that_the_flat_does_not_show_are_flagged(self):
+        rho = squared() / (np.hypot(*SHAPE) / 2) ** 2
+        image, masked = 1 - 1.3 * rho, rho > 0.6
+        found = lens.fit_falloff(np.where(masked, np.nan, image), law="radial")
+        correction = found.correction()
+        flagged = (correction.flags & equipix.Flag.NO_FLAT_FIELD) != 0
+        np.testing.assert_array_equal(np.isnan(correction.coefficients[1]), flagged)
+        # The reach exceeds the mask by a block of 5 pixels and its diagonal at most.
+        distance = np.sqrt(squared())
+        assert flagged[masked & (distance > distance[~masked].max() + 15)].all()
+        assert not flagged[~masked].any()
+        assert flagged[image < 0.1].all()
+        good = correction.coefficients[1][~flagged]
+        assert (good.min(), good.max()) > (0.9, 1.0)
+        assert good.max() < 10
+        assert correction.metadata["k1"] == pytest.approx(-1.3, abs=1e-3)
+        assert correction.metadata["k2"] == pytest.approx(0, abs=1e-3)
+        whole = lens.fit_falloff(1 - 0.3 * rho, law="radial").correction()
+        assert not whole.flags.any()
+
+    def test_a_corner_with_little_light_is_not_corrected(self):
+        light = lens.cos4(squared(), 90.0)
+        correction = lens.fit_falloff(1000 * light).correction()
+        flagged = correction.flags != 0
+        # But for the error of the law by block means, at most some 0.1 % here.
+        assert flagged[light < 0.099].all()
+        assert not flagged[light > 0.101].any()
+        assert (light < 0.099).any()
+
+    def test_corrected_frames_are_linear_in_light_only_where_the_mean_curve_is(self):
+        shape, light = (100, 120), np.array([0.5e6, 2e6, 5e6, 8e6, 11e6, 14e6, 16e6])
+        array = simulate.StaringArray.of("HgCdTe", shape, rng=1)
+        dark = equipix.average(array.frames(0, 16, rng=50))
+        levels = [
+            equipix.average(array.frames(e, 8, rng=k), dark=dark) for k, e in enumerate(light)
+        ]
+        response = nuc.fit(levels, order=2)
+        fall = lens.cos4(squared(shape, (48.0, 63.0)), 150.0)
+        frames = np.stack(list(array.frames(14e6 * fall, 16, rng=4)))
+        corrected = response.correct(frames).mean(axis=0)
+        bent = lens.fit_falloff(corrected)
+        assert bent.focal_length == pytest.approx(152.0, abs=0.05)  # as docs/nuc.md says
+        assert bent.focal_length - 150 > 100 * bent.std["focal_length"]
+        linear = np.polynomial.Polynomial.fit(response.levels, light, 3)
+        straight = lens.fit_falloff(linear(corrected))
+        assert abs(straight.focal_length - 150) < 5 * straight.std["focal_length"]
+
+    def test_the_example_prints_the_corner_of_the_source(self, capsys):
+        path = Path(__file__).parents[1] / "examples/lens_falloff.py"
+        runpy.run_path(str(path), run_name="__main__")
+        said = capsys.readouterr().out
+        assert " 100: 0.762  1.313" in said
+
+
+class TestCombine:
+    def levels(self):
+        rng = np.random.default_rng(1)
+        gain = simulate.paper_sensitivity(SHAPE, rng=rng)
+        curve = 2e-6 * rng.standard_normal(SHAPE)
+        return [v * gain + (curve - curve.mean()) * v * v for v in (500.0, 1500.0, 2500.0, 3500.0)]
+
+    def test_response_curves_then_a_lens(self):
+        response = nuc.fit(self.levels(), order=2)
+        falloff = lens.fit_falloff(flat()).correction()
+        both = equipix.combine(response, falloff)
+        frame = self.levels()[1]
+        wanted = falloff.correct(response.correct(frame))
+        np.testing.assert_allclose(both.correct(frame), wanted, rtol=1e-12)
+
+    def test_a_shift_calibration_repairs_curves_of_an_uneven_source(self):
+        shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
+        truth = simulate.cosine_sensitivity(shape, rng=2)
+        uneven = simulate.gaussian_beam(shape, width=60)(*np.indices(shape))
+        response = nuc.fit([level * truth * uneven + 20 for level in (100.0, 900.0)], order=1)
+        beam = simulate.gaussian_beam(shape, width=100, amplitude=1000)
+        raw = simulate.exposures(truth, beam, shifts) + 20
+        raw += 0.1 * np.random.default_rng(3).standard_normal(raw.shape)
+        cal = equipix.calibrate(response.correct(raw), shifts)
+        both = equipix.combine(response, cal)
+        flat = 500 * truth + 20
+        spread = [c.std() / c.mean() for c in (response.correct(flat), both.correct(flat))]
+        assert spread[0] > 0.05
+        # Noise of 1e-4 is up to 1e-3 where the source was faint, and so is the tilt that it leaves.
+        assert spread[1] < 5e-3
+        assert set(both.metadata) == {"first", "then"}
+
+    def test_a_dark_is_not_subtracted_twice(self):
+        shifts = equipix.cross_pattern(5, 7)
+        beam = simulate.gaussian_beam(SHAPE, width=100, amplitude=1000)
+        frames = simulate.exposures(np.ones(SHAPE), beam, shifts) + 60
+        rng = np.random.default_rng(4)
+        noise = rng.standard_normal((6, 2, *SHAPE))
+        dark = equipix.average(list(60 + noise[0]))
+        averages = [
+            equipix.average(list(y + of_y), dark=dark)
+            for y, of_y in zip(frames, noise[1:], strict=True)
+        ]
+        cal = equipix.calibrate(averages, shifts)
+        response = nuc.fit(self.levels(), order=2)
+        with pytest.raises(errors.InputError, match="'then' subtracts a dark frame of 60"):
+            equipix.combine(response, cal)
+
+    def test_flags_add_up_and_files_keep_it(self, tmp_path):
+        response = nuc.fit(self.levels(), order=2)
+        flags = response.flags.copy()
+        flags[3, 4] |= equipix.Flag.HOT | equipix.Flag.DO_NOT_USE
+        falloff = lens.fit_falloff(flat()).correction()
+        both = equipix.combine(response.with_flags(flags), falloff)
+        both.save(tmp_path / "both.npz")
+        loaded = equipix.load(tmp_path / "both.npz")
+        np.testing.assert_array_equal(loaded.flags, flags)
+        np.testing.assert_array_equal(loaded.coefficients, both.coefficients)
+        assert "order 3" in repr(loaded)
+        assert equipix.Corrector(loaded).replaced == 1
+
+    @pytest.mark.parametrize("order", [0, 1, 2])
+    def test_a_gain_after_raw_levels_is_refused(self, order, tmp_path):
+        array = simulate.StaringArray.of("InSb", SHAPE, rng=1)
+        frames = [list(array.frames(e, 2, rng=k)) for k, e in enumerate((0, 4e6, 8e6, 12e6))]
+        falloff = lens.fit_falloff(flat()).correction()
+        raw = nuc.fit([equipix.average(each) for each in frames[1:]], order=order)
+        raw.save(tmp_path / "raw.npz")
+        same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
+        for first in (raw, equipix.load(tmp_path / "raw.npz"), equipix.combine(raw, same)):
+            with pytest.raises(
+                errors.InputError, match="'first' is a response to raw levels.*dark"
+            ):
+                equipix.combine(first, falloff)
+        # An offset of 'then' can take away the one that 'first' leaves.
+        offset = float(np.mean(frames[0]))
+        less = equipix.Polynomial(np.stack([np.full(SHAPE, -offset), np.ones(SHAPE)]), raw.flags)
+        equipix.combine(equipix.combine(raw, less), falloff)
+        dark = equipix.average(frames[0])
+        levels = [equipix.average(each, dark=dark) for each in frames[1:]]
+        equipix.combine(nuc.fit(levels, order=order), falloff)
+
+    def test_what_does_not_combine_is_refused(self):
+        response = nuc.fit(self.levels(), order=2)
+        with pytest.raises(errors.InputError, match="'then' has order 3"):
+            equipix.combine(response, response)
+        line = response.coefficients[:2]
+        one, other = (
+            equipix.Polynomial(line, response.flags, {"sensor": {"name": name}}) for name in "AB"
+        )
+        with pytest.raises(errors.InputError, match="of the sensor 'A', 'then' of 'B'"):
+            equipix.combine(one, other)
+        small = equipix.Polynomial(np.ones((2, 3, 4)), np.zeros((3, 4), np.uint32))
+        with pytest.raises(errors.InputError, match="'first' is of shape"):
+            equipix.combine(response, small)
+        with pytest.raises(errors.InputError, match="'coefficients' has shape"):
+            equipix.Polynomial(np.ones((5, 3, 4)), np.zeros((3, 4), np.uint32))

@@ -1,0 +1,547 @@
+"""Levels of a uniform source from files: levels.toml, the command line, corrected files."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Flag, LevelExperiment, cli, errors, io, metrics, nuc
+from equipix.correction.files import correct_files
+from equipix.correction.tone import picture
+from equipix.simulate import StaringArray
+
+SHAPE = (24, 32)
+LIGHT = (3e6, 7e6, 11e6, 15e6)
+
+
+@pytest.fixture(scope="module")
+def array():
+    return StaringArray.of("InSb", SHAPE, rng=1)
+
+
+@pytest.fixture(scope="module")
+def folder(array, tmp_path_factory):
+    """Frames of four levels and of a dark, and their description."""
+    folder = tmp_path_factory.mktemp("levels")
+    for number, light in enumerate((0.0, *LIGHT)):
+        frames = list(array.frames(light, 16, rng=number))
+        name = f"level{number}.tif" if number else "dark.tif"
+        io.write_frames(folder / name, iter(frames), nbytes=1)
+    levels = "".join(
+        f'[[level]]\nframes = "level{number}.tif"\nvalue = {10 * number}\nunit = " °C"\n'
+        for number in range(1, 5)
+    )
+    head = '[sensor]\nname = "array 7"\nbit_depth = 14\n'
+    (folder / "raw.toml").write_text(head + levels, encoding="utf-8")
+    dark = '[dark]\nframes = "dark.tif"\n'
+    (folder / "levels.toml").write_text(head + dark + levels, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*arguments):
+        with pytest.raises(SystemExit) as done:
+            cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return done.value.code or 0, captured.out, captured.err
+
+    return call
+
+
+class TestLevelExperiment:
+    def test_gives_the_same_as_averages(self, folder):
+        dark = equipix.average(folder / "dark.tif", saturation=16383)
+        averages = [
+            equipix.average(folder / f"level{number}.tif", dark=dark, saturation=16383)
+            for number in range(1, 5)
+        ]
+        wanted = nuc.fit(averages, order=2)
+        response = LevelExperiment.load(folder / "levels.toml").run(order=2)
+        for name in ("deviation", "variances", "flags", "levels", "dark", "limits"):
+            np.testing.assert_array_equal(getattr(response, name), getattr(wanted, name))
+        assert response.saturation == 16383
+
+    def test_says_where_the_response_comes_from(self, folder):
+        metadata = LevelExperiment.load(folder / "levels.toml").run().metadata
+        assert metadata["sensor"]["name"] == "array 7"
+        assert [each["name"] for each in metadata["levels"]] == [
+            f"{10 * k} °C" for k in range(1, 5)
+        ]
+        assert set(metadata["inputs"]) == {
+            "levels.toml",
+            "dark.tif",
+            *(f"level{number}.tif" for number in range(1, 5)),
+        }
+        assert metadata["noise"]["gain"] > 0
+        json.dumps(metadata)
+
+    def test_needs_no_dark(self, folder, array):
+        response = LevelExperiment.load(folder / "raw.toml").run(order=2)
+        assert response.raw
+        assert response.dark is None
+        frame = next(array.frames(9e6, 1, rng=77))
+        good = (response.flags & Flag.DO_NOT_USE) == 0
+        corrected = response.correct(frame)[good]
+        noise = array.temporal_noise(9e6).mean()
+        # One frame: temporal noise, and a quarter of it from each fit of 4·16 frames.
+        assert corrected.std() == pytest.approx(noise, rel=0.15)
+
+    def test_excludes_what_the_file_and_the_caller_mask(self, folder, tmp_path):
+        text = (folder / "levels.toml").read_text(encoding="utf-8")
+        for number in range(1, 5):
+            text = text.replace(f"level{number}.tif", f"{folder}/level{number}.tif")
+        text = text.replace('"dark.tif"', f'"{folder}/dark.tif"')
+        text = text.replace("bit_depth = 14\n", "bit_depth = 14\nregion = [{rows = [0, 2]}]\n")
+        (tmp_path / "levels.toml").write_text(text, encoding="utf-8")
+        mask = np.zeros(SHAPE, bool)
+        mask[:, :3] = True
+        response = LevelExperiment.load(tmp_path / "levels.toml").run(mask=mask)
+        wanted = mask.copy()
+        wanted[:2] = True
+        np.testing.assert_array_equal(np.isnan(response.deviation[0]), wanted)
+
+    @pytest.mark.parametrize(
+        ("old", "new", "message"),
+        [
+            ("[[level]]", "[[levels]]", "unknown key 'levels'"),
+            ("value = 10", "valeu = 10", "unknown key 'valeu' in level 0"),
+            (
+                'value = 10\nunit = " °C"',
+                'unit = " °C"',
+                "'unit' is given without 'value' in level",
+            ),
+            ('"level1.tif"', '"none.tif"', "none.tif: does not exist"),
+            ('"level2.tif"', '"level1.tif"', "'level1.tif' stands in 'frames' of level '10 °C'"),
+            ("value = 10", 'value = "warm"', "'value' in level 0 holds 'warm', expected a number"),
+        ],
+    )
+    def test_refuses_a_wrong_file_by_its_place(self, folder, old, new, message):
+        text = (folder / "levels.toml").read_text(encoding="utf-8")
+        assert old in text
+        path = folder / "wrong.toml"
+        path.write_text(text.replace(old, new, 1), encoding="utf-8")
+        with pytest.raises(errors.FileError) as error:
+            LevelExperiment.load(path)
+        assert message in str(error.value)
+
+    def test_one_table_in_place_of_many_is_named(self, folder):
+        path = folder / "wrong.toml"
+        path.write_text('[level]\nframes = "level1.tif"\n')
+        with pytest.raises(errors.FileError, match=r"write \[\[level\]\]"):
+            LevelExperiment.load(path)
+
+    def test_a_level_that_saturates_is_named(self, folder, array):
+        frames = list(array.frames(3e7, 4, rng=9))
+        io.write_frames(folder / "bright.tif", iter(frames), nbytes=1)
+        text = (folder / "raw.toml").read_text(encoding="utf-8").replace("level4", "bright")
+        level = min(int(frame.min()) for frame in frames)
+        text = text.replace("bit_depth = 14", f"bit_depth = 14\nsaturation = {level}")
+        (folder / "bright.toml").write_text(text, encoding="utf-8")
+        message = rf"level 3 \('40 °C'\): 100.0% .* {level} DN .* 'saturation'"
+        with pytest.raises(errors.FileError, match=message):
+            LevelExperiment.load(folder / "bright.toml").run()
+
+    def test_an_order_is_checked_before_the_work(self, folder):
+        with pytest.raises(errors.InputError, match="'order' is 7"):
+            LevelExperiment.load(folder / "levels.toml").run(order=7)
+
+
+class TestCommands:
+    def test_fit_and_inspect(self, run, folder, tmp_path):
+        output = tmp_path / "response.tif"
+        status, out, _ = run(
+            "nuc", "fit", folder / "levels.toml", "-o", output, "--order", "auto", "--json"
+        )
+        assert status == 0
+        told = json.loads(out)
+        wanted = LevelExperiment.load(folder / "levels.toml").run(order="auto")
+        assert told["order"] == wanted.order
+        assert len(told["prediction_errors"]) == 3
+        good = (wanted.flags & Flag.DO_NOT_USE) == 0
+        assert told["reduced_chi2"] == pytest.approx(wanted.reduced_chi2[good].mean())
+        np.testing.assert_array_equal(equipix.load(output).deviation, wanted.deviation)
+        assert json.loads(run("inspect", output, "--json")[1])["order"] == wanted.order
+        status, out, _ = run("nuc", "fit", folder / "levels.toml", "-o", output, "--force")
+        assert status == 0
+        assert "spread of K" in out
+
+    def test_by_gain(self, run, folder, tmp_path):
+        output = tmp_path / "response.npz"
+        arguments = ("nuc", "fit", folder / "levels.toml", "-o", output, "--order", "0")
+        assert run(*arguments, "--by", "gain")[0] == 0
+        response = equipix.load(output)
+        assert (response.deviation[0] == 0).all()
+        assert response.deviation[1].std() > 0.01
+
+    def test_a_level_that_saturates_without_a_level_given_is_refused(self, run, folder, tmp_path):
+        frames = np.full((4, *SHAPE), 16383, np.uint16)
+        io.write_frames(tmp_path / "bright.tif", iter(frames), nbytes=1)
+        levels = "".join(f'[[level]]\nframes = "{folder}/level{k}.tif"\n' for k in (1, 2))
+        levels += '[[level]]\nframes = "bright.tif"\n'
+        (tmp_path / "levels.toml").write_text(levels, encoding="utf-8")
+        output = tmp_path / "response.tif"
+        status, _, err = run("nuc", "fit", tmp_path / "levels.toml", "-o", output)
+        assert (status, output.exists()) == (1, False)
+        assert "100.0% of the values of level 2 are exactly 16383" in err
+
+    def test_errors_are_one_line(self, run, folder, tmp_path):
+        output = tmp_path / "response.tif"
+        assert run("nuc", "fit", folder / "levels.toml", "-o", output, "--order", "5")[0] == 2
+        status, out, err = run("nuc", "fit", folder / "none.toml", "-o", output)
+        assert (status, out) == (1, "")
+        assert err.count("\n") == 1
+        assert not output.exists()
+        assert run("nuc", "fit", "--help")[0] == 0
+        status, out, err = run("nuc")
+        # Typer shows the help of a group without a command, by releases as a success or a misuse.
+        assert status in (0, 2)
+        assert all(command in out + err for command in ("fit", "defects", "quality"))
+
+
+class TestDefectsAndQuality:
+    @pytest.fixture
+    def saved(self, folder, tmp_path):
+        response = LevelExperiment.load(folder / "levels.toml").run(order=2)
+        response.save(tmp_path / "response.tif")
+        return response, tmp_path / "response.tif"
+
+    def test_defects_are_those_of_the_function(self, run, saved, folder, tmp_path):
+        response, path = saved
+        output = tmp_path / "flagged.npz"
+        limits = {
+            "response": 0.985,
+            "gain": 1.02,
+            "noise": 1.05,
+            "correlation": 0.1,
+            "range": 1.5,
+            "misfit": 0.5,
+        }
+        given = [text for name, each in limits.items() for text in (f"--{name}-limit", str(each))]
+        options = ("-o", output, *given, "--json")
+        raw = io.read_frames(folder / "level2.tif")
+        raw[::2, 3, 4] += 300  # noise
+        raw[:8, 5, 6] += 300  # flicker
+        io.write_frames(folder / "noisy.tif", iter(raw), nbytes=1)
+        status, out, _ = run("nuc", "defects", path, folder / "noisy.tif", *options)
+        assert status == 0
+        wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(**limits))
+        # Each limit has an effect, so each option is taken.
+        assert min(wanted.counts.values()) > 0
+        told = json.loads(out)
+        assert {name: told[name] for name in wanted.counts} == wanted.counts
+        assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
+        np.testing.assert_array_equal(equipix.load(output).flags, response.flags | wanted.flags)
+
+    def test_defects_of_curves_alone(self, run, saved):
+        status, out, _ = run("nuc", "defects", saved[1])
+        assert status == 0
+        assert "non responding" in out
+
+    def test_quality_is_that_of_the_functions(self, run, saved, folder):
+        response, path = saved
+        status, out, _ = run("nuc", "quality", path, folder / "level2.tif", "--json")
+        assert status == 0
+        raw, told = io.read_frames(folder / "level2.tif"), json.loads(out)
+        wanted = metrics.correctability(response.correct(raw))
+        assert (told["C"], told["C_from"], told["C_to"]) == pytest.approx(
+            (wanted.ratio, wanted.low, wanted.high)
+        )
+        replaced = response.correct(raw, flagged="replace")
+        noise = metrics.three_d_noise(replaced)
+        assert told["noise_variances"] == pytest.approx(vars(noise))
+        assert told["roughness"] == pytest.approx(metrics.roughness(replaced.mean(axis=0)))
+
+    @pytest.mark.parametrize("command", ["defects", "quality"])
+    def test_another_sensor_is_refused(self, run, saved, folder, command):
+        arguments = ("nuc", command, saved[1], folder / "level2.tif", "--sensor")
+        assert run(*arguments, "array 7")[0] == 0
+        status, out, err = run(*arguments, "array 8")
+        assert (status, out) == (1, "")
+        assert "'array 8', but the correction is of 'array 7'" in err
+
+    @pytest.mark.parametrize("command", ["defects", "quality"])
+    def test_corrected_frames_are_noticed(self, run, saved, folder, tmp_path, command):
+        frames, once = folder / "level2.tif", tmp_path / "once.tif"
+        assert run("correct", saved[1], frames, "-o", once)[0] == 0
+        assert "corrected already" not in run("nuc", command, saved[1], frames)[2]
+        status, _, err = run("nuc", command, saved[1], once)
+        assert status == 0
+        assert f"{once}: corrected already, by this correction; what both remove is" in err
+
+    def test_files_of_another_kind_are_refused(self, run, saved, folder):
+        status, _, err = run("nuc", "quality", saved[1], saved[1])
+        assert (status, "expected raw frames" in err) == (1, True)
+        mean = saved[1].with_name("mean.npz")
+        equipix.average(folder / "level1.tif").save(mean)
+        status, _, err = run("nuc", "defects", mean)
+        assert (status, "holds frame statistics, expected response" in err) == (1, True)
+
+
+@pytest.fixture
+def corrected(run, folder, tmp_path):
+    """A response on disk, and a call that corrects the frames of a level by it."""
+    response = LevelExperiment.load(folder / "levels.toml").run()
+    response.save(tmp_path / "response.tif")
+
+    def call(output, *options, source="level2.tif"):
+        path = tmp_path / output
+        status, out, err = run(
+            "correct", tmp_path / "response.tif", folder / source, "-o", path, "--json", *options
+        )
+        assert status == 0, err
+        return path, json.loads(out)
+
+    return response, call
+
+
+class TestCorrectedFiles:
+    def test_whole_numbers_are_rounded_and_limited_and_counted(self, corrected, folder):
+        response, call = corrected
+        values = response.correct(io.read_frames(folder / "level2.tif"), flagged="replace")
+        options = ("--dtype", "uint16", "--bit-depth", "12", "--flagged", "replace")
+        path, told = call("out.tif", *options)
+        found = io.read_frames(path)
+        assert found.dtype == np.uint16
+        np.testing.assert_array_equal(found, np.clip(np.rint(values), 0, 4095))
+        wanted = np.count_nonzero((np.rint(values) < 0) | (np.rint(values) > 4095))
+        assert wanted > 0
+        assert told["limited_values"] == wanted
+
+    def test_large_files_are_read_frame_by_frame(self, corrected, monkeypatch):
+        _, call = corrected
+        whole, _ = call("whole.tif")
+        read = []
+        monkeypatch.setattr(io.images, "_AT_ONCE", 1)
+        stream = io.tiff.stream_frames
+        monkeypatch.setattr(
+            io.tiff, "stream_frames", lambda path: read.append(path) or stream(path)
+        )
+        single, _ = call("single.tif")
+        assert len(read) == 1
+        np.testing.assert_array_equal(io.read_frames(single), io.read_frames(whole))
+
+    def test_the_corrector_gives_the_same(self, corrected, folder):
+        response, call = corrected
+        path, _ = call("out.tif", "--dtype", "uint16", "--flagged", "replace")
+        corrector = equipix.Corrector(response)
+        raw = io.read_frames(folder / "level2.tif")
+        np.testing.assert_array_equal(io.read_frames(path), corrector.apply(raw))
+
+    @pytest.mark.parametrize(("dtype", "largest"), [("uint8", 255), ("uint16", 65535)])
+    def test_a_png_of_one_frame(self, corrected, folder, dtype, largest):
+        response, call = corrected
+        frame = io.read_frames(folder / "level1.tif")[0]
+        io.write_frames(folder / "one.tif", iter([frame]), nbytes=1)
+        path, told = call("out.png", "--dtype", dtype, "--flagged", "replace", source="one.tif")
+        found = io.read_frames(path)[0]
+        assert found.dtype == dtype
+        wanted = np.clip(np.rint(response.correct(frame, flagged="replace")), 0, largest)
+        np.testing.assert_array_equal(found, wanted)
+        assert told["dtype"] == dtype
+
+    @pytest.mark.usefixtures("corrected")
+    def test_a_png_of_several_frames_or_of_floats_is_refused(self, run, folder, tmp_path):
+        arguments = ("correct", tmp_path / "response.tif", folder / "level1.tif")
+        status, _, err = run(*arguments, "-o", tmp_path / "out.png")
+        assert status == 1
+        assert "holds one frame, but 16" in err
+        frame = io.read_frames(folder / "level1.tif")[:1]
+        io.write_frames(tmp_path / "one.tif", iter(frame), nbytes=1)
+        arguments = ("correct", tmp_path / "response.tif", tmp_path / "one.tif")
+        status, _, err = run(*arguments, "-o", tmp_path / "out.png", "--dtype", "float32")
+        assert status == 1
+        assert "expected 'dtype' uint8 or uint16" in err
+
+    def test_files_name_the_correction_by_its_hash(self, corrected, run, tmp_path):
+        import hashlib
+
+        _, call = corrected
+        path, _ = call("out.tif", "--dtype", "uint16")
+        digest = hashlib.sha256((tmp_path / "response.tif").read_bytes()).hexdigest()
+        assert io.description(path) == f"corrected by equipix, correction sha256 {digest}"
+        arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.tif")
+        assert "corrected already" in run(*arguments)[2]
+
+    @pytest.mark.parametrize("display", ["linear", "histogram"])
+    def test_pictures(self, corrected, folder, display):
+        response, call = corrected
+        path, _ = call("out.tif", "--display", display, "--flagged", "replace")
+        found = io.read_frames(path)
+        assert found.dtype == np.uint8
+        values = response.correct(io.read_frames(folder / "level2.tif"), flagged="replace")
+        np.testing.assert_array_equal(found[3], picture(values[3], display))
+
+    def test_a_picture_has_no_other_type(self, corrected, folder, tmp_path):
+        response, _ = corrected
+        message = "'display' makes pictures of 8 bits, but 'dtype' .* is 'uint16': leave out one"
+        with pytest.raises(errors.InputError, match=message):
+            correct_files(
+                response,
+                [str(folder / "level2.tif")],
+                tmp_path / "out.tif",
+                dtype="uint16",
+                display="linear",
+            )
+        with pytest.raises(errors.InputError, match="but 'bit_depth' .* is 12: leave out one"):
+            correct_files(
+                response,
+                [str(folder / "level2.tif")],
+                tmp_path / "out.tif",
+                bit_depth=12,
+                display="linear",
+            )
+
+    def test_values_beyond_the_levels_and_replaced_pixels_are_counted(self, corrected, folder):
+        response, call = corrected
+        raw = io.read_frames(folder / "level4.tif")
+        good = (response.flags & Flag.DO_NOT_USE) == 0
+        _, told = call("out.tif", "--flagged", "nan", source="level4.tif")
+        wanted = np.count_nonzero(response.extrapolated(raw) & good)
+        # Half of the values of the highest level are above its mean.
+        assert wanted > 0.3 * raw.size
+        # Values at a level count as within it: eight roundings, and as many of the formula.
+        margin = 16 * np.finfo(np.float32).eps * response.limits.max()
+        (low, high), values = response.limits, response.correct(raw.astype(np.float64))
+        certain = np.count_nonzero((values < low - margin) | (values > high + margin))
+        assert certain <= told["extrapolated_values"] <= wanted
+        assert "replaced_pixels" not in told
+        flags = np.zeros(SHAPE, np.uint32)
+        flags[3, 4:6] = Flag.DO_NOT_USE
+        response.with_flags(flags).save(folder / "flagged.tif", force=True)
+        path = folder / "flagged.tif"
+        done = correct_files(
+            equipix.load(path), [str(folder / "level4.tif")], folder / "c.tif", flagged="replace"
+        )
+        assert done.replaced == np.count_nonzero(~good | (flags != 0))
+
+    def test_flagged_pixels_are_counted_apart(self, corrected, run, folder, tmp_path):
+        response, _ = corrected
+        flags = np.zeros(SHAPE, np.uint32)
+        flags[3, 4:6] = Flag.DO_NOT_USE
+        two = response.with_flags(flags)
+        bad = np.count_nonzero((two.flags & Flag.DO_NOT_USE) != 0)
+        source, path = [str(folder / "level2.tif")], tmp_path / "out.tif"
+        for dtype in ("uint16", "float32"):
+            done = correct_files(two, source, path, dtype=dtype, force=True)
+            assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
+        with pytest.warns(errors.LimitedWarning, match="100% of the .* of uint8: .* uint16; or"):
+            done = correct_files(two, source, path, dtype="uint8", force=True)
+        assert done.limited == 16 * (flags.size - bad)
+        done = correct_files(two, source, path, dtype="uint16", flagged="replace", force=True)
+        assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
+        two.save(tmp_path / "two.tif")
+        arguments = ("correct", tmp_path / "two.tif", *source, "-o", path, "--force", "--json")
+        told = json.loads(run(*arguments, "--dtype", "uint16")[1])
+        assert (told["limited_values"], told["unusable_pixels"]) == (0, bad)
+
+    def test_most_values_limited_is_a_warning_of_the_command(
+        self, corrected, run, folder, tmp_path
+    ):
+        _, call = corrected
+        arguments = ("correct", tmp_path / "response.tif", folder / "level2.tif", "-o")
+        status, _, err = run(*arguments, tmp_path / "8.tif", "--dtype", "uint8")
+        assert (status, "--display linear" in err, err.count("\n")) == (0, True, 1)
+        assert run(*arguments, tmp_path / "d.tif", "--display", "linear")[2] == ""
+        status, _, err = run(
+            *arguments, tmp_path / "b.tif", "--dtype", "uint16", "--bit-depth", "8"
+        )
+        assert "more bits in 'bit_depth'" in err
+        assert call("16.tif", "--dtype", "uint16")[1]["limited_values"] == 0
+
+    def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
+        from equipix.correction import corrector as module
+
+        response, _ = corrected
+        made, real = [], module.native
+        monkeypatch.setattr(module, "native", lambda *given: made.append(1) or real(*given))
+        source = [str(folder / "level?.tif")]
+        done = correct_files(response, source, tmp_path / "all", dtype="uint16")
+        assert (done.frames, len(made)) == (64, 1)
+
+    def test_another_sensor_is_refused(self, corrected, run, folder, tmp_path):
+        _, call = corrected
+        call("out.tif", "--sensor", "array 7")
+        arguments = ("correct", tmp_path / "response.tif", folder / "level2.tif", "-o")
+        status, _, err = run(*arguments, tmp_path / "no.tif", "--sensor", "array 8")
+        assert (status, "'array 8', but the correction is of 'array 7'" in err) == (1, True)
+
+    @pytest.mark.usefixtures("corrected")
+    def test_frames_of_more_bits_are_refused(self, run, folder, tmp_path):
+        frame = np.full((1, *SHAPE), 40000, np.uint16)
+        io.write_frames(folder / "deep.tif", frame, nbytes=1)
+        arguments = ("correct", tmp_path / "response.tif", folder / "deep.tif", "-o")
+        status, _, err = run(*arguments, tmp_path / "no.tif")
+        assert (status, "holds 40000, above 16383, the largest" in err) == (1, True)
+        assert not (tmp_path / "no.tif").exists()
+
+    def test_a_png_given_again_is_noticed(self, corrected, run, folder, tmp_path):
+        _, call = corrected
+        io.write_frames(folder / "single.tif", io.read_frames(folder / "level1.tif")[:1], nbytes=1)
+        path, _ = call("out.png", source="single.tif")
+        assert io.description(path).startswith("corrected by equipix, correction sha256")
+        arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.png")
+        status, _, err = run(*arguments)
+        assert status == 0
+        assert "out.png: corrected already, by this correction" in err
+
+    @pytest.mark.usefixtures("corrected")
+    def test_pngs_of_others_have_no_mark(self, run, folder, tmp_path):
+        frame = io.read_frames(folder / "level1.tif")[0]
+        io.write_png(tmp_path / "raw.png", frame, description="of a camera")
+        assert io.description(tmp_path / "raw.png") == "of a camera"
+        arguments = ("correct", tmp_path / "response.tif", tmp_path / "raw.png")
+        status, _, err = run(*arguments, "-o", tmp_path / "out.png")
+        assert (status, "corrected already" in err) == (0, False)
+
+
+class TestToneLaws:
+    @pytest.mark.parametrize("display", ["linear", "histogram"])
+    def test_brighter_stays_brighter_and_the_range_is_used(self, display):
+        frame = np.random.default_rng(1).gamma(2.0, 100.0, (60, 80))
+        grey = picture(frame, display).ravel()[np.argsort(frame.ravel())]
+        assert (np.diff(grey.astype(int)) >= 0).all()
+        assert (grey[0], grey[-1]) == (0, 255)
+
+    def test_linear_is_a_line_between_two_percentiles(self):
+        frame = np.random.default_rng(2).random((50, 40))
+        low, high = np.percentile(frame, [0.5, 99.5])
+        wanted = np.rint(255 * np.clip((frame - low) / (high - low), 0, 1))
+        np.testing.assert_array_equal(picture(frame, "linear"), wanted)
+
+    def test_the_plateau_limits_what_an_even_area_takes(self):
+        frame = np.full((100, 100), 500.0)
+        frame[:10] = np.linspace(0, 1000, 1000).reshape(10, 100)
+        grey = picture(frame, "histogram")
+        # 1000 bins of 1 and one of 9000: without a plateau that one would take 90 % of the range;
+        # with one at 4 times the mean of about 10 it takes 40 of 1040.
+        below, above = grey[:10][frame[:10] < 500].max(), grey[:10][frame[:10] > 500].min()
+        assert int(above) - int(below) == pytest.approx(255 * 40 / 1040, abs=2)
+
+    @pytest.mark.parametrize("display", ["linear", "histogram"])
+    def test_what_is_not_finite_is_black_and_even_frames_grey(self, display):
+        frame = np.full((4, 5), 7.0)
+        frame[1, 2], frame[2, 2] = np.nan, np.inf
+        grey = picture(frame, display)
+        assert (grey[1, 2], grey[2, 2], grey[0, 0]) == (0, 0, 128)
+        assert (picture(np.full((2, 2), np.nan), display) == 0).all()
+
+
+@pytest.mark.data
+def test_a_real_camera_from_files(data_dir, tmp_path):
+    """Six of the exposure levels of a 12-bit CCD."""
+    folder = data_dir / "emva1288-set001-ccd-12bit/images"
+    levels = "".join(
+        f'[[level]]\nframes = "{folder}/b_{level:03}_snap_*.png"\n' for level in range(2, 32, 5)
+    )
+    (tmp_path / "levels.toml").write_text(f"[sensor]\nbit_depth = 12\n{levels}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        response = LevelExperiment.load(tmp_path / "levels.toml").run()
+    good = (response.flags & Flag.DO_NOT_USE) == 0
+    assert good.mean() > 0.999
+    assert response.reduced_chi2[good].mean() == pytest.approx(1, abs=0.02)

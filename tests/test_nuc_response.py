@@ -1,0 +1,228 @@
+"""The response as a correction: files, command line, flags, real levels of a camera."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Flag, cli, errors, nuc
+
+SHAPE = (24, 32)
+LEVELS = (200.0, 1000.0, 2000.0, 3000.0)
+
+
+@pytest.fixture(scope="module")
+def averages():
+    """Four levels of a 12-bit camera in 16-bit frames, with a dead pixel."""
+    rng = np.random.default_rng(1)
+    gain = 1 + 0.05 * rng.standard_normal(SHAPE)
+    gain[3, 4] = 0
+    dark = equipix.average(
+        np.rint(60 + 3 * rng.standard_normal((16, *SHAPE))).astype(np.uint16), saturation=4095
+    )
+    return [
+        equipix.average(
+            np.rint(60 + level * gain + 3 * rng.standard_normal((4, *SHAPE))).astype(np.uint16),
+            dark=dark,
+            saturation=4095,
+        )
+        for level in LEVELS
+    ]
+
+
+@pytest.fixture(scope="module", params=[0, 1, 3])
+def response(request, averages):
+    return nuc.fit(averages, order=request.param)
+
+
+def frames(count=3):
+    return np.random.default_rng(2).integers(100, 3000, (count, *SHAPE), dtype=np.uint16)
+
+
+class TestFile:
+    @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+    def test_brings_back_every_bit(self, response, tmp_path, suffix):
+        path = tmp_path / f"response{suffix}"
+        response.save(path)
+        loaded = equipix.load(path)
+        assert isinstance(loaded, nuc.Response)
+        for name, value in vars(response).items():
+            if isinstance(value, np.ndarray):
+                assert getattr(loaded, name).dtype == value.dtype
+                np.testing.assert_array_equal(getattr(loaded, name), value)
+            else:
+                assert getattr(loaded, name) == value
+        corrected = response.correct(frames(), flagged="replace")
+        np.testing.assert_array_equal(loaded.correct(frames(), flagged="replace"), corrected)
+
+    def test_is_not_replaced_without_force(self, response, tmp_path):
+        response.save(tmp_path / "r.npz")
+        with pytest.raises(errors.FileError, match="exists already"):
+            response.save(tmp_path / "r.npz")
+        response.save(tmp_path / "r.npz", force=True)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"format": 2}, "install a newer one"),
+            ({"levels": "many"}, "damaged"),
+            ({"saturation": "full"}, "damaged"),
+        ],
+    )
+    def test_with_other_metadata_is_refused(self, response, tmp_path, change, message):
+        path = tmp_path / "r.npz"
+        response.save(path)
+        with np.load(path) as file:
+            pages = dict(file)
+        pages["metadata"] = np.array(json.dumps(json.loads(str(pages["metadata"])) | change))
+        np.savez(path, **pages)
+        with pytest.raises(errors.FileError, match=message):
+            equipix.load(path)
+
+    @pytest.mark.parametrize("name", ["deviation", "variances", "inverse", "limits", "flags"])
+    def test_with_a_page_missing_or_cut_is_refused(self, response, tmp_path, name):
+        path = tmp_path / "r.npz"
+        response.save(path)
+        with np.load(path) as file:
+            pages = dict(file)
+        for changed in (None, pages[name][:-1]):
+            rest = {key: page for key, page in pages.items() if key != name}
+            np.savez(path, **rest, **({} if changed is None else {name: changed}))
+            with pytest.raises(errors.FileError, match="damaged"):
+                equipix.load(path)
+
+
+class TestProtocol:
+    def test_a_response_is_a_correction(self, response):
+        assert isinstance(response, equipix.Correction)
+        assert response.shape == SHAPE
+        assert response.flags.dtype == np.uint32
+        json.dumps(response.metadata)
+        assert f"order {response.order}" in repr(response)
+
+    def test_its_arrays_are_read_only_and_what_it_computes_is_the_callers(self, response):
+        for each in (response, copy.deepcopy(response), pickle.loads(pickle.dumps(response))):
+            arrays = [value for value in vars(each).values() if isinstance(value, np.ndarray)]
+            assert len(arrays) >= 9
+            assert not any(array.flags.writeable for array in arrays)
+        for made in (response.coefficients, response.valid_range, response.correct(frames())):
+            assert made.flags.writeable
+
+    def test_dtypes_follow_the_frames(self, response):
+        assert response.correct(frames()).dtype == np.float32
+        assert response.correct(frames().astype(np.float64)).dtype == np.float64
+        out = np.empty((3, *SHAPE), np.float32)
+        assert response.correct(frames(), out=out) is out
+
+    def test_a_dead_pixel_is_replaced_on_request(self, averages):
+        response = nuc.fit(averages, order=1)
+        assert response.flags[3, 4] & Flag.DEAD
+        assert response.deviation[1, 3, 4] == pytest.approx(-1, abs=0.02)
+        corrected = response.correct(frames())
+        assert np.argwhere(np.isnan(corrected[0])).tolist() == [[3, 4]]
+        replaced = response.correct(frames(), flagged="replace")
+        assert np.isfinite(replaced).all()
+
+
+class TestOtherFrames:
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            (np.zeros((3, 4)), r"shape \(3, 4\), the sensor \(24, 32\)"),
+            (np.full(SHAPE, 4096, np.uint16), "4096, above 4095, the largest value of the 12 bits"),
+            (np.zeros(SHAPE, np.uint8), "uint8, but the correction was measured with 12 bits"),
+        ],
+    )
+    def test_are_refused_with_the_numbers(self, response, given, message):
+        with pytest.raises(errors.InputError, match=message):
+            response.correct(given)
+
+    def test_wrong_words_are_refused(self, response):
+        with pytest.raises(errors.InputError, match="'dark' is 'none'"):
+            response.correct(frames(), dark="none")
+        with pytest.raises(errors.InputError, match="'flagged' is 'bad'"):
+            response.correct(frames(), flagged="bad")
+        with pytest.raises(errors.InputError, match="'dark' has shape"):
+            response.correct(frames(), dark=np.zeros((2, 2)))
+        with pytest.raises(errors.InputError, match="'frames' has shape"):
+            response.extrapolated(np.zeros((2, 2)))
+
+
+class TestCommandLine:
+    def run(self, *arguments):
+        with pytest.raises(SystemExit) as end:
+            cli.main([*map(str, arguments)])
+        assert not end.value.code
+
+    def test_inspect_shows_a_response(self, averages, tmp_path, capsys):
+        nuc.fit(averages, order=1).save(tmp_path / "r.tif")
+        self.run("inspect", tmp_path / "r.tif", "--json")
+        shown = json.loads(capsys.readouterr().out)
+        assert shown["order"] == 1
+        assert shown["flagged_pixels"] == {"DO_NOT_USE": 1, "DEAD": 1}
+
+    def test_correct_applies_a_response(self, response, tmp_path):
+        response.save(tmp_path / "r.tif")
+        equipix.io.write_frames(tmp_path / "raw.tif", iter(frames()), nbytes=1)
+        self.run("correct", tmp_path / "r.tif", tmp_path / "raw.tif", "-o", tmp_path / "c.tif")
+        corrected = np.concatenate(
+            [each for _, each in equipix.io.stream_frames([tmp_path / "c.tif"])]
+        )
+        np.testing.assert_array_equal(corrected, response.correct(frames()))
+
+
+@pytest.fixture(scope="module")
+def levels(data_dir):
+    """Averages of the 50 exposure levels of a 12-bit CCD, two frames each."""
+    folder = data_dir / "emva1288-set001-ccd-12bit/images"
+    names = [sorted(folder.glob(f"b_{level:03}_snap_*.png")) for level in range(50)]
+    assert {len(files) for files in names} == {2}
+    return [equipix.average(files, saturation=4095) for files in names]
+
+
+@pytest.mark.data
+class TestRealCamera:
+    def test_levels_that_saturate_are_refused(self, levels):
+        with pytest.raises(errors.InputError, match=r"level 30: 100.0% .* 4095 DN"):
+            nuc.fit(levels[:30] + levels[39:40])
+
+    def test_two_points_explain_a_ccd_and_the_order_is_found(self, levels):
+        free = [each for each in levels if np.mean(each.saturated > 0) < 0.01]
+        assert len(free) == 37
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            response = nuc.fit(free, order="auto")
+        assert response.order == 1
+        good = (response.flags & Flag.DO_NOT_USE) == 0
+        assert good.mean() > 0.999
+        # χ² of a noise model fitted to the same frames: within 1 % of its expectation, whose
+        # standard error over 307 200 pixels with 35 degrees of freedom is 0.04 %.
+        assert response.reduced_chi2[good].mean() == pytest.approx(1, abs=0.01)
+        # The spread of K is the PRNU of 0.433 % (README of the data) and the error of each K.
+        gain = response.deviation[1][good]
+        spread = np.sqrt(np.var(gain) - np.mean(response.variances[1][good]))
+        assert spread == pytest.approx(0.00433, rel=0.05)
+
+    def test_levels_left_out_are_corrected_and_higher_orders_add_noise(self, levels, data_dir):
+        free = [k for k, each in enumerate(levels) if np.mean(each.saturated > 0) < 0.01]
+        held = [free[9], free[18], free[27]]
+        rest = [levels[k] for k in free if k not in held]
+        folder = data_dir / "emva1288-set001-ccd-12bit/images"
+        ratios = {}
+        for order in (1, 2, 3):
+            response = nuc.fit(rest, order=order)
+            for level in held:
+                frames = equipix.io.read_frames(sorted(folder.glob(f"b_{level:03}_snap_*.png")))
+                ratios[level, order] = equipix.metrics.correctability(response.correct(frames))
+                ratios[level, 0] = equipix.metrics.correctability(frames)
+            # Few of the 307 200 pixels are inverted worse than noise.
+            assert response.metadata["inverse"]["pixels_beyond"] < 300
+        for level in held:
+            assert ratios[level, 1].high < ratios[level, 0].low
+            assert ratios[level, 1].high < ratios[level, 3].low
