@@ -88,7 +88,9 @@ impl WeakLight {
             Some(information) => information,
             None => first_information(exposures, workers, control)?,
         };
+        control.check()?;
         let weights = prior::weights(&information, variance);
+        control.check()?;
         self.freed = prior::freed(&weights, &information, variance, 0.0);
         let prior = if weights.iter().any(|&weight| weight > 0.0) {
             check_memory(exposures, BYTES_OF_PRIOR)?;
