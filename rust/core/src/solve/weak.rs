@@ -62,7 +62,12 @@ impl WeakLight {
     fn hears<T: Real>(&mut self, exposures: &Exposures<'_, T>, noise: Option<f64>) -> bool {
         let most = if exposures.variance_is_known() { 1.0 } else { f64::INFINITY };
         self.noise = noise.unwrap_or(0.0).min(most);
-        self.noise.log2().ceil().exp2() < self.variance
+        rounded_up(self.noise) < self.variance
+    }
+
+    /// σ² that this noise makes, D of a bright pixel being given.
+    fn sought(&self, bright: f64) -> f64 {
+        rounded_up(self.noise.max(FAINTEST * bright / LIT))
     }
 
     /// The prior, if it is another one; `range` is the least D and that of a bright pixel.
@@ -74,13 +79,13 @@ impl WeakLight {
         workers: &Workers,
         control: &Control,
     ) -> Result<Option<Option<Prior>>> {
-        let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
+        let variance = self.sought(bright);
         // Neither holds where there is no light at all, and no number.
         let falls = variance < self.variance;
         if falls {
             self.variance = variance;
         }
-        let is_weak = self.first.is_some() || least < CHANGE * LIT * variance;
+        let is_weak = self.first.is_some() || may_be_weak(least, variance);
         if !falls || !is_weak {
             return Ok(None);
         }
@@ -115,8 +120,7 @@ impl WeakLight {
         let pixels = self.count(exposures, control)?;
         self.hears(exposures, estimate.variance(pixels, self.freed));
         let [least, bright] = search.reduced.information_range();
-        let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
-        Ok(least < CHANGE * LIT * variance)
+        Ok(may_be_weak(least, self.sought(bright)))
     }
 
     /// How many pixels have a measurement.
@@ -200,6 +204,16 @@ impl WeakLight {
         let freed = prior::freed(weights, &information, self.noise, scatter);
         (prior::held(weights, &information, self.noise), freed)
     }
+}
+
+/// The next power of 2.
+fn rounded_up(variance: f64) -> f64 {
+    variance.log2().ceil().exp2()
+}
+
+/// Whether the least D may need a prior, or may have needed one at the first beam.
+fn may_be_weak(least: f64, variance: f64) -> bool {
+    least < CHANGE * LIT * variance
 }
 
 /// D at the first beam.
