@@ -40,19 +40,6 @@ def calibration(experiment):
     return path
 
 
-@pytest.fixture
-def run(capsys):
-    """Run a command; its exit status, stdout and stderr."""
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as done:
-            cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return done.value.code or 0, captured.out, captured.err
-
-    return call
-
-
 def refused(result, *words):
     """A failed job says why in one line on stderr, and nothing on stdout."""
     status, out, err = result

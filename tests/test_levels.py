@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, LevelExperiment, cli, errors, io, metrics, nuc
+from equipix import Flag, LevelExperiment, errors, io, metrics, nuc
 from equipix.correction.files import correct_files
 from equipix.correction.tone import picture
 from equipix.simulate import StaringArray
@@ -40,17 +40,6 @@ def folder(array, tmp_path_factory):
     dark = '[dark]\nframes = "dark.tif"\n'
     (folder / "levels.toml").write_text(head + dark + levels, encoding="utf-8")
     return folder
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*arguments):
-        with pytest.raises(SystemExit) as done:
-            cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return done.value.code or 0, captured.out, captured.err
-
-    return call
 
 
 class TestLevelExperiment:
