@@ -371,6 +371,18 @@ class TestBadPixels:
         np.testing.assert_allclose(response.levels, means, rtol=10 * EPS)
         assert np.abs(response.deviation[1] - plain.deviation[1])[others].max() < 1e-3
 
+    def test_a_pixel_that_saturates_does_not_bend_the_others(self, levels):
+        of_mean = NOISE.of_mean(400)
+        levels = noisy(levels, np.random.default_rng(16), of_mean)
+        levels[:, 3, 4] = np.minimum(1.9 * levels[:, 3, 4], 4000)
+        others = np.ones(SHAPE, bool)
+        others[3, 4] = False
+        means = [each[others].mean() for each in levels]
+        for variance in (of_mean, None):
+            response = nuc.fit(levels, order=1, variance=variance)
+            # Sums of 3071 values in another order.
+            np.testing.assert_allclose(response.levels, means, rtol=3072 * EPS)
+
     def test_a_pixel_that_rises_twice_as_much_is_hot(self, levels):
         levels[:, 3, 4] *= 2.3
         response = nuc.fit(levels, order=1)

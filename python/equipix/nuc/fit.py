@@ -10,6 +10,7 @@ import numpy as np
 from equipix import _native
 from equipix._check import naming_memory, positive_workers
 from equipix.flags import set_bits, usable
+from equipix.nuc.alike import alike_pixels
 from equipix.nuc.curve import least_slope
 from equipix.nuc.inverse import horner_inverse, inverse_verdict
 from equipix.nuc.levels import levels_of
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
     from equipix.nuc.levels import Levels
+
+_MOST_MOVED = 0.01
+"""Square by which pixels that deviate may move V̄, over the variance of a value."""
 
 
 def fit(
@@ -97,7 +101,8 @@ def fit(
     the mean over good pixels that have a value at every level, so it is nearly free of noise;
     within the fit it is scaled to [−1, 1]. A pixel is good if it is not hot, noisy or dead by the
     tests of `equipix.calibrate`, and rises from the lowest to the highest level by half to twice
-    as much as its neighbours.
+    as much as its neighbours. Pixels whose residuals deviate from the others by more than six
+    standard deviations do not count in V̄ where they move it by more than a tenth of the noise.
 
     The radiation need not be known, only uniform: the fall-off of the source or of a lens enters
     the coefficients as gain.
@@ -160,7 +165,11 @@ def _fitted(
     levels: Levels, order: int, by: By, workers: int | None, metadata: dict[str, Any]
 ) -> Response:
     """Fit one order and invert it."""
-    deviation, variances, misfit, used = levels.fit(form_of(order, by), workers=workers)
+    found = levels.fit(form_of(order, by), workers=workers)
+    cleaned = _of_alike_pixels(levels, found[2]) if order > 0 else None
+    if cleaned is not None:
+        levels, found = cleaned, cleaned.fit(form_of(order, by), workers=workers)
+    deviation, variances, misfit, used = found
     freedom = used.astype(np.int64) - (order + 1)
     chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
     if levels.noise is None:
@@ -187,6 +196,22 @@ def _fitted(
         saturation=levels.saturation,
         metadata=metadata | {"finished": finished},
     )
+
+
+def _of_alike_pixels(levels: Levels, misfit: Floats) -> Levels | None:
+    """Levels without pixels in V̄ that deviate from the others, where these move it by much.
+
+    A pixel that saturates bends V̄, and so the deviation of all others. Moves below a tenth of the
+    noise of a value, which add 1 % to χ², pass.
+    """
+    squares = misfit[levels.usable][None]
+    alike = alike_pixels(squares)
+    if alike.all():
+        return None
+    cleaned = levels.without(~alike)
+    noise = levels.variances if levels.noise else np.median(squares) / len(levels)
+    moved = (cleaned.references - levels.references) ** 2
+    return cleaned if np.any(moved > _MOST_MOVED * noise) else None
 
 
 def _pooled(misfit: Floats, freedom: Array, usable: Array) -> float:
