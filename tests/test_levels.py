@@ -163,7 +163,7 @@ class TestCommands:
         assert told["order"] == wanted.order
         assert len(told["prediction_errors"]) == 3
         good = (wanted.flags & Flag.DO_NOT_USE) == 0
-        assert told["reduced_chi2"] == pytest.approx(wanted.reduced_chi2[good].mean())
+        assert told["reduced_chi2"] == pytest.approx(np.median(wanted.reduced_chi2[good]))
         np.testing.assert_array_equal(equipix.load(output).deviation, wanted.deviation)
         assert json.loads(run("inspect", output, "--json")[1])["order"] == wanted.order
         status, out, _ = run("nuc", "fit", folder / "levels.toml", "-o", output, "--force")
@@ -188,6 +188,24 @@ class TestCommands:
         status, _, err = run("nuc", "fit", tmp_path / "levels.toml", "-o", output)
         assert (status, output.exists()) == (1, False)
         assert "100.0% of the values of level 2 are exactly 16383" in err
+
+    def test_an_order_that_is_too_low_is_said(self, run, tmp_path):
+        array = StaringArray.of("HgCdTe", SHAPE, rng=1)
+        text = ""
+        for k, light in enumerate((2e6, 5e6, 8e6, 11e6, 14e6)):
+            io.write_frames(tmp_path / f"{k}.tif", array.frames(light, 8, rng=k), nbytes=1)
+            text += f'[[level]]\nframes = "{k}.tif"\n'
+        (tmp_path / "levels.toml").write_text(text, encoding="utf-8")
+        given = ("nuc", "fit", tmp_path / "levels.toml", "-o", tmp_path / "response.tif", "--force")
+        status, out, err = run(*given)
+        assert status == 0
+        assert "warning: curves of order 1" in err
+        assert "order=2 or order='auto'" in err
+        assert "curves of order" not in run(*given, "--order", "2")[2]
+        two = text.split("[[level]]")
+        (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
+        status, out, _ = run(*given)
+        assert "reduced chi2           not determined" in out
 
     def test_errors_are_one_line(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"

@@ -41,17 +41,25 @@ def of_response(response: Response) -> dict[str, Any]:
         for name, plane in zip("aKce", response.deviation, strict=False)
     }
     prediction = options.get("prediction_errors")
-    chi2 = response.reduced_chi2[good]
     return {
         "shape": list(response.shape),
         "order": response.order,
         "levels": [float(f"{level:.6g}") for level in response.levels],
         **spread,
-        _misfit_name(options): float(np.mean(chi2)) if chi2.size else float("nan"),
+        _misfit_name(options): _misfit(response, options),
         "largest_inverse_error": response.largest_inverse_error,
         **({} if prediction is None else {"prediction_errors": prediction}),
         "flagged_pixels": flagged(response),
     }
+
+
+def _misfit(response: Response, options: dict[str, Any]) -> float | str:
+    """Median reduced χ² of usable pixels; without variances their mean, a variance in DN²."""
+    judged = usable(response.flags) & (response.freedom > 0)
+    if not judged.any():
+        return "not determined"
+    middle = np.mean if options.get("weights") == "equal" else np.median
+    return float(middle(response.reduced_chi2[judged]))
 
 
 def of_statistics(frames: FrameStatistics) -> dict[str, Any]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from equipix._check import naming_memory
 from equipix._readonly import ReadOnly
-from equipix.errors import MisfitWarning, warn
 from equipix.flags import set_bits, usable
-from equipix.nuc.criteria import common_misfit, mean_slope, misfit_advice, of_frames, of_response
+from equipix.nuc.criteria import mean_slope, of_frames, of_response
 from equipix.nuc.limits import DefectLimits
+from equipix.nuc.misfit import common_misfit, warn_of_misfit
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -25,9 +25,6 @@ __all__ = ["DefectLimits", "Defects", "find_defects"]
 
 PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 """Percentiles that describe the distribution of K."""
-
-_MISFIT = 2.0
-"""Misfit of the array above which more of it comes from the order than from noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +131,5 @@ def find_defects(
     known = gain[np.isfinite(gain)]
     percentiles = np.percentile(known, PERCENTILES) if known.size else np.full(len(PERCENTILES), 0)
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
-    if misfit > _MISFIT:
-        warn(misfit_advice(response, misfit), MisfitWarning)
+    warn_of_misfit(response, misfit)
     return Defects(flags, counts, named, misfit, limits)

@@ -14,6 +14,7 @@ from equipix.nuc.alike import alike_pixels
 from equipix.nuc.curve import least_slope
 from equipix.nuc.inverse import horner_inverse, inverse_verdict
 from equipix.nuc.levels import levels_of
+from equipix.nuc.misfit import common_misfit, warn_of_misfit
 from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
 from equipix.nuc.response import Response
 
@@ -85,6 +86,9 @@ def fit(
     -----
     SaturationWarning
         If many values are exactly the highest one, and no saturation level was given for it.
+    MisfitWarning
+        If the noise is known, and half of the pixels have a reduced χ² above twice that of noise:
+        the order, if it is not 0, is too low, or the source was not steady.
     InverseWarning
         If the cubic of orders 2 and 3 differs from the exact inverse by more than 0.3 of the noise
         of a frame at the lowest level, which adds 4 % to it, in more than 0.1 % of the usable
@@ -158,7 +162,10 @@ def fitted(
             "options": options,
             "started": started.isoformat(timespec="seconds"),
         }
-        return _fitted(given, chosen, by, workers, metadata | (provenance or {}))
+        response = _fitted(given, chosen, by, workers, metadata | (provenance or {}))
+        if chosen > 0:  # one point is right at one level, whatever the others are
+            warn_of_misfit(response, common_misfit(response))
+        return response
 
 
 def _fitted(
