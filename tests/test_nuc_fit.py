@@ -498,8 +498,14 @@ class TestRefusals:
             ({"order": "auto", "by": "gain"}, "order 'auto' corrects offset and gain"),
             ({"mask": np.zeros((2, 2), bool)}, "'mask' has shape"),
             ({"variance": np.ones(3)}, "'variance'"),
-            ({"variance": np.ones((8, *SHAPE))}, "expected \\(8,\\) or a NoiseModel"),
-            ({"variance": np.zeros(8)}, "'?noise'? "),
+            ({"variance": np.ones((8, *SHAPE))}, r"expected \(8,\), .* or a NoiseModel"),
+            ({"variance": np.zeros(8)}, "'variance' holds 0, expected .* above 0"),
+            ({"variance": [-1] * 8}, "'variance' holds -1, expected .* above 0"),
+            ({"variance": [np.nan] * 8}, "'variance' holds nan, expected .* above 0"),
+            ({"variance": [1, 2]}, "'variance' has 2 entries, expected 8: one a level"),
+            ({"variance": [NOISE] * 2}, "'variance' has 2 entries, expected 8: one a level"),
+            ({"variance": 4.0}, r"'variance' has shape \(\), expected \(8,\), one number a level"),
+            ({"variance": np.ones(SHAPE)}, r"'variance' has shape \(48, 64\), expected \(8,\)"),
             ({"workers": 0}, "'workers'"),
             ({"saturation": -1}, "'saturation'"),
         ],
@@ -524,6 +530,16 @@ class TestRefusals:
             nuc.fit(levels[0])
         with pytest.raises(errors.InputError, match="'levels' mixes"):
             nuc.fit([averages[0], levels[1]])
+
+    def test_raw_frames_in_place_of_means(self, levels):
+        stacks = np.repeat(levels[:, None], 3, axis=1)
+        for given in (stacks, list(stacks), [stacks[0], stacks[1][:2]]):
+            with pytest.raises(errors.InputError, match="holds raw frames.*equipix.average"):
+                nuc.fit(given)
+        with pytest.raises(errors.InputError, match="holds iterators.*equipix.average"):
+            nuc.fit([iter(each) for each in stacks])
+        with pytest.raises(errors.InputError, match=r"shapes \(48, 64\) and \(48, 50\), expected"):
+            nuc.fit([levels[0], levels[1][:, :50]])
 
     def test_a_gain_without_signal(self):
         with pytest.raises(errors.InputError, match="largest mean is -10 DN"):

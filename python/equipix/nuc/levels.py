@@ -16,6 +16,7 @@ from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
+from equipix.nuc.arguments import check_levels, check_variance
 from equipix.nuc.saturation import check_saturation
 
 if TYPE_CHECKING:
@@ -153,10 +154,13 @@ def levels_of(
     saturation: float | None = None,
 ) -> Levels:
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
+    check_levels(levels)
     averaged = _averaged(levels)
     if averaged is not None and averaged.raw and averaged.count > 1:
         averaged = averaged.counted_from_lowest()
     source = levels if averaged is None else averaged
+    if (count := _count(source)) is not None:
+        check_variance(variance, count)
     measured = measured_of(source, variance, saturation, words=_LEVELS)
     given = None if mask is None else as_mask(mask, measured.values.shape)
     check_saturation(measured)
@@ -183,6 +187,14 @@ def levels_of(
 def _references(values: Array, usable: Bools) -> Floats:
     """Mean V̄ of each level over usable pixels."""
     return np.array([each[usable].mean(dtype=np.float64) for each in values])
+
+
+def _count(source: object) -> int | None:
+    """Number of levels given; None where they are no sequence, which is refused later."""
+    if isinstance(source, Averaged):
+        return source.count
+    known = isinstance(source, list | tuple) or (isinstance(source, np.ndarray) and source.ndim > 0)
+    return len(source) or None if known else None  # type: ignore[arg-type]
 
 
 def _frame_noise(
@@ -228,12 +240,6 @@ def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | N
         )
     if measured.variance is None:
         return None
-    if measured.variance.ndim != 1:
-        raise InputError(
-            f"'variance' has shape {measured.variance.shape}, expected "
-            f"({len(measured.values)},) or a NoiseModel: a pixel's own sample variance makes "
-            "weights noisy"
-        )
     return tuple(LevelNoise(float(each), 0.0, 0.0) for each in measured.variance)
 
 
