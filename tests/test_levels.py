@@ -146,6 +146,12 @@ class TestLevelExperiment:
         with pytest.raises(errors.FileError, match=message):
             LevelExperiment.load(folder / "bright.toml").run()
 
+    def test_a_bit_depth_that_is_too_low_is_named(self, folder):
+        text = (folder / "raw.toml").read_text(encoding="utf-8").replace("= 14", "= 12")
+        (folder / "few.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(errors.EquipixError, match="'bit_depth'"):
+            LevelExperiment.load(folder / "few.toml").run()
+
     def test_an_order_is_checked_before_the_work(self, folder):
         with pytest.raises(errors.InputError, match="'order' is 7"):
             LevelExperiment.load(folder / "levels.toml").run(order=7)

@@ -447,6 +447,22 @@ class TestRefusals:
         with pytest.raises(errors.InputError, match=r"1 of 2 differ .*noise .*, 8.9 DN"):
             nuc.fit(close, order=1, variance=NOISE)
 
+    def test_arrays_of_one_light_are_refused(self, levels):
+        rng = np.random.default_rng(17)
+        again = levels + rng.standard_normal(levels.shape)
+        with pytest.raises(errors.InputError, match=r"2 of 3 differ .* order 2 needs 3"):
+            nuc.fit([levels[0], levels[7], again[0]], order=2)
+        with pytest.raises(errors.InputError, match=r"1 of 2 differ .* order 1 needs 2"):
+            nuc.fit([levels[0], again[0]], order=1)
+
+    def test_a_dark_brighter_than_a_level_is_named(self, levels):
+        rng = np.random.default_rng(18)
+        dark = equipix.average(noisy(np.repeat(levels[7][None], 4, axis=0), rng))
+        frames = [noisy(np.repeat(levels[k][None], 4, axis=0), rng) for k in (0, 5)]
+        averages = [equipix.average(each, dark=dark) for each in frames]
+        with pytest.raises(errors.InputError, match="the dark is brighter than a level"):
+            nuc.fit(averages, order=1)
+
     def test_levels_that_saturate(self, levels):
         clipped = np.minimum(np.rint(levels), 3100).astype(np.uint16)
         message = r"'levels': 1.2% .*expected 50% .*Level 7 has no value in 98.8%"

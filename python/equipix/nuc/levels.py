@@ -36,6 +36,9 @@ FEWEST_VALID = 0.5
 _ROUNDING = 1e-9
 """Relative difference below which two means are equal, where no noise is known."""
 
+_SAMPLED = 10_000
+"""Pixels of which the scatter of differences is taken."""
+
 
 class LevelNoise(NamedTuple):
     """Variance of a level's mean, in DN²: ``constant + slope · (value − dark)``."""
@@ -124,13 +127,19 @@ class Levels(ReadOnly):
         return np.stack([low, high])
 
     def distinct(self) -> int:
-        """Count the levels whose means differ by more than six standard deviations of a pixel's."""
+        """Count the levels whose means differ by more than six standard deviations of a pixel's.
+
+        Where no noise is known, by more than the median deviation of the pixels' differences: that
+        is of noise between levels of one light, and of gains between others.
+        """
         order = np.argsort(self.references)
         sigma = np.sqrt(self.variances) if self.noise else np.zeros(len(self))
         count, last = 1, order[0]
         for level in order[1:]:
             smallest = SIGMAS * np.hypot(sigma[level], sigma[last])
             smallest = max(smallest, _ROUNDING * abs(self.references[level]))
+            if not self.noise:
+                smallest = max(smallest, _scatter(self.values, int(last), int(level)))
             if self.references[level] - self.references[last] > smallest:
                 count, last = count + 1, level
         return count
@@ -261,7 +270,7 @@ def _with_odd_responses(
     rise = means[high] - means[low]
     variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
     # A rise within the noise is refused later, with the number of levels that differ.
-    if rise <= SIGMAS * np.sqrt(variance):
+    if rise <= SIGMAS * np.sqrt(variance) or (not noise and rise <= _scatter(values, low, high)):
         return findings
     response = (values[high] - values[low]) / rise
     std = np.full(response.shape, np.sqrt(variance) / rise)
@@ -269,6 +278,15 @@ def _with_odd_responses(
     return dataclasses.replace(
         findings, dead=union(findings.dead, dead), hot=union(findings.hot, hot)
     )
+
+
+def _scatter(values: Array, low: int, high: int) -> float:
+    """Scatter between pixels of the rise from one level to another: of noise and of gains."""
+    step = max(1, values[0].size // _SAMPLED)
+    ends = values.reshape(len(values), -1)[[low, high], ::step].astype(np.float64)
+    rise = ends[1] - ends[0]
+    known = rise[np.isfinite(rise)]
+    return float(np.median(np.abs(known - np.median(known)))) if known.size else 0.0
 
 
 def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
@@ -284,12 +302,33 @@ def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
     share = float(usable.sum() / max(1, int(wanted.sum())))
     if share < FEWEST_VALID or not usable.any():
         missing = [1 - np.mean(each[wanted]) if wanted.any() else 1.0 for each in known]
-        worst = int(np.argmax(missing))
-        odd = 0.0 if bad is None or not wanted.any() else np.mean(bad[wanted])
+        odd = 0.0 if bad is None or not wanted.any() else float(np.mean(bad[wanted]))
         raise InputError(
             f"'levels': {share:.1%} of the pixels are good and have a value at every level, "
-            f"expected {FEWEST_VALID:.0%} or more. Level {worst} has no value in "
-            f"{missing[worst]:.1%} (saturated, masked or not finite), and {odd:.1%} are dead, hot "
-            "or noisy: leave out levels that saturate, or expose less"
+            f"expected {FEWEST_VALID:.0%} or more. {_cause(values, missing, odd)}"
         )
     return usable
+
+
+def _cause(values: Array, missing: Sequence[float], odd: float) -> str:
+    """Say which level has few values, or why pixels are odd, and what to do."""
+    worst = int(np.argmax(missing))
+    said = (
+        f"Level {worst} has no value in {missing[worst]:.1%} (saturated, masked or not finite), "
+        f"and {odd:.1%} are dead, hot or noisy: "
+    )
+    if missing[worst] >= odd:
+        return said + (
+            "leave out levels that saturate, or expose less; if they do not, correct 'bit_depth' "
+            "or 'saturation', which are too low for these values"
+        )
+    means = ", ".join(f"{np.nanmedian(each):.6g}" for each in values)
+    if np.nanmedian(values, axis=(1, 2)).min() < 0:
+        return said + (
+            f"the dark is brighter than a level, as the medians less the dark are {means} DN: give "
+            "the dark frames of these levels, or none"
+        )
+    return said + (
+        f"the medians of the levels are {means} DN: give levels that differ by more than the "
+        "noise, and the noise of these frames"
+    )
