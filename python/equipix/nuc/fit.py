@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 _MOST_MOVED = 0.01
 """Square by which pixels that deviate may move V̄, over the variance of a value."""
 
+_ROUNDING = 1e-9
+"""Residual of exact levels, relative to the largest: it shows no pixel that deviates."""
+
 
 def fit(
     levels: ArrayLike | Sequence[FrameStatistics] | Averaged,
@@ -211,7 +214,8 @@ def _of_alike_pixels(levels: Levels, misfit: Floats) -> Levels | None:
     A pixel that saturates bends V̄, and so the deviation of all others. Moves below a tenth of the
     noise of a value, which add 1 % to χ², pass.
     """
-    squares = misfit[levels.usable][None]
+    rounding = (_ROUNDING * np.abs(levels.references).max()) ** 2 / levels.variances.min()
+    squares = np.maximum(misfit[levels.usable], len(levels) * rounding)[None]
     alike = alike_pixels(squares)
     if alike.all():
         return None
