@@ -1,4 +1,4 @@
-"""What the tests share: the folder of real and simulated data."""
+"""What the tests share: the folder of real and simulated data, and a run of a command."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 
 import pytest
+
+from equipix import cli
 
 ROOT = Path(__file__).parents[1]
 
@@ -20,3 +22,16 @@ def data_dir() -> Path:
             pytest.fail(reason)
         pytest.skip(reason)
     return folder
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command; its exit status, stdout and stderr."""
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as done:
+            cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return done.value.code or 0, captured.out, captured.err
+
+    return call

@@ -40,19 +40,6 @@ def calibration(experiment):
     return path
 
 
-@pytest.fixture
-def run(capsys):
-    """Run a command; its exit status, stdout and stderr."""
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as done:
-            cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return done.value.code or 0, captured.out, captured.err
-
-    return call
-
-
 def refused(result, *words):
     """A failed job says why in one line on stderr, and nothing on stdout."""
     status, out, err = result
@@ -384,6 +371,14 @@ def test_frames_of_another_sensor_are_refused(run, calibration, tmp_path, data_d
 
 def command_line(*arguments):
     return [sys.executable, "-c", "from equipix.cli import main; main()", *map(str, arguments)]
+
+
+def test_the_package_is_a_command(tmp_path):
+    command = [sys.executable, "-m", "equipix", "inspect", tmp_path / "none.tif"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("equipix: error: ")
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_pipe_sees_no_bars(experiment, tmp_path):

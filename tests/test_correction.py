@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, cli, io, loading, simulate
+from equipix import Flag, io, loading, simulate
 from equipix.correction.apply import apply
 from equipix.correction.files import correct_files
 from equipix.errors import FileError, InputError
@@ -230,16 +230,6 @@ class TestLoad:
 
 
 class TestCommandLine:
-    @pytest.fixture
-    def run(self, capsys):
-        def call(*arguments):
-            with pytest.raises(SystemExit) as done:
-                cli.main([str(argument) for argument in arguments])
-            captured = capsys.readouterr()
-            return done.value.code or 0, captured.out, captured.err
-
-        return call
-
     @pytest.fixture
     def saved(self, bent, tmp_path):
         bent.save(tmp_path / "bent.tif")

@@ -6,6 +6,7 @@ import gc
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -234,7 +235,7 @@ class TestRefusals:
             ({"bit_depth": 17}, "'bit_depth' is 17, expected 8 to 16"),
             ({"bit_depth": 7}, "'bit_depth' is 7, expected 8 to 16"),
             ({"dtype": "uint8", "bit_depth": 12}, "'bit_depth' is 12, expected 8 to 8"),
-            ({"dtype": "float32", "bit_depth": 12}, "expected None for float32"),
+            ({"dtype": "float32", "bit_depth": 12}, "None for float32: whole numbers need 'dtype'"),
             ({"flagged": "bad"}, "'flagged' is 'bad'"),
             ({"workers": 0}, "'workers'"),
         ],
@@ -242,6 +243,24 @@ class TestRefusals:
     def test_wrong_arguments(self, given, message):
         with pytest.raises(errors.InputError, match=message):
             Corrector(Given(coefficients(2)), **given)
+
+    @pytest.mark.parametrize(
+        ("given", "was"),
+        [
+            ("r1.tif", "'r1.tif'"),
+            (Path("r1.tif"), r"PosixPath\('r1.tif'\)"),
+            (None, "None"),
+            (np.ones(SHAPE), "of type ndarray"),
+        ],
+    )
+    def test_what_is_no_correction(self, given, was):
+        right, message = Given(coefficients(2)), f"is {was}, expected a correction: equipix.load"
+        with pytest.raises(errors.InputError, match=f"'correction' {message}"):
+            Corrector(given)
+        with pytest.raises(errors.InputError, match=f"'first' {message}"):
+            equipix.combine(given, right)
+        with pytest.raises(errors.InputError, match=f"'then' {message}"):
+            equipix.combine(right, given)
 
     def test_frames_of_other_shapes_and_types(self):
         corrector = Corrector(Given(coefficients(2)))

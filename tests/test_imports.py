@@ -37,6 +37,7 @@ CORE = ROOT / "rust/core/src"
 BINDING = ROOT / "rust/python/src"
 
 LAYERS = (
+    {"__main__"},
     {"cli"},
     {"pictures"},
     {"demo"},

@@ -161,6 +161,24 @@ class TestCorrection:
         assert not flagged[light > 0.101].any()
         assert (light < 0.099).any()
 
+    def test_corrected_frames_are_linear_in_light_only_where_the_mean_curve_is(self):
+        shape, light = (100, 120), np.array([0.5e6, 2e6, 5e6, 8e6, 11e6, 14e6, 16e6])
+        array = simulate.StaringArray.of("HgCdTe", shape, rng=1)
+        dark = equipix.average(array.frames(0, 16, rng=50))
+        levels = [
+            equipix.average(array.frames(e, 8, rng=k), dark=dark) for k, e in enumerate(light)
+        ]
+        response = nuc.fit(levels, order=2)
+        fall = lens.cos4(squared(shape, (48.0, 63.0)), 150.0)
+        frames = np.stack(list(array.frames(14e6 * fall, 16, rng=4)))
+        corrected = response.correct(frames).mean(axis=0)
+        bent = lens.fit_falloff(corrected)
+        assert bent.focal_length == pytest.approx(152.0, abs=0.05)  # as docs/nuc.md says
+        assert bent.focal_length - 150 > 100 * bent.std["focal_length"]
+        linear = np.polynomial.Polynomial.fit(response.levels, light, 3)
+        straight = lens.fit_falloff(linear(corrected))
+        assert abs(straight.focal_length - 150) < 5 * straight.std["focal_length"]
+
     def test_the_example_prints_the_corner_of_the_source(self, capsys):
         path = Path(__file__).parents[1] / "examples/lens_falloff.py"
         runpy.run_path(str(path), run_name="__main__")
@@ -228,6 +246,27 @@ class TestCombine:
         np.testing.assert_array_equal(loaded.coefficients, both.coefficients)
         assert "order 3" in repr(loaded)
         assert equipix.Corrector(loaded).replaced == 1
+
+    @pytest.mark.parametrize("order", [0, 1, 2])
+    def test_a_gain_after_raw_levels_is_refused(self, order, tmp_path):
+        array = simulate.StaringArray.of("InSb", SHAPE, rng=1)
+        frames = [list(array.frames(e, 2, rng=k)) for k, e in enumerate((0, 4e6, 8e6, 12e6))]
+        falloff = lens.fit_falloff(flat()).correction()
+        raw = nuc.fit([equipix.average(each) for each in frames[1:]], order=order)
+        raw.save(tmp_path / "raw.npz")
+        same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
+        for first in (raw, equipix.load(tmp_path / "raw.npz"), equipix.combine(raw, same)):
+            with pytest.raises(
+                errors.InputError, match="'first' is a response to raw levels.*dark"
+            ):
+                equipix.combine(first, falloff)
+        # An offset of 'then' can take away the one that 'first' leaves.
+        offset = float(np.mean(frames[0]))
+        less = equipix.Polynomial(np.stack([np.full(SHAPE, -offset), np.ones(SHAPE)]), raw.flags)
+        equipix.combine(equipix.combine(raw, less), falloff)
+        dark = equipix.average(frames[0])
+        levels = [equipix.average(each, dark=dark) for each in frames[1:]]
+        equipix.combine(nuc.fit(levels, order=order), falloff)
 
     def test_what_does_not_combine_is_refused(self):
         response = nuc.fit(self.levels(), order=2)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, LevelExperiment, cli, errors, io, metrics, nuc
+from equipix import Flag, LevelExperiment, errors, io, metrics, nuc
 from equipix.correction.files import correct_files
 from equipix.correction.tone import picture
 from equipix.simulate import StaringArray
@@ -40,17 +40,6 @@ def folder(array, tmp_path_factory):
     dark = '[dark]\nframes = "dark.tif"\n'
     (folder / "levels.toml").write_text(head + dark + levels, encoding="utf-8")
     return folder
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*arguments):
-        with pytest.raises(SystemExit) as done:
-            cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return done.value.code or 0, captured.out, captured.err
-
-    return call
 
 
 class TestLevelExperiment:
@@ -288,6 +277,15 @@ class TestDefectsAndQuality:
         assert (status, out) == (1, "")
         assert "'array 8', but the correction is of 'array 7'" in err
 
+    @pytest.mark.parametrize("command", ["defects", "quality"])
+    def test_corrected_frames_are_noticed(self, run, saved, folder, tmp_path, command):
+        frames, once = folder / "level2.tif", tmp_path / "once.tif"
+        assert run("correct", saved[1], frames, "-o", once)[0] == 0
+        assert "corrected already" not in run("nuc", command, saved[1], frames)[2]
+        status, _, err = run("nuc", command, saved[1], once)
+        assert status == 0
+        assert f"{once}: corrected already, by this correction; what both remove is" in err
+
     def test_files_of_another_kind_are_refused(self, run, saved, folder):
         status, _, err = run("nuc", "quality", saved[1], saved[1])
         assert (status, "expected raw frames" in err) == (1, True)
@@ -393,12 +391,21 @@ class TestCorrectedFiles:
 
     def test_a_picture_has_no_other_type(self, corrected, folder, tmp_path):
         response, _ = corrected
-        with pytest.raises(errors.InputError, match="'display' makes pictures of 8 bits"):
+        message = "'display' makes pictures of 8 bits, but 'dtype' .* is 'uint16': leave out one"
+        with pytest.raises(errors.InputError, match=message):
             correct_files(
                 response,
                 [str(folder / "level2.tif")],
                 tmp_path / "out.tif",
                 dtype="uint16",
+                display="linear",
+            )
+        with pytest.raises(errors.InputError, match="but 'bit_depth' .* is 12: leave out one"):
+            correct_files(
+                response,
+                [str(folder / "level2.tif")],
+                tmp_path / "out.tif",
+                bit_depth=12,
                 display="linear",
             )
 
@@ -424,6 +431,40 @@ class TestCorrectedFiles:
             equipix.load(path), [str(folder / "level4.tif")], folder / "c.tif", flagged="replace"
         )
         assert done.replaced == np.count_nonzero(~good | (flags != 0))
+
+    def test_flagged_pixels_are_counted_apart(self, corrected, run, folder, tmp_path):
+        response, _ = corrected
+        flags = np.zeros(SHAPE, np.uint32)
+        flags[3, 4:6] = Flag.DO_NOT_USE
+        two = response.with_flags(flags)
+        bad = np.count_nonzero((two.flags & Flag.DO_NOT_USE) != 0)
+        source, path = [str(folder / "level2.tif")], tmp_path / "out.tif"
+        for dtype in ("uint16", "float32"):
+            done = correct_files(two, source, path, dtype=dtype, force=True)
+            assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
+        with pytest.warns(errors.LimitedWarning, match="100% of the .* of uint8: .* uint16; or"):
+            done = correct_files(two, source, path, dtype="uint8", force=True)
+        assert done.limited == 16 * (flags.size - bad)
+        done = correct_files(two, source, path, dtype="uint16", flagged="replace", force=True)
+        assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
+        two.save(tmp_path / "two.tif")
+        arguments = ("correct", tmp_path / "two.tif", *source, "-o", path, "--force", "--json")
+        told = json.loads(run(*arguments, "--dtype", "uint16")[1])
+        assert (told["limited_values"], told["unusable_pixels"]) == (0, bad)
+
+    def test_most_values_limited_is_a_warning_of_the_command(
+        self, corrected, run, folder, tmp_path
+    ):
+        _, call = corrected
+        arguments = ("correct", tmp_path / "response.tif", folder / "level2.tif", "-o")
+        status, _, err = run(*arguments, tmp_path / "8.tif", "--dtype", "uint8")
+        assert (status, "--display linear" in err, err.count("\n")) == (0, True, 1)
+        assert run(*arguments, tmp_path / "d.tif", "--display", "linear")[2] == ""
+        status, _, err = run(
+            *arguments, tmp_path / "b.tif", "--dtype", "uint16", "--bit-depth", "8"
+        )
+        assert "more bits in 'bit_depth'" in err
+        assert call("16.tif", "--dtype", "uint16")[1]["limited_values"] == 0
 
     def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
         from equipix.correction import corrector as module

@@ -387,7 +387,7 @@ class TestEmvaTransfer:
 
     def test_counts_that_do_not_fit_are_refused(self):
         dark, bright, light = self.levels(np.random.default_rng(13))
-        with pytest.raises(errors.InputError, match="'bright' has 19 levels"):
+        with pytest.raises(errors.InputError, match="'bright' has 19 levels, 'dark' .* one 'dark'"):
             metrics.emva_transfer(dark, bright[:19], light)
         with pytest.raises(errors.InputError, match="expected three or more"):
             metrics.emva_transfer(dark[:2], bright[:2], light[:2])

@@ -139,6 +139,13 @@ class TestAlwaysAnAnswer:
         found = cal.sensitivity[block].mean() / cal.sensitivity[:15].mean()
         assert found == pytest.approx(1.5, abs=5 * deviation + noise**2 / 5)
 
+    def test_even_weak_light_has_no_flags_but_large_standard_deviations(self):
+        frames, _ = experiment((48, 64), simulate.gaussian_beam((48, 64), width=200), noise=0.1)
+        cal = equipix.calibrate(frames, CROSS, variance=[0.01] * 5, uncertainty=True)
+        # No D is a sixteenth of that of a bright pixel: nothing is flagged, though none has 4 %.
+        assert not cal.flags.any()
+        assert (cal.sensitivity_std > 0.04).all()
+
     @pytest.mark.parametrize("side", [27, 30])
     def test_masked_pixels_are_no_unknowns(self, side):
         """With a fifth of the sensor in use there are fewer measurements than pixels."""

@@ -58,6 +58,10 @@ class AlreadyCorrectedWarning(EquipixWarning):
     """Frames to correct have been corrected before."""
 
 
+class LimitedWarning(EquipixWarning):
+    """Most corrected values are outside of the range of the output's type."""
+
+
 class MissingDarkWarning(EquipixWarning):
     """Averages from which no dark was subtracted count as light."""
 

@@ -148,7 +148,9 @@ def fit_falloff(
     Parameters
     ----------
     flat : array_like, shape (rows, cols)
-        Mean frame of a uniform scene through the lens, the dark subtracted. NaN does not count.
+        Mean frame of a uniform scene through the lens, the dark subtracted. NaN does not count. It
+        must be linear in light: frames corrected by a response are so only where the array's mean
+        curve is, else f is off beyond its standard error (docs/nuc.md, section 2).
     law : {"cos4", "radial"}
         The law: the natural fall-off, or a polynomial for lenses with vignetting.
     sensitivity : array_like, shape (rows, cols), optional

@@ -13,7 +13,7 @@ from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import Corrected, correct_files, is_folder
 from equipix.errors import InputError
-from equipix.experiment.provenance import sha256_of
+from equipix.experiment.provenance import origin_of
 from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
 from equipix.frames import refuse_subtracted, saved_shape
@@ -129,7 +129,7 @@ def correct(
             display=display,
             sensor=sensor,
             workers=workers,
-            origin=f"correction sha256 {sha256_of([correction])[correction]}",
+            origin=origin_of(correction),
             force=force,
             progress=progress,
         )
@@ -145,6 +145,8 @@ def _counts(done: Corrected, *, whole: bool) -> dict[str, Any]:
         counts["extrapolated_values"] = done.extrapolated
     if done.replaced:
         counts["replaced_pixels"] = done.replaced
+    if done.flagged:
+        counts["unusable_pixels"] = done.flagged
     return counts
 
 

@@ -14,8 +14,10 @@ from equipix.cli.options import Force, Json, Mask, Sensor, Workers, naming_mask
 from equipix.cli.summary import flagged as flag_counts
 from equipix.cli.summary import summary
 from equipix.cli.terminal import check_output, progress_bars, show_result
+from equipix.correction.files import warn_of_corrected
 from equipix.correction.protocol import check_sensor
 from equipix.experiment.levels import LevelExperiment
+from equipix.experiment.provenance import origin_of
 from equipix.io import SUFFIXES, find_files, read_frames, read_mask, refuse_inputs, refuse_saved
 from equipix.loading import load, load_response
 from equipix.metrics import correctability, roughness, three_d_noise
@@ -86,11 +88,15 @@ def defects(
         typer.Option("--output", "-o", help="The response with the flags found: .tif or .npz."),
     ] = None,
     response_limit: Annotated[
-        float, typer.Option(help="Least response over the mean one (GB/T 17444-2013).")
+        float,
+        typer.Option(
+            help="Least response over that of the neighbours (GB/T 17444-2013: the mean)."
+        ),
     ] = DefectLimits.response,
     gain_limit: Annotated[float, typer.Option(help="Largest 1/(1 + K).")] = DefectLimits.gain,
     noise_limit: Annotated[
-        float, typer.Option(help="Largest noise over the mean one (GB/T 17444-2013).")
+        float,
+        typer.Option(help="Largest noise over that of its signal (GB/T 17444-2013: the mean)."),
     ] = DefectLimits.noise,
     correlation_limit: Annotated[
         float, typer.Option(help="Least deviation of von Neumann's ratio for flicker, in sigmas.")
@@ -120,7 +126,7 @@ def defects(
     curves = load_response(response)
     check_sensor(curves, sensor)
     with naming_memory("finding bad pixels"):
-        found = find_defects(curves, None if not frames else _raw(frames), limits=limits)
+        found = find_defects(curves, None if not frames else _raw(frames, response), limits=limits)
     flagged = curves.with_flags(found.flags)
     if output is not None:
         flagged.save(output, force=force)
@@ -143,7 +149,7 @@ def quality(
     loaded = load(correction)
     check_sensor(loaded, sensor)
     with naming_memory("measuring quality"):
-        result = _quality(loaded, _raw(frames), confidence)
+        result = _quality(loaded, _raw(frames, correction), confidence)
     show_result(result, as_json=as_json)
 
 
@@ -167,9 +173,10 @@ def _quality(correction: Correction, raw: Array, confidence: float) -> dict[str,
     }
 
 
-def _raw(source: list[str]) -> Array:
-    """Read raw frames, and refuse files that equipix has saved."""
+def _raw(source: list[str], correction: Path) -> Array:
+    """Read raw frames, refuse files that equipix has saved, and warn of corrected ones."""
     files = find_files(source)
     for file in files:
         refuse_saved(file)
+    warn_of_corrected(files, origin_of(correction))
     return read_frames(files)

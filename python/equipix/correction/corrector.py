@@ -19,7 +19,7 @@ from equipix.correction.kernel import (
     output_dtype,
     run,
 )
-from equipix.correction.protocol import check_sensor, takes_dark
+from equipix.correction.protocol import check_correction, check_sensor, takes_dark
 from equipix.errors import InputError
 from equipix.flags import usable
 
@@ -62,7 +62,7 @@ class Corrector:
     ----------
     clipped : int
         Values of whole numbers so far that had to be limited to the range from 0 to the largest
-        value, or were not a number.
+        value, or were not a number, such as those of flagged pixels with ``flagged="nan"``.
     extrapolated : int or None
         Values so far that were corrected to below the lowest or above the highest level that the
         response of their pixel was fitted to, to the rounding of float32. None where a correction
@@ -113,6 +113,7 @@ class Corrector:
         sensor: str | None = None,
         workers: int | None = None,
     ) -> None:
+        check_correction("correction", correction)
         self.shape = correction.shape
         self.dtype = output_dtype(dtype)
         self._depth = depth_of(correction)

@@ -11,7 +11,8 @@ from equipix.correction.corrector import Corrector
 from equipix.correction.kernel import FAST, output_dtype
 from equipix.correction.protocol import takes_dark
 from equipix.correction.tone import picture
-from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, warn
+from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, LimitedWarning, warn
+from equipix.flags import usable
 from equipix.frames import average, refuse_subtracted
 from equipix.io import (
     description,
@@ -53,12 +54,15 @@ class Corrected(NamedTuple):
     frames : int
         Number of frames.
     limited : int
-        Values that had to be limited to the range of whole numbers, or were not a number.
+        Values of pixels in use that had to be limited to the range of whole numbers, or were not a
+        number.
     extrapolated : int or None
         Values corrected to outside of the levels of their pixel's response; None where the
         correction has none.
     replaced : int
         Pixels that were replaced in each frame.
+    flagged : int
+        Pixels flagged ``DO_NOT_USE`` that became NaN in each frame, 0 in whole numbers.
     """
 
     dtype: str
@@ -66,6 +70,7 @@ class Corrected(NamedTuple):
     limited: int
     extrapolated: int | None
     replaced: int
+    flagged: int
 
 
 def correct_files(
@@ -135,6 +140,8 @@ def correct_files(
     -----
     AlreadyCorrectedWarning
         If files were written by this function.
+    LimitedWarning
+        If most values had to be limited to the range of whole numbers.
     """
     wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
@@ -143,7 +150,7 @@ def correct_files(
     counts = {file: _count(file, correction) for file in files}
     total, done = sum(counts.values()), 0
     _refuse_pictures(output, total, wanted)
-    _warn_of_corrected(files, origin)
+    warn_of_corrected(files, origin)
     corrector = Corrector(
         correction,
         "float32" if display else wanted,
@@ -176,8 +183,10 @@ def correct_files(
             output.mkdir(exist_ok=True)
             for path in outputs:
                 (folder / path.name).replace(path)
-    limited, extrapolated = corrector.clipped, corrector.extrapolated
-    return Corrected(wanted.name, total, limited, extrapolated, corrector.replaced)
+    bad = int(np.count_nonzero(~usable(correction.flags))) if flagged == "nan" else 0
+    limited = max(0, corrector.clipped - bad * total)  # NaN is limited in whole numbers alone
+    _warn_of_limited(limited, total * (correction.flags.size - bad), wanted)
+    return Corrected(wanted.name, total, limited, corrector.extrapolated, corrector.replaced, bad)
 
 
 def _dtype(
@@ -186,10 +195,14 @@ def _dtype(
     """Type of the output, by its name unless it is given."""
     if display is None:
         return output_dtype(dtype or ("uint16" if is_picture(output) else "float32"))
-    if dtype not in (None, "uint8") or bit_depth is not None:
+    if dtype not in (None, "uint8"):
         raise InputError(
-            f"'display' makes pictures of 8 bits, but 'dtype' is '{dtype}' and 'bit_depth' is "
-            f"{bit_depth}: leave both out"
+            f"'display' makes pictures of 8 bits, but 'dtype' (--dtype) is '{dtype}': leave out one"
+        )
+    if bit_depth is not None:
+        raise InputError(
+            "'display' makes pictures of 8 bits, but 'bit_depth' (--bit-depth) is "
+            f"{bit_depth}: leave out one"
         )
     return np.dtype(np.uint8)
 
@@ -242,8 +255,8 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def _warn_of_corrected(files: list[Path], origin: str) -> None:
-    """Warn of files that this module has written."""
+def warn_of_corrected(files: list[Path], origin: str) -> None:
+    """Warn of files that this module has written; `origin` as for `correct_files`."""
     marks = {file: description(file) for file in files if file.suffix.lower() in _MARKED}
     corrected = [file for file, mark in marks.items() if mark.startswith(_MARK)]
     if not corrected:
@@ -255,6 +268,20 @@ def _warn_of_corrected(files: list[Path], origin: str) -> None:
         f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
         "the raw frames",
         AlreadyCorrectedWarning,
+    )
+
+
+def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
+    """Warn where most values of pixels in use are outside of the range of the output."""
+    if limited <= values / 2:
+        return
+    remedy = "float32, or more bits in 'bit_depth' (--bit-depth)"
+    if dtype == np.uint8:
+        remedy = "uint16; or 'display' (--display linear), which scales frames to 8 bits"
+    warn(
+        f"{limited / values:.0%} of the corrected values were limited to the range of {dtype}: "
+        f"choose 'dtype' (--dtype) {remedy}",
+        LimitedWarning,
     )
 
 

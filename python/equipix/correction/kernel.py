@@ -138,6 +138,8 @@ def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
         return largest_of(dtype)
     bits = 8 * dtype.itemsize
     if dtype.kind != "u" or isinstance(bit_depth, bool) or bit_depth not in range(8, bits + 1):
-        wanted = f"8 to {bits}" if dtype.kind == "u" else "None for float32"
+        wanted = f"8 to {bits}"
+        if dtype.kind != "u":
+            wanted = "None for float32: whole numbers need 'dtype' (--dtype) uint16 or uint8"
         raise InputError(f"'bit_depth' is {bit_depth!r}, expected {wanted}")
     return float(2**bit_depth - 1)

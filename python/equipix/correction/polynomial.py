@@ -10,7 +10,7 @@ import numpy as np
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.depth import depth_of
-from equipix.correction.protocol import sensor_of
+from equipix.correction.protocol import check_correction, sensor_of
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
 
@@ -39,7 +39,8 @@ class Polynomial(ReadOnly):
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`.
     metadata : dict
-        Origin, as JSON values.
+        Origin, as JSON values. Of two corrections combined, ``"raw"`` is true where corrected
+        frames hold the mean offset of raw levels.
     saturation : float or None
         Level of saturation of the raw values in DN, where it is known.
 
@@ -160,7 +161,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     then : Correction
         Applied to the result, so measured on frames that `first` has corrected: offset and gain,
         such as a lens fall-off, or a shift calibration of corrected exposures. One of raw exposures
-        holds the gain that `first` takes away already, which would be taken away twice.
+        holds the gain that `first` takes away already, which would be taken away twice. A gain
+        needs a `first` that leaves no offset.
 
     Returns
     -------
@@ -172,7 +174,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     ------
     InputError
         If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
-        order above 1 or subtracts a dark frame.
+        order above 1 or subtracts a dark frame; or `then` is a gain alone, and `first` a response
+        to averages of raw levels: the mean offset stays in frames that it has corrected, and the
+        gain would multiply it.
 
     Examples
     --------
@@ -184,6 +188,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     >>> bool(np.allclose(twice.coefficients[1], response.coefficients[1] ** 2))
     True
     """
+    check_correction("first", first)
+    check_correction("then", then)
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
     one, other = sensor_of(first), sensor_of(then)
@@ -202,10 +208,24 @@ def combine(first: Correction, then: Correction) -> Polynomial:
             "order, or correct frames twice"
         )
     gain = after[1] if len(after) == 2 else 0.0
+    raw = _leaves_offset(first) and not np.nan_to_num(after[0]).any()
+    if raw and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
+        raise InputError(
+            "'first' is a response to raw levels, which leaves the mean offset in corrected "
+            "frames, and the gain of 'then' would multiply it: average the levels with a dark, "
+            "equipix.average(frames, dark=dark), and fit the response again"
+        )
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
     metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
     if one or other:
         metadata["sensor"] = (first if one else then).metadata["sensor"]
+    if raw:
+        metadata["raw"] = True
     level: float | None = getattr(first, "saturation", None)
     return Polynomial(coefficients, first.flags | then.flags, metadata, level)
+
+
+def _leaves_offset(correction: Correction) -> bool:
+    """Whether corrected frames hold the mean offset of the raw levels that it was fitted to."""
+    return bool(getattr(correction, "raw", False) or correction.metadata.get("raw", False))

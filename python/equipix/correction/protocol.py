@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
-    from os import PathLike
     from typing import TypeGuard
 
     from numpy.typing import ArrayLike, NDArray
@@ -68,6 +68,19 @@ class DarkCorrection(Correction, Protocol):
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
         """Frames as `Correction.correct` gives them, after `dark` is subtracted."""
+
+
+def check_correction(name: str, given: object) -> None:
+    """Refuse what is no correction, such as the name of its file."""
+    needed = ("shape", "flags", "metadata", "coefficients")
+    # Of the class first: a property of the object may be costly.
+    if all(hasattr(type(given), each) or hasattr(given, each) for each in needed):
+        return
+    plain = given is None or isinstance(given, str | PathLike)
+    raise InputError(
+        f"'{name}' is {repr(given) if plain else f'of type {type(given).__name__}'}, expected a "
+        "correction: equipix.load(path), or the result of equipix.calibrate or equipix.nuc.fit"
+    )
 
 
 def takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:

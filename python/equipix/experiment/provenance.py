@@ -45,3 +45,8 @@ def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def origin_of(correction: Path) -> str:
+    """Name a correction by the hash of its file, as corrected frames do."""
+    return f"correction sha256 {sha256_of([correction])[correction]}"

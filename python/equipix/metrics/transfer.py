@@ -96,8 +96,8 @@ def emva_transfer(
     levels = as_array("light", light, ndim=1).astype(np.float64)
     if len(bright) != len(levels) or len(dark) not in (1, len(levels)):
         raise InputError(
-            f"'bright' has {len(bright)} levels and 'dark' {len(dark)}, expected {len(levels)} as "
-            "'light', of 'dark' also 1"
+            f"'bright' has {len(bright)} levels, 'dark' {len(dark)} and 'light' {len(levels)} "
+            "values: expected as many of each, or one 'dark' for all"
         )
     if not (np.isfinite(levels).all() and (levels >= 0).all()):
         wrong = levels[~(np.isfinite(levels) & (levels >= 0))][0]

@@ -32,6 +32,8 @@ const WEAK: f64 = 16.0;
 const BRIGHT: f64 = 0.9;
 /// Degrees of freedom, as a share of the measurements, of which residuals determine the noise.
 const LEAST_FREEDOM: f64 = 0.1;
+/// Pixels of a sensor that are looked at for a bright one, at most.
+const SAMPLES: usize = 1 << 16;
 /// Fewer lit pixels are chance.
 const FEWEST: usize = 16;
 
@@ -61,13 +63,14 @@ pub(crate) fn weights(information: &[f64], variance: f64) -> Arc<[f64]> {
 
 /// D of a bright pixel: of those that are lit, however few they are, or else of all.
 fn bright(information: &[f64], variance: f64) -> f64 {
-    let above = |least: f64| information.iter().copied().filter(|d| *d > least).collect();
-    let mut lit: Vec<f64> = above(LIT * variance);
-    if lit.len() < FEWEST {
-        lit = above(0.0);
-    }
-    let place = (lit.len() as f64 * BRIGHT) as usize;
-    if lit.is_empty() { 0.0 } else { *lit.select_nth_unstable_by(place, f64::total_cmp).1 }
+    let above = move |least: f64| information.iter().copied().filter(move |d| *d > least);
+    let lit = above(LIT * variance).count();
+    let (least, count) =
+        if lit < FEWEST { (0.0, above(0.0).count()) } else { (LIT * variance, lit) };
+    let step = count.div_ceil(SAMPLES).max(1);
+    let mut sample: Vec<f64> = above(least).step_by(step).collect();
+    let place = (sample.len() as f64 * BRIGHT) as usize;
+    if sample.is_empty() { 0.0 } else { *sample.select_nth_unstable_by(place, f64::total_cmp).1 }
 }
 
 /// The least D above 0, and the largest.

@@ -312,10 +312,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let history = History { looks: self.looks, ended };
         let smallest = self.search.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
-        let (held, freed) = system.prior.as_ref().map_or((Vec::new(), 0.0), |prior| {
-            let square = prior.mean * prior.mean;
-            let weights: Vec<f64> = prior.weights.iter().map(|weight| weight * square).collect();
-            self.weak.held(&weights, system.information(), &fit.sensitivity, prior.mean)
+        let priors = fit.prior.as_ref().zip(system.prior.as_ref());
+        let (held, freed) = priors.map_or((Vec::new(), 0.0), |(weights, prior)| {
+            self.weak.held(weights, system.information(), &fit.sensitivity, prior.mean)
         });
         fit.degrees_of_freedom =
             degrees_of_freedom(system, &fit, without_offset.len()) + freed.round() as i64;

@@ -105,8 +105,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             scale: Scale::of(exposures).slope(),
             products: 0,
             looks: Vec::new(),
-            // The last look must have the best L.
-            by_logarithms: start.is_none() && limit > 2,
+            // Its products are lost where the light turns out weak: with few there must be none.
+            by_logarithms: start.is_none() && limit >= TYPICAL,
             length: 1.0,
             halvings: 0,
             rescues: 0,

@@ -24,9 +24,11 @@ use crate::sweep::{Estimate, Plain};
 const FAINTEST: f64 = 1e-24;
 /// How much D changes at most from the first beam on.
 const CHANGE: f64 = 4.0;
-/// Bytes that weak light takes for each pixel and each cell of each view: D, M and L of the first beam; λ, λ in
-/// the units of the search and pieces; and the components that these are (`connectivity.rs`).
-const BYTES: [u64; 2] = [16 + 16 + 22, 8 + 13];
+/// Bytes for each pixel and each cell of each view that the first D takes: D, M and L.
+const BYTES: [u64; 2] = [16, 8];
+/// Bytes that a prior takes likewise: λ, λ in the units of the search and pieces; and the components that these
+/// are (`connectivity.rs`).
+const BYTES_OF_PRIOR: [u64; 2] = [16 + 22, 13];
 
 /// The prior while it is sought.
 pub(crate) struct WeakLight {
@@ -58,12 +60,14 @@ impl WeakLight {
 
     /// Takes this noise, if residuals show any; whether σ² falls.
     fn hears<T: Real>(&mut self, exposures: &Exposures<'_, T>, noise: Option<f64>) -> bool {
-        self.noise = if exposures.variance_is_known() {
-            noise.unwrap_or(1.0).min(1.0)
-        } else {
-            noise.unwrap_or(0.0)
-        };
-        self.noise.log2().ceil().exp2() < self.variance
+        let most = if exposures.variance_is_known() { 1.0 } else { f64::INFINITY };
+        self.noise = noise.unwrap_or(0.0).min(most);
+        rounded_up(self.noise) < self.variance
+    }
+
+    /// σ² that this noise makes, D of a bright pixel being given.
+    fn sought(&self, bright: f64) -> f64 {
+        rounded_up(self.noise.max(FAINTEST * bright / LIT))
     }
 
     /// The prior, if it is another one; `range` is the least D and that of a bright pixel.
@@ -75,13 +79,13 @@ impl WeakLight {
         workers: &Workers,
         control: &Control,
     ) -> Result<Option<Option<Prior>>> {
-        let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
+        let variance = self.sought(bright);
         // Neither holds where there is no light at all, and no number.
         let falls = variance < self.variance;
         if falls {
             self.variance = variance;
         }
-        let is_weak = self.first.is_some() || least < CHANGE * LIT * variance;
+        let is_weak = self.first.is_some() || may_be_weak(least, variance);
         if !falls || !is_weak {
             return Ok(None);
         }
@@ -89,9 +93,12 @@ impl WeakLight {
             Some(information) => information,
             None => first_information(exposures, workers, control)?,
         };
+        control.check()?;
         let weights = prior::weights(&information, variance);
+        control.check()?;
         self.freed = prior::freed(&weights, &information, variance, 0.0);
         let prior = if weights.iter().any(|&weight| weight > 0.0) {
+            check_memory(exposures, BYTES_OF_PRIOR)?;
             let found = self.pieces.take().map_or_else(|| pieces(&information), Ok)?;
             self.pieces = Some(Arc::clone(&found));
             Some(Prior::new(weights, found))
@@ -113,8 +120,7 @@ impl WeakLight {
         let pixels = self.count(exposures, control)?;
         self.hears(exposures, estimate.variance(pixels, self.freed));
         let [least, bright] = search.reduced.information_range();
-        let variance = self.noise.max(FAINTEST * bright / LIT).log2().ceil().exp2();
-        Ok(least < CHANGE * LIT * variance)
+        Ok(may_be_weak(least, self.sought(bright)))
     }
 
     /// How many pixels have a measurement.
@@ -149,6 +155,9 @@ impl WeakLight {
         let (range, workers) = (search.reduced.information_range(), search.workers());
         let found = self.decide(exposures, range, connected, workers, control)?;
         let Some(prior) = found else { return Ok(false) };
+        if prior.is_none() && estimate.prior.is_none() {
+            return Ok(false);
+        }
         estimate.prior = prior;
         search.renew();
         Ok(true)
@@ -197,18 +206,33 @@ impl WeakLight {
     }
 }
 
+/// The next power of 2.
+fn rounded_up(variance: f64) -> f64 {
+    variance.log2().ceil().exp2()
+}
+
+/// Whether the least D may need a prior, or may have needed one at the first beam.
+fn may_be_weak(least: f64, variance: f64) -> bool {
+    least < CHANGE * LIT * variance
+}
+
 /// D at the first beam.
 fn first_information<T: Real>(
     exposures: &Exposures<'_, T>,
     workers: &Workers,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let (pixels, geometry) = (exposures.sensor().len(), exposures.geometry());
-    let cells: usize = geometry.views.iter().map(|view| view.shape.len()).sum();
-    memory::check(BYTES[0] * pixels as u64 + BYTES[1] * cells as u64, || {
-        format!("weak light in {} exposures of {}", exposures.count(), exposures.sensor())
-    })?;
+    check_memory(exposures, BYTES)?;
     Estimate::first_information(exposures, workers, control)
+}
+
+/// Whether there are so many bytes for each pixel and each cell of each view.
+fn check_memory<T: Real>(exposures: &Exposures<'_, T>, bytes: [u64; 2]) -> Result<()> {
+    let cells: usize = exposures.geometry().views.iter().map(|view| view.shape.len()).sum();
+    let needed = bytes[0] * exposures.sensor().len() as u64 + bytes[1] * cells as u64;
+    memory::check(needed, || {
+        format!("weak light in {} exposures of {}", exposures.count(), exposures.sensor())
+    })
 }
 
 /// A sweep of coordinate descent; returns F + R before it where there is a prior, else F after it.
