@@ -1,8 +1,6 @@
 //! Laws of a fit: the light of its beam leaves the residuals that it minimised; a start saves passes and
 //! changes nothing; questions do not depend on each other.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot start says so by a panic")]
-
 use equipix_core::{
     Control, Ended, Exposures, Fit, Flux, FluxKind, Mask, Measurements, Method, Options, Positions,
     Result, Rotation, Shape, Stack, Variance, Workers, calibrate,

@@ -33,7 +33,10 @@ def warn_of_misfit(response: Response, misfit: float) -> None:
     if not misfit > _MOST:
         return
     order, levels = response.order, len(response.levels)
-    higher = f"fit with order={order + 1} or order='auto', " if order < min(3, levels - 2) else ""
+    higher = ""
+    if order < 3:
+        more = "fit with" if order < levels - 2 else "give more levels and fit with"
+        higher = f"{more} order={order + 1} or order='auto', "
     warn(
         f"curves of order {order} leave half of the pixels a misfit of {misfit:.3g} or more times "
         f"that of noise: {higher}check that the source was steady and that the noise was as "

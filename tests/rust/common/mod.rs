@@ -2,7 +2,6 @@
 //!
 //! The tests know no other name of the crate, so that a change of its interface changes this file alone.
 
-#![allow(dead_code, reason = "each test file uses its own part of it")]
 #![allow(
     clippy::redundant_closure_for_method_calls,
     reason = "the methods are not general enough in their lifetimes"

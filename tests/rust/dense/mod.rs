@@ -10,8 +10,6 @@
 //! fourth differences of five seen cells, and P x = x − a (aᵀD x)/(aᵀD a) takes out the beam's multiples,
 //! D being Σ w c² M² B. The unknowns are M, O, a, θ of ln c = ln c₀ + T θ and ζ of d = d₀ + Z ζ.
 
-#![allow(dead_code, reason = "each test file uses its own part of it")]
-
 pub(crate) mod covariance;
 pub(crate) mod gauge;
 pub(crate) mod lamp;
