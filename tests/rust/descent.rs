@@ -2,10 +2,10 @@
 
 use std::num::NonZeroUsize;
 
+use crate::experiment::{Experiment, experiments, rounding_of_objective};
 use equipix_core::geometry::Geometry;
 use equipix_core::sweep::Estimate;
 use equipix_core::{Control, Exposures, Flux, Positions, Result, Shape, Stack, Workers};
-use crate::experiment::{Experiment, experiments, rounding_of_objective};
 use proptest::prelude::*;
 
 impl Experiment {

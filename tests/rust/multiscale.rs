@@ -2,8 +2,8 @@
 
 use std::num::NonZeroUsize;
 
-use equipix_core::{Control, Ended, Fit, History, Method, Options, Result, Workers, calibrate};
 use crate::experiment::{Experiment, experiments, rounding_of_objective};
+use equipix_core::{Control, Ended, Fit, History, Method, Options, Result, Workers, calibrate};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 
