@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
-from equipix.correction.apply import dark_frame
+from equipix.correction.apply import dark_frame, is_stored
 from equipix.correction.depth import depth_of
 from equipix.correction.kernel import (
     FAST,
@@ -208,7 +208,7 @@ def levels_of(correction: Correction) -> Array | None:
 
 def coefficients_of(correction: Correction, dark: Dark) -> Array:
     """Coefficients with this dark frame in place of that stored, by the rules of ``correct``."""
-    stored = isinstance(dark, str) and dark == "stored"
+    stored = is_stored(dark)
     if not takes_dark(correction):
         if stored:
             return correction.coefficients

@@ -137,7 +137,8 @@ def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
     if bit_depth is None:
         return largest_of(dtype)
     bits = 8 * dtype.itemsize
-    if dtype.kind != "u" or isinstance(bit_depth, bool) or bit_depth not in range(8, bits + 1):
+    number = isinstance(bit_depth, int | np.integer) and not isinstance(bit_depth, bool)
+    if dtype.kind != "u" or not number or bit_depth not in range(8, bits + 1):
         wanted = f"8 to {bits}"
         if dtype.kind != "u":
             wanted = "None for float32: whole numbers need 'dtype' (--dtype) uint16 or uint8"

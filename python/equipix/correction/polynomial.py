@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._check import check_type
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.depth import depth_of
@@ -57,6 +58,8 @@ class Polynomial(ReadOnly):
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
+        for name in ("coefficients", "flags"):
+            check_type(name, getattr(self, name), np.ndarray, "an array")
         ReadOnly.__post_init__(self)
         planes, shape = self.coefficients.shape[:1], self.coefficients.shape[1:]
         if shape != self.flags.shape or not 2 <= planes[0] <= _MOST or len(shape) != 2:
