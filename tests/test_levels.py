@@ -147,6 +147,28 @@ class TestLevelExperiment:
 
 
 class TestCommands:
+    def test_inspect_tells_the_sensor_and_what_the_levels_were(self, run, folder, tmp_path):
+        output = tmp_path / "response.npz"
+        assert run("nuc", "fit", folder / "levels.toml", "-o", output)[0] == 0
+        told = json.loads(run("inspect", output, "--json")[1])
+        assert told["sensor"] == "array 7"
+        assert told["level_values"] == ["10 °C", "20 °C", "30 °C", "40 °C"]
+        assert [each["value"] for each in told["metadata"]["levels"]] == [10, 20, 30, 40]
+        shown = run("inspect", output)[1]
+        assert "10 °C, 20 °C, 30 °C, 40 °C" in shown
+        assert "array 7" in shown
+
+    def test_inspect_tells_names_where_levels_have_no_value(self, run, folder, tmp_path):
+        names = '[[level]]\nframes = "{0}/level1.tif"\n[[level]]\nframes = "{0}/level2.tif"\n'
+        text = names.format(folder)
+        for head, wanted in (("", None), ('name = "dim"\n', ["0", "dim"])):
+            (tmp_path / "levels.toml").write_text(text + head, encoding="utf-8")
+            response = LevelExperiment.load(tmp_path / "levels.toml").run()
+            response.save(tmp_path / "response.npz", force=True)
+            told = json.loads(run("inspect", tmp_path / "response.npz", "--json")[1])
+            assert told.get("level_values") == wanted
+            assert "sensor" not in told
+
     def test_fit_and_inspect(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"
         status, out, _ = run(

@@ -146,6 +146,8 @@ def _words(value: Any) -> str:
             return "none"
         case [dict(), *_]:
             return "\n".join(": ".join(map(str, each.values())) for each in value)
+        case [float() | str(), *_]:
+            return ", ".join(map(_words, value))
         case list() | tuple():
             return " × ".join(str(item) for item in value)
     return str(value)
