@@ -11,7 +11,7 @@ from equipix._check import check_type
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.depth import depth_of
-from equipix.correction.protocol import check_correction, sensor_of
+from equipix.correction.protocol import check_correction
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
 
@@ -171,15 +171,15 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     -------
     Polynomial
         Of the order of `first`, with its level of saturation and the flags of both; `metadata`
-        holds that of both, and the sensor.
+        holds that of both, and what is known of the sensor.
 
     Raises
     ------
     InputError
-        If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
-        order above 1 or subtracts a dark frame; or `then` is a gain alone, and `first` a response
-        to averages of raw levels: the mean offset stays in frames that it has corrected, and the
-        gain would multiply it.
+        If the sensors differ in shape, or in the name or the bit depth where both metadata have
+        one, or `then` is of an order above 1 or subtracts a dark frame; or `then` is a gain alone,
+        and `first` a response to averages of raw levels: the mean offset stays in frames that it
+        has corrected, and the gain would multiply it.
 
     Examples
     --------
@@ -195,9 +195,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     check_correction("then", then)
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
-    one, other = sensor_of(first), sensor_of(then)
-    if one and other and one != other:
-        raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
+    sensor = _common_sensor(first, then)
     dark = getattr(then, "dark", None)
     if dark is not None:
         raise InputError(
@@ -221,12 +219,31 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
     metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
-    if one or other:
-        metadata["sensor"] = (first if one else then).metadata["sensor"]
+    if sensor:
+        metadata["sensor"] = sensor
     if raw:
         metadata["raw"] = True
     level: float | None = getattr(first, "saturation", None)
     return Polynomial(coefficients, first.flags | then.flags, metadata, level)
+
+
+def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
+    """Return the sensor of `first`, with the name and the bits of that of `then` where it has none.
+
+    Levels of `then` are those of corrected frames, so none is taken over.
+    """
+    tables = [each.metadata.get("sensor") for each in (first, then)]
+    one, other = (each if isinstance(each, dict) else {} for each in tables)
+    for key, words in (("name", "the sensor"), ("bit_depth", "a sensor of the bit depth")):
+        known, found = one.get(key), other.get(key)
+        if known and found and known != found:
+            raise InputError(
+                f"'first' is of {words} {known!r}, 'then' of {found!r}: expected one sensor"
+            )
+    # Without any the bits follow from the level of saturation of `first`.
+    taken = ("name",) if depth_of(first).bits else ("name", "bit_depth")
+    added = {key: other[key] for key in taken if other.get(key) and not one.get(key)}
+    return {**one, **added}
 
 
 def _leaves_offset(correction: Correction) -> bool:
