@@ -177,6 +177,7 @@ def _fast(
             return None
         depth.refuse_type(raw.dtype)
         result = np.empty(raw.shape, np.float32) if out is None else out
+        check_flagged(flagged, result.dtype)
         if raw.size:
             prepared = kept(sources, flagged, coefficients)
             counts = run(prepared, raw, result, largest_of(result.dtype), None)

@@ -166,8 +166,8 @@ class Response(ReadOnly):
             end of the valid range beyond it. The cubic differs by at most `inverse_error`.
         out : ndarray, optional
             Array for the result, of the frames' shape, float32 or float64; of frames of 8 or 16
-            bits and float32, unless `exact`, also uint8 or uint16: rounded half to even, and
-            limited to the range of the type (`equipix.Corrector` counts such values).
+            bits and float32, unless `exact`, also uint8 or uint16, which hold no NaN: rounded half
+            to even, and limited to the range of the type (`equipix.Corrector` counts such values).
 
         Returns
         -------
