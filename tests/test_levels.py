@@ -157,6 +157,8 @@ class TestCommands:
         shown = run("inspect", output)[1]
         assert "10 °C, 20 °C, 30 °C, 40 °C" in shown
         assert "array 7" in shown
+        levels = ", ".join(f"{each:.6g}" for each in equipix.load(output).levels)
+        assert levels in shown
 
     def test_inspect_tells_names_where_levels_have_no_value(self, run, folder, tmp_path):
         names = '[[level]]\nframes = "{0}/level1.tif"\n[[level]]\nframes = "{0}/level2.tif"\n'

@@ -77,7 +77,15 @@ class TestAFullWell:
             equipix.average(array.frames(each, 8, rng=k)) for k, each in enumerate((4e6, 8e6, 25e6))
         ]
         (message,) = said(levels)
-        assert message.startswith("level 2 of 'levels'")
+        assert message.startswith("level 2 of 'levels' probably saturates below")
+        # With the level that it names the same frames are refused for their saturation.
+        named = float(message.split("saturation = ")[1].split()[0])
+        again = [
+            equipix.average(array.frames(each, 8, rng=k), saturation=named)
+            for k, each in enumerate((4e6, 8e6, 25e6))
+        ]
+        with pytest.raises(errors.InputError, match=r"Level 2 has no value in .*leave out levels"):
+            nuc.fit(again)
 
     def test_under_a_mask_is_not_judged(self):
         levels = [level(each, 8, k) for k, each in enumerate((8_000, 14_000, 15_000))]

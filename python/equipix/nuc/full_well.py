@@ -117,13 +117,15 @@ def _raw(averaged: Averaged, level: int) -> Array:
 def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
     """Say which levels saturate, with the numbers of the darkest of them."""
     named = " and ".join(f"level {each.level}" for each in full)
+    verbs = ("saturates", "counts") if len(full) == 1 else ("saturate", "count")
     least, most = (
         f"{each.variance:.3g} DN² at {each.mean:.6g} DN (level {each.level})"
         for each in (first, darker)
     )
     return (
-        f"{named} of 'levels' probably saturate below the top of the ADC, by a full well, and "
-        f"count as valid: the variance of a frame is {least}, but {most}. Leave out what saturates"
+        f"{named} of 'levels' probably {verbs[0]} below the top of the ADC, by a full well, and "
+        f"{verbs[1]} as valid: the variance of a frame is {least}, but {most}. Leave out what "
+        "saturates"
     )
 
 

@@ -344,7 +344,8 @@ def _cause(values: Array, missing: Sequence[float], odd: float) -> str:
         f"Level {worst} has no value in {missing[worst]:.1%} (saturated, masked or not finite), "
         f"and {odd:.1%} are dead, hot or noisy: "
     )
-    if missing[worst] >= odd:
+    # Noise judged by few values makes the rest odd.
+    if missing[worst] >= min(odd, 1 - FEWEST_VALID):
         return said + (
             "leave out levels that saturate, or expose less; if they do not, correct 'bit_depth' "
             "or 'saturation', which are too low for these values"
