@@ -147,6 +147,30 @@ class TestLevelExperiment:
 
 
 class TestCommands:
+    def test_inspect_tells_the_sensor_and_what_the_levels_were(self, run, folder, tmp_path):
+        output = tmp_path / "response.npz"
+        assert run("nuc", "fit", folder / "levels.toml", "-o", output)[0] == 0
+        told = json.loads(run("inspect", output, "--json")[1])
+        assert told["sensor"] == "array 7"
+        assert told["level_values"] == ["10 °C", "20 °C", "30 °C", "40 °C"]
+        assert [each["value"] for each in told["metadata"]["levels"]] == [10, 20, 30, 40]
+        shown = run("inspect", output)[1]
+        assert "10 °C, 20 °C, 30 °C, 40 °C" in shown
+        assert "array 7" in shown
+        levels = ", ".join(f"{each:.6g}" for each in equipix.load(output).levels)
+        assert levels in shown
+
+    def test_inspect_tells_names_where_levels_have_no_value(self, run, folder, tmp_path):
+        names = '[[level]]\nframes = "{0}/level1.tif"\n[[level]]\nframes = "{0}/level2.tif"\n'
+        text = names.format(folder)
+        for head, wanted in (("", None), ('name = "dim"\n', ["0", "dim"])):
+            (tmp_path / "levels.toml").write_text(text + head, encoding="utf-8")
+            response = LevelExperiment.load(tmp_path / "levels.toml").run()
+            response.save(tmp_path / "response.npz", force=True)
+            told = json.loads(run("inspect", tmp_path / "response.npz", "--json")[1])
+            assert told.get("level_values") == wanted
+            assert "sensor" not in told
+
     def test_fit_and_inspect(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"
         status, out, _ = run(
@@ -439,18 +463,31 @@ class TestCorrectedFiles:
         two = response.with_flags(flags)
         bad = np.count_nonzero((two.flags & Flag.DO_NOT_USE) != 0)
         source, path = [str(folder / "level2.tif")], tmp_path / "out.tif"
-        for dtype in ("uint16", "float32"):
-            done = correct_files(two, source, path, dtype=dtype, force=True)
-            assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
+        done = correct_files(two, source, path, dtype="float32", force=True)
+        assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
+        assert np.count_nonzero(np.isnan(io.read_frames(path))) == 16 * bad
+        done = correct_files(two, source, path, dtype="uint16", force=True)
+        assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
         with pytest.warns(errors.LimitedWarning, match="100% of the .* of uint8: .* uint16; or"):
             done = correct_files(two, source, path, dtype="uint8", force=True)
-        assert done.limited == 16 * (flags.size - bad)
-        done = correct_files(two, source, path, dtype="uint16", flagged="replace", force=True)
+        assert done.limited == 16 * flags.size
+        done = correct_files(two, source, path, dtype="float32", flagged="replace", force=True)
         assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
         two.save(tmp_path / "two.tif")
         arguments = ("correct", tmp_path / "two.tif", *source, "-o", path, "--force", "--json")
         told = json.loads(run(*arguments, "--dtype", "uint16")[1])
-        assert (told["limited_values"], told["unusable_pixels"]) == (0, bad)
+        assert (told["limited_values"], told["replaced_pixels"]) == (0, bad)
+        status, _, err = run(*arguments, "--dtype", "uint16", "--flagged", "nan")
+        assert (status, "which uint16 does not hold: take 'replace'" in err) == (1, True)
+        values, black = io.read_frames(folder / "level2.tif"), 0
+        for options in ((), ("--flagged", "nan")):
+            assert run(*arguments, "--display", "linear", *options)[0] == 0
+            shown = io.read_frames(path)[0, 3, 4:6]
+            wanted = "nan" if options else "replace"
+            whole = picture(two.correct(values[0], flagged=wanted), "linear")
+            np.testing.assert_array_equal(shown, whole[3, 4:6])
+            black += np.count_nonzero(shown == 0)
+        assert black == 2
 
     def test_most_values_limited_is_a_warning_of_the_command(
         self, corrected, run, folder, tmp_path

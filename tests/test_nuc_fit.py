@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -462,6 +464,23 @@ class TestRefusals:
         averages = [equipix.average(each, dark=dark) for each in frames]
         with pytest.raises(errors.InputError, match="the dark is brighter than a level"):
             nuc.fit(averages, order=1)
+
+    def test_a_dark_brighter_than_a_level_is_named_where_the_fit_goes_on(self, levels):
+        rng = np.random.default_rng(19)
+        offset, noise = levels[0] / 3, (4, *SHAPE)
+        dark = equipix.average(offset + 2 * rng.standard_normal(noise))
+        for shade, number in ((30.0, 1), (0.0, 0)):
+            lights = (levels[5], offset - shade, levels[7])
+            given = [
+                equipix.average(each + 2 * rng.standard_normal(noise), dark=dark) for each in lights
+            ]
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                nuc.fit(given, order=1)
+            told = [each for each in said if each.category is errors.BrightDarkWarning]
+            assert len(told) == number
+            assert all("is -30" in str(each.message) for each in told)
+            assert all("DN at level 1. Give" in str(each.message) for each in told)
 
     def test_levels_that_saturate(self, levels):
         clipped = np.minimum(np.rint(levels), 3100).astype(np.uint16)

@@ -342,7 +342,8 @@ class Calibration(ReadOnly):
             The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
         out : ndarray, optional
-            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`;
+            whole numbers hold no NaN, so they need another `flagged`.
 
         Returns
         -------

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix.calibration.result import Calibration
+from equipix.correction.protocol import sensor_of
 from equipix.flags import Flag, usable
 from equipix.frames import FrameStatistics
 from equipix.nuc.response import Response
@@ -26,6 +27,7 @@ def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
     if isinstance(content, Response):
         return of_response(content)
     return {
+        **_sensor(content),
         "shape": list(content.shape),
         "order": len(content.coefficients) - 1,
         "flagged_pixels": flagged(content),
@@ -42,15 +44,34 @@ def of_response(response: Response) -> dict[str, Any]:
     }
     prediction = options.get("prediction_errors")
     return {
+        **_sensor(response),
         "shape": list(response.shape),
         "order": response.order,
         "levels": [float(f"{level:.6g}") for level in response.levels],
+        **_level_values(response),
         **spread,
         _misfit_name(options): _misfit(response, options),
         "largest_inverse_error": response.largest_inverse_error,
         **({} if prediction is None else {"prediction_errors": prediction}),
         "flagged_pixels": flagged(response),
     }
+
+
+def _sensor(correction: Correction) -> dict[str, str]:
+    """Name of the sensor, where it is known."""
+    name = sensor_of(correction)
+    return {"sensor": name} if name else {}
+
+
+def _level_values(response: Response) -> dict[str, list[str]]:
+    """Values of the levels with their units, or the names, where levels.toml has any."""
+    levels = response.metadata.get("levels", [])
+    texts = [
+        each["name"] if each["value"] is None else f"{each['value']:g} {each['unit'] or ''}"
+        for each in levels
+    ]
+    named = texts != [str(number) for number in range(len(levels))]
+    return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
 def _misfit(response: Response, options: dict[str, Any]) -> float | str:
@@ -92,6 +113,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
     options = calibration.metadata.get("options", {})
     orientation = calibration.orientation
     return {
+        **_sensor(calibration),
         "shape": list(calibration.shape),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
         "spread": float(np.nanstd(sensitivity, dtype=np.float64)),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._check import as_array
 from equipix.errors import InputError
 from equipix.noise import NoiseModel
 
@@ -39,13 +40,11 @@ def check_variance(variance: Any, count: int) -> None:
     if isinstance(variance, list | tuple) and any(isinstance(e, NoiseModel) for e in variance):
         _check_count(len(variance), count)
         return
-    try:
-        numbers = np.asarray(variance, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"'variance' is not an array of numbers: {error}") from error
-    if numbers.ndim != 1:
+    numbers = as_array("variance", variance, ndim=(0, 1, 2, 3)).astype(np.float64)
+    shape = np.shape(variance)  # as_array makes one number an array of one
+    if len(shape) != 1:
         raise InputError(
-            f"'variance' has shape {numbers.shape}, expected ({count},), one number a level, or a "
+            f"'variance' has shape {shape}, expected ({count},), one number a level, or a "
             "NoiseModel: a pixel's own sample variance makes weights noisy"
         )
     _check_count(len(numbers), count)

@@ -88,7 +88,10 @@ def fit(
     Warns
     -----
     SaturationWarning
-        If many values are exactly the highest one, and no saturation level was given for it.
+        If many values are exactly the highest one, and no saturation level was given for it; or
+        averages show less than half the noise of a darker level, as a full well has it.
+    BrightDarkWarning
+        If the median of a level less the dark is below 0 by more than the noise of a value.
     MisfitWarning
         If the noise is known, and half of the pixels have a reduced χ² above twice that of noise:
         the order, if it is not 0, is too low, or the source was not steady.

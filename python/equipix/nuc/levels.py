@@ -11,11 +11,11 @@ import numpy as np
 from equipix import _native
 from equipix._readonly import ReadOnly
 from equipix.defects import SIGMAS, Findings, response_outliers
-from equipix.errors import InputError
+from equipix.errors import BrightDarkWarning, InputError, warn
 from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
-from equipix.noise import NoiseModel
+from equipix.noise import MEDIAN_SQUARE, NoiseModel
 from equipix.nuc.arguments import check_levels, check_variance
 from equipix.nuc.saturation import check_saturation
 
@@ -172,12 +172,14 @@ def levels_of(
         check_variance(variance, count)
     measured = measured_of(source, variance, saturation, words=_LEVELS)
     given = None if mask is None else as_mask(mask, measured.values.shape)
-    check_saturation(measured)
+    check_saturation(measured, averaged, given)
     pedestal = 0.0 if averaged is None else averaged.pedestal
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
     findings = _with_odd_responses(values, noise, measured.findings)
     usable = _usable(values, findings, given)
+    if measured.dark is not None:
+        _warn_of_bright_dark(values[:, usable], noise, measured.dark_variance)
     references = _references(values, usable)
     return Levels(
         values=values,
@@ -310,6 +312,31 @@ def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
     return usable
 
 
+def _warn_of_bright_dark(
+    values: Array, noise: tuple[LevelNoise, ...] | None, dark_variance: Floats | None
+) -> None:
+    """Warn of levels whose median less the dark is below 0 by more than the noise of a value.
+
+    Where no noise is known the scatter of the level takes its place.
+    """
+    of_dark = 0.0 if dark_variance is None else float(np.median(dark_variance))
+    below = []
+    for level, each in enumerate(values):
+        median = float(np.median(each))
+        if noise is None:
+            sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)
+        else:
+            sigma = np.sqrt(float(noise[level].variance(median)) + of_dark)
+        if median < -SIGMAS * sigma:
+            below.append(f"{median:.6g} DN at level {level}")
+    if below:
+        warn(
+            f"the dark is brighter than a level of 'levels': the median less the dark is "
+            f"{' and '.join(below)}. Give the dark frames of these levels, or none",
+            BrightDarkWarning,
+        )
+
+
 def _cause(values: Array, missing: Sequence[float], odd: float) -> str:
     """Say which level has few values, or why pixels are odd, and what to do."""
     worst = int(np.argmax(missing))
@@ -317,7 +344,8 @@ def _cause(values: Array, missing: Sequence[float], odd: float) -> str:
         f"Level {worst} has no value in {missing[worst]:.1%} (saturated, masked or not finite), "
         f"and {odd:.1%} are dead, hot or noisy: "
     )
-    if missing[worst] >= odd:
+    # Noise judged by few values makes the rest odd.
+    if missing[worst] >= min(odd, 1 - FEWEST_VALID):
         return said + (
             "leave out levels that saturate, or expose less; if they do not, correct 'bit_depth' "
             "or 'saturation', which are too low for these values"

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
+from equipix._check import check_word, described
 from equipix._types import By, Order
 from equipix.errors import InputError
 from equipix.nuc.alike import alike_pixels
@@ -36,10 +37,9 @@ def form_of(order: int, by: By) -> str:
 def check_order(order: object, by: object) -> None:
     """Refuse an unknown order, an unknown `by`, and a `by` that an order does not have."""
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if not (whole or order == "auto") or order not in get_args(Order):
-        raise InputError(f"'order' is {order!r}, expected one of {get_args(Order)}")
-    if by not in get_args(By):
-        raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
+    if not (whole or isinstance(order, str)) or order not in get_args(Order):
+        raise InputError(f"'order' is {described(order)}, expected one of {get_args(Order)}")
+    check_word("by", by, get_args(By))
     if by == "gain" and order != 0:
         raise InputError(
             f"'by' is 'gain', but order {order!r} corrects offset and gain: expected order=0"
