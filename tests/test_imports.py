@@ -43,7 +43,7 @@ LAYERS = (
     {"demo"},
     {"comparison", "experiment", "loading"},
     {"calibration", "nuc"},
-    {"detector"},
+    {"bolometer", "detector"},
     {"exposures", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
