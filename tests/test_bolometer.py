@@ -226,6 +226,12 @@ class TestCorrectionAtAState:
         assert spatial < np.hypot(1 / 8, 0.2) * temporal
         assert after < np.hypot(1, 0.2) * temporal
 
+    def test_a_gain_after_it_is_refused_since_frames_hold_the_level(self, both):
+        now, gain = both.at(12.5), np.stack([np.zeros(SHAPE), np.full(SHAPE, 1.1)])
+        then = equipix.Polynomial(gain, np.zeros(SHAPE, np.uint32))
+        with pytest.raises(errors.InputError, match="the gain of 'then' would multiply it"):
+            equipix.combine(now, then)
+
     def test_without_a_bias_it_is_that_in_the_middle_of_the_squares(self, both):
         middle = both.at(12.5)
         np.testing.assert_array_equal(middle.coefficients, both.at(12.5, 2.0).coefficients)

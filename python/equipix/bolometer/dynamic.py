@@ -140,7 +140,9 @@ class DynamicCorrection(ReadOnly):
             response += np.tensordot(self.gain_axes.basis(celsius, volts)[0], self.gain, 1)
         with np.errstate(divide="ignore", invalid="ignore"):  # in pixels that do not respond
             gain = np.where(response == 0, np.nan, 1 / response)
-        metadata = self.metadata | {"state": {"substrate_c": celsius, "bias_v": volts}}
+        state = {"substrate_c": celsius, "bias_v": volts}
+        # Corrected frames hold the level L, which no gain may multiply: `combine` asks for "raw".
+        metadata = self.metadata | {"state": state, "raw": True}
         offset = level - (level + deviation) * gain
         return Polynomial(np.stack([offset, gain]), self.flags, metadata)
 
