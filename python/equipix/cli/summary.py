@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.bolometer import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.protocol import sensor_of
 from equipix.flags import Flag, usable
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from equipix.correction.protocol import Correction
 
 
-def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
+def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     if isinstance(content, FrameStatistics):
         return of_statistics(content)
@@ -26,6 +27,8 @@ def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
         return of_calibration(content)
     if isinstance(content, Response):
         return of_response(content)
+    if isinstance(content, DynamicCorrection):
+        return of_dynamic(content)
     return {
         **_sensor(content),
         "shape": list(content.shape),
@@ -83,6 +86,19 @@ def _misfit(response: Response, options: dict[str, Any]) -> float | str:
     return float(middle(response.reduced_chi2[judged]))
 
 
+def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
+    """Collect the main figures of a correction that follows temperature and bias."""
+    return {
+        "shape": list(correction.shape),
+        "substrate_c": list(correction.axes.substrate_c),
+        "bias_v": list(correction.axes.bias_v),
+        "order": correction.axes.order,
+        "bias_order": correction.axes.bias_order,
+        "gain_order": None if correction.gain is None else correction.gain_axes.order,
+        "flagged_pixels": flagged(correction),
+    }
+
+
 def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
     """Collect the main figures of averaged frames."""
     several = (frames.count > 1).any()
@@ -98,7 +114,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
     }
 
 
-def flagged(correction: Correction) -> dict[str, int]:
+def flagged(correction: Correction | DynamicCorrection) -> dict[str, int]:
     """Count the pixels that have each flag."""
     return {
         flag.name or "": int(np.count_nonzero(correction.flags & flag))
