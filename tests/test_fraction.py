@@ -1,4 +1,4 @@
-"""Shifts with one fraction of a pixel in common, which differ by whole pixels and count as whole."""
+"""Shifts with one fraction of a pixel in common: they differ by whole pixels and count as whole."""
 
 from __future__ import annotations
 
