@@ -245,8 +245,8 @@ fn component_means(experiment: &Experiment, answer: &Answer) -> Vec<f64> {
     let light = |at: usize| {
         let (k, pixel) = (at / pixels, at % pixels);
         let u = place(experiment.shape, experiment.degrees[k], pixel);
-        let [row, col] = [0, 1]
-            .map(|axis| (u[axis] + experiment.shifts[k][axis]) as i64 + answer.origin[axis] as i64);
+        let [row, col] =
+            [0, 1].map(|axis| (u[axis] + experiment.shifts[k][axis] + answer.origin[axis]) as i64);
         answer.flux[k] * answer.beam[row as usize * answer.beam_shape[1] + col as usize]
     };
     let m = |pixel: usize| {

@@ -9,6 +9,7 @@ mod dense;
 mod descent;
 mod experiment;
 mod fit;
+mod fraction;
 mod joint;
 mod laws;
 mod multiscale;

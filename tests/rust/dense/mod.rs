@@ -102,7 +102,7 @@ impl<'e> Dense<'e> {
         for (cell, value) in coefficients.iter().enumerate() {
             let at = [cell / answer.beam_shape[1], cell % answer.beam_shape[1]];
             let [row, col] =
-                [0, 1].map(|axis| at[axis] as f64 - answer.origin[axis] as f64 - self.low[axis]);
+                [0, 1].map(|axis| at[axis] as f64 - answer.origin[axis] - self.low[axis]);
             let inside = |at: f64, axis: usize| at >= 0.0 && at < self.sizes[axis] as f64;
             if inside(row, 0) && inside(col, 1) {
                 x[self.cell(row, col)] = known(value);
