@@ -1,4 +1,4 @@
-"""What shifts between pixels cost, against whole ones."""
+"""What shifts between pixels cost against whole ones, and error bars after such a fit."""
 
 from __future__ import annotations
 
@@ -9,19 +9,36 @@ import numpy as np
 import equipix
 from equipix import simulate
 
+Array = np.ndarray
 Row = tuple[str, str, str, str]
 
 TOLERANCE = 1e-5
 
 
+NOISE = 1e-3
+MASKED = 0.02
+"""Share of masked pixels, in single pixels."""
+
+
 def rows(shape: tuple[int, int] = (582, 782), repetitions: int = 3) -> list[Row]:
-    """Time a calibration at whole and at fractional shifts, to the same tolerance, in turn."""
+    """Compare calibrations between pixels with others, in turn."""
     rng = np.random.default_rng(0)
     truth = simulate.paper_sensitivity(shape, rng=rng)
     beam = simulate.wavy_beam(shape, rng=rng)
     whole = equipix.cross_pattern(11, 19)
     between = whole + rng.uniform(-0.5, 0.5, whole.shape)
-    both = [(shifts, simulate.exposures(truth, beam, shifts)) for shifts in (whole, between)]
+    exact = [(shifts, simulate.exposures(truth, beam, shifts)) for shifts in (whole, between)]
+    noisy = exact[1][1] + NOISE * rng.standard_normal(exact[1][1].shape)
+    masked = rng.random(shape) < MASKED
+    return [
+        between_row(exact, repetitions),
+        error_bar_row(noisy, between, None, repetitions),
+        error_bar_row(noisy, between, masked, repetitions),
+    ]
+
+
+def between_row(both: list[tuple[Array, Array]], repetitions: int) -> Row:
+    """Time calibrations at whole and at fractional shifts, to the same tolerance."""
     times: list[list[float]] = [[], []]
     sweeps = [0, 0]
     for _ in range(repetitions):
@@ -31,12 +48,41 @@ def rows(shape: tuple[int, int] = (582, 782), repetitions: int = 3) -> list[Row]
             times[index].append(time.perf_counter() - start)
             sweeps[index] = cal.sweeps
     whole_s, between_s = (float(np.median(each)) for each in times)
-    return [
-        (
-            f"shifts between pixels, {shape[1]}×{shape[0]}×5 float64, to {TOLERANCE:.0e}",
-            "<= 4 x whole shifts",
-            f"{between_s / whole_s:.1f} x",
-            f"{between_s:.2f} s, {sweeps[1]} passes; {whole_s:.3f} s, {sweeps[0]} passes; medians "
-            f"of {repetitions} in turn",
-        )
-    ]
+    return (
+        f"shifts between pixels, {named(both[0][1])} float64, to {TOLERANCE:.0e}",
+        "<= 4 x whole shifts",
+        f"{between_s / whole_s:.1f} x",
+        f"{between_s:.2f} s, {sweeps[1]} passes; {whole_s:.3f} s, {sweeps[0]} passes; medians "
+        f"of {repetitions} in turn",
+    )
+
+
+def error_bar_row(frames: Array, shifts: Array, mask: Array | None, repetitions: int) -> Row:
+    """Time calibrations between pixels with and without error bars."""
+    variance = np.full(len(shifts), NOISE**2)
+    seconds = []
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        equipix.calibrate(frames, shifts, variance=variance, mask=mask)
+        fit = time.perf_counter() - start
+        equipix.calibrate(frames, shifts, variance=variance, mask=mask, uncertainty=True)
+        seconds.append((fit, time.perf_counter() - start - 2 * fit))
+    fit, extra = np.median(seconds, axis=0)
+    masked = "" if mask is None else f", {np.mean(mask):.0%} of the pixels masked"
+    return (
+        f"error map and tilt between pixels, {named(frames)} float64{masked}",
+        "<= 8 fits",
+        f"{extra / fit:.1f} fits",
+        f"{extra:.2f} s, fit {fit:.2f} s; medians of {repetitions}",
+    )
+
+
+def named(frames: Array) -> str:
+    """Sizes of some exposures."""
+    count, height, width = frames.shape
+    return f"{width}×{height}×{count}"
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(" | ".join(row))

@@ -46,6 +46,8 @@ def stopped(frames: NDArray, shifts: NDArray, method: str, limit: int) -> equipi
     """Calibrate with at most so many sweeps: those of a longer run, as far as they go."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", equipix.errors.ConvergenceWarning)
+        # Of even light without noise all exposures are equal.
+        warnings.simplefilter("ignore", equipix.errors.MisfitWarning)
         return equipix.calibrate(frames, shifts, method=method, max_sweeps=limit)
 
 

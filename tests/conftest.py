@@ -7,9 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from equipix import cli
-
 ROOT = Path(__file__).parents[1]
+
+
+def pytest_configure() -> None:
+    """Give each process of a parallel run one processor, before NumPy counts them.
+
+    Threads of two processes that share two processors mostly wait for each other.
+    """
+    name = os.environ.get("PYTEST_XDIST_WORKER", "")
+    if name and hasattr(os, "sched_setaffinity"):
+        processors = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {processors[int(name.removeprefix("gw")) % len(processors)]})
 
 
 @pytest.fixture(scope="session")
@@ -27,6 +36,7 @@ def data_dir() -> Path:
 @pytest.fixture
 def run(capsys):
     """Run a command; its exit status, stdout and stderr."""
+    from equipix import cli
 
     def call(*arguments):
         with pytest.raises(SystemExit) as done:

@@ -121,7 +121,7 @@ def test_calibrate_names_what_is_wrong(options, message):
 
 @pytest.mark.parametrize(
     ("shift", "options"),
-    [((0.3, 0.4), {}), ((0, 0), {"flux": "fit"}), ((2, 2), {"shift_std": 0.1})],
+    [((0.3, 0.4), {"flux": "fit"}), ((0, 0), {"flux": "fit"}), ((2, 2), {"shift_std": 0.1})],
 )
 @pytest.mark.parametrize("rotation", [None, [0, 180, 0, 180, 0]])
 def test_one_position_is_refused_where_the_solver_would_search_in_vain(shift, options, rotation):
@@ -300,6 +300,10 @@ class TestFiles:
             {"rotation": [0]},
             {"beam_origin": [-1, 0]},
             {"beam_origin": [0.5, 0]},
+            {"beam_origin": ["0", 0]},
+            {"beam_origin": [0, None]},
+            {"beam_origin": [0, 0, 0]},
+            {"beam_origin": [0, 99]},
             {"shifts": [1, 2]},
             {"verdicts": [{"kind": "unheard", "message": "of"}]},
             {"history": {"sweep": [-1], "objective": [1.0], "error_estimate": [1.0]}},

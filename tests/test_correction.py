@@ -143,7 +143,7 @@ class TestFiles:
         frames, source = images
         assert correct_files(bent, source, tmp_path / "out.tif", flagged="replace").frames == 4
         found = io.read_frames(tmp_path / "out.tif")
-        wanted = equipix.Corrector(bent, "float32").apply(frames)
+        wanted = equipix.Corrector(bent, "float32", flagged="replace").apply(frames)
         np.testing.assert_array_equal(found, wanted)
         np.testing.assert_allclose(
             found, bent.correct(frames, flagged="replace"), rtol=0, atol=rounding(bent, frames)

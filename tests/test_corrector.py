@@ -112,6 +112,24 @@ class TestAgainstNumPy:
             # A sum of eight values in float32: some roundings of it.
             np.testing.assert_allclose(each[mask], wanted[mask], rtol=1e-6)
 
+    @pytest.mark.parametrize("dtype", TYPES)
+    def test_the_treatment_follows_from_the_type_unless_it_is_named(self, dtype):
+        given = Given(coefficients(2), [0, 60])
+        whole = dtype != np.float32
+        wanted = Corrector(given, dtype, flagged="replace" if whole else "nan")
+        corrector = Corrector(given, dtype)
+        np.testing.assert_array_equal(corrector.apply(frames()), wanted.apply(frames()))
+        assert corrector.replaced == (2 if whole else 0)
+
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+    def test_whole_numbers_hold_no_nan(self, dtype):
+        polynomial = equipix.Polynomial(*identity())
+        message = f"'nan', which {np.dtype(dtype)} does not hold: take 'replace' or 'keep'"
+        with pytest.raises(errors.InputError, match=message):
+            Corrector(polynomial, dtype, flagged="nan")
+        with pytest.raises(errors.InputError, match=message):
+            polynomial.correct(frames(), out=np.empty((3, *SHAPE), dtype))
+
     def test_a_stack_is_its_frames_one_by_one(self):
         corrector = Corrector(Given(coefficients(4), [70]))
         stack = corrector.apply(frames())
@@ -154,7 +172,7 @@ class TestAgainstNumPy:
 
 class TestNotANumber:
     def test_a_raw_value_does_not_spread(self):
-        corrector = Corrector(Given(coefficients(2), [60]), "float32")
+        corrector = Corrector(Given(coefficients(2), [60]), "float32", flagged="replace")
         raw = frames(np.float32, 1)[0]
         raw.flat[61] = np.nan
         got = corrector.apply(raw)
@@ -375,6 +393,8 @@ def twelve_bits(saturation=4095):
 
 
 class TestCountsOfLevels:
+    # Levels of curved responses, to which order 1 is no fit.
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     @pytest.mark.parametrize("order", [1, 2])
     def test_are_those_that_the_response_tells(self, order):
         array = simulate.StaringArray.of("HgCdTe", SHAPE, rng=3)
@@ -383,7 +403,7 @@ class TestCountsOfLevels:
         ]
         mask = np.zeros((3, *SHAPE), bool)
         mask[2, :5], mask[0, 7:9] = True, True
-        response = nuc.fit(averages, order=order if order == 1 else 1, mask=mask)
+        response = nuc.fit(averages, order=order, mask=mask)
         raw = frames(count=4) % 16384
         corrector = Corrector(response, flagged="keep")
         corrector.apply(raw)

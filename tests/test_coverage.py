@@ -32,12 +32,25 @@ def stripes():
     [
         ([(0, 0), (0, 11)], {}, "2 exposures compare pixels along one direction only"),
         ([(3, 3)] * 4, {}, "they are all alike: move the sensor"),
+        ([(3.3, 2.5)] * 4, {}, "they are all alike: move the sensor"),
         ([(0, 0), (0, 7), (0, 11), (0, 19)], {}, "they lie on one line"),
+        ([(0.5, 0.1), (0.5, 7.1), (0.5, 11.1), (0.5, 19.1)], {}, "they lie on one line"),
         (equipix.cross_pattern(4, 6), {}, "leave 4 parts .* unconnected: choose other shifts"),
         (CROSS, {"mask": stripes()}, "pixels between them are masked"),
+        (CROSS + 0.5, {"mask": stripes()}, "pixels between them are masked"),
         (CROSS, {"saturation": 0.97}, "most of the others reach the saturation level"),
     ],
-    ids=["two", "alike", "line", "lattice", "mask", "saturation"],
+    ids=[
+        "two",
+        "alike",
+        "alike between pixels",
+        "line",
+        "line between pixels",
+        "lattice",
+        "mask",
+        "mask between pixels",
+        "saturation",
+    ],
 )
 def test_the_cause_is_named(shifts, options, cause):
     with pytest.warns(errors.IdentifiabilityWarning, match=rf"only \d+ of \d+ unmasked .*{cause}"):

@@ -16,6 +16,7 @@ from equipix import simulate
 SHAPE = (40, 52)
 CROSS = equipix.cross_pattern(5, 7).astype(float)
 BETWEEN = CROSS + np.array([[0, 0], [0.3, 0.2], [0.1, -0.4], [0.45, 0.1], [-0.2, 0.35]])
+ONE = (0.1, -0.4)
 VARIANCE = np.array([1.0, 2.0, 1.5, 1.0, 0.5]) * 1e-6
 
 CASES = {
@@ -24,6 +25,14 @@ CASES = {
     "turned": {"rotation": [0, 90, 180, 270, 0]},
     "between pixels": {"shifts": BETWEEN},
     "between pixels, turned": {"shifts": BETWEEN, "rotation": [0, 90, 0, 180, 270]},
+    "one fraction": {"shifts": CROSS + ONE},
+    "one fraction, coordinate descent": {
+        "shifts": CROSS + ONE,
+        "method": "coordinate-descent",
+        "tolerance": 1e-4,
+    },
+    "one fraction, turned": {"shifts": CROSS + ONE, "rotation": [0, 90, 180, 270, 0]},
+    "one fraction, free fluxes": {"shifts": CROSS + ONE, "flux": "fit"},
     "free fluxes": {"flux": "fit"},
     "free fluxes between pixels": {"shifts": BETWEEN, "flux": "fit"},
     "linear fluxes between pixels": {
@@ -122,7 +131,11 @@ def test_a_tilt_that_the_gauge_removes_goes_to_the_beam():
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 @pytest.mark.parametrize(
-    "case", ["whole", "turned", "refined", "free fluxes between pixels", "dark fitted", "float32"]
+    "case",
+    [
+        *("whole", "turned", "one fraction, turned", "one fraction, free fluxes", "refined"),
+        *("free fluxes between pixels", "dark fitted", "float32"),
+    ],
 )
 def test_a_loaded_calibration_predicts_the_same_bytes(case, suffix, tmp_path):
     cal, frames, variance, _ = calibrated(case)

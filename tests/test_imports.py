@@ -43,6 +43,7 @@ LAYERS = (
     {"demo"},
     {"comparison", "experiment", "loading"},
     {"calibration", "nuc"},
+    {"bolometer", "detector"},
     {"exposures", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},

@@ -268,6 +268,40 @@ class TestCombine:
         levels = [equipix.average(each, dark=dark) for each in frames[1:]]
         equipix.combine(nuc.fit(levels, order=order), falloff)
 
+    @pytest.mark.parametrize(
+        ("one", "other", "wanted"),
+        [
+            ({"bit_depth": 12}, {"name": "A"}, {"bit_depth": 12, "name": "A"}),
+            ({"name": "A"}, {"bit_depth": 12}, {"bit_depth": 12, "name": "A"}),
+            ({"name": ""}, {"name": "A", "bit_depth": 12}, {"bit_depth": 12, "name": "A"}),
+            (None, {"name": "A", "bit_depth": 12}, {"bit_depth": 12, "name": "A"}),
+            (
+                {"bit_depth": 12, "gain_dn_per_e": 0.2},
+                None,
+                {"bit_depth": 12, "gain_dn_per_e": 0.2},
+            ),
+        ],
+    )
+    def test_what_is_known_of_the_sensor_is_kept(self, one, other, wanted):
+        planes, flags = np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32)
+        first, then = (
+            equipix.Polynomial(planes, flags, {} if each is None else {"sensor": each})
+            for each in (one, other)
+        )
+        both = equipix.combine(first, then)
+        assert both.metadata["sensor"] == wanted
+        with pytest.raises(errors.InputError, match="4096, above 4095, .* of the 12 bits"):
+            both.correct(np.full(SHAPE, 4096, np.uint16))
+
+    def test_bits_of_corrected_frames_are_not_those_of_raw_ones(self):
+        planes, flags = np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32)
+        first = equipix.Polynomial(planes, flags, saturation=4095.0)
+        then = equipix.Polynomial(planes, flags, {"sensor": {"bit_depth": 16, "saturation": 6e4}})
+        both = equipix.combine(first, then)
+        assert both.saturation == 4095
+        with pytest.raises(errors.InputError, match="4096, above 4095, .* of the 12 bits"):
+            both.correct(np.full(SHAPE, 4096, np.uint16))
+
     def test_what_does_not_combine_is_refused(self):
         response = nuc.fit(self.levels(), order=2)
         with pytest.raises(errors.InputError, match="'then' has order 3"):
@@ -277,6 +311,12 @@ class TestCombine:
             equipix.Polynomial(line, response.flags, {"sensor": {"name": name}}) for name in "AB"
         )
         with pytest.raises(errors.InputError, match="of the sensor 'A', 'then' of 'B'"):
+            equipix.combine(one, other)
+        one, other = (
+            equipix.Polynomial(line, response.flags, {"sensor": {"bit_depth": bits}})
+            for bits in (12, 14)
+        )
+        with pytest.raises(errors.InputError, match="of the bit depth 12, 'then' of 14: expected"):
             equipix.combine(one, other)
         small = equipix.Polynomial(np.ones((2, 3, 4)), np.zeros((3, 4), np.uint32))
         with pytest.raises(errors.InputError, match="'first' is of shape"):

@@ -135,12 +135,42 @@ class TestLevelExperiment:
         with pytest.raises(errors.FileError, match=message):
             LevelExperiment.load(folder / "bright.toml").run()
 
+    def test_a_bit_depth_that_is_too_low_is_named(self, folder):
+        text = (folder / "raw.toml").read_text(encoding="utf-8").replace("= 14", "= 12")
+        (folder / "few.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(errors.EquipixError, match="'bit_depth'"):
+            LevelExperiment.load(folder / "few.toml").run()
+
     def test_an_order_is_checked_before_the_work(self, folder):
         with pytest.raises(errors.InputError, match="'order' is 7"):
             LevelExperiment.load(folder / "levels.toml").run(order=7)
 
 
 class TestCommands:
+    def test_inspect_tells_the_sensor_and_what_the_levels_were(self, run, folder, tmp_path):
+        output = tmp_path / "response.npz"
+        assert run("nuc", "fit", folder / "levels.toml", "-o", output)[0] == 0
+        told = json.loads(run("inspect", output, "--json")[1])
+        assert told["sensor"] == "array 7"
+        assert told["level_values"] == ["10 °C", "20 °C", "30 °C", "40 °C"]
+        assert [each["value"] for each in told["metadata"]["levels"]] == [10, 20, 30, 40]
+        shown = run("inspect", output)[1]
+        assert "10 °C, 20 °C, 30 °C, 40 °C" in shown
+        assert "array 7" in shown
+        levels = ", ".join(f"{each:.6g}" for each in equipix.load(output).levels)
+        assert levels in shown
+
+    def test_inspect_tells_names_where_levels_have_no_value(self, run, folder, tmp_path):
+        names = '[[level]]\nframes = "{0}/level1.tif"\n[[level]]\nframes = "{0}/level2.tif"\n'
+        text = names.format(folder)
+        for head, wanted in (("", None), ('name = "dim"\n', ["0", "dim"])):
+            (tmp_path / "levels.toml").write_text(text + head, encoding="utf-8")
+            response = LevelExperiment.load(tmp_path / "levels.toml").run()
+            response.save(tmp_path / "response.npz", force=True)
+            told = json.loads(run("inspect", tmp_path / "response.npz", "--json")[1])
+            assert told.get("level_values") == wanted
+            assert "sensor" not in told
+
     def test_fit_and_inspect(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"
         status, out, _ = run(
@@ -152,7 +182,7 @@ class TestCommands:
         assert told["order"] == wanted.order
         assert len(told["prediction_errors"]) == 3
         good = (wanted.flags & Flag.DO_NOT_USE) == 0
-        assert told["reduced_chi2"] == pytest.approx(wanted.reduced_chi2[good].mean())
+        assert told["reduced_chi2"] == pytest.approx(np.median(wanted.reduced_chi2[good]))
         np.testing.assert_array_equal(equipix.load(output).deviation, wanted.deviation)
         assert json.loads(run("inspect", output, "--json")[1])["order"] == wanted.order
         status, out, _ = run("nuc", "fit", folder / "levels.toml", "-o", output, "--force")
@@ -177,6 +207,24 @@ class TestCommands:
         status, _, err = run("nuc", "fit", tmp_path / "levels.toml", "-o", output)
         assert (status, output.exists()) == (1, False)
         assert "100.0% of the values of level 2 are exactly 16383" in err
+
+    def test_an_order_that_is_too_low_is_said(self, run, tmp_path):
+        array = StaringArray.of("HgCdTe", SHAPE, rng=1)
+        text = ""
+        for k, light in enumerate((2e6, 5e6, 8e6, 11e6, 14e6)):
+            io.write_frames(tmp_path / f"{k}.tif", array.frames(light, 8, rng=k), nbytes=1)
+            text += f'[[level]]\nframes = "{k}.tif"\n'
+        (tmp_path / "levels.toml").write_text(text, encoding="utf-8")
+        given = ("nuc", "fit", tmp_path / "levels.toml", "-o", tmp_path / "response.tif", "--force")
+        status, out, err = run(*given)
+        assert status == 0
+        assert "warning: curves of order 1" in err
+        assert "order=2 or order='auto'" in err
+        assert "curves of order" not in run(*given, "--order", "2")[2]
+        two = text.split("[[level]]")
+        (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
+        status, out, _ = run(*given)
+        assert "reduced chi2           not determined" in out
 
     def test_errors_are_one_line(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"
@@ -415,18 +463,31 @@ class TestCorrectedFiles:
         two = response.with_flags(flags)
         bad = np.count_nonzero((two.flags & Flag.DO_NOT_USE) != 0)
         source, path = [str(folder / "level2.tif")], tmp_path / "out.tif"
-        for dtype in ("uint16", "float32"):
-            done = correct_files(two, source, path, dtype=dtype, force=True)
-            assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
+        done = correct_files(two, source, path, dtype="float32", force=True)
+        assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
+        assert np.count_nonzero(np.isnan(io.read_frames(path))) == 16 * bad
+        done = correct_files(two, source, path, dtype="uint16", force=True)
+        assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
         with pytest.warns(errors.LimitedWarning, match="100% of the .* of uint8: .* uint16; or"):
             done = correct_files(two, source, path, dtype="uint8", force=True)
-        assert done.limited == 16 * (flags.size - bad)
-        done = correct_files(two, source, path, dtype="uint16", flagged="replace", force=True)
+        assert done.limited == 16 * flags.size
+        done = correct_files(two, source, path, dtype="float32", flagged="replace", force=True)
         assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
         two.save(tmp_path / "two.tif")
         arguments = ("correct", tmp_path / "two.tif", *source, "-o", path, "--force", "--json")
         told = json.loads(run(*arguments, "--dtype", "uint16")[1])
-        assert (told["limited_values"], told["unusable_pixels"]) == (0, bad)
+        assert (told["limited_values"], told["replaced_pixels"]) == (0, bad)
+        status, _, err = run(*arguments, "--dtype", "uint16", "--flagged", "nan")
+        assert (status, "which uint16 does not hold: take 'replace'" in err) == (1, True)
+        values, black = io.read_frames(folder / "level2.tif"), 0
+        for options in ((), ("--flagged", "nan")):
+            assert run(*arguments, "--display", "linear", *options)[0] == 0
+            shown = io.read_frames(path)[0, 3, 4:6]
+            wanted = "nan" if options else "replace"
+            whole = picture(two.correct(values[0], flagged=wanted), "linear")
+            np.testing.assert_array_equal(shown, whole[3, 4:6])
+            black += np.count_nonzero(shown == 0)
+        assert black == 2
 
     def test_most_values_limited_is_a_warning_of_the_command(
         self, corrected, run, folder, tmp_path

@@ -57,6 +57,33 @@ class TestArraysThatNoMachineHolds:
         with pytest.raises(InsufficientMemoryError, match=r"fitting response curves: .* PiB"):
             equipix.nuc.fit(levels)
 
+    @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+    @pytest.mark.parametrize(
+        ("work", "named"),
+        [
+            (lambda response, raw: response.correct(raw), "correcting"),
+            (lambda response, raw: response.correct(raw, exact=True), "correcting"),
+            (lambda response, raw: response.extrapolated(raw), "finding extrapolated values"),
+        ],
+    )
+    def test_frames_of_a_response(self, dtype, work, named):
+        response = equipix.nuc.fit(np.arange(2.0 * 8 * 9).reshape(2, 8, 9))
+        raw = np.broadcast_to(dtype(1), (2**52, 8, 9))
+        with pytest.raises(InsufficientMemoryError, match=f"{named}: .* (P|E)iB"):
+            work(response, raw)
+
+    def test_a_dark_of_the_caller(self, monkeypatch):
+        """NumPy's own error, wherever it comes from."""
+
+        def refuse(*_):
+            raise MemoryError("no 8 bytes")
+
+        response = equipix.nuc.fit(np.arange(2.0 * 8 * 9).reshape(2, 8, 9))
+        monkeypatch.setattr("equipix.nuc.response.dark_frame", refuse)
+        for work, named in ((response.correct, "correcting"), (response.extrapolated, "finding")):
+            with pytest.raises(InsufficientMemoryError, match=f"{named}.*: no 8 bytes"):
+                work(np.ones((8, 9)), dark=np.ones((8, 9)))
+
     @pytest.mark.parametrize("shape", [(2, 2**25, 2**25), (2, 2**31, 2**29)])
     def test_average(self, shape):
         words = r"averaging frames of .* needs .* \(\d{17,} bytes\) .* are available: "

@@ -189,7 +189,7 @@ def test_data_without_noise_say_nothing():
 
 
 def test_a_sample_has_the_residuals_of_its_rows():
-    frames, shifts = photograph(np.random.default_rng(9), wavy(9), CROSS + 0.25)
+    frames, shifts = photograph(np.random.default_rng(9), wavy(9), CROSS + 0.25 * np.eye(5, 2))
     cal = equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2), tolerance=1e-4)
     whole, part = sampled(cal.weighted), sampled(cal.weighted, most=5 * 96 * 32)
     expected = cal.residuals(frames, variance=np.full(5, NOISE**2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -371,6 +373,18 @@ class TestBadPixels:
         np.testing.assert_allclose(response.levels, means, rtol=10 * EPS)
         assert np.abs(response.deviation[1] - plain.deviation[1])[others].max() < 1e-3
 
+    def test_a_pixel_that_saturates_does_not_bend_the_others(self, levels):
+        of_mean = NOISE.of_mean(400)
+        levels = noisy(levels, np.random.default_rng(16), of_mean)
+        levels[:, 3, 4] = np.minimum(1.9 * levels[:, 3, 4], 4000)
+        others = np.ones(SHAPE, bool)
+        others[3, 4] = False
+        means = [each[others].mean() for each in levels]
+        for variance in (of_mean, None):
+            response = nuc.fit(levels, order=1, variance=variance)
+            # Sums of 3071 values in another order.
+            np.testing.assert_allclose(response.levels, means, rtol=3072 * EPS)
+
     def test_a_pixel_that_rises_twice_as_much_is_hot(self, levels):
         levels[:, 3, 4] *= 2.3
         response = nuc.fit(levels, order=1)
@@ -435,6 +449,39 @@ class TestRefusals:
         with pytest.raises(errors.InputError, match=r"1 of 2 differ .*noise .*, 8.9 DN"):
             nuc.fit(close, order=1, variance=NOISE)
 
+    def test_arrays_of_one_light_are_refused(self, levels):
+        rng = np.random.default_rng(17)
+        again = levels + rng.standard_normal(levels.shape)
+        with pytest.raises(errors.InputError, match=r"2 of 3 differ .* order 2 needs 3"):
+            nuc.fit([levels[0], levels[7], again[0]], order=2)
+        with pytest.raises(errors.InputError, match=r"1 of 2 differ .* order 1 needs 2"):
+            nuc.fit([levels[0], again[0]], order=1)
+
+    def test_a_dark_brighter_than_a_level_is_named(self, levels):
+        rng = np.random.default_rng(18)
+        dark = equipix.average(noisy(np.repeat(levels[7][None], 4, axis=0), rng))
+        frames = [noisy(np.repeat(levels[k][None], 4, axis=0), rng) for k in (0, 5)]
+        averages = [equipix.average(each, dark=dark) for each in frames]
+        with pytest.raises(errors.InputError, match="the dark is brighter than a level"):
+            nuc.fit(averages, order=1)
+
+    def test_a_dark_brighter_than_a_level_is_named_where_the_fit_goes_on(self, levels):
+        rng = np.random.default_rng(19)
+        offset, noise = levels[0] / 3, (4, *SHAPE)
+        dark = equipix.average(offset + 2 * rng.standard_normal(noise))
+        for shade, number in ((30.0, 1), (0.0, 0)):
+            lights = (levels[5], offset - shade, levels[7])
+            given = [
+                equipix.average(each + 2 * rng.standard_normal(noise), dark=dark) for each in lights
+            ]
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                nuc.fit(given, order=1)
+            told = [each for each in said if each.category is errors.BrightDarkWarning]
+            assert len(told) == number
+            assert all("is -30" in str(each.message) for each in told)
+            assert all("DN at level 1. Give" in str(each.message) for each in told)
+
     def test_levels_that_saturate(self, levels):
         clipped = np.minimum(np.rint(levels), 3100).astype(np.uint16)
         message = r"'levels': 1.2% .*expected 50% .*Level 7 has no value in 98.8%"
@@ -486,8 +533,14 @@ class TestRefusals:
             ({"order": "auto", "by": "gain"}, "order 'auto' corrects offset and gain"),
             ({"mask": np.zeros((2, 2), bool)}, "'mask' has shape"),
             ({"variance": np.ones(3)}, "'variance'"),
-            ({"variance": np.ones((8, *SHAPE))}, "expected \\(8,\\) or a NoiseModel"),
-            ({"variance": np.zeros(8)}, "'?noise'? "),
+            ({"variance": np.ones((8, *SHAPE))}, r"expected \(8,\), .* or a NoiseModel"),
+            ({"variance": np.zeros(8)}, "'variance' holds 0, expected .* above 0"),
+            ({"variance": [-1] * 8}, "'variance' holds -1, expected .* above 0"),
+            ({"variance": [np.nan] * 8}, "'variance' holds nan, expected .* above 0"),
+            ({"variance": [1, 2]}, "'variance' has 2 entries, expected 8: one a level"),
+            ({"variance": [NOISE] * 2}, "'variance' has 2 entries, expected 8: one a level"),
+            ({"variance": 4.0}, r"'variance' has shape \(\), expected \(8,\), one number a level"),
+            ({"variance": np.ones(SHAPE)}, r"'variance' has shape \(48, 64\), expected \(8,\)"),
             ({"workers": 0}, "'workers'"),
             ({"saturation": -1}, "'saturation'"),
         ],
@@ -512,6 +565,16 @@ class TestRefusals:
             nuc.fit(levels[0])
         with pytest.raises(errors.InputError, match="'levels' mixes"):
             nuc.fit([averages[0], levels[1]])
+
+    def test_raw_frames_in_place_of_means(self, levels):
+        stacks = np.repeat(levels[:, None], 3, axis=1)
+        for given in (stacks, list(stacks), [stacks[0], stacks[1][:2]]):
+            with pytest.raises(errors.InputError, match="holds raw frames.*equipix.average"):
+                nuc.fit(given)
+        with pytest.raises(errors.InputError, match="holds iterators.*equipix.average"):
+            nuc.fit([iter(each) for each in stacks])
+        with pytest.raises(errors.InputError, match=r"shapes \(48, 64\) and \(48, 50\), expected"):
+            nuc.fit([levels[0], levels[1][:, :50]])
 
     def test_a_gain_without_signal(self):
         with pytest.raises(errors.InputError, match="largest mean is -10 DN"):

@@ -20,7 +20,7 @@ import numpy as np, equipix
 frames = np.random.default_rng(0).uniform(1, 2, (5, {rows}, {cols})).astype(np.float32)
 print("ready", flush=True)
 try:
-    shifts = equipix.cross_pattern(2, 3) + {fraction}
+    shifts = equipix.cross_pattern(2, 3) + {fraction} * np.eye(5, 2)
     equipix.calibrate(frames, shifts, method="{method}", tolerance=1e-300)
 except KeyboardInterrupt:
     print("interrupted", flush=True)

@@ -13,7 +13,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, lens, metrics, nuc, plan, simulate, uncertainty
+    from equipix import bolometer, detector, errors, lens, metrics, nuc, plan, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
@@ -55,7 +55,17 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "lens", "metrics", "nuc", "plan", "simulate", "uncertainty")
+_MODULES = (
+    "bolometer",
+    "detector",
+    "errors",
+    "lens",
+    "metrics",
+    "nuc",
+    "plan",
+    "simulate",
+    "uncertainty",
+)
 """Public modules."""
 
 __all__ = [
@@ -74,10 +84,12 @@ __all__ = [
     "Spot",
     "__version__",
     "average",
+    "bolometer",
     "calibrate",
     "combine",
     "compare",
     "cross_pattern",
+    "detector",
     "errors",
     "lens",
     "load",

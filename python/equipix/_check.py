@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,24 @@ def naming_memory(what: str) -> Iterator[None]:
     except MemoryError as error:
         reason = str(error) or "no more memory is available"
         raise InsufficientMemoryError(f"{what}: {reason}") from error
+
+
+def check_type(name: str, given: object, kind: type | tuple[type, ...], wanted: str) -> None:
+    """Refuse what is of another type, such as the name of a file in place of its content."""
+    if not isinstance(given, kind):
+        raise InputError(f"'{name}' is {described(given)}, expected {wanted}")
+
+
+def check_word(name: str, given: object, words: tuple[str, ...]) -> None:
+    """Refuse what is none of some words."""
+    if not (isinstance(given, str) and given in words):
+        raise InputError(f"'{name}' is {described(given)}, expected one of {words}")
+
+
+def described(given: object) -> str:
+    """Describe what was given: None, a text, a number or a path by itself, else by its type."""
+    plain = given is None or isinstance(given, str | bytes | int | float | PathLike)
+    return repr(given) if plain else f"of type {type(given).__name__}"
 
 
 def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:

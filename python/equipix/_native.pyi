@@ -15,6 +15,7 @@ __all__ = [
     "Uncertainty",
     "__version__",
     "average_files",
+    "common_fraction",
     "file_format",
     "fit_response",
     "locate_spots",
@@ -113,7 +114,7 @@ class Beam:
         cls,
         values: NDArray[Any],
         coefficients: NDArray[Any] | None,
-        origin: tuple[int, int],
+        origin: tuple[float, float],
         *,
         tilt: tuple[float, float] | list[float] = ...,
     ) -> Beam: ...
@@ -122,7 +123,7 @@ class Beam:
     @property
     def coefficients(self) -> NDArray[Any] | None: ...
     @property
-    def origin(self) -> tuple[int, int]: ...
+    def origin(self) -> tuple[float, float]: ...
     @property
     def tilt(self) -> list[float]: ...
     def light(
@@ -226,6 +227,7 @@ def locate_spots(
     after: NDArray[Any],
     saturations: tuple[float | None, float | None],
 ) -> tuple[_Spot, _Spot]: ...
+def common_fraction(shifts: NDArray[Any]) -> list[float] | None: ...
 def needs_whole_shifts(method: str) -> bool: ...
 def planned_components(
     shape: tuple[int, int],

@@ -66,6 +66,10 @@ class MissingDarkWarning(EquipixWarning):
     """Averages from which no dark was subtracted count as light."""
 
 
+class BrightDarkWarning(EquipixWarning):
+    """A dark that was subtracted is brighter than a level."""
+
+
 class UnusedInputWarning(EquipixWarning):
     """Part of what is given is not used."""
 

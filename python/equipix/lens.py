@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from equipix._check import as_array, check_shape
+from equipix._check import as_array, check_shape, check_word, number
 from equipix._readonly import ReadOnly
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Bools, Floats
+    from equipix._types import Array, Bools, Floats
 
 Law = Literal["cos4", "radial"]
 
@@ -115,7 +115,7 @@ def cos4(squared_distance: ArrayLike, focal_length: float) -> Floats:
 
     Parameters
     ----------
-    squared_distance : array_like
+    squared_distance : array_like of up to three dimensions
         Square r² of the distance, in the square of the unit of `focal_length`.
     focal_length : float
         Focal length f of the lens.
@@ -125,6 +125,11 @@ def cos4(squared_distance: ArrayLike, focal_length: float) -> Floats:
     ndarray, float64
         1/(1 + r²/f²)².
 
+    Raises
+    ------
+    InputError
+        If an argument holds no numbers, or the focal length is not above 0.
+
     Examples
     --------
     The corner of an array of 54 mm behind a lens of 100 mm:
@@ -133,7 +138,11 @@ def cos4(squared_distance: ArrayLike, focal_length: float) -> Floats:
     >>> round(float(lens.cos4(27**2 + 27**2, 100.0)), 3)
     0.762
     """
-    return np.asarray((1 + np.asarray(squared_distance, np.float64) / focal_length**2) ** -2)
+    if not number("focal_length", focal_length) > 0:
+        raise InputError(f"'focal_length' is {focal_length!r}, expected a number above 0")
+    squared = as_array("squared_distance", squared_distance, ndim=(0, 1, 2, 3)).astype(np.float64)
+    # as_array makes one number an array of one.
+    return (1 + squared.reshape(np.shape(squared_distance)) / focal_length**2) ** -2
 
 
 def fit_falloff(
@@ -191,8 +200,7 @@ def fit_falloff(
     >>> round(found.focal_length, 1), tuple(round(each, 3) for each in found.centre)
     (300.0, (62.0, 75.0))
     """
-    if law not in get_args(Law):
-        raise InputError(f"'law' is {law!r}, expected one of {get_args(Law)}")
+    check_word("law", law, get_args(Law))
     image = _image(flat, sensitivity, mask)
     shape = check_shape((image.shape[0], image.shape[1]))
     half = _half_diagonal(shape)
@@ -226,14 +234,11 @@ def fit_falloff(
 def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | None) -> Floats:
     """Return the flat as float64 without the sensor's gain, NaN where it does not count."""
     image = as_array("flat", flat, ndim=2).astype(np.float64)
-    for name, given in (("sensitivity", sensitivity), ("mask", mask)):
-        if given is not None and np.shape(given) != image.shape:
-            raise InputError(f"'{name}' has shape {np.shape(given)}, expected {image.shape}")
     if sensitivity is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            image = image / as_array("sensitivity", sensitivity, ndim=2)
+            image = image / _map("sensitivity", sensitivity, image.shape)
     if mask is not None:
-        given = as_array("mask", mask, ndim=2)
+        given = _map("mask", mask, image.shape)
         if given.dtype != np.bool_:
             raise InputError(f"'mask' has dtype {given.dtype}, expected bool: True = do not use")
         image[given] = np.nan
@@ -241,6 +246,14 @@ def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | Non
     if np.count_nonzero(np.isfinite(image)) < 100:
         raise InputError("'flat' has fewer than 100 finite values, expected those of a sensor")
     return image
+
+
+def _map(name: str, given: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Refuse a map of another shape than the flat."""
+    array = as_array(name, given, ndim=2)
+    if array.shape != shape:
+        raise InputError(f"'{name}' has shape {array.shape}, expected {shape}")
+    return array
 
 
 def _blocks(image: Floats) -> tuple[Floats, Floats, Floats]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 READERS = {
     "calibration": ("equipix.calibration.reading", "read_calibration"),
+    "dynamic correction": ("equipix.bolometer.dynamic", "read_dynamic"),
     "frame statistics": ("equipix.frames", "read_statistics"),
     "polynomial": ("equipix.correction.polynomial", "read_polynomial"),
     "response": ("equipix.nuc.reading", "read_response"),
@@ -26,6 +27,8 @@ READERS = {
 the content of ``(path, pages, metadata)``."""
 
 _NO_CORRECTIONS = {
+    "dynamic correction": "maps against the temperature of the substrate: "
+    "bolometer.DynamicCorrection.load reads it, and its at(...) gives the correction at a state",
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
     "themselves: FrameStatistics.load reads them, equipix correct subtracts them as --dark",
 }

@@ -151,9 +151,9 @@ def photon_transfer(
     limit = scatter_limit(frames)
     points = []
     for chunk in np.array_split(pixels, min(_BINS, len(pixels)) or 1):
-        inliers = _inliers(variance.ravel()[chunk], limit)
-        if inliers.any():
-            bin_ = chunk[inliers]
+        kept = inliers(variance.ravel()[chunk], limit)
+        if kept.any():
+            bin_ = chunk[kept]
             mean = (signal.ravel()[bin_].mean(), variance.ravel()[bin_].mean())
             points.append((*mean, len(bin_) * (frames - 1)))
     return np.array(points).reshape(-1, 3)
@@ -186,7 +186,7 @@ def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
     return float((1 - width + sigmas * np.sqrt(width)) ** 3)
 
 
-def _inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
+def inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
     """Which values are at most `limit` times the mean of those that are; found in a few rounds."""
     keep: NDArray[Any] = np.isfinite(values)
     for _ in range(5):

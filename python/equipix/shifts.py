@@ -15,6 +15,8 @@ from equipix.mending import hot_places, mended
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from equipix._types import Floats
+
 _UNNOTICED = 0.02
 """Fraction of a pixel that a shift may be rounded by without a warning."""
 
@@ -231,6 +233,14 @@ def round_shifts(
     worst = int(change.max(axis=1).argmax())
     rounding = Rounding(worst, exact[worst].tolist()) if change[worst].any() else None
     return whole.astype(np.int64), rounding
+
+
+def whole_moves(shifts: Floats) -> NDArray[np.int64]:
+    """Whole shifts that differ from the first one by the nearest whole numbers of pixels.
+
+    A part of a pixel that all shifts have in common moves the grid of the beam along.
+    """
+    return np.asarray(np.rint(shifts - shifts[0]) + np.rint(shifts[0])).astype(np.int64)
 
 
 def _frames(name: str, values: ArrayLike) -> NDArray[Any]:

@@ -1,7 +1,5 @@
 //! Frames corrected by the kernel against the formula written out.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
 use equipix_core::apply::{Corrected, Corrector, Counts, Raw, Unusable};
 use equipix_core::{Control, Shape, Stack, Workers};
 

@@ -1,15 +1,9 @@
 //! Which solver finds an answer, and that those that may find the same do.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
-mod common;
-mod dense;
-mod simulation;
-
-use common::{Experiment, Lamp, Method, Options, fit};
-use dense::lamp::Columns;
-use dense::minimum::{Minimum, apart};
-use simulation::{CROSS, DRIFT, SMALL, Simulation, TIMES, TURNED, place};
+use crate::common::{Experiment, Lamp, Method, Options, fit};
+use crate::dense::lamp::Columns;
+use crate::dense::minimum::{Minimum, apart};
+use crate::simulation::{CROSS, DRIFT, SMALL, Simulation, TIMES, TURNED, place};
 
 const TOLERANCE: f64 = 1e-8;
 

@@ -1,13 +1,11 @@
 //! Coordinate descent beside the same sweep in its plainest form, and the laws it must obey.
 
-mod experiment;
-
 use std::num::NonZeroUsize;
 
+use crate::experiment::{Experiment, experiments, rounding_of_objective};
 use equipix_core::geometry::Geometry;
 use equipix_core::sweep::Estimate;
 use equipix_core::{Control, Exposures, Flux, Positions, Result, Shape, Stack, Workers};
-use experiment::{Experiment, experiments, rounding_of_objective};
 use proptest::prelude::*;
 
 impl Experiment {

@@ -1,8 +1,6 @@
 //! Laws of a fit: the light of its beam leaves the residuals that it minimised; a start saves passes and
 //! changes nothing; questions do not depend on each other.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot start says so by a panic")]
-
 use equipix_core::{
     Control, Ended, Exposures, Fit, Flux, FluxKind, Mask, Measurements, Method, Options, Positions,
     Result, Rotation, Shape, Stack, Variance, Workers, calibrate,
@@ -104,6 +102,8 @@ fn white(index: usize) -> f64 {
 
 const WHOLE: [[f64; 2]; COUNT] = [[0.0, 0.0], [0.0, 5.0], [0.0, 7.0], [5.0, 0.0], [7.0, 0.0]];
 const BETWEEN: [[f64; 2]; COUNT] = [[0.0, 0.0], [0.3, 5.4], [-0.2, 7.1], [5.3, 0.45], [6.6, -0.4]];
+/// Whole pixels apart.
+const APART: [[f64; 2]; COUNT] = [[0.1, -0.4], [0.1, 4.6], [0.1, 6.6], [5.1, -0.4], [7.1, -0.4]];
 const DRIFT: [f64; COUNT] = [1.0, 1.004, 0.997, 1.002, 0.999];
 
 /// One of every kind.
@@ -115,6 +115,9 @@ fn cases() -> Vec<(&'static str, Case)> {
     for (k, shift) in refined.positions.shifts.iter_mut().enumerate() {
         *shift = [0, 1].map(|axis| shift[axis] + 0.02 * white(2 * k + axis));
     }
+    let beside = [[0.1, -0.4], [1.1, -0.4], [0.1, 0.6], [5.1, 3.6], [7.1, -3.4]];
+    let mut turned_apart = Case::at(beside).with_lamp(DRIFT, FluxKind::Free);
+    turned_apart.positions.rotations[4] = Rotation::Half;
     let mut dark = Case::at(WHOLE).with_lamp([1.0, 0.5, 1.0, 0.7, 0.8], FluxKind::Known);
     dark.offset = true;
     let times = vec![0.0, 30.0, 10.0, 40.0, 20.0];
@@ -125,6 +128,8 @@ fn cases() -> Vec<(&'static str, Case)> {
         ("between pixels", Case::at(BETWEEN)),
         ("free fluxes between pixels", Case::at(BETWEEN).with_lamp(DRIFT, FluxKind::Free)),
         ("turned", turned),
+        ("whole pixels apart", Case::at(APART)),
+        ("free fluxes whole pixels apart, turned", turned_apart),
         ("linear", Case::at(BETWEEN).with_lamp(linear, FluxKind::Linear(times))),
         ("refined", refined),
         ("dark", dark),
@@ -196,7 +201,17 @@ fn a_start_may_come_from_another_kind_of_fit() {
     let (whole, free) = (Case::at(WHOLE), Case::at(WHOLE).with_lamp(DRIFT, FluxKind::Free));
     let frames = free.frames();
     let variance = vec![NOISE * NOISE; frames.len()];
-    for (from, to) in [(&whole, &free), (&free, &whole), (&Case::at(BETWEEN), &whole)] {
+    let (apart, between) = (Case::at(APART), Case::at(BETWEEN));
+    let pairs = [
+        (&whole, &free),
+        (&free, &whole),
+        (&between, &whole),
+        (&apart, &between),
+        (&between, &apart),
+        (&apart, &free),
+        (&free, &apart),
+    ];
+    for (from, to) in pairs {
         let start = from.fit(&frames, &variance, &TO, None);
         let (scratch, again) =
             (to.fit(&frames, &variance, &TO, None), to.fit(&frames, &variance, &TO, Some(&start)));

@@ -1,16 +1,10 @@
 //! The joint fit against dense algebra, and on measurements whose truth is known.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
-mod common;
-mod dense;
-mod simulation;
-
-use common::{Answer, Experiment, Lamp, Noise, Options, fit};
-use dense::covariance::Covariance;
-use dense::gauge::Gauge;
-use dense::minimum::{Minimum, apart};
-use simulation::{
+use crate::common::{Answer, Experiment, Lamp, Noise, Options, fit};
+use crate::dense::covariance::Covariance;
+use crate::dense::gauge::Gauge;
+use crate::dense::minimum::{Minimum, apart};
+use crate::simulation::{
     BETWEEN, CROSS, DRIFT, LONG, SHIFT_STD, SMALL, Simulation, TIMES, TURNED, cubic, even, rolling,
 };
 

@@ -1,16 +1,10 @@
 //! Laws that hold whatever the measurements are: of the gauge, of symmetry, and of the number of workers.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
-mod common;
-mod dense;
-mod simulation;
-
-use common::{Answer, Experiment, Lamp, Method, Noise, Options, fit};
-use dense::gauge::Gauge;
-use dense::lamp::is_turned;
-use dense::minimum::{Minimum, apart};
-use simulation::{BETWEEN, CROSS, DRIFT, SMALL, Simulation, TIMES, TURNED, place};
+use crate::common::{Answer, Experiment, Lamp, Method, Noise, Options, fit};
+use crate::dense::gauge::Gauge;
+use crate::dense::lamp::is_turned;
+use crate::dense::minimum::{Minimum, apart};
+use crate::simulation::{BETWEEN, CROSS, DRIFT, SMALL, Simulation, TIMES, TURNED, place};
 
 const TOLERANCE: f64 = 1e-8;
 
@@ -251,8 +245,8 @@ fn component_means(experiment: &Experiment, answer: &Answer) -> Vec<f64> {
     let light = |at: usize| {
         let (k, pixel) = (at / pixels, at % pixels);
         let u = place(experiment.shape, experiment.degrees[k], pixel);
-        let [row, col] = [0, 1]
-            .map(|axis| (u[axis] + experiment.shifts[k][axis]) as i64 + answer.origin[axis] as i64);
+        let [row, col] =
+            [0, 1].map(|axis| (u[axis] + experiment.shifts[k][axis] + answer.origin[axis]) as i64);
         answer.flux[k] * answer.beam[row as usize * answer.beam_shape[1] + col as usize]
     };
     let m = |pixel: usize| {

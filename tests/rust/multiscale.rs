@@ -1,11 +1,9 @@
 //! The multiscale method: the minimum of coordinate descent, and the laws it must obey.
 
-mod experiment;
-
 use std::num::NonZeroUsize;
 
+use crate::experiment::{Experiment, experiments, rounding_of_objective};
 use equipix_core::{Control, Ended, Fit, History, Method, Options, Result, Workers, calibrate};
-use experiment::{Experiment, experiments, rounding_of_objective};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 

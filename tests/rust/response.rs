@@ -1,7 +1,5 @@
 //! Response curves against polynomials that are known, and against the dense formula.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
 use equipix_core::response::{Form, LevelNoise, Levels, fit};
 use equipix_core::{Control, Shape, Stack, Workers};
 

@@ -1,17 +1,11 @@
 //! Error bars against the dense covariance.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
-mod common;
-mod dense;
-mod simulation;
-
-use common::{
+use crate::common::{
     Answer, ErrorMap, Experiment, Lamp, Noise, Options, error_map, fit, misfit_by_dark,
     offset_variances, shift_variances, variances,
 };
-use dense::covariance::Covariance;
-use simulation::{
+use crate::dense::covariance::Covariance;
+use crate::simulation::{
     BETWEEN, CROSS, DRIFT, LONG, SHIFT_STD, SMALL, Simulation, TIMES, TURNED, random, rolling,
     smooth,
 };

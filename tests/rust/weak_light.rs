@@ -1,15 +1,9 @@
 //! Weak light: the minimum of F with the prior of M, and its error bars, against dense algebra.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
-mod common;
-mod dense;
-mod simulation;
-
-use common::{Answer, Experiment, Method, Options, error_map, fit, variances};
-use dense::covariance::Covariance;
-use dense::minimum::Minimum;
-use simulation::{CROSS, SMALL, Simulation, TURNED, narrow, random};
+use crate::common::{Answer, Experiment, Method, Options, error_map, fit, variances};
+use crate::dense::covariance::Covariance;
+use crate::dense::minimum::Minimum;
+use crate::simulation::{CROSS, SMALL, Simulation, TURNED, narrow, random};
 
 const TOLERANCE: f64 = 1e-8;
 /// What the variance of a functional may lack, and what single precision adds.

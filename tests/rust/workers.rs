@@ -1,15 +1,10 @@
 //! The same bytes come out for any number of workers.
 
-#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
-
-mod common;
-mod simulation;
-
-use common::{
+use crate::common::{
     Answer, Experiment, Lamp, Method, Options, error_map, fit, offset_variances, shift_variances,
     variances,
 };
-use simulation::{BETWEEN, CROSS, DRIFT, SHIFT_STD, Simulation, even, random};
+use crate::simulation::{BETWEEN, CROSS, DRIFT, SHIFT_STD, Simulation, even, random};
 
 /// Sensors of several bands of rows, which workers share: bands of eight rows for whole pixels, of 32 for
 /// joint fits.

@@ -82,8 +82,8 @@ def calibrate(
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels: pixel p of an
         unrotated sensor sees the beam at p + shift. A wrong sign gives a wrong result, and in a
-        smooth beam it leaves no residual: see `Calibration.shift_sign`. If shifts are not whole
-        numbers the beam is a cubic spline; coordinate descent rounds them.
+        smooth beam it leaves no residual: see `Calibration.shift_sign`. If shifts differ by parts
+        of pixels the beam is a cubic spline; coordinate descent rounds them.
     variance : array_like, shape (n,) or (n, rows, cols), or NoiseModel, optional
         Variance of the values given; without it all weights are 1. A noise model, or one for each
         exposure, is evaluated at the signal of a first fit: evaluated at the noisy values, it
@@ -193,9 +193,10 @@ def calibrate(
     is determined only if exposures are turned against each other, or by `flux_std` or `time`:
     else its least-squares slope over valid pixels is set to 0, with a warning.
 
-    With shifts between pixels L is a cubic B-spline on the padded grid, with a penalty of 1e-5 of a
-    cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like L, are found by
-    Gauss-Newton steps in which M is eliminated by its closed form.
+    Where shifts differ by whole pixels L is a value in each cell of its padded grid: a fraction of
+    a pixel that all have in common moves the grid. Else it is a cubic B-spline on the grid, with a
+    penalty of 1e-5 of a cell's mean weight on its fourth differences [2]_. Fluxes and shifts, like
+    L, are found by Gauss-Newton steps in which M is eliminated by its closed form.
 
     The orientation of the shifts is tested with at most twelve exposures, as far apart as possible,
     and with the central pixels: four times as many along each axis as the largest shift, or fewer

@@ -9,6 +9,7 @@ import numpy as np
 from equipix import _native
 from equipix.calibration.verdicts import Verdict
 from equipix.flags import Flag, usable
+from equipix.shifts import whole_moves
 
 if TYPE_CHECKING:
     from equipix._native import Fit
@@ -114,7 +115,7 @@ def _cause_in_shifts(exposures: Exposures, components: int) -> str:
 def _mask_separates(exposures: Exposures) -> bool:
     """Whether the same shifts connect most of a sensor without masked pixels."""
     rotation = exposures.positions.rotation.tolist()
-    whole = np.rint(exposures.positions.shifts).astype(np.int64)
+    whole = whole_moves(exposures.positions.shifts)
     _, counts, _ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
     rows, cols = exposures.shape
     return max(counts) >= _LEAST * rows * cols

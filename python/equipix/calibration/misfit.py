@@ -215,9 +215,8 @@ def _is_fine(weighted: Weighted, residuals: Residuals) -> bool:
     A wave of period P and amplitude A has second differences of amplitude 4 A sin²(π/P), which for
     P < 6 are larger than A.
     """
-    shifts = np.array(weighted.fit.shifts)
     beam = weighted.fit.beam.values
-    if not weighted.fit.is_joint or np.array_equal(shifts, np.rint(shifts)) or min(beam.shape) < 8:
+    if weighted.fit.beam.coefficients is None or min(beam.shape) < 8:
         return False
     logarithm = np.log(beam, where=beam > 0, out=np.full(beam.shape, np.nan))
     differences = [np.diff(logarithm, 2, axis=axis) for axis in (0, 1)]

@@ -51,12 +51,15 @@ class Calibration(ReadOnly):
         float32 frames, else float64.
     beam : ndarray, shape of the padded grid, float64
         The beam L in the units of the frames; NaN where unobserved.
-    beam_origin : tuple of int
-        ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0.
+    beam_origin : tuple of int or float
+        ``beam[beam_origin + p]`` is the beam at pixel p of a sensor with shift 0, and
+        ``beam[beam_origin + shift + p]`` at another shift. Whole numbers, but where all shifts have
+        the same fraction of a pixel: then shift 0 is between cells, ``beam_origin`` a float, and
+        ``beam_origin + shift`` whole, but for rounding, in each exposure.
     beam_coefficients : ndarray, shape of the padded grid, float64, or None
-        Coefficients of the cubic B-spline that the beam is where shifts are no whole numbers; None
-        where it is known at the cells alone, and in a file of format 1. Between the cells of such a
-        beam polynomials of degree 5 interpolate.
+        Coefficients of the cubic B-spline that the beam is where shifts differ by parts of pixels;
+        None where it is known at the cells alone, and in a file of format 1. Between the cells of
+        such a beam polynomials of degree 5 interpolate.
     beam_tilt : ndarray, shape (2,), float64
         Slope β of ln L (row, col) per cell that the gauge put into the coefficients a:
         L(u) = Σ_j a_j exp(β·(u − j)) B(u − j).
@@ -138,7 +141,7 @@ class Calibration(ReadOnly):
 
     sensitivity: NDArray[Any]
     beam: NDArray[Any]
-    beam_origin: tuple[int, int]
+    beam_origin: tuple[float, float]
     beam_coefficients: NDArray[Any] | None
     beam_tilt: NDArray[Any]
     flags: NDArray[Any]
@@ -183,7 +186,7 @@ class Calibration(ReadOnly):
         return cls(
             sensitivity=fit.sensitivity.astype(dtype, copy=False),
             beam=fit.beam.values,
-            beam_origin=fit.beam.origin,
+            beam_origin=_whole_if_possible(fit.beam.origin),
             beam_coefficients=fit.beam.coefficients,
             beam_tilt=np.array(fit.beam.tilt),
             flags=flags,
@@ -342,7 +345,8 @@ class Calibration(ReadOnly):
             The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
             (NaN still where M is undetermined), or the mean of the nearest good pixels around.
         out : ndarray, optional
-            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`;
+            whole numbers hold no NaN, so they need another `flagged`.
 
         Returns
         -------
@@ -493,3 +497,9 @@ class Calibration(ReadOnly):
             If the suffix is unknown.
         """
         save_fields(path, vars(self), force=force)
+
+
+def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:
+    """Return a place on the grid with whole numbers as int, as indices are."""
+    row, col = (int(each) if each.is_integer() else each for each in place)
+    return row, col

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import operator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.exposures.positions import ROUNDING
 from equipix.io import check_format, check_pages, save_pages
 
 if TYPE_CHECKING:
@@ -81,8 +81,8 @@ def read_fields(
         former = {"rotation": options["rotation"], "dark_is_fitted": options["dark"] == "fit"}
         numbers = {**numbers, **former, "verdicts": [], "beam_tilt": [0.0, 0.0]}
     chi2, rejected = numbers["reduced_chi2"], pages.get("rejected")
-    row, col = (operator.index(cell) for cell in numbers["beam_origin"])
     _check_numbers(numbers, pages["beam"].shape)
+    row, col = numbers["beam_origin"]
     return {
         **{name: pages[name] for name in ("sensitivity", "beam", "flags", "component_labels")},
         **{name: pages.get(name) for name in _OPTIONAL},
@@ -109,11 +109,23 @@ def _check_numbers(numbers: Mapping[str, Any], grid: tuple[int, ...]) -> None:
         raise ValueError(f"shifts and rotations, expected those of {count} exposures")
     if not set(numbers["rotation"]) <= {0, 90, 180, 270}:
         raise ValueError(f"rotation {numbers['rotation']}, expected 0, 90, 180 or 270 degrees")
-    inside = all(0 <= cell < size for cell, size in zip(numbers["beam_origin"], grid, strict=True))
-    if not inside:
-        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected a cell of {grid}")
+    origin = np.array(numbers["beam_origin"])
+    if origin.shape != (2,) or origin.dtype.kind not in "if" or not _is_inside(origin, grid):
+        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected a place on {grid}")
+    if not (_are_whole(origin) or _are_whole(origin + numbers["shifts"])):
+        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected exposures in cells")
     if np.shape(numbers["beam_tilt"]) != (2,):
         raise ValueError(f"beam_tilt {numbers['beam_tilt']}, expected two numbers")
+
+
+def _is_inside(place: NDArray[Any], grid: tuple[int, ...]) -> bool:
+    """Whether a place is in a cell of a grid, which reaches half of its side around it."""
+    return bool(np.all((place >= -0.5) & (place <= np.subtract(grid, 0.5))))
+
+
+def _are_whole(places: NDArray[Any]) -> bool:
+    """Whether places are whole numbers, but for rounding."""
+    return bool(np.all(np.abs(places - np.rint(places)) < ROUNDING))
 
 
 def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

@@ -89,8 +89,12 @@ def correct(
         str, typer.Option(help="'stored', 'none', or a file: dark frames or their average.")
     ] = "stored",
     flagged: Annotated[
-        Flagged, typer.Option(help="What flagged pixels become; 'nan' is 0 in whole numbers.")
-    ] = "nan",
+        Flagged | None,
+        typer.Option(
+            help="What flagged pixels become. Unless given, NaN in floating-point numbers; in "
+            "whole numbers and pictures the mean of good neighbours."
+        ),
+    ] = None,
     dtype: Annotated[
         OutputType | None,
         typer.Option(

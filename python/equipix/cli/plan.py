@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from equipix.cli.options import Force, Json, Picture, Seed
@@ -13,6 +12,7 @@ from equipix.errors import InputError
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
 from equipix.plan import ErrorBudget, advise_order, distinct_trend, error_budget, identify, suggest
+from equipix.shifts import whole_moves
 
 commands = typer.Typer()
 
@@ -94,7 +94,7 @@ def _pairs(text: str) -> list[list[float]]:
 def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
     """Collect the figures of a pattern."""
     # Rounded: equations and unknowns are the same between pixels, and the budget has the parts.
-    found = identify(budget.shape, np.rint(budget.shifts))
+    found = identify(budget.shape, whole_moves(budget.shifts))
     order = advise_order(budget.shifts)
     return {
         "shifts": budget.shifts.tolist(),

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.bolometer import DynamicCorrection
 from equipix.calibration.result import Calibration
+from equipix.correction.protocol import sensor_of
 from equipix.flags import Flag, usable
 from equipix.frames import FrameStatistics
 from equipix.nuc.response import Response
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     from equipix.correction.protocol import Correction
 
 
-def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
+def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     if isinstance(content, FrameStatistics):
         return of_statistics(content)
@@ -25,7 +27,10 @@ def summary(content: Correction | FrameStatistics) -> dict[str, Any]:
         return of_calibration(content)
     if isinstance(content, Response):
         return of_response(content)
+    if isinstance(content, DynamicCorrection):
+        return of_dynamic(content)
     return {
+        **_sensor(content),
         "shape": list(content.shape),
         "order": len(content.coefficients) - 1,
         "flagged_pixels": flagged(content),
@@ -41,16 +46,56 @@ def of_response(response: Response) -> dict[str, Any]:
         for name, plane in zip("aKce", response.deviation, strict=False)
     }
     prediction = options.get("prediction_errors")
-    chi2 = response.reduced_chi2[good]
     return {
+        **_sensor(response),
         "shape": list(response.shape),
         "order": response.order,
         "levels": [float(f"{level:.6g}") for level in response.levels],
+        **_level_values(response),
         **spread,
-        _misfit_name(options): float(np.mean(chi2)) if chi2.size else float("nan"),
+        _misfit_name(options): _misfit(response, options),
         "largest_inverse_error": response.largest_inverse_error,
         **({} if prediction is None else {"prediction_errors": prediction}),
         "flagged_pixels": flagged(response),
+    }
+
+
+def _sensor(correction: Correction) -> dict[str, str]:
+    """Name of the sensor, where it is known."""
+    name = sensor_of(correction)
+    return {"sensor": name} if name else {}
+
+
+def _level_values(response: Response) -> dict[str, list[str]]:
+    """Values of the levels with their units, or the names, where levels.toml has any."""
+    levels = response.metadata.get("levels", [])
+    texts = [
+        each["name"] if each["value"] is None else f"{each['value']:g} {each['unit'] or ''}"
+        for each in levels
+    ]
+    named = texts != [str(number) for number in range(len(levels))]
+    return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
+
+
+def _misfit(response: Response, options: dict[str, Any]) -> float | str:
+    """Median reduced χ² of usable pixels; without variances their mean, a variance in DN²."""
+    judged = usable(response.flags) & (response.freedom > 0)
+    if not judged.any():
+        return "not determined"
+    middle = np.mean if options.get("weights") == "equal" else np.median
+    return float(middle(response.reduced_chi2[judged]))
+
+
+def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
+    """Collect the main figures of a correction that follows temperature and bias."""
+    return {
+        "shape": list(correction.shape),
+        "substrate_c": list(correction.axes.substrate_c),
+        "bias_v": list(correction.axes.bias_v),
+        "order": correction.axes.order,
+        "bias_order": correction.axes.bias_order,
+        "gain_order": None if correction.gain is None else correction.gain_axes.order,
+        "flagged_pixels": flagged(correction),
     }
 
 
@@ -69,7 +114,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
     }
 
 
-def flagged(correction: Correction) -> dict[str, int]:
+def flagged(correction: Correction | DynamicCorrection) -> dict[str, int]:
     """Count the pixels that have each flag."""
     return {
         flag.name or "": int(np.count_nonzero(correction.flags & flag))
@@ -84,6 +129,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
     options = calibration.metadata.get("options", {})
     orientation = calibration.orientation
     return {
+        **_sensor(calibration),
         "shape": list(calibration.shape),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
         "spread": float(np.nanstd(sensitivity, dtype=np.float64)),

@@ -146,6 +146,10 @@ def _words(value: Any) -> str:
             return "none"
         case [dict(), *_]:
             return "\n".join(": ".join(map(str, each.values())) for each in value)
+        case [float(), *_]:
+            return ", ".join(f"{item:.6g}" for item in value)
+        case [str(), *_]:
+            return ", ".join(value)
         case list() | tuple():
             return " × ".join(str(item) for item in value)
     return str(value)

@@ -177,6 +177,7 @@ def _fast(
             return None
         depth.refuse_type(raw.dtype)
         result = np.empty(raw.shape, np.float32) if out is None else out
+        check_flagged(flagged, result.dtype)
         if raw.size:
             prepared = kept(sources, flagged, coefficients)
             counts = run(prepared, raw, result, largest_of(result.dtype), None)
@@ -199,14 +200,19 @@ def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArra
     return raw
 
 
+def is_stored(dark: str | FrameStatistics | ArrayLike | None) -> bool:
+    """Whether a dark is the word "stored"; another word is refused."""
+    if isinstance(dark, str) and dark != "stored":
+        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+    return isinstance(dark, str)
+
+
 def dark_or_stored(
     dark: str | FrameStatistics | ArrayLike | None, stored: NDArray[Any] | None
 ) -> FrameStatistics | ArrayLike | None:
     """Return the dark given, or the stored one of a calibration where it is "stored"."""
-    if not isinstance(dark, str):
+    if not is_stored(dark):
         return dark
-    if dark != "stored":
-        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
     if stored is None:
         raise InputError(
             "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if it "

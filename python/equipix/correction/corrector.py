@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from equipix._check import as_array, naming_memory, positive_workers
-from equipix.correction.apply import dark_frame
+from equipix.correction.apply import dark_frame, is_stored
 from equipix.correction.depth import depth_of
 from equipix.correction.kernel import (
     FAST,
@@ -18,6 +18,7 @@ from equipix.correction.kernel import (
     native,
     output_dtype,
     run,
+    usual_treatment,
 )
 from equipix.correction.protocol import check_correction, check_sensor, takes_dark
 from equipix.errors import InputError
@@ -45,9 +46,10 @@ class Corrector:
     bit_depth : int, optional
         Significant bits of whole numbers, 8 to 16: the largest value is 2^bits − 1. By default all
         bits of the type.
-    flagged : {"replace", "nan", "keep"}
-        The value of pixels flagged ``DO_NOT_USE``: the mean of the nearest good pixels around, in
-        the same pass; NaN, which is 0 in whole numbers; or the value that the formula gives.
+    flagged : {"nan", "replace", "keep"}, optional
+        The value of pixels flagged ``DO_NOT_USE``: NaN; the mean of the nearest good pixels around,
+        in the same pass; or the value that the formula gives. Unless given, they become NaN in
+        floating-point numbers, and are replaced in whole numbers, which hold no NaN.
     dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
         The dark frame to subtract, as for the correction's own ``correct``. A calibration that
         holds none needs one, or None for frames whose dark is already subtracted.
@@ -62,7 +64,7 @@ class Corrector:
     ----------
     clipped : int
         Values of whole numbers so far that had to be limited to the range from 0 to the largest
-        value, or were not a number, such as those of flagged pixels with ``flagged="nan"``.
+        value, or were not a number.
     extrapolated : int or None
         Values so far that were corrected to below the lowest or above the highest level that the
         response of their pixel was fitted to, to the rounding of float32. None where a correction
@@ -108,7 +110,7 @@ class Corrector:
         dtype: DTypeLike = "uint16",
         *,
         bit_depth: int | None = None,
-        flagged: Flagged = "replace",
+        flagged: Flagged | None = None,
         dark: Dark = "stored",
         sensor: str | None = None,
         workers: int | None = None,
@@ -119,7 +121,8 @@ class Corrector:
         self._depth = depth_of(correction)
         self._largest = largest_value(self.dtype, bit_depth)
         self._workers = positive_workers(workers)
-        check_flagged(flagged)
+        flagged = usual_treatment(self.dtype) if flagged is None else flagged
+        check_flagged(flagged, self.dtype)
         check_sensor(correction, sensor)
         levels = levels_of(correction)
         with naming_memory("preparing a correction"):
@@ -208,7 +211,7 @@ def levels_of(correction: Correction) -> Array | None:
 
 def coefficients_of(correction: Correction, dark: Dark) -> Array:
     """Coefficients with this dark frame in place of that stored, by the rules of ``correct``."""
-    stored = isinstance(dark, str) and dark == "stored"
+    stored = is_stored(dark)
     if not takes_dark(correction):
         if stored:
             return correction.coefficients

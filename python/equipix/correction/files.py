@@ -8,7 +8,7 @@ import numpy as np
 
 from equipix._types import Display, Flagged, OutputType, Progress
 from equipix.correction.corrector import Corrector
-from equipix.correction.kernel import FAST, output_dtype
+from equipix.correction.kernel import FAST, output_dtype, usual_treatment
 from equipix.correction.protocol import takes_dark
 from equipix.correction.tone import picture
 from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, LimitedWarning, warn
@@ -54,15 +54,14 @@ class Corrected(NamedTuple):
     frames : int
         Number of frames.
     limited : int
-        Values of pixels in use that had to be limited to the range of whole numbers, or were not a
-        number.
+        Values that had to be limited to the range of whole numbers, or were not a number.
     extrapolated : int or None
         Values corrected to outside of the levels of their pixel's response; None where the
         correction has none.
     replaced : int
         Pixels that were replaced in each frame.
     flagged : int
-        Pixels flagged ``DO_NOT_USE`` that became NaN in each frame, 0 in whole numbers.
+        Pixels flagged ``DO_NOT_USE`` that became NaN in each frame; black in pictures.
     """
 
     dtype: str
@@ -79,7 +78,7 @@ def correct_files(
     output: Path,
     *,
     dark: str = "stored",
-    flagged: Flagged = "nan",
+    flagged: Flagged | None = None,
     dtype: OutputType | None = None,
     bit_depth: int | None = None,
     display: Display | None = None,
@@ -103,8 +102,9 @@ def correct_files(
     dark : str
         "stored", "none", a file or glob of dark frames, or one of their saved statistics. Only a
         correction that subtracts a dark frame takes another than "stored".
-    flagged : {"nan", "keep", "replace"}
-        What becomes of flagged pixels; NaN is 0 in whole numbers.
+    flagged : {"nan", "keep", "replace"}, optional
+        What becomes of flagged pixels. Unless given, they become NaN in floating-point numbers, and
+        are replaced in whole numbers and pictures.
     dtype : {"float32", "uint16", "uint8"}, optional
         Type of the output; float32 unless given, and uint16 for a .png.
     bit_depth : int, optional
@@ -151,6 +151,7 @@ def correct_files(
     total, done = sum(counts.values()), 0
     _refuse_pictures(output, total, wanted)
     warn_of_corrected(files, origin)
+    flagged = usual_treatment(wanted) if flagged is None else flagged
     corrector = Corrector(
         correction,
         "float32" if display else wanted,
@@ -184,9 +185,10 @@ def correct_files(
             for path in outputs:
                 (folder / path.name).replace(path)
     bad = int(np.count_nonzero(~usable(correction.flags))) if flagged == "nan" else 0
-    limited = max(0, corrector.clipped - bad * total)  # NaN is limited in whole numbers alone
-    _warn_of_limited(limited, total * (correction.flags.size - bad), wanted)
-    return Corrected(wanted.name, total, limited, corrector.extrapolated, corrector.replaced, bad)
+    _warn_of_limited(corrector.clipped, total * correction.flags.size, wanted)
+    return Corrected(
+        wanted.name, total, corrector.clipped, corrector.extrapolated, corrector.replaced, bad
+    )
 
 
 def _dtype(
@@ -272,7 +274,7 @@ def warn_of_corrected(files: list[Path], origin: str) -> None:
 
 
 def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
-    """Warn where most values of pixels in use are outside of the range of the output."""
+    """Warn where most values are outside of the range of the output."""
     if limited <= values / 2:
         return
     remedy = "float32, or more bits in 'bit_depth' (--bit-depth)"

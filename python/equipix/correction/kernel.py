@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 
 from equipix import _native
+from equipix._check import check_word
 from equipix._types import Flagged
 from equipix.errors import InputError
 from equipix.flags import usable
@@ -110,10 +111,19 @@ def run(
     return Counts(*done)
 
 
-def check_flagged(flagged: str) -> None:
-    """Refuse an unknown treatment of flagged pixels."""
-    if flagged not in get_args(Flagged):
-        raise InputError(f"'flagged' is {flagged!r}, expected one of {get_args(Flagged)}")
+def check_flagged(flagged: object, dtype: np.dtype[Any] | None = None) -> None:
+    """Refuse an unknown treatment of flagged pixels, and NaN in whole numbers of a dtype."""
+    check_word("flagged", flagged, get_args(Flagged))
+    if flagged == "nan" and dtype is not None and dtype.kind == "u":
+        raise InputError(
+            f"'flagged' (--flagged) is 'nan', which {dtype} does not hold: take 'replace' or "
+            "'keep', or float32"
+        )
+
+
+def usual_treatment(dtype: np.dtype[Any]) -> Flagged:
+    """Return the treatment of flagged pixels where none is named: NaN, if a dtype holds it."""
+    return "replace" if dtype.kind == "u" else "nan"
 
 
 def largest_of(dtype: np.dtype[Any]) -> float:
@@ -137,7 +147,8 @@ def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
     if bit_depth is None:
         return largest_of(dtype)
     bits = 8 * dtype.itemsize
-    if dtype.kind != "u" or isinstance(bit_depth, bool) or bit_depth not in range(8, bits + 1):
+    number = isinstance(bit_depth, int | np.integer) and not isinstance(bit_depth, bool)
+    if dtype.kind != "u" or not number or bit_depth not in range(8, bits + 1):
         wanted = f"8 to {bits}"
         if dtype.kind != "u":
             wanted = "None for float32: whole numbers need 'dtype' (--dtype) uint16 or uint8"

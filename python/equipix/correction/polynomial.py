@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix._check import check_type
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.depth import depth_of
-from equipix.correction.protocol import check_correction, sensor_of
+from equipix.correction.protocol import check_correction
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
 
@@ -57,6 +58,8 @@ class Polynomial(ReadOnly):
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
+        for name in ("coefficients", "flags"):
+            check_type(name, getattr(self, name), np.ndarray, "an array")
         ReadOnly.__post_init__(self)
         planes, shape = self.coefficients.shape[:1], self.coefficients.shape[1:]
         if shape != self.flags.shape or not 2 <= planes[0] <= _MOST or len(shape) != 2:
@@ -89,7 +92,8 @@ class Polynomial(ReadOnly):
             The value of pixels flagged ``DO_NOT_USE``: NaN, that of the formula, or the mean of the
             nearest good pixels around.
         out : ndarray, optional
-            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`.
+            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`;
+            whole numbers hold no NaN, so they need another `flagged`.
 
         Returns
         -------
@@ -168,15 +172,15 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     -------
     Polynomial
         Of the order of `first`, with its level of saturation and the flags of both; `metadata`
-        holds that of both, and the sensor.
+        holds that of both, and what is known of the sensor.
 
     Raises
     ------
     InputError
-        If the sensors differ in shape, or in name where both metadata have one, or `then` is of an
-        order above 1 or subtracts a dark frame; or `then` is a gain alone, and `first` a response
-        to averages of raw levels: the mean offset stays in frames that it has corrected, and the
-        gain would multiply it.
+        If the sensors differ in shape, or in the name or the bit depth where both metadata have
+        one, or `then` is of an order above 1 or subtracts a dark frame; or `then` is a gain alone,
+        and `first` a response to averages of raw levels: the mean offset stays in frames that it
+        has corrected, and the gain would multiply it.
 
     Examples
     --------
@@ -192,9 +196,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     check_correction("then", then)
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
-    one, other = sensor_of(first), sensor_of(then)
-    if one and other and one != other:
-        raise InputError(f"'first' is of the sensor '{one}', 'then' of '{other}': expected one")
+    sensor = _common_sensor(first, then)
     dark = getattr(then, "dark", None)
     if dark is not None:
         raise InputError(
@@ -218,12 +220,31 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
     metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
-    if one or other:
-        metadata["sensor"] = (first if one else then).metadata["sensor"]
+    if sensor:
+        metadata["sensor"] = sensor
     if raw:
         metadata["raw"] = True
     level: float | None = getattr(first, "saturation", None)
     return Polynomial(coefficients, first.flags | then.flags, metadata, level)
+
+
+def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
+    """Return the sensor of `first`, with the name and the bits of that of `then` where it has none.
+
+    Levels of `then` are those of corrected frames, so none is taken over.
+    """
+    tables = [each.metadata.get("sensor") for each in (first, then)]
+    one, other = (each if isinstance(each, dict) else {} for each in tables)
+    for key, words in (("name", "the sensor"), ("bit_depth", "a sensor of the bit depth")):
+        known, found = one.get(key), other.get(key)
+        if known and found and known != found:
+            raise InputError(
+                f"'first' is of {words} {known!r}, 'then' of {found!r}: expected one sensor"
+            )
+    # Without any the bits follow from the level of saturation of `first`.
+    taken = ("name",) if depth_of(first).bits else ("name", "bit_depth")
+    added = {key: other[key] for key in taken if other.get(key) and not one.get(key)}
+    return {**one, **added}
 
 
 def _leaves_offset(correction: Correction) -> bool:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
+from equipix._check import described
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
+    from os import PathLike
     from typing import TypeGuard
 
     from numpy.typing import ArrayLike, NDArray
@@ -76,10 +77,9 @@ def check_correction(name: str, given: object) -> None:
     # Of the class first: a property of the object may be costly.
     if all(hasattr(type(given), each) or hasattr(given, each) for each in needed):
         return
-    plain = given is None or isinstance(given, str | PathLike)
     raise InputError(
-        f"'{name}' is {repr(given) if plain else f'of type {type(given).__name__}'}, expected a "
-        "correction: equipix.load(path), or the result of equipix.calibrate or equipix.nuc.fit"
+        f"'{name}' is {described(given)}, expected a correction: equipix.load(path), or the result "
+        "of equipix.calibrate or equipix.nuc.fit"
     )
 
 

@@ -4,37 +4,35 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from equipix._check import naming_memory
 from equipix.errors import FileError, InputError
+from equipix.experiment.described import Described
 from equipix.experiment.formats import check_formats
-from equipix.experiment.manifest import find_files, read_level_manifest
+from equipix.experiment.manifest import LevelManifest, read_level_manifest
 from equipix.experiment.mask import excluded_pixels
 from equipix.experiment.provenance import sha256_of
 from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, union
-from equipix.frames import average, refuse_subtracted
-from equipix.io import as_path
+from equipix.frames import refuse_subtracted
 from equipix.nuc.fit import fitted
 from equipix.nuc.levels import levels_of
 from equipix.nuc.order import check_order
 
 if TYPE_CHECKING:
-    from os import PathLike
     from pathlib import Path
 
     from numpy.typing import ArrayLike
 
     from equipix._types import By, Order, Progress
-    from equipix.experiment.manifest import LevelManifest
     from equipix.frames import FrameStatistics
     from equipix.nuc.response import Response
 
 
 @dataclass(frozen=True)
-class LevelExperiment:
+class LevelExperiment(Described[LevelManifest]):
     """Frames of a uniform source at several levels, as files on disk.
 
     Attributes
@@ -56,40 +54,9 @@ class LevelExperiment:
     of the curves.
     """
 
-    path: Path
-    manifest: LevelManifest
-
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
-        """Read and check the description of the levels.
-
-        Parameters
-        ----------
-        path : str or path
-            The levels.toml.
-
-        Returns
-        -------
-        LevelExperiment
-            What `run` evaluates.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be read, has an unknown key or a wrong value, or names a file that
-            does not exist, or one file for two levels.
-        """
-        file = as_path("path", path)
-        experiment = cls(file, read_level_manifest(file))
-        experiment.files()
-        refuse_repeats(file, experiment.manifest)
-        return experiment
-
-    def files(self) -> list[Path]:
-        """All image files of the levels, each once."""
-        mask = self.manifest.sensor.mask
-        masks = [] if mask is None else find_files(self.path, mask)
-        return list(dict.fromkeys([*self._images(), *masks]))
+    def _read(cls, path: Path) -> LevelManifest:
+        return read_level_manifest(path)
 
     def run(
         self,
@@ -142,14 +109,6 @@ class LevelExperiment:
         origin = self._provenance(averaged, levels.references.tolist(), hashes)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
-    def _images(self) -> list[Path]:
-        """The files of frames, each once, those of the dark first."""
-        dark = self.manifest.dark
-        entries = [] if dark is None else [dark.frames]
-        entries += [level.frames for level in self.manifest.level]
-        found = [find_files(self.path, entry) for entry in entries]
-        return list(dict.fromkeys(file for files in found for file in files))
-
     def _average(self, workers: int | None, progress: Progress | None) -> Averaged:
         """Mean of every level; the frames' other statistics are reduced at once."""
         sensor = self.manifest.sensor
@@ -176,21 +135,6 @@ class LevelExperiment:
         dark = self._statistics("dark", self.manifest.dark.frames, None, workers, progress)
         refuse_subtracted(dark, f"{self.path}: [dark]")
         return dark
-
-    def _statistics(
-        self,
-        name: str,
-        entry: str | list[str],
-        dark: FrameStatistics | None,
-        workers: int | None,
-        progress: Progress | None,
-    ) -> FrameStatistics:
-        def report(done: int, total: int, _: str) -> None:
-            if progress is not None:
-                progress(done, total, f"averaging {name}")
-
-        level, files = self.manifest.sensor.saturation_level, find_files(self.path, entry)
-        return average(files, dark=dark, saturation=level, workers=workers, progress=report)
 
     def _provenance(
         self, averaged: Averaged, means: list[float], hashes: dict[Path, str]

@@ -74,6 +74,11 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
             )
 
 
+def image_files(path: Path, manifest: Manifest | LevelManifest) -> list[Path]:
+    """List the files of all measurements, each once."""
+    return list(dict.fromkeys(file for entry in _entries(path, manifest) for file in entry.files))
+
+
 def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
     """Give the keys that name files of measurements, with the files."""
     if manifest.dark is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,19 +15,18 @@ from equipix.calibration.weights import weighted_fit
 from equipix.defects import hot_pixels
 from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
+from equipix.experiment.described import Described
 from equipix.experiment.formats import check_formats
-from equipix.experiment.manifest import find_files, read_manifest
+from equipix.experiment.manifest import Manifest, find_files, read_manifest
 from equipix.experiment.mask import excluded_pixels
 from equipix.experiment.provenance import provenance, sha256_of
 from equipix.experiment.repeats import refuse_repeats
 from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import as_mask, exposures_of, union
 from equipix.exposures.options import FitOptions
-from equipix.frames import average, refuse_subtracted
-from equipix.io import as_path
+from equipix.frames import refuse_subtracted
 
 if TYPE_CHECKING:
-    from os import PathLike
     from pathlib import Path
     from typing import Any
 
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
 
     from equipix._types import Bools, Floats, FluxModel, Method, Progress
     from equipix.calibration.result import Calibration
-    from equipix.experiment.manifest import Manifest
     from equipix.exposures.exposures import Exposures
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
@@ -45,7 +43,7 @@ _ROUGH = 1e-4
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Described[Manifest]):
     """Exposures of one steady beam at several sensor positions, as files on disk.
 
     Attributes
@@ -69,48 +67,9 @@ class Experiment:
     a small aperture in the beam, taken before and after the move.
     """
 
-    path: Path
-    manifest: Manifest
-
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
-        """Read and check the description of an experiment.
-
-        Parameters
-        ----------
-        path : str or path
-            The experiment.toml.
-
-        Returns
-        -------
-        Experiment
-            What `run` evaluates.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be read, has an unknown key or a wrong value, or names a file that
-            does not exist, or one file for two measurements.
-        """
-        file = as_path("path", path)
-        experiment = cls(file, read_manifest(file))
-        experiment.files()
-        refuse_repeats(file, experiment.manifest)
-        return experiment
-
-    def files(self) -> list[Path]:
-        """All image files of the experiment, each once."""
-        mask = self.manifest.sensor.mask
-        masks = [] if mask is None else find_files(self.path, mask)
-        return list(dict.fromkeys([*self._images(), *masks]))
-
-    def _images(self) -> list[Path]:
-        """The files of frames and of images of the aperture, each once."""
-        entries: list[str | list[str] | None] = [self.manifest.dark.frames]
-        for exposure in self.manifest.exposure:
-            entries += [exposure.frames, exposure.aperture_before, exposure.aperture_after]
-        found = [find_files(self.path, entry) for entry in entries if entry is not None]
-        return list(dict.fromkeys(file for files in found for file in files))
+    def _read(cls, path: Path) -> Manifest:
+        return read_manifest(path)
 
     def check_formats(self) -> None:
         """Read the files' headers: all images must be of one shape and depth.
@@ -178,7 +137,7 @@ class Experiment:
 
     def _dark(self, options: FitOptions) -> FrameStatistics:
         frames = self.manifest.dark.frames
-        dark = self._statistics("dark", frames, None, options)
+        dark = self._statistics("dark", frames, None, options.workers, options.progress)
         files = ", ".join(map(str, find_files(self.path, frames)))
         refuse_subtracted(dark, f"{self.path}: [dark] {files}")
         return dark
@@ -333,27 +292,14 @@ class Experiment:
                 saturation_key=sensor.saturation_key,
             )
             for each in exposures:
-                statistics = self._statistics(each.name, each.frames, dark, options)
+                statistics = self._statistics(
+                    each.name, each.frames, dark, options.workers, options.progress
+                )
                 try:
                     averaged.add(statistics, each.name)
                 except InputError as error:
                     raise FileError(f"{self.path}: {error}") from error
         return averaged
-
-    def _statistics(
-        self,
-        name: str,
-        entry: str | list[str],
-        dark: FrameStatistics | None,
-        options: FitOptions,
-    ) -> FrameStatistics:
-        def report(done: int, total: int, _: str) -> None:
-            if options.progress is not None:
-                options.progress(done, total, f"averaging {name}")
-
-        level = self.manifest.sensor.saturation_level
-        files = find_files(self.path, entry)
-        return average(files, dark=dark, saturation=level, workers=options.workers, progress=report)
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""

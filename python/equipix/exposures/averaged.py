@@ -171,6 +171,11 @@ class Averaged:
         return NoiseModel.fit(np.concatenate(points), gain=self.gain) if known else None
 
     @property
+    def frames(self) -> tuple[int, ...]:
+        """Number of frames of each exposure."""
+        return tuple(self._frames)
+
+    @property
     def clipped(self) -> Clipping | None:
         """A saturation level that was not given, if the values show one."""
         return highest(self._clipped)

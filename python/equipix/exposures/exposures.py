@@ -104,7 +104,7 @@ class Exposures(ReadOnly):
         return dataclasses.replace(self, mask=mask if self.mask is None else mask | self.mask)
 
     def whole(self, std: Floats | None = None) -> Self:
-        """Return the exposures at the nearest whole shifts; `std` are errors of the shifts."""
+        """Return the exposures at shifts that differ by whole pixels; see `Positions.whole`."""
         return dataclasses.replace(self, positions=self.positions.whole(std))
 
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
@@ -209,9 +209,8 @@ class Exposures(ReadOnly):
         """Return a view of the cells of the beam's grid that are nearest to each pixel."""
         turn = int(self.positions.rotation[exposure])
         rows, cols = self.shape if turn % 180 == 0 else self.shape[::-1]
-        shift = np.array(fit.shifts[exposure])
-        floor = np.floor(shift)
-        row, col = np.array(fit.beam.origin) + (floor + np.rint(shift - floor)).astype(int)
+        corner = np.add(fit.beam.origin, fit.shifts[exposure])
+        row, col = np.ceil(corner - 0.5).astype(int)
         return np.rot90(grid[row : row + rows, col : col + cols], turn // 90)
 
     def _compiled(self, options: FitOptions) -> _native.Exposures:

@@ -23,7 +23,7 @@ class FitOptions:
     Attributes
     ----------
     method : {"multiscale", "coordinate-descent"}
-        The solver at whole shifts.
+        The solver at shifts that differ by whole pixels.
     tolerance : float
         Largest relative error of the sensitivity at which the solver stops.
     max_sweeps : int or None
@@ -42,7 +42,7 @@ class FitOptions:
 
     @property
     def whole_shifts(self) -> bool:
-        """Whether the method takes whole shifts alone, as the core decides."""
+        """Whether the method takes shifts alone that differ by whole pixels: the core decides."""
         return _native.needs_whole_shifts(self.method)
 
     @classmethod

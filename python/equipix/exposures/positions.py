@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix import _native
 from equipix._check import as_array, as_shifts, check_count, per_exposure
 from equipix._readonly import ReadOnly
 from equipix.errors import InputError
@@ -34,8 +35,8 @@ _TURNS = {
 WIDEST = 0.3
 """Largest prior standard deviation of a shift, in pixels: a fit moves it by less than a pixel."""
 
-_ROUNDING = 1e-6
-"""Largest fraction of a pixel that counts as rounding."""
+ROUNDING = 1e-6
+"""Largest fraction of a pixel that counts as rounding, as in the core."""
 
 _BEYOND = 2**31
 """More pixels than any sensor has along a side."""
@@ -75,7 +76,7 @@ class Positions(ReadOnly):
         # A shift beyond any sensor, which the solver refuses, must still fit an integer.
         exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
         whole = np.rint(exact)
-        places = np.where(np.abs(exact - whole) < _ROUNDING, whole, exact)
+        places = np.where(np.abs(exact - whole) < ROUNDING, whole, exact)
         if count is not None:
             check_count("shifts", len(places), count)
         turns = as_rotation(rotation, len(places))
@@ -96,7 +97,12 @@ class Positions(ReadOnly):
         )
 
     def whole(self, std: ArrayLike | None = None) -> Self:
-        """Return the positions at the nearest whole shifts; `std` are errors of the shifts."""
+        """Return the positions at the nearest whole shifts, unless shifts differ by whole pixels.
+
+        `std` are errors of the shifts.
+        """
+        if _native.common_fraction(self.shifts) is not None:
+            return self
         shifts, rounding = round_shifts(self.shifts, std)
         return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
 

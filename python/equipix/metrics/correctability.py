@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array, naming_memory
+from equipix._check import as_array, naming_memory, number
 from equipix.errors import InputError
 from equipix.metrics.moments import signed_root, stack_of, temporal_of
 
@@ -103,7 +103,7 @@ def correctability(
     True
     """
     stack = stack_of("frames", frames)
-    if not 0 < confidence < 1:
+    if not 0 < number("confidence", confidence) < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
     found = temporal_of(stack, _as_mask(mask, stack.shape[1:]))
     n, pixels = found.frames, int(np.count_nonzero(found.used))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from equipix._check import naming_memory
+from equipix._check import naming_memory, number
 from equipix.errors import InputError
 from equipix.metrics.moments import Moments, moments, signed_root
 
@@ -133,7 +133,7 @@ def emva_spatial(
             f"'bright' has the mean {on.mean.mean():.6g} DN, 'dark' {off.mean.mean():.6g}: "
             "expected more light"
         )
-    if gain_dn_per_e is not None and not gain_dn_per_e > 0:
+    if gain_dn_per_e is not None and not number("gain_dn_per_e", gain_dn_per_e) > 0:
         raise InputError(f"'gain_dn_per_e' is {gain_dn_per_e!r}, expected a number above 0")
     dsnu = _roots(split_variances(off) / (gain_dn_per_e or 1.0) ** 2)
     filtered = [

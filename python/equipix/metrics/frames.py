@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array, naming_memory
+from equipix._check import as_array, naming_memory, number
 from equipix.errors import InputError
 from equipix.metrics.moments import stack_of, temporal_of
 
@@ -49,7 +49,7 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     >>> print(f"{np.median(metrics.netd(cold, hot, delta_t=5.0)):.3f}")
     0.025
     """
-    if not delta_t > 0:
+    if not number("delta_t", delta_t) > 0:
         raise InputError(f"'delta_t' is {delta_t!r}, expected a difference above 0 kelvin")
     low, high = stack_of("cold", cold), stack_of("hot", hot)
     if low.shape[1:] != high.shape[1:]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import as_array, naming_memory
+from equipix._check import as_array, check_type, naming_memory
 from equipix.errors import InputError
 from equipix.metrics.moments import moments, signed_root
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
     from equipix._types import Floats
     from equipix.frames import FrameStatistics
+
+_SEQUENCES = (list, tuple, np.ndarray)
+"""Types of a sequence of levels: a text, and one average, are none."""
 
 _TRANSFER = 0.7
 """Highest signal, over that at saturation, that counts for gain and responsivity."""
@@ -94,6 +97,8 @@ def emva_transfer(
     .. [1] European Machine Vision Association, "EMVA Standard 1288", release 4.0 linear, 2021.
     """
     levels = as_array("light", light, ndim=1).astype(np.float64)
+    for name, given in (("dark", dark), ("bright", bright)):
+        check_type(name, given, _SEQUENCES, "a list of frames or averages, one a level")
     if len(bright) != len(levels) or len(dark) not in (1, len(levels)):
         raise InputError(
             f"'bright' has {len(bright)} levels, 'dark' {len(dark)} and 'light' {len(levels)} "

@@ -7,27 +7,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import naming_memory
+from equipix._check import check_type, naming_memory
 from equipix._readonly import ReadOnly
-from equipix.errors import MisfitWarning, warn
 from equipix.flags import set_bits, usable
-from equipix.nuc.criteria import common_misfit, mean_slope, misfit_advice, of_frames, of_response
+from equipix.nuc.criteria import mean_slope, of_frames, of_response
 from equipix.nuc.limits import DefectLimits
+from equipix.nuc.misfit import common_misfit, warn_of_misfit
+from equipix.nuc.response import Response
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from equipix._types import Array
     from equipix.frames import FrameStatistics
-    from equipix.nuc.response import Response
 
 __all__ = ["DefectLimits", "Defects", "find_defects"]
 
 PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
 """Percentiles that describe the distribution of K."""
-
-_MISFIT = 2.0
-"""Misfit of the array above which more of it comes from the order than from noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +80,8 @@ def find_defects(
     Raises
     ------
     InputError
-        If the frames are of another shape, fewer than two, or all equal.
+        If an argument is of another type, or the frames are of another shape, fewer than two, or
+        all equal.
 
     Warns
     -----
@@ -119,7 +117,10 @@ def find_defects(
     .. [1] J. von Neumann, "Distribution of the ratio of the mean square successive difference to
        the variance", Annals of Mathematical Statistics 12 (1941) 367-395.
     """
-    limits = limits or DefectLimits()
+    wanted = "a Response: equipix.load(path), or the result of equipix.nuc.fit"
+    check_type("response", response, Response, wanted)
+    limits = DefectLimits() if limits is None else limits
+    check_type("limits", limits, DefectLimits, "equipix.nuc.DefectLimits(noise=2.0, ...)")
     with naming_memory("finding bad pixels"):
         misfit = common_misfit(response)
         found = of_response(response, limits, misfit)
@@ -134,6 +135,5 @@ def find_defects(
     known = gain[np.isfinite(gain)]
     percentiles = np.percentile(known, PERCENTILES) if known.size else np.full(len(PERCENTILES), 0)
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
-    if misfit > _MISFIT:
-        warn(misfit_advice(response, misfit), MisfitWarning)
+    warn_of_misfit(response, misfit)
     return Defects(flags, counts, named, misfit, limits)

@@ -8,7 +8,6 @@ import numpy as np
 
 from equipix.defects import noisy_pixels, response_outliers
 from equipix.errors import InputError
-from equipix.flags import usable
 from equipix.frames import FrameStatistics
 from equipix.metrics.moments import stack_of, temporal_of
 from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
@@ -31,29 +30,6 @@ def mean_slope(response: Response) -> Floats:
         rise = response_at(response.deviation, high) - response_at(response.deviation, low)
         slope = rise / (high - low)
     return np.asarray(np.where(high > low, slope, 1 + response.deviation[1]))
-
-
-def common_misfit(response: Response) -> float:
-    """Median over usable pixels of reduced χ², over the median that noise alone has."""
-    if response.metadata.get("options", {}).get("weights") != "variances":
-        return float("nan")
-    judged = usable(response.flags) & (response.freedom > 0)
-    if not judged.any():
-        return float("nan")
-    # The median of χ²/f after Wilson and Hilferty.
-    noise = (1 - 2 / (9 * response.freedom[judged])) ** 3
-    return float(np.median(response.reduced_chi2[judged] / noise))
-
-
-def misfit_advice(response: Response, misfit: float) -> str:
-    """Say what to do about curves of another order."""
-    order, levels = response.order, len(response.levels)
-    higher = f"fit with order={order + 1} or order='auto', " if order < min(3, levels - 2) else ""
-    return (
-        f"curves of order {order} leave half of the pixels a misfit of {misfit:.3g} or more times "
-        f"that of noise: {higher}check that the source was steady and that the noise was as "
-        "stated. Pixels that deviate from the others are flagged, not what all have in common"
-    )
 
 
 def of_response(response: Response, limits: DefectLimits, misfit: float) -> dict[str, Bools]:

@@ -10,9 +10,11 @@ import numpy as np
 from equipix import _native
 from equipix._check import naming_memory, positive_workers
 from equipix.flags import set_bits, usable
+from equipix.nuc.alike import alike_pixels
 from equipix.nuc.curve import least_slope
 from equipix.nuc.inverse import horner_inverse, inverse_verdict
 from equipix.nuc.levels import levels_of
+from equipix.nuc.misfit import common_misfit, warn_of_misfit
 from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
 from equipix.nuc.response import Response
 
@@ -26,6 +28,12 @@ if TYPE_CHECKING:
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
     from equipix.nuc.levels import Levels
+
+_MOST_MOVED = 0.01
+"""Square by which pixels that deviate may move V̄, over the variance of a value."""
+
+_ROUNDING = 1e-9
+"""Residual of exact levels, relative to the largest: it shows no pixel that deviates."""
 
 
 def fit(
@@ -80,7 +88,13 @@ def fit(
     Warns
     -----
     SaturationWarning
-        If many values are exactly the highest one, and no saturation level was given for it.
+        If many values are exactly the highest one, and no saturation level was given for it; or
+        averages show less than half the noise of a darker level, as a full well has it.
+    BrightDarkWarning
+        If the median of a level less the dark is below 0 by more than the noise of a value.
+    MisfitWarning
+        If the noise is known, and half of the pixels have a reduced χ² above twice that of noise:
+        the order, if it is not 0, is too low, or the source was not steady.
     InverseWarning
         If the cubic of orders 2 and 3 differs from the exact inverse by more than 0.3 of the noise
         of a frame at the lowest level, which adds 4 % to it, in more than 0.1 % of the usable
@@ -97,7 +111,8 @@ def fit(
     the mean over good pixels that have a value at every level, so it is nearly free of noise;
     within the fit it is scaled to [−1, 1]. A pixel is good if it is not hot, noisy or dead by the
     tests of `equipix.calibrate`, and rises from the lowest to the highest level by half to twice
-    as much as its neighbours.
+    as much as its neighbours. Pixels whose residuals deviate from the others by more than six
+    standard deviations do not count in V̄ where they move it by more than a tenth of the noise.
 
     The radiation need not be known, only uniform: the fall-off of the source or of a lens enters
     the coefficients as gain.
@@ -153,14 +168,21 @@ def fitted(
             "options": options,
             "started": started.isoformat(timespec="seconds"),
         }
-        return _fitted(given, chosen, by, workers, metadata | (provenance or {}))
+        response = _fitted(given, chosen, by, workers, metadata | (provenance or {}))
+        if chosen > 0:  # one point is right at one level, whatever the others are
+            warn_of_misfit(response, common_misfit(response))
+        return response
 
 
 def _fitted(
     levels: Levels, order: int, by: By, workers: int | None, metadata: dict[str, Any]
 ) -> Response:
     """Fit one order and invert it."""
-    deviation, variances, misfit, used = levels.fit(form_of(order, by), workers=workers)
+    found = levels.fit(form_of(order, by), workers=workers)
+    cleaned = _of_alike_pixels(levels, found[2]) if order > 0 else None
+    if cleaned is not None:
+        levels, found = cleaned, cleaned.fit(form_of(order, by), workers=workers)
+    deviation, variances, misfit, used = found
     freedom = used.astype(np.int64) - (order + 1)
     chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
     if levels.noise is None:
@@ -187,6 +209,23 @@ def _fitted(
         saturation=levels.saturation,
         metadata=metadata | {"finished": finished},
     )
+
+
+def _of_alike_pixels(levels: Levels, misfit: Floats) -> Levels | None:
+    """Levels without pixels in V̄ that deviate from the others, where these move it by much.
+
+    A pixel that saturates bends V̄, and so the deviation of all others. Moves below a tenth of the
+    noise of a value, which add 1 % to χ², pass.
+    """
+    rounding = (_ROUNDING * np.abs(levels.references).max()) ** 2 / levels.variances.min()
+    squares = np.maximum(misfit[levels.usable], len(levels) * rounding)[None]
+    alike = alike_pixels(squares)
+    if alike.all():
+        return None
+    cleaned = levels.without(~alike)
+    noise = levels.variances if levels.noise else np.median(squares) / len(levels)
+    moved = (cleaned.references - levels.references) ** 2
+    return cleaned if np.any(moved > _MOST_MOVED * noise) else None
 
 
 def _pooled(misfit: Floats, freedom: Array, usable: Array) -> float:

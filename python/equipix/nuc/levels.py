@@ -11,11 +11,12 @@ import numpy as np
 from equipix import _native
 from equipix._readonly import ReadOnly
 from equipix.defects import SIGMAS, Findings, response_outliers
-from equipix.errors import InputError
+from equipix.errors import BrightDarkWarning, InputError, warn
 from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
-from equipix.noise import NoiseModel
+from equipix.noise import MEDIAN_SQUARE, NoiseModel
+from equipix.nuc.arguments import check_levels, check_variance
 from equipix.nuc.saturation import check_saturation
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ FEWEST_VALID = 0.5
 
 _ROUNDING = 1e-9
 """Relative difference below which two means are equal, where no noise is known."""
+
+_SAMPLED = 10_000
+"""Pixels of which the scatter of differences is taken."""
 
 
 class LevelNoise(NamedTuple):
@@ -123,13 +127,19 @@ class Levels(ReadOnly):
         return np.stack([low, high])
 
     def distinct(self) -> int:
-        """Count the levels whose means differ by more than six standard deviations of a pixel's."""
+        """Count the levels whose means differ by more than six standard deviations of a pixel's.
+
+        Where no noise is known, by more than the median deviation of the pixels' differences: that
+        is of noise between levels of one light, and of gains between others.
+        """
         order = np.argsort(self.references)
         sigma = np.sqrt(self.variances) if self.noise else np.zeros(len(self))
         count, last = 1, order[0]
         for level in order[1:]:
             smallest = SIGMAS * np.hypot(sigma[level], sigma[last])
             smallest = max(smallest, _ROUNDING * abs(self.references[level]))
+            if not self.noise:
+                smallest = max(smallest, _scatter(self.values, int(last), int(level)))
             if self.references[level] - self.references[last] > smallest:
                 count, last = count + 1, level
         return count
@@ -153,18 +163,23 @@ def levels_of(
     saturation: float | None = None,
 ) -> Levels:
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
+    check_levels(levels)
     averaged = _averaged(levels)
     if averaged is not None and averaged.raw and averaged.count > 1:
         averaged = averaged.counted_from_lowest()
     source = levels if averaged is None else averaged
+    if (count := _count(source)) is not None:
+        check_variance(variance, count)
     measured = measured_of(source, variance, saturation, words=_LEVELS)
     given = None if mask is None else as_mask(mask, measured.values.shape)
-    check_saturation(measured)
+    check_saturation(measured, averaged, given)
     pedestal = 0.0 if averaged is None else averaged.pedestal
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
     findings = _with_odd_responses(values, noise, measured.findings)
     usable = _usable(values, findings, given)
+    if measured.dark is not None:
+        _warn_of_bright_dark(values[:, usable], noise, measured.dark_variance)
     references = _references(values, usable)
     return Levels(
         values=values,
@@ -183,6 +198,14 @@ def levels_of(
 def _references(values: Array, usable: Bools) -> Floats:
     """Mean V̄ of each level over usable pixels."""
     return np.array([each[usable].mean(dtype=np.float64) for each in values])
+
+
+def _count(source: object) -> int | None:
+    """Number of levels given; None where they are no sequence, which is refused later."""
+    if isinstance(source, Averaged):
+        return source.count
+    known = isinstance(source, list | tuple) or (isinstance(source, np.ndarray) and source.ndim > 0)
+    return len(source) or None if known else None  # type: ignore[arg-type]
 
 
 def _frame_noise(
@@ -228,12 +251,6 @@ def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | N
         )
     if measured.variance is None:
         return None
-    if measured.variance.ndim != 1:
-        raise InputError(
-            f"'variance' has shape {measured.variance.shape}, expected "
-            f"({len(measured.values)},) or a NoiseModel: a pixel's own sample variance makes "
-            "weights noisy"
-        )
     return tuple(LevelNoise(float(each), 0.0, 0.0) for each in measured.variance)
 
 
@@ -255,7 +272,7 @@ def _with_odd_responses(
     rise = means[high] - means[low]
     variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
     # A rise within the noise is refused later, with the number of levels that differ.
-    if rise <= SIGMAS * np.sqrt(variance):
+    if rise <= SIGMAS * np.sqrt(variance) or (not noise and rise <= _scatter(values, low, high)):
         return findings
     response = (values[high] - values[low]) / rise
     std = np.full(response.shape, np.sqrt(variance) / rise)
@@ -263,6 +280,15 @@ def _with_odd_responses(
     return dataclasses.replace(
         findings, dead=union(findings.dead, dead), hot=union(findings.hot, hot)
     )
+
+
+def _scatter(values: Array, low: int, high: int) -> float:
+    """Scatter between pixels of the rise from one level to another: of noise and of gains."""
+    step = max(1, values[0].size // _SAMPLED)
+    ends = values.reshape(len(values), -1)[[low, high], ::step].astype(np.float64)
+    rise = ends[1] - ends[0]
+    known = rise[np.isfinite(rise)]
+    return float(np.median(np.abs(known - np.median(known)))) if known.size else 0.0
 
 
 def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
@@ -278,12 +304,59 @@ def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
     share = float(usable.sum() / max(1, int(wanted.sum())))
     if share < FEWEST_VALID or not usable.any():
         missing = [1 - np.mean(each[wanted]) if wanted.any() else 1.0 for each in known]
-        worst = int(np.argmax(missing))
-        odd = 0.0 if bad is None or not wanted.any() else np.mean(bad[wanted])
+        odd = 0.0 if bad is None or not wanted.any() else float(np.mean(bad[wanted]))
         raise InputError(
             f"'levels': {share:.1%} of the pixels are good and have a value at every level, "
-            f"expected {FEWEST_VALID:.0%} or more. Level {worst} has no value in "
-            f"{missing[worst]:.1%} (saturated, masked or not finite), and {odd:.1%} are dead, hot "
-            "or noisy: leave out levels that saturate, or expose less"
+            f"expected {FEWEST_VALID:.0%} or more. {_cause(values, missing, odd)}"
         )
     return usable
+
+
+def _warn_of_bright_dark(
+    values: Array, noise: tuple[LevelNoise, ...] | None, dark_variance: Floats | None
+) -> None:
+    """Warn of levels whose median less the dark is below 0 by more than the noise of a value.
+
+    Where no noise is known the scatter of the level takes its place.
+    """
+    of_dark = 0.0 if dark_variance is None else float(np.median(dark_variance))
+    below = []
+    for level, each in enumerate(values):
+        median = float(np.median(each))
+        if noise is None:
+            sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)
+        else:
+            sigma = np.sqrt(float(noise[level].variance(median)) + of_dark)
+        if median < -SIGMAS * sigma:
+            below.append(f"{median:.6g} DN at level {level}")
+    if below:
+        warn(
+            f"the dark is brighter than a level of 'levels': the median less the dark is "
+            f"{' and '.join(below)}. Give the dark frames of these levels, or none",
+            BrightDarkWarning,
+        )
+
+
+def _cause(values: Array, missing: Sequence[float], odd: float) -> str:
+    """Say which level has few values, or why pixels are odd, and what to do."""
+    worst = int(np.argmax(missing))
+    said = (
+        f"Level {worst} has no value in {missing[worst]:.1%} (saturated, masked or not finite), "
+        f"and {odd:.1%} are dead, hot or noisy: "
+    )
+    # Noise judged by few values makes the rest odd.
+    if missing[worst] >= min(odd, 1 - FEWEST_VALID):
+        return said + (
+            "leave out levels that saturate, or expose less; if they do not, correct 'bit_depth' "
+            "or 'saturation', which are too low for these values"
+        )
+    means = ", ".join(f"{np.nanmedian(each):.6g}" for each in values)
+    if np.nanmedian(values, axis=(1, 2)).min() < 0:
+        return said + (
+            f"the dark is brighter than a level, as the medians less the dark are {means} DN: give "
+            "the dark frames of these levels, or none"
+        )
+    return said + (
+        f"the medians of the levels are {means} DN: give levels that differ by more than the "
+        "noise, and the noise of these frames"
+    )

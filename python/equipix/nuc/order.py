@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
+from equipix._check import check_word, described
 from equipix._types import By, Order
-from equipix.defects import SIGMAS
 from equipix.errors import InputError
-from equipix.noise import MEDIAN_SQUARE
+from equipix.nuc.alike import alike_pixels
 from equipix.nuc.curve import response_at
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Bools, Floats
+    from equipix._types import Array, Floats
     from equipix.nuc.levels import Levels
 
 FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
@@ -24,9 +24,6 @@ HELD = 4
 
 _BETTER = 1e-3
 """Relative fall of the prediction error that a higher order must bring."""
-
-_FEW = 0.05
-"""Largest share of pixels that are left out because they deviate from the others."""
 
 _ROUNDING = 1e-9
 """Prediction error of exact data, relative to the largest level."""
@@ -40,10 +37,9 @@ def form_of(order: int, by: By) -> str:
 def check_order(order: object, by: object) -> None:
     """Refuse an unknown order, an unknown `by`, and a `by` that an order does not have."""
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if not (whole or order == "auto") or order not in get_args(Order):
-        raise InputError(f"'order' is {order!r}, expected one of {get_args(Order)}")
-    if by not in get_args(By):
-        raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
+    if not (whole or isinstance(order, str)) or order not in get_args(Order):
+        raise InputError(f"'order' is {described(order)}, expected one of {get_args(Order)}")
+    check_word("by", by, get_args(By))
     if by == "gain" and order != 0:
         raise InputError(
             f"'by' is 'gain', but order {order!r} corrects offset and gain: expected order=0"
@@ -89,10 +85,10 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     deviations of the level where noise is known, mean square over usable pixels and levels. The
     lowest order within 0.1 % of the smallest error is taken.
 
-    A pixel that deviates from the others at some order counts at none: its mean square is above 36
-    times the variance of the normal variable whose square has the median of the array. These are
-    the same pixels for all orders, and one in twenty at most: more are a part of the array, which
-    the order must fit.
+    A pixel that deviates from the others at some order counts at none, nor in V̄: its mean square is
+    above 36 times the variance of the normal variable whose square has the median of the array.
+    These are the same pixels for all orders, and one in twenty at most: more are a part of the
+    array, which the order must fit.
     """
     between = np.argsort(levels.references)[1:-1]
     highest = min(3, levels.distinct() - 2)
@@ -104,11 +100,11 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     places = np.unique(np.linspace(0, len(between) - 1, HELD).round().astype(int))
     held, orders = between[places], range(highest + 1)
     squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
-    alike = _alike(squares)
+    alike = alike_pixels(squares)
     if not alike.all():
         levels = levels.without(~alike)
         squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
-        alike = _alike(squares)
+        alike = alike_pixels(squares)
     errors = squares[:, alike].mean(axis=1).tolist()
     enough = min(errors) * (1 + _BETTER) + (_ROUNDING * np.abs(levels.references).max()) ** 2
     return next(order for order, error in enumerate(errors) if error <= enough), errors
@@ -123,15 +119,3 @@ def _squares(levels: Levels, held: Array, order: int, by: By, workers: int | Non
         error = levels.values[each] - response_at(deviation, levels.references[each])
         total += error[levels.usable] ** 2 / levels.variances[each]
     return total / len(held)
-
-
-def _alike(squares: Floats) -> Bools:
-    """Pixels that do not deviate from the others at any order; `squares` has a row for each."""
-    limits = SIGMAS**2 / MEDIAN_SQUARE * np.median(squares, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # the median of exact levels may be 0
-        excess = np.nan_to_num(squares / limits[:, None], posinf=0).max(axis=0)
-    most = int(_FEW * excess.size)
-    if not most:
-        return np.ones(excess.size, bool)
-    # Of more than `most`, those that deviate most are left out.
-    return np.asarray(excess <= max(1.0, float(np.partition(excess, -most - 1)[-most - 1])))

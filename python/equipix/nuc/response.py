@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from equipix._check import as_array
+from equipix._check import as_array, naming_memory
 from equipix._readonly import ReadOnly
-from equipix.correction.apply import apply, apply_polynomial, dark_frame
+from equipix.correction.apply import apply, apply_polynomial, dark_frame, is_stored
 from equipix.correction.depth import depth_of
 from equipix.errors import InputError
 from equipix.flags import usable
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
     from equipix._types import Array, Bools, Flagged, Floats
     from equipix.frames import FrameStatistics
+
+
+_LARGEST = int(np.iinfo(np.uint32).max)
+"""Largest number of the flags of a pixel."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,6 +139,7 @@ class Response(ReadOnly):
             f"<Response of {rows} x {cols} pixels, order {self.order}, {len(self.levels)} levels>"
         )
 
+    @naming_memory("correcting")
     def correct(
         self,
         frames: ArrayLike,
@@ -161,8 +166,8 @@ class Response(ReadOnly):
             end of the valid range beyond it. The cubic differs by at most `inverse_error`.
         out : ndarray, optional
             Array for the result, of the frames' shape, float32 or float64; of frames of 8 or 16
-            bits and float32, unless `exact`, also uint8 or uint16: rounded half to even, and
-            limited to the range of the type (`equipix.Corrector` counts such values).
+            bits and float32, unless `exact`, also uint8 or uint16, which hold no NaN: rounded half
+            to even, and limited to the range of the type (`equipix.Corrector` counts such values).
 
         Returns
         -------
@@ -195,6 +200,7 @@ class Response(ReadOnly):
 
         return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, depth=depth)
 
+    @naming_memory("finding extrapolated values")
     def extrapolated(
         self,
         frames: ArrayLike,
@@ -244,13 +250,18 @@ class Response(ReadOnly):
         Raises
         ------
         InputError
-            If the shape or dtype does not fit.
+            If the shape or dtype does not fit, or a number is not one of 32 bits.
         """
         more = as_array("flags", flags, ndim=2)
         if more.shape != self.shape or more.dtype.kind not in "iu":
             raise InputError(
                 f"'flags' is {more.dtype} of shape {more.shape}, expected whole numbers of shape "
-                f"{self.shape}"
+                f"{self.shape}: bits of equipix.Flag"
+            )
+        wrong = more[(more < 0) | (more > _LARGEST)]
+        if wrong.size:
+            raise InputError(
+                f"'flags' holds {wrong[0]}, expected bits of equipix.Flag: 0 to {_LARGEST}"
             )
         return replace(self, flags=self.flags | more.astype(np.uint32))
 
@@ -280,9 +291,7 @@ class Response(ReadOnly):
 
     def _offset(self, dark: Literal["stored"] | FrameStatistics | ArrayLike | None) -> Array | None:
         """Dark frame to subtract, if any."""
-        if isinstance(dark, str):
-            if dark != "stored":
-                raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+        if is_stored(dark):
             return self.dark
         if dark is None:
             return None

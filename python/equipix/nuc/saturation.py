@@ -8,11 +8,13 @@ import numpy as np
 
 from equipix.errors import InputError, SaturationWarning, warn
 from equipix.exposures.clipping import Clipping, clipping_advice, is_of_bits
+from equipix.nuc.full_well import warn_of_full_wells
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from equipix._types import Array
+    from equipix._types import Array, Bools
+    from equipix.exposures.averaged import Averaged
     from equipix.exposures.front import Measured
 
 _MOST = 0.5
@@ -28,7 +30,9 @@ _ROUNDING = 1e-9
 """Relative rounding of means from which a dark was subtracted, and added again."""
 
 
-def check_saturation(measured: Measured) -> None:
+def check_saturation(
+    measured: Measured, averaged: Averaged | None = None, mask: Bools | None = None
+) -> None:
     """Warn of levels that probably saturate, and refuse those that do so as a whole.
 
     Raises
@@ -40,7 +44,8 @@ def check_saturation(measured: Measured) -> None:
     -----
     A level with most of its pixels at exactly the highest value saturates, if the pixels of another
     level differ, or the value is the largest number of some bits. If all levels are even without
-    it, they are no frames of a camera.
+    it, they are no frames of a camera. Where no such value is found, the noise of averages shows
+    levels that a full well limits.
     """
     top, shares = _at_highest(measured)
     crowded = [level for level, share in enumerate(shares) if share > _MOST]
@@ -50,6 +55,8 @@ def check_saturation(measured: Measured) -> None:
         values = round(sum(shares) * measured.values[0].size)
         found = found or Clipping(top, values)
     if found is None:
+        if averaged is not None:
+            warn_of_full_wells(averaged, mask)
         return
     where = [level for level, share in enumerate(shares) if share > 0] if found.level == top else []
     named = f"{_named(shares, where)} of 'levels': " if where else ""

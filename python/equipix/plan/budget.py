@@ -16,6 +16,7 @@ from equipix.plan.noise import factor, local_variance
 from equipix.plan.order import distinct_trend
 from equipix.plan.shift_errors import shift_error_effect
 from equipix.plan.spectrum import Spectrum, smallest_near, spectrum
+from equipix.shifts import whole_moves
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -189,7 +190,7 @@ def error_budget(
     powers = per_exposure("flux", flux, len(exact), default=1)
     if not (np.isfinite(powers).all() and (powers > 0).all()):
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
-    positions = np.rint(exact - exact[0]).astype(np.int64) + np.rint(exact[0]).astype(np.int64)
+    positions = whole_moves(exact)
     waves = spectrum(exact, powers)
     components = _components(sizes, positions, _between_pixels(exact, waves))
     scale = noise**2 * factor(sizes, positions, powers)

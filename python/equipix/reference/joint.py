@@ -3,9 +3,9 @@
     F = Σ w·(y − c·L(u)·M − O)² + τ‖G a‖² + Σ (ln c − ln c₀)²/s_c² + Σ (d − d₀)²/s_d²
 
 with L(u) = Σ_j a_j·B(u − j), B the cubic B-spline along rows and columns (de Boor, A Practical
-Guide to Splines, 1978), or a_u itself where all shifts are whole and known, and G the fourth
-differences. Gauss-Newton steps in all unknowns at once, each a dense least-squares problem of
-least norm.
+Guide to Splines, 1978), or a_u itself where all shifts are known and whole, but for a fraction that
+they have in common, and G the fourth differences. Gauss-Newton steps in all unknowns at once, each
+a dense least-squares problem of least norm.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ Array: TypeAlias = "NDArray[Any]"
 
 SMOOTHING = 1e-5
 EXACT_SHIFT = 1e-6
+ROUNDING = 1e-6
 FOURTH = np.array([1, -4, 6, -4, 1])
 
 
@@ -37,8 +38,8 @@ class JointSolution:
         The offset O; 0 unless it was sought.
     beam : ndarray, shape of the grid
         L at the cells; NaN where it is undetermined.
-    beam_origin : tuple of int
-        Cell that pixel (0, 0) of the unrotated sensor sees at shift 0.
+    beam_origin : tuple of int or float
+        Cell, or place between cells, of pixel (0, 0) of the unrotated sensor at shift 0.
     flux : ndarray, shape (n,)
         c of each exposure.
     shifts : ndarray, shape (n, 2)
@@ -58,7 +59,7 @@ class JointSolution:
     sensitivity: Array
     dark: Array
     beam: Array
-    beam_origin: tuple[int, int]
+    beam_origin: tuple[float, float]
     flux: Array
     shifts: Array
     objective: list[float]
@@ -117,7 +118,10 @@ def joint(
     weight = np.bincount(np.tile(np.arange(pixels), count), root**2)
 
     turns = np.zeros(count, int) if rotation is None else np.asarray(rotation, int) // 90
-    measured = np.array(shifts, float)
+    measured, fraction = np.array(shifts, float), np.zeros(2, int)
+    if shift_std is None and _differ_by_whole(measured) and np.any(measured[0] % 1):
+        fraction = measured[0] % 1
+        measured = np.rint(measured - fraction)
     given = np.ones(count) if flux is None or isinstance(flux, str) else np.asarray(flux, float)
     by_theta, open_ways = _flux_columns(flux, flux_std, time, measured, turns)
     by_zeta, shift_prior = _shift_columns(shift_std, count)
@@ -212,15 +216,21 @@ def joint(
         sensitivity=(sensitivity / scale).reshape(rows, cols),
         dark=(offset if sizes[1] else np.zeros(pixels)).reshape(rows, cols),
         beam=(beam * scale).reshape(grid.shape),
-        beam_origin=grid.origin,
+        beam_origin=tuple((grid.origin - fraction).tolist()),
         flux=np.exp(logs),
-        shifts=places,
+        shifts=places + fraction,
         objective=history,
         covariance=of_gain @ of_gain.T,
         dark_std=dark_std.reshape(rows, cols),
         dark_along_std=dark_along_std,
         shift_std=np.sqrt(left),
     )
+
+
+def _differ_by_whole(shifts: Array) -> bool:
+    """Whether shifts differ by whole pixels, but for rounding."""
+    moves = shifts - shifts[0]
+    return bool(np.all(np.abs(moves - np.rint(moves)) < ROUNDING))
 
 
 def _flux_columns(

@@ -9,6 +9,7 @@ import numpy as np
 from equipix._check import as_array, as_shifts
 from equipix.errors import InputError
 from equipix.maps import rms_at_both_scales
+from equipix.shifts import whole_moves
 from equipix.simulate.signal import exposures
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def noise_prediction(
     beam : callable
         True beam L, a function of arrays of row and column coordinates.
     shifts : array_like, shape (n, 2)
-        Shifts (row, col) in pixels, rounded to whole ones here.
+        Shifts (row, col) in pixels, rounded here so that they differ by whole ones.
     variance : array_like
         Variance of the noise of each value, in the units of the beam squared: one number,
         (rows, cols) or (n, rows, cols). The solution weights each value by its inverse.
@@ -83,7 +84,7 @@ def noise_prediction(
     5.5e-04
     """
     truth = as_array("sensitivity", sensitivity, ndim=2).astype(np.float64)
-    cells = np.rint(as_shifts(shifts)).astype(int)
+    cells = whole_moves(as_shifts(shifts))
     signal = exposures(truth, beam, cells)
     noise = _like_signal("variance", variance, signal.shape)
     if not (np.all(noise > 0) and np.all(signal > 0)):

@@ -9,6 +9,8 @@ import numpy as np
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import ArrayLike
 
     from equipix._types import Floats
@@ -16,8 +18,14 @@ if TYPE_CHECKING:
 _SECOND_RADIATION = 14387.768775
 """hc/k in µm K."""
 
-_EV_UM = 1.239841984
+EV_UM = 1.239841984
 """hc in eV µm."""
+
+_GAP, _GAP_PER_K = (-0.302, 1.93, -0.81, 0.832), 5.35e-4
+"""Coefficients of the band gap of HgCdTe in eV by powers of x, and of T(1 − 2x) in eV/K."""
+
+LARGEST_X = 0.6
+"""Largest composition to which the band gap was fitted, besides CdTe itself."""
 
 _STEPS = 2048
 """Intervals of the integral over the wavelength; Simpson's rule errs by less than 1e-9 of it."""
@@ -42,7 +50,13 @@ def photon_exitance(wavelength_um: ArrayLike, temperature_k: float) -> Floats:
     return np.asarray(wavelength**-4 / np.expm1(_SECOND_RADIATION / (wavelength * temperature_k)))
 
 
-def band_photons(start_um: float, cutoff_um: ArrayLike, temperature_k: float) -> Floats:
+def band_photons(
+    start_um: float,
+    cutoff_um: ArrayLike,
+    temperature_k: float,
+    *,
+    response: Callable[[Floats], Floats] | None = None,
+) -> Floats:
     """Photons of a black body from a wavelength to each of many cut-off wavelengths.
 
     Parameters
@@ -53,11 +67,14 @@ def band_photons(start_um: float, cutoff_um: ArrayLike, temperature_k: float) ->
         Longest wavelength of each pixel, in µm.
     temperature_k : float
         Temperature in kelvin.
+    response : callable, optional
+        Factor at each wavelength in µm, such as the transmission of a filter; 1 unless given. It
+        must be smooth over a two-thousandth of the band.
 
     Returns
     -------
     ndarray, of the shape of `cutoff_um`
-        ∫ of `photon_exitance` from start to cut-off, per µm³.
+        ∫ of `photon_exitance` times `response` from start to cut-off, per µm³.
 
     Raises
     ------
@@ -84,16 +101,20 @@ def band_photons(start_um: float, cutoff_um: ArrayLike, temperature_k: float) ->
     if wrong.size:
         raise InputError(f"'cutoff_um' holds {wrong.flat[0]:g}, expected {start_um:g} or more")
     ends = np.linspace(start_um, float(cutoff.max()), _STEPS + 1)
-    below = np.concatenate([[0.0], np.cumsum(_integral(ends[:-1], ends[1:], temperature_k))])
+
+    def integrand(wavelength: Floats) -> Floats:
+        photons = photon_exitance(wavelength, temperature_k)
+        return photons if response is None else photons * response(wavelength)
+
+    below = np.concatenate([[0.0], np.cumsum(_integral(integrand, ends[:-1], ends[1:]))])
     interval = np.clip(np.searchsorted(ends, cutoff, side="right") - 1, 0, _STEPS - 1)
-    return np.asarray(below[interval] + _integral(ends[interval], cutoff, temperature_k))
+    return np.asarray(below[interval] + _integral(integrand, ends[interval], cutoff))
 
 
-def _integral(start: Floats, end: Floats, temperature_k: float) -> Floats:
+def _integral(integrand: Callable[[Floats], Floats], start: Floats, end: Floats) -> Floats:
     """Simpson's rule over one short interval each."""
-    ends = photon_exitance(start, temperature_k) + photon_exitance(end, temperature_k)
-    middle = photon_exitance((start + end) / 2, temperature_k)
-    return np.asarray((end - start) / 6 * (ends + 4 * middle))
+    ends = integrand(start) + integrand(end)
+    return np.asarray((end - start) / 6 * (ends + 4 * integrand((start + end) / 2)))
 
 
 def hgcdte_cutoff(composition: ArrayLike, temperature_k: float = 77.0) -> Floats:
@@ -126,6 +147,64 @@ def hgcdte_cutoff(composition: ArrayLike, temperature_k: float = 77.0) -> Floats
     >>> round(float(blackbody.hgcdte_cutoff(0.225)), 1)
     10.0
     """
+    return np.asarray(EV_UM / hgcdte_gap(composition, temperature_k))
+
+
+def hgcdte_gap(composition: ArrayLike, temperature_k: float = 77.0) -> Floats:
+    """Band gap of Hg₁₋ₓCdₓTe in eV; parameters and formula are those of `hgcdte_cutoff`.
+
+    Parameters
+    ----------
+    composition : array_like
+        Fraction x of Cd.
+    temperature_k : float
+        Temperature of the detector in kelvin.
+
+    Returns
+    -------
+    ndarray, float64
+        Band gap E_g in eV.
+    """
     x = np.asarray(composition, np.float64)
-    gap = -0.302 + 1.93 * x - 0.81 * x**2 + 0.832 * x**3 + 5.35e-4 * temperature_k * (1 - 2 * x)
-    return np.asarray(_EV_UM / gap)
+    gap = _GAP[0] + x * (_GAP[1] + x * (_GAP[2] + x * _GAP[3]))
+    return np.asarray(gap + _GAP_PER_K * temperature_k * (1 - 2 * x))
+
+
+def hgcdte_composition(cutoff_um: float, temperature_k: float = 77.0) -> float:
+    """Fraction x of Cd at which Hg₁₋ₓCdₓTe has a cut-off wavelength.
+
+    Parameters
+    ----------
+    cutoff_um : float
+        Cut-off wavelength in µm.
+    temperature_k : float
+        Temperature of the detector in kelvin, below 1000.
+
+    Returns
+    -------
+    float
+        The real root of the cubic of `hgcdte_cutoff`; the gap rises with x, so there is one.
+
+    Raises
+    ------
+    InputError
+        If no x from 0 to 0.6, where the formula holds, has this cut-off.
+
+    Examples
+    --------
+    >>> from equipix.simulate import blackbody
+    >>> round(blackbody.hgcdte_composition(10.0), 4)
+    0.2254
+    """
+    low, high = (float(hgcdte_cutoff(x, temperature_k)) for x in (LARGEST_X, 0.0))
+    high = high if high > 0 else np.inf  # a gap below 0 has no cut-off
+    if not low <= cutoff_um <= high:
+        raise InputError(
+            f"'cutoff_um' is {cutoff_um!r}, but HgCdTe of x from 0 to {LARGEST_X} at "
+            f"{temperature_k:g} K has {low:.3g} µm or more"
+        )
+    thermal = _GAP_PER_K * temperature_k
+    gap = EV_UM / cutoff_um
+    constant, linear, square, cube = _GAP
+    roots = np.roots([cube, square, linear - 2 * thermal, constant + thermal - gap])
+    return float(roots[np.argmin(np.abs(roots.imag))].real)

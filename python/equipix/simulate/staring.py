@@ -320,11 +320,12 @@ class StaringArray:
         Notes
         -----
         The numbers of electrons are normally distributed with the variance of a Poisson
-        distribution: wells of infrared arrays hold millions.
+        distribution: wells of infrared arrays hold millions. A full well loses what exceeds it, so
+        only the read noise is left.
         """
         rng = np.random.default_rng(rng)
         n = self.electrons(light_e, warmer_k=warmer_k)
-        sigma, offset = np.hypot(np.sqrt(n), self._maps["read_noise_e"]), self._offset(time_s)
+        sigma, offset = self._noise_e(n), self._offset(time_s)
         for _ in range(count):
             values = offset + self._converted(n + sigma * rng.standard_normal(self.shape))
             whole = np.clip(np.rint(values), 0, self.full_scale)
@@ -332,10 +333,13 @@ class StaringArray:
 
     def temporal_noise(self, light_e: ArrayLike) -> Floats:
         """Standard deviation of one frame, in DN, rounding included, curvature left out."""
-        n = self.electrons(light_e)
-        variance = n + self._maps["read_noise_e"] ** 2
         gain = self.gain_dn_per_e * self._maps["amplification"]
-        return np.sqrt(gain**2 * variance + 1 / 12)
+        return np.sqrt((gain * self._noise_e(self.electrons(light_e))) ** 2 + 1 / 12)
+
+    def _noise_e(self, electrons: Floats) -> Floats:
+        """Standard deviation of the electrons that are read."""
+        of_light = np.where(electrons < self.well_e, electrons, 0.0)
+        return np.asarray(np.hypot(np.sqrt(of_light), self._maps["read_noise_e"]))
 
     def _converted(self, electrons: Floats) -> Floats:
         """Electrons as DN without the offset."""

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::frames::Shape;
-use crate::geometry::{Rotation, Taps, Walk};
+use crate::geometry::{Rotation, Taps, Walk, whole_number};
 use crate::parallel::{Add, Workers};
 
 /// The beam L on its padded grid, row by row, in the units of the frames.
@@ -21,8 +21,10 @@ pub struct Beam<V = Vec<f64>> {
     pub tilt: [f64; 2],
     /// Sizes of the grid.
     pub shape: Shape,
-    /// The cell that the sensor's first pixel sees at shift 0, not turned.
-    pub origin: [usize; 2],
+    /// Where on the grid (row, column), in cells, the sensor's first pixel is at shift 0, not turned. It is
+    /// between cells where all shifts have a fraction of a pixel in common
+    /// ([`Positions::fraction`](crate::Positions::fraction)): then cells are where their pixels are.
+    pub origin: [f64; 2],
 }
 
 impl<V: AsRef<[f64]> + Sync> Beam<V> {
@@ -52,13 +54,12 @@ impl<V: AsRef<[f64]> + Sync> Beam<V> {
         let window = rotation.turned(sensor);
         let beam = self.view();
         let tilt = beam.coefficients.map(|_| beam.tilt);
-        let [rows, cols] = [0, 1].map(|axis| {
-            Factors::at(shift[axis] - shift[axis].floor(), tilt.map(|tilt| tilt[axis]))
-        });
-        let corner = [0, 1].map(|axis| shift[axis].floor() as i64 + beam.origin[axis] as i64);
+        let [(top, above), (left, beside)] = [0, 1].map(|axis| beam.place(shift[axis], axis));
+        let rows = Factors::at(above, tilt.map(|tilt| tilt[0]));
+        let cols = Factors::at(beside, tilt.map(|tilt| tilt[1]));
         let mut light = vec![0.0; window.len()];
         workers.map_blocks(&mut light, window.cols, |row, light| {
-            let first = [corner[0] + row as i64 - rows.before, corner[1] - cols.before];
+            let first = [top + row as i64 - rows.before, left - cols.before];
             let width = window.cols + cols.count() - 1;
             let mut between = vec![0.0; width];
             rows.combine(|i| beam.row(first[0] + i as i64, first[1], width), &mut between);
@@ -72,6 +73,16 @@ impl<V: AsRef<[f64]> + Sync> Beam<V> {
 }
 
 impl Beam<&[f64]> {
+    /// The cell that the first pixel sees at a shift along one axis, and the fraction of a cell behind it.
+    fn place(&self, shift: f64, axis: usize) -> (i64, f64) {
+        let cell = self.origin[axis].round();
+        let place = shift + (self.origin[axis] - cell);
+        // Rounding must not make a cell's own value depend on the cells beside it.
+        let at_cell = whole_number(place).filter(|_| self.coefficients.is_none());
+        let place = at_cell.unwrap_or(place);
+        (place.floor() as i64 + cell as i64, place - place.floor())
+    }
+
     /// So many values or coefficients of a row, from a column on; NaN beyond the grid.
     fn row(&self, row: i64, first: i64, width: usize) -> Vec<f64> {
         let mut found = vec![f64::NAN; width];
@@ -173,7 +184,7 @@ mod tests {
 
     /// A beam on a grid of 12×14 cells with shift 0 at cell (3, 2).
     fn beam(at: impl Fn(f64, f64) -> f64, is_spline: bool) -> Beam {
-        let (shape, origin) = (Shape::new(12, 14), [3, 2]);
+        let (shape, origin) = (Shape::new(12, 14), [3.0, 2.0]);
         let cells = (0..shape.len()).map(|cell| (cell / shape.cols, cell % shape.cols));
         let values: Vec<f64> = cells.map(|(r, c)| at(r as f64 - 3.0, c as f64 - 2.0)).collect();
         let coefficients = is_spline.then(|| values.clone());
@@ -204,6 +215,18 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn cells_beside_whole_places_are_seen_without_interpolation() {
+        let workers = Workers::new(None).unwrap();
+        // No polynomial, and the cells that no exposure sees are not known.
+        let wild = |r: f64, c: f64| if r < 0.0 { f64::NAN } else { (7.0 * r + 3.0 * c).sin() };
+        let beam = Beam { origin: [3.0 - 0.1, 2.0 + 0.3], ..beam(wild, false) };
+        let seen = beam.light([2.1, 0.7], Rotation::None, Shape::new(1, 3), &workers);
+        assert_eq!(seen, [wild(2.0, 1.0), wild(2.0, 2.0), wild(2.0, 3.0)]);
+        let half = beam.light([0.1, 0.7], Rotation::Half, Shape::new(1, 3), &workers);
+        assert_eq!(half, [wild(0.0, 3.0), wild(0.0, 2.0), wild(0.0, 1.0)]);
     }
 
     #[test]

@@ -98,8 +98,8 @@ impl Fit {
         }
     }
 
-    /// Whether the pixels were eliminated, as for fractional shifts or where more than M and L was
-    /// sought.
+    /// Whether the pixels were eliminated, as for shifts that differ by parts of pixels or where more than
+    /// M and L was sought.
     #[must_use]
     pub const fn is_joint(&self) -> bool {
         self.smallest_ritz.is_some()

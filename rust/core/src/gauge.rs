@@ -112,7 +112,7 @@ fn untilt(fit: &mut Fit, slope: [f64; 2], rotation: Rotation, sensor: Shape) {
     let (shape, origin) = (fit.beam.shape, fit.beam.origin);
     let factor = |cell: usize| {
         let (row, col) = (cell / shape.cols, cell % shape.cols);
-        let u = [row as f64 - origin[0] as f64, col as f64 - origin[1] as f64];
+        let u = [row as f64 - origin[0], col as f64 - origin[1]];
         (down * u[0] + along * u[1] + corner).exp()
     };
     if fit.beam.coefficients.is_some() {

@@ -14,7 +14,9 @@
 mod placement;
 mod rotation;
 mod taps;
+mod whole;
 
 pub use placement::{Geometry, Placement, View, Walk};
 pub use rotation::Rotation;
 pub(crate) use taps::{TAPS, Taps};
+pub(crate) use whole::whole_number;

@@ -53,8 +53,9 @@
 //!
 //! # A joint fit, and its error bars
 //!
-//! Shifts between pixels, fluxes to be fitted, shifts to be refined or an offset of each pixel make it
-//! a joint fit: the beam is then a spline. What is known of the exposures decides, not the caller.
+//! Shifts that differ by parts of pixels, fluxes to be fitted, shifts to be refined or an offset of each
+//! pixel make it a joint fit. With such shifts, and with refined ones, the beam is a spline. What is known
+//! of the exposures decides, not the caller.
 //!
 //! ```
 //! use equipix_core::{

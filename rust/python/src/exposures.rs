@@ -93,7 +93,13 @@ impl PyExposures {
     }
 }
 
-/// Whether a method takes whole shifts alone.
+/// The part of a pixel that all shifts have in common, if they differ by whole pixels.
+#[pyfunction]
+pub(crate) fn common_fraction(shifts: PyReadonlyArray2<'_, f64>) -> PyResult<Option<[f64; 2]>> {
+    Ok(Positions::of_shifts(&pairs(&shifts)?).fraction())
+}
+
+/// Whether a method takes shifts alone that differ by whole pixels.
 #[pyfunction]
 pub(crate) fn needs_whole_shifts(py: Python<'_>, method: &str) -> PyResult<bool> {
     let method = method_named(method).map_err(|error| errors::exception(py, &error))?;

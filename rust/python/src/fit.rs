@@ -27,7 +27,7 @@ use crate::run;
 pub(crate) struct PyBeam {
     values: Py<PyArray2<f64>>,
     coefficients: Option<Py<PyArray2<f64>>>,
-    origin: (usize, usize),
+    origin: (f64, f64),
     tilt: [f64; 2],
 }
 
@@ -38,7 +38,7 @@ impl PyBeam {
     const fn new(
         values: Py<PyArray2<f64>>,
         coefficients: Option<Py<PyArray2<f64>>>,
-        origin: (usize, usize),
+        origin: (f64, f64),
         tilt: [f64; 2],
     ) -> Self {
         Self { values, coefficients, origin, tilt }
@@ -85,7 +85,7 @@ impl PyBeam {
 struct BorrowedBeam<'py> {
     values: PyReadonlyArray2<'py, f64>,
     coefficients: Option<PyReadonlyArray2<'py, f64>>,
-    origin: [usize; 2],
+    origin: [f64; 2],
     tilt: [f64; 2],
 }
 

@@ -33,7 +33,7 @@ mod _native {
     #[pymodule_export]
     use crate::centroid::locate_spots;
     #[pymodule_export]
-    use crate::exposures::{PyExposures, needs_whole_shifts};
+    use crate::exposures::{PyExposures, common_fraction, needs_whole_shifts};
     #[pymodule_export]
     use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
     #[pymodule_export]

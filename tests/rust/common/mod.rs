@@ -2,7 +2,6 @@
 //!
 //! The tests know no other name of the crate, so that a change of its interface changes this file alone.
 
-#![allow(dead_code, reason = "each test file uses its own part of it")]
 #![allow(
     clippy::redundant_closure_for_method_calls,
     reason = "the methods are not general enough in their lifetimes"
@@ -104,8 +103,8 @@ pub(crate) struct Answer {
     /// The coefficients of the spline that L is, of a joint fit.
     pub(crate) coefficients: Option<Vec<f64>>,
     pub(crate) beam_shape: [usize; 2],
-    /// The cell that pixel (0, 0) sees at shift 0, unrotated.
-    pub(crate) origin: [usize; 2],
+    /// Where pixel (0, 0) is at shift 0, unrotated, in cells of the grid.
+    pub(crate) origin: [f64; 2],
     pub(crate) flux: Vec<f64>,
     pub(crate) shifts: Vec<[f64; 2]>,
     /// Whether shifts were refined.

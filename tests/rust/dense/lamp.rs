@@ -124,7 +124,7 @@ pub(crate) fn without_gauge(experiment: &Experiment, answer: &Answer) -> (Answer
         }
         for (cell, a) in coefficients.iter_mut().enumerate() {
             let at = [cell / answer.beam_shape[1], cell % answer.beam_shape[1]];
-            let at = [0, 1].map(|axis| at[axis] as f64 - answer.origin[axis] as f64);
+            let at = [0, 1].map(|axis| at[axis] as f64 - answer.origin[axis]);
             *a *= (mean + along(at)).exp();
         }
         for (c, d) in answer.flux.iter_mut().zip(&answer.shifts) {

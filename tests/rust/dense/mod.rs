@@ -10,8 +10,6 @@
 //! fourth differences of five seen cells, and P x = x − a (aᵀD x)/(aᵀD a) takes out the beam's multiples,
 //! D being Σ w c² M² B. The unknowns are M, O, a, θ of ln c = ln c₀ + T θ and ζ of d = d₀ + Z ζ.
 
-#![allow(dead_code, reason = "each test file uses its own part of it")]
-
 pub(crate) mod covariance;
 pub(crate) mod gauge;
 pub(crate) mod lamp;
@@ -104,7 +102,7 @@ impl<'e> Dense<'e> {
         for (cell, value) in coefficients.iter().enumerate() {
             let at = [cell / answer.beam_shape[1], cell % answer.beam_shape[1]];
             let [row, col] =
-                [0, 1].map(|axis| at[axis] as f64 - answer.origin[axis] as f64 - self.low[axis]);
+                [0, 1].map(|axis| at[axis] as f64 - answer.origin[axis] - self.low[axis]);
             let inside = |at: f64, axis: usize| at >= 0.0 && at < self.sizes[axis] as f64;
             if inside(row, 0) && inside(col, 1) {
                 x[self.cell(row, col)] = known(value);

@@ -1,7 +1,5 @@
 //! Tiny experiments whose truth is known.
 
-#![allow(dead_code, reason = "each test file uses its own part of it")]
-
 use crate::common::{Experiment, Lamp, Noise};
 
 /// A cross that a sensor of eight pixels a side sees.

@@ -49,16 +49,16 @@ impl<N: Value> pulp::NullaryFnOnce for Accumulate<'_, N> {
         let width = self.lines.len() / 4;
         let whole = width - width % LANES;
         for start in (0..whole).step_by(LANES) {
-            let mut sums = [[N::default(); LANES]; 4];
-            for (row, factors) in self.values.chunks_exact(width).zip(self.factors) {
-                let values = &row[start..start + LANES];
-                for (sums, factor) in sums.iter_mut().zip(factors) {
-                    for i in 0..LANES {
-                        sums[i] += *factor * values[i];
-                    }
-                }
+            // One loop for each sum: in one loop over all four they are not kept in registers.
+            let [mut a, mut b, mut c, mut d] = [[N::default(); LANES]; 4];
+            for (row, &[s, t, u, v]) in self.values.chunks_exact(width).zip(self.factors) {
+                let Some(values) = row[start..].first_chunk::<LANES>() else { break };
+                add(&mut a, s, values);
+                add(&mut b, t, values);
+                add(&mut c, u, values);
+                add(&mut d, v, values);
             }
-            for (line, sums) in self.lines.chunks_exact_mut(width).zip(&sums) {
+            for (line, sums) in self.lines.chunks_exact_mut(width).zip(&[a, b, c, d]) {
                 line[start..start + LANES].copy_from_slice(sums);
             }
         }
@@ -70,6 +70,14 @@ impl<N: Value> pulp::NullaryFnOnce for Accumulate<'_, N> {
                 self.lines[i * width + col] = sum;
             }
         }
+    }
+}
+
+/// sums ← sums + factor · values
+#[inline(always)]
+fn add<N: Value>(sums: &mut [N; LANES], factor: N, values: &[N; LANES]) {
+    for i in 0..LANES {
+        sums[i] += factor * values[i];
     }
 }
 

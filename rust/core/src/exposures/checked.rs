@@ -139,7 +139,7 @@ impl<'a, T: Real> Exposures<'a, T> {
         &self.checked.positions
     }
 
-    /// The places at the nearest whole shifts.
+    /// The places at the nearest whole shifts on the grid of the beam.
     #[must_use]
     pub const fn geometry(&self) -> &Geometry {
         &self.checked.geometry
@@ -168,9 +168,9 @@ impl<'a, T: Real> Exposures<'a, T> {
         &self.checked.unreliable
     }
 
-    /// Whether all shifts are whole and exact, and nothing is sought besides M and L.
+    /// Whether all shifts differ by whole pixels and are exact, and nothing is sought besides M and L.
     pub(crate) fn are_whole(&self) -> bool {
-        self.checked.positions.are_whole() && !self.seek_more()
+        self.checked.positions.fraction().is_some() && !self.seek_more()
     }
 
     /// Whether fluxes or offsets are sought.

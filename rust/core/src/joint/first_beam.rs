@@ -9,7 +9,8 @@ use crate::parallel::Workers;
 /// Values on another grid; 0 where nothing is known.
 pub(crate) struct Source<F> {
     pub(crate) shape: Shape,
-    pub(crate) origin: [usize; 2],
+    /// The cell that the sensor's first pixel sees at shift 0 on the grid, not turned.
+    pub(crate) origin: [i64; 2],
     /// The value at (row, column).
     pub(crate) value: F,
 }
@@ -26,14 +27,16 @@ pub(crate) fn first_beam(
     control: &Control,
 ) -> Result<Vec<f64>> {
     let (shape, origin) = (grid.geometry.beam, grid.geometry.origin);
-    let (from, start) = (source.shape, source.origin);
+    let from = source.shape;
+    let [down, right] = [0, 1].map(|axis| source.origin[axis] - origin[axis] as i64);
+    let beside = |place: usize, offset: i64, side: usize| {
+        place.checked_add_signed(offset as isize).filter(|&place| place < side)
+    };
     let mut beam = workers.filled(shape.len(), 0.0, control);
     workers.map_blocks(&mut beam, shape.cols, |row, cells| {
-        let row = (row + start[0]).checked_sub(origin[0]).filter(|&row| row < from.rows);
-        let Some(row) = row else { return };
+        let Some(row) = beside(row, down, from.rows) else { return };
         for (col, value) in cells.iter_mut().enumerate() {
-            let col = (col + start[1]).checked_sub(origin[1]).filter(|&col| col < from.cols);
-            *value = col.map_or(0.0, |col| (source.value)(row, col));
+            *value = beside(col, right, from.cols).map_or(0.0, |col| (source.value)(row, col));
         }
     });
     if !grid.is_spline() {

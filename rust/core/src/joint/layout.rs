@@ -1,7 +1,9 @@
 //! Where the pixels of each exposure lie on the beam's grid, between its cells too.
 //!
-//! Between cells the beam is a cubic B-spline, and a pixel sees 4×4 cells. Where all shifts are whole
-//! and stay so, a cell is its own value: one factor, 1.
+//! Between cells the beam is a cubic B-spline, and a pixel sees 4×4 cells. Where all shifts are whole on
+//! the grid of the beam and stay so, a cell is its own value: one factor, 1. A fraction of a pixel that all
+//! shifts have in common is not part of them here
+//! ([`Positions::on_grid`](crate::exposures::Positions::on_grid)).
 
 use crate::error::Result;
 use crate::frames::Shape;

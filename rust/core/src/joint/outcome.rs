@@ -9,7 +9,7 @@ use crate::connectivity::{Components, Edges, Stretches};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
-use crate::geometry::{Rotation, View};
+use crate::geometry::{Rotation, View, whole_number};
 
 /// Measurements less unknowns.
 pub(crate) fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
@@ -39,7 +39,7 @@ pub(crate) fn components<T: Real>(
     let shifts = &system.state.shifts;
     let whole = [0, 1].map(|axis| {
         let apart = |d: &[f64; 2]| d[axis] - shifts[0][axis];
-        shifts.iter().all(|d| apart(d).fract() == 0.0)
+        shifts.iter().all(|d| whole_number(apart(d)).is_some())
     });
     let windows = system.pass.grid.windows(shifts);
     let mut edges = Edges::new(sensor.len(), geometry.beam.len());

@@ -14,6 +14,7 @@ pub(crate) struct State {
     pub(crate) beam: Vec<f64>,
     /// θ of the fluxes.
     pub(crate) theta: Vec<f64>,
+    /// The shifts on the grid of the beam.
     pub(crate) shifts: Vec<[f64; 2]>,
 }
 

@@ -11,15 +11,15 @@ use crate::parallel::Workers;
 
 /// Minimises F, and gives M in the gauge mean(M) = 1 over the pixels of each component.
 ///
-/// Whole shifts and known fluxes leave M and L alone to be found, by the method asked for; everything
-/// else is fitted jointly. Pixels that their measurements leave almost no weight, or whose measurements
-/// contradict each other, are flagged and not in the mean. A `start` saves passes over the data; it must be of
-/// the same sensor, with as many exposures.
+/// Shifts that differ by whole pixels and known fluxes leave M and L alone to be found, by the method
+/// asked for; everything else is fitted jointly. Pixels that their measurements leave almost no weight, or
+/// whose measurements contradict each other, are flagged and not in the mean. A `start` saves passes over
+/// the data; it must be of the same sensor, with as many exposures.
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for options that make no sense, and for what does not go
-/// together: coordinate descent with anything fitted besides or with fractional shifts, fitted fluxes,
-/// shifts or offsets where all shifts are alike, and offsets where all fluxes are;
+/// together: coordinate descent with anything fitted besides or with shifts that differ by parts of pixels,
+/// fitted fluxes, shifts or offsets where all shifts are alike, and offsets where all fluxes are;
 /// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had;
 /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
 pub fn calibrate<T: Real>(

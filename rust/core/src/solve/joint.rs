@@ -343,6 +343,8 @@ fn fit<T: Real>(
 ) -> Result<Fit> {
     let (exposures, grid) = (system.pass.exposures, &system.pass.grid.geometry);
     let [sensitivity, offset] = system.pixels();
+    let positions = exposures.positions();
+    let shifts = if refinement.is_done() { &system.state.shifts } else { &positions.shifts };
     Ok(Fit {
         components: joint::components(system, control)?,
         sensitivity,
@@ -352,10 +354,10 @@ fn fit<T: Real>(
             coefficients: joint::coefficients(system),
             tilt: [0.0; 2],
             shape: grid.beam,
-            origin: grid.origin,
+            origin: positions.origin(grid.origin),
         },
         flux: system.pass.flux.clone(),
-        shifts: system.state.shifts.clone(),
+        shifts: shifts.clone(),
         flags: Vec::new(),
         refinement,
         leaves_tilt: !system.fluxes.open.is_empty(),

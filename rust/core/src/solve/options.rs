@@ -7,12 +7,12 @@ use crate::error::{Error, Result};
 pub enum Method {
     /// Gauss-Newton steps on all scales at once.
     Multiscale,
-    /// The method of the paper, for whole shifts and known fluxes.
+    /// The method of the paper, for shifts that differ by whole pixels and known fluxes.
     CoordinateDescent,
 }
 
 impl Method {
-    /// Whether the method takes whole shifts alone: fractions are rounded before.
+    /// Whether the method takes shifts alone that differ by whole pixels: others are rounded before.
     #[must_use]
     pub const fn needs_whole_shifts(self) -> bool {
         matches!(self, Self::CoordinateDescent)

@@ -31,10 +31,11 @@ fn check_method<T: Real>(exposures: &Exposures<'_, T>, options: &Options) -> Res
         return Ok(());
     }
     let problem = if exposures.seek_more() || exposures.positions().std.is_some() {
-        "is 'coordinate-descent', which supports only whole shifts and given fluxes: use \
-         'multiscale' to fit fluxes, shifts or the dark"
+        "is 'coordinate-descent', which supports only given shifts and fluxes: use 'multiscale' to \
+         fit fluxes, shifts or the dark"
     } else {
-        "is 'coordinate-descent', which supports only whole shifts: round them, or use 'multiscale'"
+        "is 'coordinate-descent', which supports only shifts that differ by whole pixels: round them, or \
+         use 'multiscale'"
     };
     Err(Error::value("method", problem))
 }

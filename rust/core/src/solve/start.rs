@@ -38,9 +38,9 @@ pub(super) fn system<'m, 'a, T: Real>(
     control: &Control,
 ) -> Result<(System<'m, 'a, T>, u64)> {
     let positions = exposures.positions();
-    let (shifts, rotations) = (&positions.shifts, &positions.rotations);
-    let grid = Grid::new(exposures.sensor(), shifts, rotations, positions.std.is_some())?;
-    let fluxes = Fluxes::new(exposures.flux(), exposures.flux_kind(), shifts, rotations);
+    let (shifts, rotations) = (positions.on_grid(&positions.shifts), &positions.rotations);
+    let grid = Grid::new(exposures.sensor(), &shifts, rotations, positions.std.is_some())?;
+    let fluxes = Fluxes::new(exposures.flux(), exposures.flux_kind(), &shifts, rotations);
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
         None => (swept(exposures, &grid, &fluxes, workers, control)?, FIRST_SWEEPS),
@@ -64,14 +64,15 @@ fn swept<T: Real>(
         weak::sweep(&mut estimate, &mut search, control)?;
     }
     drop(search);
-    let geometry = exposures.geometry();
+    let (geometry, positions) = (exposures.geometry(), exposures.positions());
     let (known, places) = (&estimate.beams()[0], geometry.views[0].places);
     let value = |row, col| known[places.at(row, col)];
-    let source = Source { shape: geometry.beam, origin: geometry.origin, value };
+    let origin = geometry.origin.map(|cell| cell as i64);
+    let source = Source { shape: geometry.beam, origin, value };
     Ok(State {
         beam: first_beam(grid, &source, workers, control)?,
         theta: vec![0.0; fluxes.columns.len()],
-        shifts: exposures.positions().shifts.clone(),
+        shifts: positions.on_grid(&positions.shifts),
     })
 }
 
@@ -94,14 +95,16 @@ fn moved<T: Real>(
     let beam = &start.beam;
     let cells = beam.coefficients.filter(|_| grid.is_spline()).unwrap_or(beam.values);
     let value = |row: usize, col: usize| {
-        let [down, right] =
-            [row as f64 - beam.origin[0] as f64, col as f64 - beam.origin[1] as f64];
+        let [down, right] = [row as f64 - beam.origin[0], col as f64 - beam.origin[1]];
         let value = cells[row * beam.shape.cols + col];
         let factor = (level + slope[0] * down + slope[1] * right).exp();
         if value.is_finite() { value * factor } else { 0.0 }
     };
-    let source = Source { shape: beam.shape, origin: beam.origin, value };
-    let mut shifts = positions.shifts.clone();
+    // To the nearest cell, where the start has another fraction of a pixel.
+    let fraction = positions.fraction().unwrap_or_default();
+    let origin = [0, 1].map(|axis| (beam.origin[axis] + fraction[axis]).round() as i64);
+    let source = Source { shape: beam.shape, origin, value };
+    let mut shifts = positions.on_grid(&positions.shifts);
     if let Some(prior) = ShiftPrior::of(positions).filter(|_| start.refinement.is_done()) {
         shifts.copy_from_slice(start.shifts);
         prior.keep_near(&mut shifts);

@@ -1,4 +1,4 @@
-//! The fit of M and L alone, at whole shifts and known fluxes.
+//! The fit of M and L alone, at shifts that differ by whole pixels and known fluxes.
 
 use super::found::Found;
 use super::options::{Method, Options};
@@ -17,7 +17,7 @@ use crate::parallel::Workers;
 use crate::prior::Prior;
 use crate::reduced;
 
-/// Minimises F, with whole shifts and known fluxes.
+/// Minimises F, with shifts that differ by whole pixels and known fluxes.
 ///
 /// Pixels that their measurements leave almost no weight, and pixels that do not respond, tie no parts
 /// together.
@@ -61,6 +61,7 @@ pub(super) fn minimise<T: Real>(
         None => Components::of(exposures, &ties(sensitivity.len(), &[], &dead), control)?,
     };
     let Geometry { beam: shape, origin, .. } = *exposures.geometry();
+    let origin = exposures.positions().origin(origin);
     let fit = Fit {
         sensitivity,
         beam: Beam { values, coefficients: None, tilt: [0.0; 2], shape, origin },

@@ -480,15 +480,16 @@ fn problem<'m, 'a, T: Real>(
     control: &Control,
 ) -> Result<System<'m, 'a, T>> {
     let positions = exposures.positions();
-    let (shifts, rotations) = (&positions.shifts, &positions.rotations);
-    let grid = Grid::new(exposures.sensor(), shifts, rotations, positions.std.is_some())?;
-    let fluxes = Fluxes::new(solution.flux, exposures.flux_kind(), solution.shifts, rotations);
+    let (given, rotations) = (positions.on_grid(&positions.shifts), &positions.rotations);
+    let grid = Grid::new(exposures.sensor(), &given, rotations, positions.std.is_some())?;
+    let shifts = positions.on_grid(solution.shifts);
+    let fluxes = Fluxes::new(solution.flux, exposures.flux_kind(), &shifts, rotations);
     let beam = solution.beam.coefficients.unwrap_or(solution.beam.values);
     let known = |value: &f64| if value.is_finite() { *value } else { 0.0 };
     let state = State {
         beam: beam.iter().map(known).collect(),
         theta: vec![0.0; fluxes.columns.len()],
-        shifts: solution.shifts.to_vec(),
+        shifts,
     };
     let mut system = System::new(exposures, grid, fluxes, state, workers, control);
     system.unit = solution.unit;

@@ -1,0 +1,126 @@
+"""States of operation, substrate temperature and bias, and the polynomials in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from equipix._check import as_array
+from equipix.bolometer.physics import ZERO_C
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Bools, Floats
+
+Regressor: TypeAlias = Literal["temperature", "inverse"]
+"""What the polynomials are of: the temperature, or one over the absolute temperature."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Ranges of the states, which the polynomials are scaled by, and their orders.
+
+    Attributes
+    ----------
+    substrate_c : tuple of float
+        Lowest and highest temperature of the substrate in °C.
+    bias_v : tuple of float
+        Lowest and highest bias in volts.
+    order : int
+        Highest power of the temperature.
+    bias_order : int
+        Highest power of the square of the bias.
+    regressor : {"temperature", "inverse"}
+        What the polynomials are of: the temperature, or one over the absolute temperature.
+    """
+
+    substrate_c: tuple[float, float]
+    bias_v: tuple[float, float]
+    order: int
+    bias_order: int
+    regressor: Regressor = "temperature"
+
+    @property
+    def terms(self) -> int:
+        """Number of coefficients."""
+        return (self.order + 1) * (self.bias_order + 1)
+
+    def basis(self, substrate_c: ArrayLike, bias_v: ArrayLike) -> Floats:
+        """Values of all terms, shape (n, terms): T_i(t)·T_j(v) with Chebyshev polynomials.
+
+        t is the regressor and v the square of the bias, scaled to [−1, 1].
+        """
+        celsius = np.atleast_1d(substrate_c).astype(np.float64)
+        t = _scaled(self._regressor(celsius), self._regressor(np.array(self.substrate_c)))
+        squares = np.square(np.atleast_1d(bias_v).astype(np.float64))
+        v = _scaled(squares, np.square(self.bias_v))
+        of_t = np.polynomial.chebyshev.chebvander(t, self.order)
+        of_v = np.polynomial.chebyshev.chebvander(v, self.bias_order)
+        return np.asarray((of_t[:, :, None] * of_v[:, None, :]).reshape(len(t), self.terms))
+
+    def _regressor(self, celsius: Floats) -> Floats:
+        return 1 / (celsius + ZERO_C) if self.regressor == "inverse" else celsius
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """The states of n references: temperatures in °C and biases in volts, checked."""
+
+    substrate_c: Floats
+    bias_v: Floats
+
+    @classmethod
+    def of(cls, substrate_c: ArrayLike, bias_v: ArrayLike, count: int) -> States:
+        """Check one state for each of `count` references; one bias may serve all."""
+        celsius = as_array("substrate_c", substrate_c, ndim=1).astype(np.float64)
+        volts = as_array("bias_v", bias_v, ndim=(0, 1)).astype(np.float64).ravel()
+        volts = np.broadcast_to(volts, count) if volts.size == 1 else volts
+        for name, values in (("substrate_c", celsius), ("bias_v", volts)):
+            if len(values) != count:
+                raise InputError(
+                    f"'{name}' has {len(values)} entries, expected {count}: one a reference"
+                )
+        wrong = celsius[~((celsius > -ZERO_C) & (celsius < np.inf))]
+        if wrong.size:
+            raise InputError(
+                f"'substrate_c' holds {wrong[0]:g} °C, expected more than {-ZERO_C} °C"
+            )
+        wrong = volts[~((volts > 0) & (volts < np.inf))]
+        if wrong.size:
+            raise InputError(f"'bias_v' holds {wrong[0]:g} V, expected finite volts above 0")
+        return cls(celsius, volts)
+
+    @property
+    def temperatures(self) -> Floats:
+        """Temperatures that differ, lowest first."""
+        return np.unique(self.substrate_c)
+
+    @property
+    def biases(self) -> Floats:
+        """Biases that differ, lowest first."""
+        return np.unique(self.bias_v)
+
+    def chosen(self, which: Bools) -> States:
+        """Return some of the states."""
+        return States(self.substrate_c[which], self.bias_v[which])
+
+    def axes(self, order: int, bias_order: int, regressor: Regressor) -> Axes:
+        """Ranges of these states, with orders and regressor."""
+        celsius, volts = self.temperatures, self.biases
+        return Axes(
+            (float(celsius[0]), float(celsius[-1])),
+            (float(volts[0]), float(volts[-1])),
+            order,
+            bias_order,
+            regressor,
+        )
+
+
+def _scaled(values: Floats, ends: Floats) -> Floats:
+    """Values with the ends at −1 and 1; 0 where there is one end."""
+    middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
+    return np.asarray((values - middle) / half if half else np.zeros_like(values))

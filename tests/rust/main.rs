@@ -1,0 +1,21 @@
+//! The tests of the core, in one program: the core's generic code is then compiled for them once.
+
+#![allow(clippy::unwrap_used, reason = "what a test calls fails with it")]
+
+mod apply;
+mod choice;
+mod common;
+mod dense;
+mod descent;
+mod experiment;
+mod fit;
+mod fraction;
+mod joint;
+mod laws;
+mod multiscale;
+mod response;
+mod simulation;
+mod statistics;
+mod uncertainty;
+mod weak_light;
+mod workers;

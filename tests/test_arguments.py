@@ -1,0 +1,128 @@
+"""Arguments of another kind: every public function names them, and what it wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import errors, lens, metrics, nuc
+
+SHAPE = (24, 32)
+
+
+def frames(value, rng, count=4):
+    noise = np.random.default_rng(rng).standard_normal((count, *SHAPE))
+    return np.rint(value + np.sqrt(value) * noise).astype(np.uint16)
+
+
+LIGHT = (200.0, 900.0, 1800.0, 2700.0)
+STACKS = [frames(each, k) for k, each in enumerate(LIGHT)]
+LEVELS = [equipix.average(each) for each in STACKS]
+RESPONSE = nuc.fit(LEVELS)
+ROWS, COLS = np.mgrid[: SHAPE[0], : SHAPE[1]]
+FLAT = 1000 * lens.cos4((ROWS - 12.0) ** 2 + (COLS - 15.0) ** 2, 60.0)
+GAIN = lens.fit_falloff(FLAT).correction()
+
+CALLS = {
+    nuc.fit: {
+        "levels": LEVELS,
+        "order": 1,
+        "by": "offset",
+        "variance": None,
+        "mask": None,
+        "saturation": None,
+        "workers": None,
+    },
+    nuc.find_defects: {"response": RESPONSE, "frames": STACKS[1], "limits": None},
+    nuc.DefectLimits: {"response": 0.5, "noise": 2.0},
+    RESPONSE.correct: {"frames": STACKS[1], "dark": "stored", "flagged": "nan", "out": None},
+    RESPONSE.extrapolated: {"frames": STACKS[1], "dark": "stored"},
+    RESPONSE.with_flags: {"flags": np.zeros(SHAPE, np.uint32)},
+    metrics.correctability: {"frames": STACKS[1], "mask": None, "confidence": 0.95},
+    metrics.validity_interval: {"times": [0.0, 1.0], "ratios": [0.1, 0.2]},
+    metrics.emva_spatial: {"dark": frames(50, 9), "bright": STACKS[1], "gain_dn_per_e": None},
+    metrics.emva_transfer: {"dark": [frames(50, 9)], "bright": STACKS, "light": list(LIGHT)},
+    metrics.netd: {"cold": STACKS[0], "hot": STACKS[1], "delta_t": 5.0},
+    metrics.roughness: {"frame": FLAT},
+    metrics.three_d_noise: {"frames": STACKS[1]},
+    lens.fit_falloff: {"flat": FLAT, "law": "cos4", "sensitivity": None, "mask": None},
+    lens.cos4: {"squared_distance": 1.0, "focal_length": 3.0},
+    equipix.Corrector: {
+        "correction": RESPONSE,
+        "dtype": "uint16",
+        "bit_depth": None,
+        "flagged": None,
+        "dark": "stored",
+        "sensor": None,
+        "workers": None,
+    },
+    equipix.Corrector(RESPONSE).apply: {"frames": STACKS[1], "out": None},
+    equipix.combine: {"first": GAIN, "then": GAIN},
+    equipix.Polynomial: {"coefficients": GAIN.coefficients, "flags": GAIN.flags},
+}
+"""Public functions with arguments that are right."""
+
+WRONG = {
+    "a name": "r1.tif",
+    "a path": Path("r1.tif"),
+    "None": None,
+    "a dict": {"noise": 2.0},
+    "an empty list": [],
+    "an object": object(),
+    "an average": LEVELS[0],
+    "a response": RESPONSE,
+    "a small array": np.ones((3, 4)),
+    "a negative number": -1,
+    "not a number": np.nan,
+    "a mixture": [LEVELS[0], RESPONSE],
+    "names": ["a.tif", "b.tif"],
+    "texts": np.array(["a"]),
+    "a complex array": np.ones(SHAPE) * 1j,
+    "limits": nuc.DefectLimits(),
+}
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+@pytest.mark.parametrize("function", CALLS, ids=lambda each: each.__qualname__)
+@pytest.mark.parametrize("wrong", WRONG)
+def test_is_refused_by_the_name_of_the_argument(function, wrong):
+    function(**CALLS[function])
+    for name in CALLS[function]:
+        try:
+            function(**CALLS[function] | {name: WRONG[wrong]})
+        except errors.InputError as error:
+            # Of two that must fit together the message names the second.
+            others = {"times": "'ratios'"}
+            assert f"'{name}'" in str(error) or others.get(name, "''") in str(error)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: nuc.find_defects("r1.tif"), "'response' is 'r1.tif', .*equipix.load"),
+        (lambda: nuc.find_defects(GAIN), "'response' is of type Polynomial, expected a Response"),
+        (lambda: nuc.find_defects(RESPONSE, limits={}), "'limits' is of type dict, .*DefectLimits"),
+        (lambda: metrics.emva_transfer("d.tif", STACKS, LIGHT), "'dark' is 'd.tif', .* a list of"),
+        (lambda: metrics.emva_transfer([STACKS[0]], LEVELS[0], LIGHT), "'bright' is of type Frame"),
+        (lambda: metrics.netd(*STACKS[:2], "5 K"), "'delta_t' is '5 K', expected a number"),
+        (lambda: metrics.correctability(STACKS[0], confidence="high"), "'confidence' is 'high'"),
+        (lambda: lens.cos4(1.0, 0), "'focal_length' is 0, expected a number above 0"),
+        (lambda: equipix.Polynomial([[1.0]], GAIN.flags), "'coefficients' is of type list"),
+        (lambda: RESPONSE.with_flags(-1), r"'flags' has shape \(\), expected 2 dimensions"),
+        (lambda: RESPONSE.with_flags(np.full(SHAPE, -1)), "'flags' holds -1, expected bits"),
+        (lambda: RESPONSE.with_flags(np.full(SHAPE, 2**32)), "'flags' holds 4294967296, expected"),
+        (lambda: RESPONSE.with_flags(np.full(SHAPE, 1.5)), "'flags' is float64 of shape"),
+        (lambda: RESPONSE.with_flags(np.ones((3, 4), int)), r"'flags' is int64 of shape \(3, 4\)"),
+    ],
+)
+def test_messages_say_what_is_wanted(call, message):
+    with pytest.raises(errors.InputError, match=message):
+        call()
+
+
+def test_the_largest_number_of_flags_is_taken():
+    flags = np.full(SHAPE, 2**32 - 1)
+    assert (RESPONSE.with_flags(flags).flags == flags).all()

@@ -1,0 +1,350 @@
+"""Corrections that follow temperature and bias: known truth, laws, the figures of the source."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Flag, bolometer, errors, io
+from equipix.bolometer import BolometerArray, DynamicCorrection
+
+EPS = np.finfo(np.float64).eps
+SHAPE = (24, 32)
+LIMIT = 1 / 250_000
+"""The source's average non-uniformity relative to the range."""
+
+NOMINAL = 2.0
+TESTED = -20 + 80 * (np.arange(40) + 0.5) / 40
+"""Temperatures of the substrate from -20 to 60 °C that no fit uses."""
+
+
+def states(count, changes=(-0.05, 0.05)):
+    """Temperatures and biases of references, with V² changed by shares of the nominal one."""
+    nodes = 20 - 40 * np.cos(np.pi * np.arange(count) / (count - 1))
+    return np.array([(t, NOMINAL * np.sqrt(1 + each)) for t in nodes for each in changes])
+
+
+def means(array, at, **scene):
+    return np.stack([array.mean(t, bias_v=v, **scene) for t, v in at])
+
+
+class Simulated:
+    """Noise-free frames of references and of states that no fit uses."""
+
+    def __init__(self):
+        self.array = BolometerArray.of(SHAPE, rng=5)
+        self.at = states(6)
+        self.shutter = means(self.array, self.at)
+        changes = np.random.default_rng(1).uniform(-0.05, 0.05, len(TESTED))
+        self.tested = np.stack([TESTED, NOMINAL * np.sqrt(1 + changes)], axis=1)
+        self.raw = means(self.array, self.tested)
+        self.span = self.array.output_span([-20.0, *TESTED[::13], 60.0], [-20.0, 100.0])
+
+    def left(self, correction, raw=None):
+        frames = self.raw if raw is None else raw
+        corrected = [
+            correction.at(t, v, extrapolate=True).correct(frame)
+            for (t, v), frame in zip(self.tested, frames, strict=True)
+        ]
+        return bolometer.non_uniformity(np.stack(corrected), self.span)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return Simulated()
+
+
+@pytest.fixture(scope="module")
+def both(simulated):
+    """Offset and gain of the simulated array."""
+    bodies = tuple(means(simulated.array, simulated.at, scene_c=each) for each in (0.0, 40.0))
+    return bolometer.fit(simulated.shutter, *simulated.at.T, black_bodies=bodies)
+
+
+class TestClaimsOfTheSource:
+    """Average non-uniformity below 1/250 000 of the range, by static and dynamic correction."""
+
+    def test_the_order_that_is_chosen_suffices(self, simulated):
+        correction = bolometer.fit(simulated.shutter, *simulated.at.T)
+        assert correction.axes.order == 4
+        assert simulated.left(correction) < LIMIT
+
+    def test_a_static_correction_fails(self, simulated):
+        correction = bolometer.fit([simulated.array.mean(20.0)], [20.0], NOMINAL)
+        assert (correction.axes.order, correction.axes.bias_order) == (0, 0)
+        assert simulated.left(correction) > 1e3 * LIMIT
+
+    def test_order_3_fails(self, simulated):
+        correction = bolometer.fit(simulated.shutter, *simulated.at.T, order=3)
+        assert simulated.left(correction) > 2 * LIMIT
+
+    def test_without_the_bias_it_fails(self, simulated):
+        at = states(6, (0.0,))
+        shutter = means(simulated.array, at)
+        correction = bolometer.fit(shutter, *at.T, order=4)
+        assert simulated.left(correction) > 2 * LIMIT
+
+    def test_the_inverse_temperature_needs_one_order_less(self, simulated):
+        correction = bolometer.fit(simulated.shutter, *simulated.at.T, order=3, regressor="inverse")
+        assert simulated.left(correction) < LIMIT
+
+    @pytest.mark.parametrize("scene_c", [-20.0, 20.0, 60.0])
+    def test_with_a_gain_scenes_are_as_even_as_the_shutter(self, simulated, both, scene_c):
+        raw = means(simulated.array, simulated.tested, scene_c=scene_c)
+        assert simulated.left(both, raw) < LIMIT
+        offset = bolometer.fit(simulated.shutter, *simulated.at.T)
+        assert simulated.left(offset, raw) > 10 * LIMIT
+
+    def test_noise_of_the_references_adds_little(self, simulated):
+        array, at = simulated.array, states(8, (0.0,))
+        averages = [equipix.average(array.frames(t, 64, rng=k)) for k, (t, _) in enumerate(at)]
+        correction = bolometer.fit(averages, *at.T)
+        shares = []
+        for celsius in TESTED:
+            left = correction.at(celsius).correct(array.mean(celsius)).std()
+            shares.append(left / np.sqrt(np.mean(array.temporal_noise(celsius) ** 2)))
+        # Orders of 4 or 5 from 8 x 64 frames leave the noise of √(6/8/64) = 0.11 of a frame.
+        assert np.mean(shares) < 0.2
+
+    def test_it_is_comparable_with_johnson_noise(self, simulated, both):
+        johnson = simulated.array.dn_per_v * simulated.array.johnson_v(20.0).mean()
+        assert simulated.left(both) < johnson / simulated.span < 10 * LIMIT
+
+
+class TestKnownTruth:
+    """Pixels whose offset and response are polynomials of the states."""
+
+    def made(self, order=3, seed=2):
+        rng, at = np.random.default_rng(seed), states(6)
+        axes = bolometer.fit(np.ones((12, 2, 3)), *at.T, order=order).axes
+        offset = 100 * rng.standard_normal((axes.terms, 6, 7))
+        gain = 0.02 * rng.standard_normal((axes.terms, 6, 7))
+        level = np.append(1e4, 10 * rng.standard_normal(axes.terms - 1))
+        offset -= offset.mean(axis=(1, 2), keepdims=True)
+        gain -= gain.mean(axis=(1, 2), keepdims=True)
+
+        def frames(states_, signal):
+            basis = axes.basis(*np.transpose(states_))
+            response = 1 + np.tensordot(basis, gain, 1)
+            levels = (basis @ level)[:, None, None]
+            return levels + np.tensordot(basis, offset, 1) + response * signal, levels
+
+        return frames, at
+
+    @pytest.mark.parametrize("order", [1, 3])
+    def test_offset_and_gain_are_found_to_rounding(self, order):
+        frames, at = self.made(order)
+        bodies = tuple(frames(at, signal)[0] for signal in (200.0, 900.0))
+        found = bolometer.fit(frames(at, 0.0)[0], *at.T, black_bodies=bodies)
+        assert (found.axes.order, found.gain_axes.order) == (order, order)
+        for state in ((3.3, 1.97), (-11.0, 2.03)):
+            raw, level = frames([state], 500.0)
+            corrected = found.at(*state).correct(raw)
+            # Values of 1e4, some ten operations and 16 terms; the black bodies differ by 700.
+            np.testing.assert_allclose(corrected, level.item() + 500, rtol=0, atol=1e3 * EPS * 1e4)
+
+    def test_states_in_any_order_and_pixels_in_any_place(self):
+        frames, at = self.made()
+        raw = frames(at, 0.0)[0]
+        found = bolometer.fit(raw, *at.T, order=3)
+        mixed = np.random.default_rng(1).permutation(len(at))
+        again = bolometer.fit(raw[mixed], *at[mixed].T, order=3)
+        turned = bolometer.fit(raw.transpose(0, 2, 1), *at.T, order=3)
+        scale = 100 * len(at) * EPS * 1e4
+        np.testing.assert_allclose(again.offset, found.offset, rtol=0, atol=scale)
+        np.testing.assert_allclose(
+            turned.offset.transpose(0, 2, 1), found.offset, rtol=0, atol=scale
+        )
+
+    def test_what_all_pixels_share_is_no_deviation(self):
+        frames, at = self.made()
+        raw = frames(at, 0.0)[0]
+        common = 50 * np.random.default_rng(1).standard_normal((len(at), 1, 1))
+        found, other = (bolometer.fit(each, *at.T, order=3) for each in (raw, raw + common))
+        np.testing.assert_allclose(other.offset, found.offset, rtol=0, atol=1e3 * EPS * 1e4)
+
+    def test_one_bias_has_no_order_in_it(self):
+        frames, _ = self.made()
+        at = states(6, (0.0,))
+        found = bolometer.fit(frames(at, 0.0)[0], *at.T)
+        assert (found.axes.bias_order, found.axes.order) == (0, 3)
+        assert found.metadata["options"]["bias_order"] == 0
+
+
+class TestBadPixels:
+    def test_they_are_flagged_and_change_no_other(self, simulated):
+        at = simulated.at
+        bodies = [means(simulated.array, at, scene_c=each) for each in (0.0, 40.0)]
+        shutter = simulated.shutter.copy()
+        shutter[3, 2, 3] = np.nan
+        shutter[:, 5, 6] = bodies[0][:, 5, 6] = bodies[1][:, 5, 6] = 60000.0
+        mask = np.zeros(SHAPE, bool)
+        mask[7, 8] = True
+        found = bolometer.fit(shutter, *at.T, black_bodies=tuple(bodies), mask=mask)
+        unknown, dead = Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE, Flag.DEAD | Flag.DO_NOT_USE
+        assert (found.flags[2, 3], found.flags[7, 8]) == (unknown, unknown)
+        assert found.flags[5, 6] == dead
+        assert np.count_nonzero(found.flags) == 3
+        corrected = found.at(10.0).correct(simulated.array.mean(10.0))
+        assert np.isnan(corrected).sum() == 3
+        assert np.nanstd(corrected) < LIMIT * simulated.span
+
+    def test_no_good_pixel_is_refused(self, simulated):
+        with pytest.raises(errors.InputError, match="no pixel with a value at every state"):
+            bolometer.fit(simulated.shutter, *simulated.at.T, mask=np.ones(SHAPE, bool))
+
+
+class TestCorrectionAtAState:
+    def test_it_is_a_correction_of_frames(self, simulated, both, tmp_path):
+        now = both.at(12.5, 1.98)
+        assert isinstance(now, equipix.Correction)
+        assert now.metadata["state"] == {"substrate_c": 12.5, "bias_v": 1.98}
+        frame = next(simulated.array.frames(12.5, 1, rng=3, scene_c=30.0, bias_v=1.98))
+        corrector = equipix.Corrector(now, "uint16")
+        wanted = np.rint(now.correct(frame.astype(np.float64)))
+        # Single precision moves some values of 3e4 by 0.004, so a few round otherwise.
+        assert np.abs(corrector.apply(frame) - wanted).max() <= 1
+        assert np.mean(corrector.apply(frame) != wanted) < 0.02
+        now.save(tmp_path / "now.npz")
+        again = equipix.load(tmp_path / "now.npz")
+        np.testing.assert_array_equal(again.coefficients, now.coefficients)
+
+    def test_the_example_leaves_less_than_the_noise(self, capsys):
+        path = Path(__file__).parents[1] / "examples/bolometer.py"
+        runpy.run_path(str(path), run_name="__main__")
+        *_, frame, noise = capsys.readouterr().out.splitlines()
+        before, after = map(float, re.findall(r"(\d+\.\d+) DN", frame))
+        temporal, spatial = map(float, re.findall(r"(\d+\.\d+) DN", noise))
+        assert before > 1000 * after
+        # The mean of 64 frames has an eighth of the temporal noise, references add 0.2 of it.
+        assert spatial < np.hypot(1 / 8, 0.2) * temporal
+        assert after < np.hypot(1, 0.2) * temporal
+
+    def test_a_gain_after_it_is_refused_since_frames_hold_the_level(self, both):
+        now, gain = both.at(12.5), np.stack([np.zeros(SHAPE), np.full(SHAPE, 1.1)])
+        then = equipix.Polynomial(gain, np.zeros(SHAPE, np.uint32))
+        with pytest.raises(errors.InputError, match="the gain of 'then' would multiply it"):
+            equipix.combine(now, then)
+
+    def test_without_a_bias_it_is_that_in_the_middle_of_the_squares(self, both):
+        middle = both.at(12.5)
+        np.testing.assert_array_equal(middle.coefficients, both.at(12.5, 2.0).coefficients)
+
+    @pytest.mark.parametrize(
+        ("state", "message"),
+        [
+            ((61.0, 2.0), "'substrate_c' is 61 °C, but the references cover -20 to 60 °C"),
+            ((20.0, 2.2), "'bias_v' is 2.2 V, but the references cover 1.94936 to 2.04939 V"),
+            ((np.nan, 2.0), "'substrate_c' is nan"),
+        ],
+    )
+    def test_states_outside_of_the_references_are_refused(self, both, state, message):
+        with pytest.raises(errors.InputError, match=message):
+            both.at(*state)
+
+    def test_extrapolation_must_be_asked_for(self, both):
+        assert np.isfinite(both.at(61.0, 2.2, extrapolate=True).coefficients).all()
+        with pytest.raises(errors.InputError, match="'substrate_c' is inf"):
+            both.at(np.inf, extrapolate=True)
+
+
+class TestFiles:
+    @pytest.mark.parametrize("suffix", [".tif", ".npz"])
+    @pytest.mark.parametrize("gain", [True, False])
+    def test_a_saved_one_is_the_same(self, simulated, both, tmp_path, suffix, gain):
+        kept = both if gain else bolometer.fit(simulated.shutter, *simulated.at.T, order=2)
+        kept.save(tmp_path / f"kept{suffix}")
+        read = DynamicCorrection.load(tmp_path / f"kept{suffix}")
+        assert (read.axes, read.gain_axes, read.metadata) == (
+            kept.axes,
+            kept.gain_axes,
+            kept.metadata,
+        )
+        for state in ((1.0, 2.0), (44.0, 1.95)):
+            one, other = (each.at(*state).coefficients for each in (kept, read))
+            assert one.tobytes() == other.tobytes()
+        assert repr(read) == repr(kept)
+
+    def test_load_says_how_to_read_it(self, both, tmp_path):
+        both.save(tmp_path / "kept.tif")
+        with pytest.raises(errors.FileError, match="holds dynamic correction, .*at\\(...\\) gives"):
+            equipix.load(tmp_path / "kept.tif")
+
+    def test_inspect_shows_it(self, both, tmp_path, run):
+        both.save(tmp_path / "kept.tif")
+        status, out, _ = run("inspect", tmp_path / "kept.tif", "--json")
+        assert status == 0
+        shown = json.loads(out)
+        assert (shown["order"], shown["gain_order"], shown["bias_order"]) == (4, 4, 1)
+        assert shown["substrate_c"] == [-20.0, 60.0]
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"format": 2}, "has format 2, this version of equipix reads up to 1"),
+            ({"kind": "response"}, "holds response, expected dynamic correction"),
+            (
+                {"level": [1.0]},
+                r"damaged or incomplete dynamic correction: .*'level' has shape \(1,\)",
+            ),
+            ({"axes": {}}, "damaged or incomplete dynamic correction: KeyError.'substrate_c'"),
+        ],
+    )
+    def test_damaged_files_are_refused(self, both, tmp_path, change, message):
+        both.save(tmp_path / "kept.npz")
+        pages, content = io.load_pages(tmp_path / "kept.npz")
+        io.save_pages(tmp_path / "kept.npz", pages, content | change, force=True)
+        with pytest.raises(errors.FileError, match=message):
+            DynamicCorrection.load(tmp_path / "kept.npz")
+
+
+class TestRefusals:
+    FRAMES = np.arange(24.0).reshape(4, 2, 3) ** 2
+    AT = ([0.0, 10.0, 20.0, 30.0], 2.0)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"substrate_c": [0.0, 10.0]}, "'substrate_c' has 2 entries, expected 4"),
+            ({"bias_v": [2.0, 2.0]}, "'bias_v' has 2 entries, expected 4"),
+            ({"substrate_c": [0, 1, 2, -300]}, "'substrate_c' holds -300 °C"),
+            ({"substrate_c": [0, 1, 2, np.nan]}, "'substrate_c' holds nan °C"),
+            ({"bias_v": [1, 1, 1, -1]}, "'bias_v' holds -1 V, expected finite volts above 0"),
+            ({"order": 4}, "'order' 4 and 'bias_order' 0 have 5 coefficients, but 4 references"),
+            ({"bias_order": 1, "order": 1}, "have 4 coefficients, .* 1 biases determine 2"),
+            ({"order": 9}, "'order' is 9, expected 0 to 8 or 'auto'"),
+            ({"order": "best"}, "'order' is 'best'"),
+            ({"bias_order": -1}, "'bias_order' is -1"),
+            ({"regressor": "square"}, "'regressor' is 'square'"),
+            ({"mask": np.zeros((2, 3))}, "'mask' is float64"),
+            ({"mask": np.zeros((3, 3), bool)}, r"'mask' is bool of shape \(3, 3\)"),
+            ({"shutter": FRAMES[0]}, r"'shutter' has shape \(2, 3\)"),
+            ({"shutter": [FRAMES[0], FRAMES[0][:1]]}, "'shutter' has frames of"),
+            ({"shutter": equipix.average(FRAMES)}, "'shutter' is one FrameStatistics"),
+            ({"shutter": np.empty((0, 2, 3))}, "'shutter' has no frames"),
+            ({"black_bodies": FRAMES}, "'black_bodies' is no pair"),
+            ({"black_bodies": (FRAMES, FRAMES[:2])}, r"'black_bodies\[1\]' has shape \(2, 2, 3\)"),
+            ({"black_bodies": (FRAMES, FRAMES)}, "'black_bodies' at state 0 differ by 0 DN"),
+        ],
+    )
+    def test_wrong_references_are_refused(self, given, message):
+        celsius, volts = self.AT
+        how = {"shutter": self.FRAMES, "substrate_c": celsius, "bias_v": volts} | given
+        with pytest.raises(errors.InputError, match=message):
+            bolometer.fit(**how)
+
+    def test_two_temperatures_leave_none_to_hold_out(self):
+        with pytest.raises(errors.InputError, match=r"\[0.0, 10.0\] °C: give three, or an order"):
+            bolometer.fit(self.FRAMES[:2], [0.0, 10.0], 2.0)
+
+    def test_measures_of_nothing_are_refused(self):
+        with pytest.raises(errors.InputError, match="'span' is 0"):
+            bolometer.non_uniformity(self.FRAMES, 0)
+        with pytest.raises(errors.InputError, match="no finite value in frame 1"):
+            bolometer.non_uniformity([[[1.0]], [[np.nan]]], 1.0)
