@@ -15,6 +15,7 @@ from pathlib import Path
 import applying
 import averaging
 import cargo
+import experiment
 import large
 import multiscale
 import numpy as np
@@ -40,6 +41,7 @@ def main(*, smoke: bool) -> None:
     rows += multiscale.rows(smoke=smoke)
     rows += uncertainty.rows((48, 64), 1) if smoke else uncertainty.rows()
     rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
+    rows += experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
