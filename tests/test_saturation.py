@@ -121,14 +121,16 @@ class TestNoFullWell:
             levels.append(equipix.average(np.rint(frames).astype(np.uint16)))
         assert said(levels, variance=[1.0] * 5) == []
 
-    @pytest.mark.parametrize("count", [2, 8, 64])
+    @pytest.mark.parametrize("count", [2, 8, 64, 256])
+    @pytest.mark.parametrize("spread", [0.02, 0.05, 0.1])
     @pytest.mark.parametrize("level_that_drifts", [1, 2])
-    def test_a_source_that_drifts_at_one_level(self, count, level_that_drifts):
+    def test_a_source_that_drifts_at_one_level(self, count, spread, level_that_drifts):
         """By 1 to 4 % of the light, which adds more variance than photons, at a level not full."""
         for drift in (0.01, 0.04):
             light = (2_000, 8_000, 10_000, 12_000)
+            drifts = [drift if k == level_that_drifts else 0.0 for k in range(len(light))]
             levels = [
-                level(each, count, 7 * k, drift=drift if k == level_that_drifts else 0.0)
+                level(each, count, 7 * k, spread=spread, drift=drifts[k])
                 for k, each in enumerate(light)
             ]
             most = np.mean(levels[level_that_drifts].variance)

@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     from equipix.exposures.averaged import Averaged
 
 _SHARE = 0.5
-"""Variance of a level that saturates over that of a darker one. Gains that differ by s hide a drift
-of the light that makes up to s·√(f/2) of the variance, of f degrees of freedom: half of it for 9 %
-and 64 frames."""
+"""Variance of a level that saturates over that of a darker one."""
 
 _ROUNDING = 0.25
 """Most by which rounding to whole DN changes a variance, in DN²."""
@@ -55,8 +53,9 @@ def warn_of_full_wells(averaged: Averaged, mask: Bools | None) -> None:
     used = _used(averaged, mask)
     if np.count_nonzero(used) < _FEWEST:
         return
+    lowest = averaged.values[int(np.argmin([each[used].mean() for each in averaged.values]))][used]
     scatters = [
-        _scatter(averaged, level, used)
+        _scatter(averaged, level, used, lowest)
         for level, frames in enumerate(averaged.frames)
         if frames > 1
     ]
@@ -84,28 +83,41 @@ def _used(averaged: Averaged, mask: Bools | None) -> Bools:
     return used if mask is None else used & ~mask.reshape(-1, *used.shape).any(axis=0)
 
 
-def _scatter(averaged: Averaged, level: int, used: Bools) -> _Scatter:
+def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Scatter:
     """Noise of a level, with its bound."""
     frames = averaged.frames[level]
     variances = averaged.variances[level][used].astype(np.float64)
-    variances = variances[inliers(variances, scatter_limit(frames))]
-    mean, variance = float(_raw(averaged, level)[used].mean()), float(variances.mean())
-    return _Scatter(level, mean, variance, variance - _common(variances, frames - 1))
+    rise = averaged.values[level][used].astype(np.float64) - lowest
+    kept = inliers(variances, scatter_limit(frames))
+    common = _common(variances[kept], rise[kept], frames - 1)
+    mean, variance = float(_raw(averaged, level)[used].mean()), float(variances[kept].mean())
+    return _Scatter(level, mean, variance, variance - common)
 
 
-def _common(variances: Array, freedom: int) -> float:
+def _common(variances: Array, rise: Array, freedom: int) -> float:
     """Largest variance that pixels may have in common, as a drift of the light gives it.
 
     Notes
     -----
     Sample variances of a variance σ² of their own and C in common have the mean σ² + C, and scatter
-    by σ⁴ + 2σ²C, times 2 over the degrees of freedom f: C² is the square of the mean less that. The
-    scatter of N variances has a relative standard error of √((2 + 12/f)/N), with the kurtosis of
-    χ².
+    by σ⁴ + 2σ²C, times 2 over the degrees of freedom f: C² is the square of the mean less that.
+    Both parts rise with the gain of a pixel, so the scatter is that about their line over the
+    `rise` from the lowest level. The scatter of N variances has a relative standard error of
+    √((2 + 12/f)/N), with the kurtosis of χ².
     """
     square = float(variances.mean()) ** 2
     error = SIGMAS * float(np.sqrt((2 + 12 / freedom) / variances.size))
-    return float(np.sqrt(max(0.0, square * (1 + error) - freedom / 2 * float(variances.var()))))
+    scatter = float(variances.var()) - _by_rise(variances, rise)
+    return float(np.sqrt(max(0.0, square * (1 + error) - freedom / 2 * scatter)))
+
+
+def _by_rise(variances: Array, rise: Array) -> float:
+    """Part of the scatter of variances that their line over the rise explains."""
+    steepness = float(rise.var())
+    if steepness == 0:  # the lowest level itself
+        return 0.0
+    covariance = float(np.mean((rise - rise.mean()) * (variances - variances.mean())))
+    return covariance**2 / steepness
 
 
 def _raw(averaged: Averaged, level: int) -> Array:
@@ -131,6 +143,8 @@ def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
 
 def _advice(averaged: Averaged, used: Bools, full: list[_Scatter]) -> str:
     """Name the saturation level, where it is above the values of all other levels."""
+    if averaged.dark is None and not averaged.raw:
+        return ""  # less a dark that was not kept
     saturate = [each.level for each in full]
     free = [level for level in range(averaged.count) if level not in saturate]
     low = min(float(np.quantile(_raw(averaged, level)[used], _TAIL)) for level in saturate)
