@@ -148,6 +148,13 @@ def test_a_rounded_shift_is_named_with_what_to_do():
     np.testing.assert_array_equal(cal.shifts, with_value(CROSS, (2, 0), 0))
 
 
+def test_moves_are_rounded_and_a_common_part_of_a_pixel_is_kept():
+    moved = CROSS + 0.5 + np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.015), (0, -0.01)])
+    rounded = Positions.of(moved).whole()
+    np.testing.assert_array_equal(rounded.shifts, CROSS + 0.5)
+    assert rounded.rounding is None
+
+
 @pytest.mark.parametrize(
     ("shift", "std", "noticeable"),
     [(0.019, 0, False), (0.021, 0, True), (0.059, 0.02, False), (0.061, 0.02, True)],

@@ -97,14 +97,17 @@ class Positions(ReadOnly):
         )
 
     def whole(self, std: ArrayLike | None = None) -> Self:
-        """Return the positions at the nearest whole shifts, unless shifts differ by whole pixels.
+        """Return the positions whole pixels from the first one that are nearest to these.
 
-        `std` are errors of the shifts.
+        `std` are errors of the shifts. A part of a pixel that all have in common is kept.
         """
         if _native.common_fraction(self.shifts) is not None:
             return self
-        shifts, rounding = round_shifts(self.shifts, std)
-        return dataclasses.replace(self, shifts=shifts.astype(np.float64), rounding=rounding)
+        first = self.shifts[0]
+        moves, rounding = round_shifts(self.shifts - first, std)
+        if rounding is not None:
+            rounding = rounding._replace(shift=self.shifts[rounding.exposure].tolist())
+        return dataclasses.replace(self, shifts=first + moves, rounding=rounding)
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
         """Return the same exposures at other shifts, measured with standard deviations `std`."""
