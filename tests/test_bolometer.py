@@ -348,3 +348,22 @@ class TestRefusals:
             bolometer.non_uniformity(self.FRAMES, 0)
         with pytest.raises(errors.InputError, match="no finite value in frame 1"):
             bolometer.non_uniformity([[[1.0]], [[np.nan]]], 1.0)
+
+
+def test_states_that_determine_almost_nothing_are_refused():
+    array = bolometer.BolometerArray.of(SHAPE, rng=1)
+    celsius = [20.0, 20.001, 60.0]
+    shutter = [array.mean(each) for each in celsius]
+    with pytest.raises(errors.InputError, match="times the noise of a reference"):
+        bolometer.fit(shutter, celsius, 2.0, order=2)
+    assert bolometer.fit(shutter, celsius, 2.0, order=1).axes.order == 1
+
+
+def test_auto_takes_no_order_that_states_without_one_do_not_determine():
+    """Nine temperatures, each at one of two biases."""
+    array = bolometer.BolometerArray.of(SHAPE, rng=1)
+    celsius = np.linspace(-20, 60, 9)
+    volts = np.where(np.arange(9) % 2, 2.05, 1.95)
+    shutter = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
+    correction = bolometer.fit(shutter, celsius, volts)
+    assert 1 <= correction.axes.order <= 3

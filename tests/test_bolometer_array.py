@@ -60,10 +60,10 @@ class TestHeat:
         np.testing.assert_allclose(before, after, rtol=0, atol=1e-9)
 
     def test_the_bias_acts_through_the_heat_alone(self):
-        cold = BolometerArray.of(SHAPE, rng=1).with_properties(capacity_j_per_k=1e3)
+        cold = BolometerArray.of(SHAPE, rng=1)
+        cold = cold.with_properties(capacity_j_per_k=1e3, conductance_w_per_k=1e3)
         change = cold.mean(20.0, bias_v=2.1) - cold.mean(20.0, bias_v=1.9)
-        # With such a capacity nothing warms: G alone limits the mean heat, of 60e-6·30 of 10 µW,
-        # to 0.2 K; the pulse itself adds 6e-13 K.
+        # With such a capacity a pulse of 10 µW warms by 6e-13 K, and G lets no heat remain.
         assert np.abs(change).max() < 1e-3 * cold.mean(20.0).std()
         warm = BolometerArray.of(SHAPE, rng=1)
         rises = [warm.temperature(20.0, bias_v=each) - KELVIN for each in (1.0, 2.0)]
@@ -146,3 +146,21 @@ def test_wrong_properties_are_refused(given, message):
 def test_states_that_are_none_are_refused(state, message):
     with pytest.raises(errors.InputError, match=message):
         BolometerArray(shape=SHAPE).mean(**state)
+
+
+@pytest.mark.parametrize("conductance", [1e-8, 2e-9])
+def test_pulses_add_up_in_pixels_that_are_slow(conductance):
+    """Pulses much shorter than the time constant τ add up to one over 1 − exp(−frame/τ)."""
+    slow = BolometerArray(shape=(1, 1), conductance_w_per_k=conductance)
+    time = float(np.ravel(slow.capacity_j_per_k)[0]) / conductance
+    once = BolometerArray(shape=(1, 1), conductance_w_per_k=conductance, frame_s=100 * time)
+    single, many = (float(each.temperature(20.0)[0, 0]) - KELVIN for each in (once, slow))
+    # Equal arms of the bridge: the power changes by the square of the change of the resistance.
+    wanted = single / (1 - np.exp(-slow.frame_s / time))
+    assert many == pytest.approx(wanted, rel=0.02)
+
+
+def test_a_pixel_without_a_steady_state_is_refused():
+    array = BolometerArray(shape=(1, 1), capacity_j_per_k=1.0)
+    with pytest.raises(errors.InputError, match="reaches no steady state"):
+        array.temperature(20.0)

@@ -25,11 +25,11 @@ _REFERENCE_K = 300.0
 _BOLTZMANN = 1.380649e-23
 """In J/K."""
 
-_PERIODS = 12
+_MOST_PERIODS = 10_000
 """Most frames until the temperature before a pulse no longer changes."""
 
-_SETTLED_K = 1e-12
-"""Change of the temperature before a pulse, from frame to frame, that ends the search, in K."""
+_SETTLED_K = 1e-9
+"""How far the temperature before a pulse may be from its steady state, in K."""
 
 _MAPS = (
     "resistance_ohm",
@@ -267,12 +267,16 @@ class BolometerArray:
         time = self._maps["capacity_j_per_k"] / self._maps["conductance_w_per_k"]
         left = np.exp(-(self.frame_s - self.pulse_s) / time)
         start = rest
-        for _ in range(_PERIODS):
+        for _ in range(_MOST_PERIODS):
             end = self._pulse(start, substrate, light, bias)
             before, start = start, rest + (end - rest) * left
-            if np.abs(start - before).max() < _SETTLED_K:
-                break
-        return self._pulse(start, substrate, light, bias)
+            if np.abs(start - before).max() <= _SETTLED_K * (1 - left.max()):
+                return self._pulse(start, substrate, light, bias)
+        raise InputError(
+            f"'capacity_j_per_k' over 'conductance_w_per_k' is up to {time.max():.3g} s, which "
+            f"reaches no steady state in {_MOST_PERIODS} frames of {self.frame_s:g} s: expected "
+            "less"
+        )
 
     def frames(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -30,6 +31,9 @@ _ROUNDING = 1e-12
 
 _HIGHEST = 8
 """Highest order in temperature."""
+
+_MOST_NOISE = 100.0
+"""Noise of a deviation between the references, over that of a reference."""
 
 
 def fit(
@@ -128,7 +132,7 @@ def fit(
     level = shown.coefficients_of_mean(chosen)
     metadata: dict[str, Any] = {
         "options": {
-            "order": order,
+            "order": order if order == "auto" else chosen,
             "bias_order": powers,
             "regressor": regressor,
             "black_bodies": bodies is not None,
@@ -172,7 +176,9 @@ class Shown:
     def coefficients(self, order: int) -> tuple[Axes, Floats]:
         """Coefficients of the deviation of each pixel, shape (terms, rows, cols)."""
         axes = self.states.axes(order, *self.form)
-        return axes, np.tensordot(_solver(axes, self.states), self.deviation, 1)
+        solver = _solver(axes, self.states)
+        _check_spread(axes, self.states, solver)
+        return axes, np.tensordot(solver, self.deviation, 1)
 
     def coefficients_of_mean(self, order: int) -> Floats:
         """Coefficients of the mean of the array."""
@@ -193,11 +199,18 @@ class Shown:
                 "order"
             )
         deviation = self.deviation[:, self.good]
-        orders = range(min(_HIGHEST, len(temperatures) - 2) + 1)
-        errors = [self._prediction_error(deviation, each) for each in orders]
+        orders = range(1, min(_HIGHEST, len(temperatures) - 2) + 1)
+        held = takewhile(self._may_be_held_out, orders)
+        errors = [self._prediction_error(deviation, each) for each in (0, *held)]
         enough = min(errors) * (1 + _BETTER)
         enough += (_ROUNDING * float(np.abs(self.values[:, self.good]).max())) ** 2
         return next(each for each, error in enumerate(errors) if error <= enough), errors
+
+    def _may_be_held_out(self, order: int) -> bool:
+        """Whether the states without any one temperature determine an order."""
+        axes = self.states.axes(order, *self.form)
+        others = [self.states.substrate_c != each for each in self.states.temperatures[1:-1]]
+        return all(_rank(axes, self.states.chosen(each)) == axes.terms for each in others)
 
     def _prediction_error(self, deviation: Floats, order: int) -> float:
         """Mean square error of predictions of temperatures held out, median over the pixels."""
@@ -212,18 +225,37 @@ class Shown:
         return float(np.median(total)) / len(held)
 
 
+def _rank(axes: Axes, states: States) -> int:
+    """Number of coefficients that states determine."""
+    return int(np.linalg.matrix_rank(axes.basis(states.substrate_c, states.bias_v)))
+
+
 def _solver(axes: Axes, states: States) -> Floats:
     """Matrix that makes coefficients of values by least squares, shape (terms, n)."""
-    basis = axes.basis(states.substrate_c, states.bias_v)
-    rank = int(np.linalg.matrix_rank(basis))
+    rank = _rank(axes, states)
     if rank < axes.terms:
         raise InputError(
             f"'order' {axes.order} and 'bias_order' {axes.bias_order} have {axes.terms} "
-            f"coefficients, but {len(basis)} references at {len(states.temperatures)} "
-            f"temperatures and {len(states.biases)} biases determine {rank}: take more states, or "
+            f"coefficients, but {len(states.substrate_c)} references at "
+            f"{len(states.temperatures)} temperatures and {len(states.biases)} biases determine "
+            f"{rank}: take more states, or lower orders"
+        )
+    return np.asarray(np.linalg.pinv(axes.basis(states.substrate_c, states.bias_v)))
+
+
+def _check_spread(axes: Axes, states: States, solver: Floats) -> None:
+    """Refuse states between which the noise of a reference is multiplied by much."""
+    celsius = np.linspace(*axes.substrate_c, 33)
+    noise = [
+        np.linalg.norm(axes.basis(celsius, np.full(len(celsius), volts)) @ solver, axis=1).max()
+        for volts in states.biases
+    ]
+    if max(noise) > _MOST_NOISE:
+        raise InputError(
+            f"'substrate_c' and 'bias_v' determine order {axes.order} with {max(noise):.3g} times "
+            f"the noise of a reference (limit {_MOST_NOISE:g}): take states further apart, or "
             "lower orders"
         )
-    return np.asarray(np.linalg.pinv(basis))
 
 
 def _bias_order(states: States, given: int | None) -> int:
