@@ -92,7 +92,8 @@ class TestCorrectability:
     def test_drift_of_the_frame_mean_does_not_count(self):
         stack = frames_of(np.random.default_rng(3), spatial=0.5)
         plain = metrics.correctability(stack)
-        drifting = metrics.correctability(stack + np.linspace(0, 500, 16)[:, None, None])
+        with pytest.warns(errors.DriftWarning, match="scatter by 159 DN, the noise of a pixel is"):
+            drifting = metrics.correctability(stack + np.linspace(0, 500, 16)[:, None, None])
         assert drifting.ratio == pytest.approx(plain.ratio, rel=1e-9)
         assert metrics.correctability(7 * stack).ratio == pytest.approx(plain.ratio, rel=1e-9)
 

@@ -51,7 +51,7 @@ class ShiftSignWarning(EquipixWarning):
 
 
 class DriftWarning(EquipixWarning):
-    """Lamp drift will tilt the sensitivity by more than noise leaves."""
+    """The light drifts: it tilts the sensitivity, or frames are not of one level."""
 
 
 class AlreadyCorrectedWarning(EquipixWarning):

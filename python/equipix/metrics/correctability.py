@@ -10,7 +10,7 @@ import numpy as np
 
 from equipix._check import as_array, naming_memory, number
 from equipix.errors import InputError
-from equipix.metrics.moments import signed_root, stack_of, temporal_of
+from equipix.metrics.moments import signed_root, stack_of, temporal_of, warn_of_drift
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -72,6 +72,12 @@ def correctability(
     InputError
         If fewer than two frames or pixels are left, or none has noise.
 
+    Warns
+    -----
+    DriftWarning
+        If frame means scatter by more than five times the noise of a pixel: they are then hardly
+        frames of one level.
+
     Notes
     -----
     The mean of each frame over the pixels is subtracted, so drift of the source does not count.
@@ -106,6 +112,7 @@ def correctability(
     if not 0 < number("confidence", confidence) < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
     found = temporal_of(stack, _as_mask(mask, stack.shape[1:]))
+    warn_of_drift(found)
     n, pixels = found.frames, int(np.count_nonzero(found.used))
     if pixels < 2:
         raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")

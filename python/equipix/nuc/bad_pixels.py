@@ -87,6 +87,9 @@ def find_defects(
     -----
     MisfitWarning
         If the curves of most pixels are of another order, or the noise was not as stated.
+    DriftWarning
+        If frame means scatter by more than five times the noise of a pixel: they are then hardly
+        frames of one level.
 
     Notes
     -----

@@ -9,7 +9,7 @@ import numpy as np
 from equipix.defects import noisy_pixels, response_outliers
 from equipix.errors import InputError
 from equipix.frames import FrameStatistics
-from equipix.metrics.moments import stack_of, temporal_of
+from equipix.metrics.moments import stack_of, temporal_of, warn_of_drift
 from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
 from equipix.nuc.curve import response_at
 
@@ -60,6 +60,7 @@ def of_frames(
         stack = stack_of("frames", frames)
         _check_shape(stack.shape[1:], good.shape)
         over_time = temporal_of(stack, ~good)
+        warn_of_drift(over_time)
         mean, variance, count = over_time.mean, over_time.variance, over_time.frames
         slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
     if count < 2:
