@@ -527,7 +527,7 @@ class TestRefusals:
             ({"order": True}, "'order' is True"),
             ({"order": 1.0}, "'order' is 1.0"),
             ({"order": "two"}, "'order' is 'two'"),
-            ({"mask": np.ones(SHAPE, bool)}, r"'levels': 0.0% .* no value in 100.0%"),
+            ({"mask": np.ones(SHAPE, bool)}, "'mask' excludes all pixels: give one"),
             ({"by": "both"}, "'by' is 'both'"),
             ({"order": 2, "by": "gain"}, "order 2 corrects offset and gain"),
             ({"order": "auto", "by": "gain"}, "order 'auto' corrects offset and gain"),
@@ -555,6 +555,8 @@ class TestRefusals:
             nuc.fit(levels)
         with pytest.raises(errors.InputError, match=r"'levels' has shape \(0,\)"):
             nuc.fit([])
+        with pytest.raises(errors.InputError, match="'levels' is one average, expected a list"):
+            nuc.fit(equipix.average(levels))
 
     def test_levels_of_other_shapes(self, levels):
         averages = [equipix.average(np.stack([each, each + 1])) for each in levels]

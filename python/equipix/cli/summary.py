@@ -12,6 +12,7 @@ from equipix.calibration.result import Calibration
 from equipix.correction.protocol import sensor_of
 from equipix.flags import Flag, usable
 from equipix.frames import FrameStatistics
+from equipix.nuc.misfit import common_misfit
 from equipix.nuc.response import Response
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def of_response(response: Response) -> dict[str, Any]:
     return {
         **_sensor(response),
         "shape": list(response.shape),
-        "order": response.order,
+        "order": 0 if options.get("by") == "gain" else response.order,
         "levels": [float(f"{level:.6g}") for level in response.levels],
         **_level_values(response),
         **spread,
@@ -78,12 +79,13 @@ def _level_values(response: Response) -> dict[str, list[str]]:
 
 
 def _misfit(response: Response, options: dict[str, Any]) -> float | str:
-    """Median reduced χ² of usable pixels; without variances their mean, a variance in DN²."""
+    """Median reduced χ² over that of noise; without variances the mean, a variance in DN²."""
     judged = usable(response.flags) & (response.freedom > 0)
     if not judged.any():
         return "not determined"
-    middle = np.mean if options.get("weights") == "equal" else np.median
-    return float(middle(response.reduced_chi2[judged]))
+    if options.get("weights") == "equal":
+        return float(np.mean(response.reduced_chi2[judged]))
+    return common_misfit(response)
 
 
 def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from equipix._check import as_array
 from equipix.errors import InputError
+from equipix.frames import FrameStatistics
 from equipix.noise import NoiseModel
 
 if TYPE_CHECKING:
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 def check_levels(levels: object) -> None:
     """Refuse stacks of raw frames, and levels of several shapes, before they become one array."""
+    if isinstance(levels, FrameStatistics):
+        raise InputError("'levels' is one average, expected a list of them: one a level")
     arrays = levels if isinstance(levels, list | tuple) else [levels]
     if any(not hasattr(each, "dtype") and hasattr(each, "__next__") for each in arrays):
         raise InputError("'levels' holds iterators of frames: average each with equipix.average")

@@ -14,7 +14,7 @@ from equipix.nuc.alike import alike_pixels
 from equipix.nuc.curve import least_slope
 from equipix.nuc.inverse import horner_inverse, inverse_verdict
 from equipix.nuc.levels import levels_of
-from equipix.nuc.misfit import common_misfit, warn_of_misfit
+from equipix.nuc.misfit import common_misfit, median_of_noise, warn_of_misfit
 from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
 from equipix.nuc.response import Response
 
@@ -169,7 +169,8 @@ def fitted(
             "started": started.isoformat(timespec="seconds"),
         }
         response = _fitted(given, chosen, by, workers, metadata | (provenance or {}))
-        if chosen > 0:  # one point is right at one level, whatever the others are
+        # One point is right at one level, whatever the others are; "auto" judged them all.
+        if chosen > 0 or order == "auto":
             warn_of_misfit(response, common_misfit(response))
         return response
 
@@ -179,7 +180,8 @@ def _fitted(
 ) -> Response:
     """Fit one order and invert it."""
     found = levels.fit(form_of(order, by), workers=workers)
-    cleaned = _of_alike_pixels(levels, found[2]) if order > 0 else None
+    spare = len(levels) - (order + 1)
+    cleaned = _of_alike_pixels(levels, found[2], spare) if order > 0 and spare > 0 else None
     if cleaned is not None:
         levels, found = cleaned, cleaned.fit(form_of(order, by), workers=workers)
     deviation, variances, misfit, used = found
@@ -211,7 +213,7 @@ def _fitted(
     )
 
 
-def _of_alike_pixels(levels: Levels, misfit: Floats) -> Levels | None:
+def _of_alike_pixels(levels: Levels, misfit: Floats, freedom: int) -> Levels | None:
     """Levels without pixels in V̄ that deviate from the others, where these move it by much.
 
     A pixel that saturates bends V̄, and so the deviation of all others. Moves below a tenth of the
@@ -223,7 +225,8 @@ def _of_alike_pixels(levels: Levels, misfit: Floats) -> Levels | None:
     if alike.all():
         return None
     cleaned = levels.without(~alike)
-    noise = levels.variances if levels.noise else np.median(squares) / len(levels)
+    typical = np.median(squares) / (freedom * median_of_noise(np.array(freedom)))
+    noise = levels.variances if levels.noise else typical
     moved = (cleaned.references - levels.references) ** 2
     return cleaned if np.any(moved > _MOST_MOVED * noise) else None
 

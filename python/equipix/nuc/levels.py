@@ -37,7 +37,7 @@ _ROUNDING = 1e-9
 """Relative difference below which two means are equal, where no noise is known."""
 
 _SAMPLED = 10_000
-"""Pixels of which the scatter of differences is taken."""
+"""Most pixels of which medians are taken."""
 
 
 class LevelNoise(NamedTuple):
@@ -179,7 +179,7 @@ def levels_of(
     findings = _with_odd_responses(values, noise, measured.findings)
     usable = _usable(values, findings, given)
     if measured.dark is not None:
-        _warn_of_bright_dark(values[:, usable], noise, measured.dark_variance)
+        _warn_of_bright_dark(values, usable, noise, measured.dark_variance)
     references = _references(values, usable)
     return Levels(
         values=values,
@@ -284,11 +284,16 @@ def _with_odd_responses(
 
 def _scatter(values: Array, low: int, high: int) -> float:
     """Scatter between pixels of the rise from one level to another: of noise and of gains."""
-    step = max(1, values[0].size // _SAMPLED)
-    ends = values.reshape(len(values), -1)[[low, high], ::step].astype(np.float64)
-    rise = ends[1] - ends[0]
+    sample = _spread(values[0].size)
+    below, above = (values[level].reshape(-1)[sample].astype(np.float64) for level in (low, high))
+    rise = above - below
     known = rise[np.isfinite(rise)]
     return float(np.median(np.abs(known - np.median(known)))) if known.size else 0.0
+
+
+def _spread(count: int) -> Array:
+    """Some of so many pixels, over all rows and columns."""
+    return np.linspace(0, count - 1, min(count, _SAMPLED)).astype(np.intp)
 
 
 def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
@@ -301,10 +306,12 @@ def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
     wanted = np.ones_like(usable)
     if mask is not None:
         wanted &= ~mask.reshape(-1, *usable.shape).all(axis=0)
-    share = float(usable.sum() / max(1, int(wanted.sum())))
+    if not wanted.any():
+        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
+    share = float(usable.sum() / int(wanted.sum()))
     if share < FEWEST_VALID or not usable.any():
-        missing = [1 - np.mean(each[wanted]) if wanted.any() else 1.0 for each in known]
-        odd = 0.0 if bad is None or not wanted.any() else float(np.mean(bad[wanted]))
+        missing = [1 - np.mean(each[wanted]) for each in known]
+        odd = 0.0 if bad is None else float(np.mean(bad[wanted]))
         raise InputError(
             f"'levels': {share:.1%} of the pixels are good and have a value at every level, "
             f"expected {FEWEST_VALID:.0%} or more. {_cause(values, missing, odd)}"
@@ -313,15 +320,22 @@ def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
 
 
 def _warn_of_bright_dark(
-    values: Array, noise: tuple[LevelNoise, ...] | None, dark_variance: Floats | None
+    values: Array,
+    usable: Bools,
+    noise: tuple[LevelNoise, ...] | None,
+    dark_variance: Floats | None,
 ) -> None:
     """Warn of levels whose median less the dark is below 0 by more than the noise of a value.
 
-    Where no noise is known the scatter of the level takes its place.
+    Where no noise is known the scatter of the level takes its place. Medians are those of a sample
+    of the usable pixels.
     """
+    sample = np.flatnonzero(usable)
+    sample = sample[_spread(len(sample))]
     of_dark = 0.0 if dark_variance is None else float(np.median(dark_variance))
     below = []
-    for level, each in enumerate(values):
+    for level, every in enumerate(values):
+        each = every.reshape(-1)[sample]
         median = float(np.median(each))
         if noise is None:
             sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)

@@ -10,10 +10,16 @@ from equipix.errors import MisfitWarning, warn
 from equipix.flags import usable
 
 if TYPE_CHECKING:
+    from equipix._types import Array
     from equipix.nuc.response import Response
 
 _MOST = 2.0
 """Misfit of the array above which more of it comes from the order than from noise."""
+
+
+def median_of_noise(freedom: Array) -> Array:
+    """Median of reduced χ² with so many degrees of freedom, after Wilson and Hilferty."""
+    return np.asarray((1 - 2 / (9 * freedom)) ** 3)
 
 
 def common_misfit(response: Response) -> float:
@@ -23,8 +29,7 @@ def common_misfit(response: Response) -> float:
     judged = usable(response.flags) & (response.freedom > 0)
     if not judged.any():
         return float("nan")
-    # The median of χ²/f after Wilson and Hilferty.
-    noise = (1 - 2 / (9 * response.freedom[judged])) ** 3
+    noise = median_of_noise(response.freedom[judged])
     return float(np.median(response.reduced_chi2[judged] / noise))
 
 
