@@ -144,7 +144,7 @@ def test_inspect_says_what_is_no_calibration(run, experiment, tmp_path):
     np.savez(tmp_path / "arrays.npz", values=np.ones(3))
     refused(run("compare", mean, mean), mean, "holds frame statistics, expected calibration")
     for other in (frames, tmp_path / "arrays.npz"):
-        refused(run("inspect", other), other, "holds neither a calibration", "did not write it")
+        refused(run("inspect", other), other, "holds neither a correction", "did not write it")
 
 
 def test_inspect_shows_an_average(run, experiment, tmp_path):

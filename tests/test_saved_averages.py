@@ -135,7 +135,7 @@ def test_an_average_of_another_shape_is_named(manifest, tmp_path):
 def test_arrays_that_are_no_averages_are_named(tmp_path, capsys):
     np.savez(tmp_path / "arrays.npz", values=np.ones((3, 3)))
     assert run("average", tmp_path / "arrays.npz", "-o", tmp_path / "mean.tif", "--json") == 1
-    assert "arrays.npz: holds neither a calibration" in capsys.readouterr().err
+    assert "arrays.npz: holds neither a correction" in capsys.readouterr().err
     equipix.average(np.ones((2, 3, 3))).save(tmp_path / "one.npz")
     assert run("inspect", tmp_path / "one.npz", "--json") == 0
     assert json.loads(capsys.readouterr().out)["saturation"] is None

@@ -100,7 +100,7 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
         metadata = json.loads(description)
     except ValueError as error:
         raise FileError(
-            f"{path}: holds neither a calibration nor frame statistics: equipix did not write it"
+            f"{path}: holds neither a correction nor frame statistics: equipix did not write it"
         ) from error
     return pages, metadata
 
