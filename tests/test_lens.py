@@ -257,7 +257,7 @@ class TestCombine:
         same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
         for first in (raw, equipix.load(tmp_path / "raw.npz"), equipix.combine(raw, same)):
             with pytest.raises(
-                errors.InputError, match="'first' is a response to raw levels.*dark"
+                errors.InputError, match=r"'first' .* offset in corrected frames.*dark"
             ):
                 equipix.combine(first, falloff)
         # An offset of 'then' can take away the one that 'first' leaves.

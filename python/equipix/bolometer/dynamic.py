@@ -141,10 +141,11 @@ class DynamicCorrection(ReadOnly):
         with np.errstate(divide="ignore", invalid="ignore"):  # in pixels that do not respond
             gain = np.where(response == 0, np.nan, 1 / response)
         state = {"substrate_c": celsius, "bias_v": volts}
-        # Corrected frames hold the level L, which no gain may multiply: `combine` asks for "raw".
-        metadata = self.metadata | {"state": state, "raw": True}
+        metadata = self.metadata | {"state": state}
         offset = level - (level + deviation) * gain
-        return Polynomial(np.stack([offset, gain]), self.flags, metadata)
+        # Corrected frames hold the level L.
+        planes = np.stack([offset, gain])
+        return Polynomial(planes, self.flags, metadata, leaves_offset=True)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `DynamicCorrection.load` reads.

@@ -40,10 +40,12 @@ class Polynomial(ReadOnly):
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`.
     metadata : dict
-        Origin, as JSON values. Of two corrections combined, ``"raw"`` is true where corrected
-        frames hold the mean offset of raw levels.
+        Origin, as JSON values.
     saturation : float or None
         Level of saturation of the raw values in DN, where it is known.
+    leaves_offset : bool
+        Whether corrected frames hold an offset, such as the mean one of raw levels, which no gain
+        may multiply.
 
     Raises
     ------
@@ -55,6 +57,7 @@ class Polynomial(ReadOnly):
     flags: Array
     metadata: dict[str, Any] = field(default_factory=dict)
     saturation: float | None = None
+    leaves_offset: bool = False
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -135,6 +138,7 @@ class Polynomial(ReadOnly):
             "format": _FORMAT,
             "kind": _KIND,
             "saturation": self.saturation,
+            "leaves_offset": self.leaves_offset,
             "metadata": self.metadata,
         }
         save_pages(path, pages, content, force=force)
@@ -152,6 +156,7 @@ def read_polynomial(
         pages["flags"],
         content["metadata"],
         None if level is None else float(level),
+        bool(content.get("leaves_offset", False)),
     )
 
 
@@ -210,22 +215,16 @@ def combine(first: Correction, then: Correction) -> Polynomial:
             "order, or correct frames twice"
         )
     gain = after[1] if len(after) == 2 else 0.0
-    raw = _leaves_offset(first) and not np.nan_to_num(after[0]).any()
-    if raw and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
-        raise InputError(
-            "'first' is a response to raw levels, which leaves the mean offset in corrected "
-            "frames, and the gain of 'then' would multiply it: average the levels with a dark, "
-            "equipix.average(frames, dark=dark), and fit the response again"
-        )
+    leaves = _leaves_offset(first) and not np.nan_to_num(after[0]).any()
+    if leaves and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
+        raise InputError(_words_of_offset(first))
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
     metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
     if sensor:
         metadata["sensor"] = sensor
-    if raw:
-        metadata["raw"] = True
     level: float | None = getattr(first, "saturation", None)
-    return Polynomial(coefficients, first.flags | then.flags, metadata, level)
+    return Polynomial(coefficients, first.flags | then.flags, metadata, level, leaves)
 
 
 def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
@@ -248,5 +247,20 @@ def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
 
 
 def _leaves_offset(correction: Correction) -> bool:
-    """Whether corrected frames hold the mean offset of the raw levels that it was fitted to."""
-    return bool(getattr(correction, "raw", False) or correction.metadata.get("raw", False))
+    """Whether corrected frames hold an offset, such as the mean one of the raw levels fitted to."""
+    return bool(getattr(correction, "raw", False) or getattr(correction, "leaves_offset", False))
+
+
+def _words_of_offset(first: Correction) -> str:
+    """Say what leaves an offset, and what to do."""
+    if getattr(first, "raw", False):
+        return (
+            "'first' is a response to raw levels, which leaves the mean offset in corrected "
+            "frames, and the gain of 'then' would multiply it: average the levels with a dark, "
+            "equipix.average(frames, dark=dark), and fit the response again"
+        )
+    return (
+        "'first' leaves an offset in corrected frames, as a response to raw levels or a correction "
+        "of bolometers does, and the gain of 'then' would multiply it: average levels with a dark, "
+        "or subtract a corrected frame of a shutter before 'then'"
+    )
