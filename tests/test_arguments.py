@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import errors, lens, metrics, nuc
+from equipix import bolometer, detector, errors, lens, metrics, nuc
 
 SHAPE = (24, 32)
 
@@ -25,6 +25,9 @@ RESPONSE = nuc.fit(LEVELS)
 ROWS, COLS = np.mgrid[: SHAPE[0], : SHAPE[1]]
 FLAT = 1000 * lens.cos4((ROWS - 12.0) ** 2 + (COLS - 15.0) ** 2, 60.0)
 GAIN = lens.fit_falloff(FLAT).correction()
+ARRAY = bolometer.BolometerArray.of(SHAPE, rng=1)
+CELSIUS = [-20.0, 0.0, 20.0, 40.0, 60.0]
+SHUTTER = np.stack([ARRAY.mean(each) for each in CELSIUS])
 
 CALLS = {
     nuc.fit: {
@@ -62,6 +65,25 @@ CALLS = {
     equipix.Corrector(RESPONSE).apply: {"frames": STACKS[1], "out": None},
     equipix.combine: {"first": GAIN, "then": GAIN},
     equipix.Polynomial: {"coefficients": GAIN.coefficients, "flags": GAIN.flags},
+    bolometer.fit: {
+        "shutter": SHUTTER,
+        "substrate_c": CELSIUS,
+        "bias_v": 2.0,
+        "black_bodies": None,
+        "order": 3,
+        "bias_order": None,
+        "regressor": "temperature",
+        "mask": None,
+    },
+    bolometer.non_uniformity: {"frames": SHUTTER, "span": 1e4},
+    detector.composition_tolerance: {
+        "material": detector.HgCdTe(start_um=3.0, cutoff_um=5.1),
+        "references_k": (290.0, 310.0),
+        "scene_k": 300.0,
+        "charge_e": 2e7,
+        "filled_k": None,
+        "by": "offset",
+    },
 }
 """Public functions with arguments that are right."""
 
@@ -96,7 +118,7 @@ def test_is_refused_by_the_name_of_the_argument(function, wrong):
         except errors.InputError as error:
             # Of two that must fit together the message names the second.
             others = {"times": "'ratios'"}
-            assert f"'{name}'" in str(error) or others.get(name, "''") in str(error)
+            assert f"'{name}" in str(error) or others.get(name, "''") in str(error)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from equipix._check import check_word, described
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.bolometer.references import bodies_of, flags_of, relative_response, stack_of
 from equipix.bolometer.states import Regressor, States
@@ -123,8 +124,7 @@ def fit(
     powers = _bias_order(states, bias_order)
     bodies = None if black_bodies is None else bodies_of(black_bodies, values.shape)
     flags = flags_of(values, bodies, mask)
-    if regressor not in get_args(Regressor):
-        raise InputError(f"'regressor' is {regressor!r}, expected one of {get_args(Regressor)}")
+    check_word("regressor", regressor, get_args(Regressor))
     form = Form(powers, regressor)
     shown = Shown(values, states, usable(flags), form)
     chosen, errors = shown.order(order)
@@ -132,7 +132,7 @@ def fit(
     level = shown.coefficients_of_mean(chosen)
     metadata: dict[str, Any] = {
         "options": {
-            "order": order if order == "auto" else chosen,
+            "order": chosen if errors is None else "auto",
             "bias_order": powers,
             "regressor": regressor,
             "black_bodies": bodies is not None,
@@ -187,7 +187,7 @@ class Shown:
 
     def order(self, order: int | Literal["auto"]) -> tuple[int, list[float] | None]:
         """Order that is given, or that which best predicts, and the prediction error of each."""
-        if order != "auto":
+        if not (isinstance(order, str) and order == "auto"):
             return _checked_order(order), None
         temperatures = self.states.temperatures
         if len(temperatures) == 1:
@@ -269,6 +269,6 @@ def _bias_order(states: States, given: int | None) -> int:
 
 def _checked_order(order: int | str) -> int:
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if isinstance(order, str) or not whole or not 0 <= order <= _HIGHEST:
-        raise InputError(f"'order' is {order!r}, expected 0 to {_HIGHEST} or 'auto'")
+    if not whole or not 0 <= int(order) <= _HIGHEST:
+        raise InputError(f"'order' is {described(order)}, expected 0 to {_HIGHEST} or 'auto'")
     return int(order)

@@ -48,6 +48,8 @@ def non_uniformity(frames: ArrayLike, span: float) -> float:
     values = as_array("frames", frames, ndim=3).astype(np.float64)
     if not 0 < number("span", span) < np.inf:
         raise InputError(f"'span' is {span!r}, expected a finite number of DN above 0")
+    if np.isinf(values).any():
+        raise InputError("'frames' holds infinite values, expected finite ones, or NaN where bad")
     empty = np.flatnonzero(~np.isfinite(values).any(axis=(1, 2)))
     if empty.size or not len(values):
         which = f"'frames' has no finite value in frame {empty[0]}" if empty.size else "no 'frames'"

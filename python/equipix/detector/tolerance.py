@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from equipix._check import number
+from equipix._check import as_array, check_type, check_word, number
 from equipix._types import By
+from equipix.detector.material import HgCdTe
 from equipix.errors import InputError
 from equipix.simulate.blackbody import LARGEST_X, hgcdte_composition, hgcdte_cutoff
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from equipix._types import Floats
-    from equipix.detector.material import HgCdTe
 
 _NODES = 16
 """Compositions of the Gauss-Legendre rule that stands for all pixels."""
@@ -111,6 +111,7 @@ def composition_tolerance(
     >>> print(f"{detector.composition_tolerance(band, references_k=()).spread:.1e}")
     4.5e-06
     """
+    check_type("material", material, HgCdTe, "a material, such as detector.HgCdTe(...)")
     references = _checked(references_k, scene_k, charge_e, filled_k, by)
     filled = scene_k if filled_k is None else filled_k
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
@@ -140,7 +141,8 @@ def _checked(
     by: str,
 ) -> list[float]:
     """Temperatures of the references, after all arguments are checked."""
-    references = [number("references_k", each) for each in references_k]
+    given = as_array("references_k", references_k, ndim=1)
+    references = [float(each) for each in given]
     if len(references) > 2 or len(set(references)) < len(references):
         raise InputError(f"'references_k' is {references}, expected up to two that differ")
     filled = scene_k if filled_k is None else filled_k
@@ -149,8 +151,7 @@ def _checked(
             raise InputError(f"'{name}' is {value!r}, expected a finite number above 0")
     if any(not 0 < each < np.inf for each in references):
         raise InputError(f"'references_k' is {references}, expected temperatures above 0 K")
-    if by not in get_args(By):
-        raise InputError(f"'by' is {by!r}, expected one of {get_args(By)}")
+    check_word("by", by, get_args(By))
     if by == "gain" and len(references) != 1:
         raise InputError(f"'by' is 'gain', but there are {len(references)} references, expected 1")
     return references
