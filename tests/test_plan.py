@@ -492,3 +492,20 @@ class TestBudget:
         with pytest.raises(InputError) as error:
             plan.error_budget((64, 80), CROSS, **options)
         assert words in str(error.value)
+
+
+def test_a_shift_error_in_an_even_beam_is_named(run):
+    arguments = (
+        "plan",
+        "--shape",
+        "60",
+        "80",
+        "--shifts",
+        "0,0 0,5 0,7 5,0 7,0",
+        "--noise",
+        "1e-3",
+    )
+    status, _, err = run(*arguments, "--shift-error", "0.1")
+    assert status == 0
+    assert "'--shift-error' has no effect in an even beam: give '--beam-width'" in err
+    assert "even beam" not in run(*arguments, "--shift-error", "0.1", "--beam-width", "100")[2]

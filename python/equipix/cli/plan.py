@@ -8,7 +8,7 @@ import typer
 
 from equipix.cli.options import Force, Json, Picture, Seed
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
-from equipix.errors import InputError
+from equipix.errors import InputError, UnusedInputWarning, warn
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
 from equipix.plan import ErrorBudget, advise_order, distinct_trend, error_budget, identify, suggest
@@ -52,6 +52,11 @@ def plan(
     if (shifts is None) == (max_shift is None):
         raise InputError(
             "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
+        )
+    if shift_error and beam_width is None:
+        warn(
+            "'--shift-error' has no effect in an even beam: give '--beam-width' for another",
+            UnusedInputWarning,
         )
     if output is not None:
         check_picture(output)
