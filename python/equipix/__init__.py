@@ -13,7 +13,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, lens, metrics, nuc, plan, simulate, uncertainty
+    from equipix import errors, lens, metrics, nuc, plan, scene, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
@@ -55,7 +55,7 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "lens", "metrics", "nuc", "plan", "simulate", "uncertainty")
+_MODULES = ("errors", "lens", "metrics", "nuc", "plan", "scene", "simulate", "uncertainty")
 """Public modules."""
 
 __all__ = [
@@ -85,6 +85,7 @@ __all__ = [
     "metrics",
     "nuc",
     "plan",
+    "scene",
     "simulate",
     "uncertainty",
 ]

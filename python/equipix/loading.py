@@ -28,6 +28,8 @@ the content of ``(path, pages, metadata)``."""
 _NO_CORRECTIONS = {
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
     "themselves: FrameStatistics.load reads them, equipix correct subtracts them as --dark",
+    "state of a correction from the scene": "equipix.scene.load reads it; its result() is a "
+    "correction",
 }
 """Kinds of files that are no corrections, and what they are."""
 

@@ -245,14 +245,16 @@ class ConstantStatistics:
         deviation = y - self.mean
         self.mean = self.mean + share * deviation
         self.variance = (1 - share) * (self.variance + share * deviation**2)
-        self.equalise()
+        if self.count > 1:
+            self.equalise()
 
     def equalise(self) -> None:
         """Find the coefficients that give each pixel the statistics of its neighbourhood."""
         known = min(self.count, self.window)
         trust = known / (known + self.prior)
         deviation = np.sqrt(self.variance)
-        ratio = box(deviation, self.width) / np.maximum(deviation, 1e-6)
+        wanted = np.maximum(box(deviation, self.width), 1e-9)
+        ratio = wanted / np.maximum(deviation, 0.1 * wanted)
         gain = 1 + trust * (ratio - 1)
         offset = box(self.mean, self.width) - gain * self.mean
         self.gain, self.offset = held(gain, offset)
@@ -282,7 +284,7 @@ class Kalman:
         self.state = np.stack([np.ones(shape), np.zeros(shape)])
         self.prior = np.diag(np.square(spread))
         self.covariance = np.broadcast_to(self.prior, (*shape, 2, 2)).copy()
-        self.keep = np.exp(-1 / memory)
+        self.keep = np.exp(-block / memory)
         self.clear()
 
     def clear(self) -> None:
@@ -323,7 +325,8 @@ class Kalman:
         self.covariance = np.linalg.inv(np.linalg.inv(covariance) + information / variance)
         change = np.einsum("...ij,...j->...i", self.covariance, left / variance)
         self.state = predicted + np.moveaxis(change, -1, 0)
-        self.gauge(1 / self.state[0], 0.5 - (0.5 + self.state[1]) / self.state[0])
+        response = np.maximum(self.state[0], 0.1)
+        self.gauge(1 / response, 0.5 - (0.5 + self.state[1]) / response)
 
     def gauge(self, gain: Floats, offset: Floats) -> None:
         """Hold the gauge in coefficients and state."""
