@@ -146,17 +146,15 @@ fn frames(count: usize) -> (Scene, Vec<Vec<f32>>) {
 #[test]
 fn the_pattern_and_the_gain_error_fall() {
     let (truth, frames) = frames(500);
-    // The figures of the standard scene after 500 moving frames, halved: a small array has more border,
-    // and a third of its pixels has a reflected neighbourhood. Gains, where a figure for them stands:
-    // a frozen one stays at 1.
-    let least = [(2.5, 0.0), (3.0, 0.0), (6.0, 1.1), (4.0, 1.1), (4.0, 1.1)];
+    // The figures of the standard scene after 500 moving frames; of the gain error a quarter of the way to
+    // its figure after 2000, 1.8 or 2.5. A frozen gain stays at 1.
+    let least = [(5.0, 0.0), (6.0, 0.0), (12.0, 1.2), (8.0, 1.375), (8.0, 1.375)];
     for (options, (pattern, gain)) in options().iter().zip(least) {
         let mut scene = made(options);
         let before = truth.left(&scene);
         learn(&mut scene, &frames, 2);
         let after = truth.left(&scene);
         let falls = [before[0] / after[0], before[1] / after[1]];
-        println!("{options:?}: {falls:?}");
         assert!(falls[0] > pattern, "{options:?}: {falls:?}");
         assert!(falls[1] > gain, "{options:?}: {falls:?}");
     }

@@ -139,7 +139,7 @@ impl Method for Registered {
         let spectrum = self.transform.of(frame.corrected, frame.mean as f32, workers);
         let (mut used, mut replace) = (false, self.frames == 0);
         if !replace {
-            let shift = self.correlation.shift(&self.spectrum, &spectrum);
+            let shift = self.correlation.shift(&self.spectrum, &spectrum, workers);
             let [row, col] = shift.pixels;
             let far = row.abs().max(col.abs()) > self.most_motion;
             replace = far || shift.agreement < self.agreement;

@@ -6,9 +6,13 @@
 //! most of their power at low frequencies.
 
 use super::spectrum::{Spectrum, Transform};
+use crate::parallel::Workers;
 
-/// Newton steps from the best whole shift.
+/// Most Newton steps from the best whole shift.
 const STEPS: usize = 8;
+
+/// A step in pixels after which the shift is known to the rounding of the phases.
+const SMALL: f64 = 1e-9;
 
 /// Least amplitude of a cross spectrum that has a phase.
 const NOTHING: f64 = 1e-30;
@@ -39,11 +43,15 @@ impl PhaseCorrelation {
     }
 
     /// The shift with the largest Σ cos(phase − f·d).
-    pub(super) fn shift(&self, before: &Spectrum, after: &Spectrum) -> Shift {
+    pub(super) fn shift(&self, before: &Spectrum, after: &Spectrum, workers: &Workers) -> Shift {
         let phases: Vec<_> = self.entries.iter().map(|(i, _)| phase(before, after, *i)).collect();
-        let mut pixels = self.best_whole(&phases);
+        let mut pixels = self.best_whole(&phases, workers);
         for _ in 0..STEPS {
-            pixels = self.newton(&phases, pixels);
+            let last = pixels;
+            pixels = self.newton(&phases, last);
+            if (pixels[0] - last[0]).hypot(pixels[1] - last[1]) < SMALL {
+                break;
+            }
         }
         let left = phases.iter().zip(&self.entries).map(|(p, (_, f))| turned(*p, *f, pixels)[0]);
         let agreement = left.sum::<f64>() / phases.len() as f64;
@@ -51,20 +59,19 @@ impl PhaseCorrelation {
     }
 
     /// The best of all whole shifts within reach.
-    fn best_whole(&self, phases: &[[f64; 2]]) -> [f64; 2] {
-        let mut best = (f64::NEG_INFINITY, [0.0; 2]);
-        for col in -self.most..=self.most {
-            let lines = self.summed_along_cols(phases, col as f64);
-            for row in -self.most..=self.most {
-                let terms =
-                    lines.iter().map(|(u, sum)| turned(*sum, [*u, 0.0], [row as f64, 0.0])[0]);
-                let height: f64 = terms.sum();
-                if height > best.0 {
-                    best = (height, [row as f64, col as f64]);
-                }
-            }
-        }
-        best.1
+    fn best_whole(&self, phases: &[[f64; 2]], workers: &Workers) -> [f64; 2] {
+        let shifts = |index: usize| index as isize - self.most;
+        let count = 2 * self.most as usize + 1;
+        let best = workers.map(count, |col| {
+            let lines = self.summed_along_cols(phases, shifts(col) as f64);
+            let height = |row: usize| {
+                let row = [shifts(row) as f64, 0.0];
+                let terms = lines.iter().map(|(u, sum)| turned(*sum, [*u, 0.0], row)[0]);
+                (terms.sum::<f64>(), [row[0], shifts(col) as f64])
+            };
+            (0..count).map(height).fold((f64::NEG_INFINITY, [0.0; 2]), higher)
+        });
+        best.into_iter().fold((f64::NEG_INFINITY, [0.0; 2]), higher).1
     }
 
     /// Σ over the frequencies along the columns, for each frequency along the rows.
@@ -100,6 +107,11 @@ impl PhaseCorrelation {
         ];
         [pixels[0] + step[0].clamp(-1.0, 1.0), pixels[1] + step[1].clamp(-1.0, 1.0)]
     }
+}
+
+/// The higher of two peaks, the first of equal ones.
+fn higher(one: (f64, [f64; 2]), other: (f64, [f64; 2])) -> (f64, [f64; 2]) {
+    if other.0 > one.0 { other } else { one }
 }
 
 /// exp(i phase) of the cross spectrum.
