@@ -40,6 +40,7 @@ PAGES = (
     "docs/glossary.md",
     "docs/method.md",
     "docs/nuc.md",
+    "docs/scene.md",
 )
 MODULES = [module.name for module in pkgutil.walk_packages(equipix.__path__, "equipix.")]
 

@@ -42,7 +42,7 @@ LAYERS = (
     {"pictures"},
     {"demo"},
     {"comparison", "experiment", "loading"},
-    {"calibration", "nuc"},
+    {"calibration", "nuc", "scene"},
     {"exposures", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
@@ -93,6 +93,7 @@ BESIDE = {
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
     "response": set[str](),
+    "scene": {"geometry"},
     "statistics": set[str](),
 }
 """Core modules beside the chain: they use these, and what is right of `geometry`."""

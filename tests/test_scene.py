@@ -35,9 +35,7 @@ def run():
             method.update(frame.values)
             if index in (249, 349):
                 # The level is paused, so coefficients alone can change the pattern.
-                found[name].append(
-                    moving.residual_pattern(method.gain, method.offset, frame.level)
-                )
+                found[name].append(moving.residual_pattern(method.gain, method.offset, frame.level))
     ones = np.ones(moving.shape)
     raw = moving.residual_pattern(ones, 0 * ones, frame.level)
     return {
@@ -104,8 +102,9 @@ def test_a_level_that_changes_during_a_stop_updates_nothing():
 class TestReference:
     """The compiled methods against NumPy in double precision.
 
-    Values of order 1 are rounded to 2⁻²⁴ some 10² times in each frame, more in squares; over n frames
-    the differences of the coefficients add up to at most n · 10² · 2⁻²⁴, since every step contracts.
+    Values of order 1 are rounded to 2⁻²⁴ some 10² times in each frame, more in squares; over n
+    frames the differences of the coefficients add up to at most n · 10² · 2⁻²⁴, since every step
+    contracts.
     """
 
     ROUNDING = 100 * 2.0**-24
@@ -135,17 +134,17 @@ class TestReference:
 
     def test_registered(self, values):
         slow = reference.Registered(SHAPE, 0.1, 0.5, 8)
-        # A phase of an amplitude near 0 turns by its rounding: the shift errs by some 1e-5 pixel, times
-        # the largest slope of the scene, 0.3 a pixel.
+        # A phase of an amplitude near 0 turns by its rounding: the shift errs by some 1e-5 pixel,
+        # times the largest slope of the scene, 0.3 a pixel.
         allowed = len(values) * (self.ROUNDING + 0.1 * 0.3 * 1e-5)
         self.compare(made("registered"), slow, values, allowed)
         assert len(slow.moves) == len(values) - 1
 
     def test_constant_statistics(self, values):
         slow = reference.ConstantStatistics(SHAPE, 21, 4000, 0.004, 100)
-        # A deviation counts from 1e-3 on, a tenth of its neighbourhood's 1e-2. Four roundings of values of
-        # order 1 change it by a share 4 · 2⁻²⁴ / 1e-3, and its gain by that times a weight of 24/124 and a
-        # ratio of at most 10.
+        # A deviation counts from 1e-3 on, a tenth of its neighbourhood's 1e-2. Four roundings of
+        # values of order 1 change it by a share 4 · 2⁻²⁴ / 1e-3, and its gain by that times a
+        # weight of 24/124 and a ratio of at most 10.
         self.compare(made("constant-statistics"), slow, values, 2 * 4 * 2.0**-24 / 1e-3)
 
     def test_kalman(self, values):
@@ -252,7 +251,9 @@ class TestEveryMethod:
     def test_a_state_of_another_size_or_version_is_refused(self, name, tmp_path, monkeypatch):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        with pytest.raises(errors.FileError, match=r"state.npz: holds a state of a sensor \(48, 64\)"):
+        with pytest.raises(
+            errors.FileError, match=r"state.npz: holds a state of a sensor \(48, 64\)"
+        ):
             scene.load(tmp_path / "state.npz", shape=(64, 64))
         other = scene.METHODS[NAMES[NAMES.index(name) - 1]]
         with pytest.raises(errors.FileError, match=rf"holds a state of '{name}', expected"):
@@ -326,7 +327,9 @@ def test_local_mean_diverges_above_the_bound_and_not_below():
 @pytest.mark.parametrize("name", ["gated", "constant-statistics", "kalman"])
 @pytest.mark.parametrize("width", [1, 10, 49])
 def test_a_width_out_of_range_is_refused(name, width):
-    with pytest.raises(errors.InputError, match=f"'width' is {width}, expected an odd number from 3"):
+    with pytest.raises(
+        errors.InputError, match=f"'width' is {width}, expected an odd number from 3"
+    ):
         made(name, width=width)
 
 

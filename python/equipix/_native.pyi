@@ -243,12 +243,12 @@ class SceneCorrection:
 
     @staticmethod
     def local_mean(
-        shape: tuple[int, int], range: tuple[float, float], step: float, kernel: NDArray[Any]
+        shape: tuple[int, int], data_range: tuple[float, float], step: float, kernel: NDArray[Any]
     ) -> SceneCorrection: ...
     @staticmethod
     def gated(
         shape: tuple[int, int],
-        range: tuple[float, float],
+        data_range: tuple[float, float],
         step: float,
         width: int,
         threshold: float,
@@ -257,7 +257,7 @@ class SceneCorrection:
     @staticmethod
     def registered(
         shape: tuple[int, int],
-        range: tuple[float, float],
+        data_range: tuple[float, float],
         step: float,
         least_motion: float,
         most_motion: int,
@@ -267,7 +267,7 @@ class SceneCorrection:
     @staticmethod
     def constant_statistics(
         shape: tuple[int, int],
-        range: tuple[float, float],
+        data_range: tuple[float, float],
         width: int,
         window: int,
         motion: float,
@@ -276,7 +276,7 @@ class SceneCorrection:
     @staticmethod
     def kalman(
         shape: tuple[int, int],
-        range: tuple[float, float],
+        data_range: tuple[float, float],
         width: int,
         block: int,
         motion: float,

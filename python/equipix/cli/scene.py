@@ -33,7 +33,8 @@ def _group() -> None: ...
 @commands.command(epilog="Example: equipix scene frames/*.tif -o nuc.tif --method registered")
 def scene(
     source: Annotated[
-        list[str], typer.Argument(help="Raw frames in order: image files or globs, many pages each.")
+        list[str],
+        typer.Argument(help="Raw frames in order: image files or globs, many pages each."),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The correction: .tif or .npz.")],
     method: Annotated[
@@ -76,7 +77,9 @@ def scene(
         check_picture(picture)
     written = [output, *(path for path in outputs if path is not None)]
     refuse_inputs(written, [*find_files(source), *([resume] if resume else [])])
-    options = {name: value for name, value in (("step", step), ("width", width)) if value is not None}
+    options = {
+        name: value for name, value in (("step", step), ("width", width)) if value is not None
+    }
     learning = _method(method, source, data_range, options, resume, workers)
     with progress_bars() as progress:
         done = run_sequence(learning, source, output=corrected, force=force, progress=progress)
@@ -111,7 +114,8 @@ def _method(
         return found
     if data_range is None and dtype.kind != "u":
         raise InputError(
-            f"the frames are {dtype}, whose range is unknown: give 'data_range' (--data-range LOW HIGH)"
+            f"the frames are {dtype}, whose range is unknown: give 'data_range' (--data-range "
+            "LOW HIGH)"
         )
     known = signature(METHODS[name]).parameters
     if unknown := [f"--{option}" for option in options if option not in known]:

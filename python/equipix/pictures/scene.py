@@ -1,4 +1,4 @@
-"""The picture of a correction from the scene: a frame before and after, and the quality over time."""
+"""The picture of a correction from the scene: before and after, and the quality over time."""
 
 from __future__ import annotations
 

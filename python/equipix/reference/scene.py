@@ -40,7 +40,10 @@ def box(image: Floats, width: int) -> Floats:
     padded = np.pad(image, reach, mode="symmetric")
     sums = np.pad(padded, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
     low, high = sums[:-width], sums[width:]
-    return (high[:, width:] - high[:, :-width] - low[:, width:] + low[:, :-width]) / width**2
+    means: Floats = (
+        high[:, width:] - high[:, :-width] - low[:, width:] + low[:, :-width]
+    ) / width**2
+    return means
 
 
 def steps(step: float, y: Floats) -> Floats:
@@ -147,7 +150,8 @@ class Registered:
         radius = np.hypot(self.row_frequency, self.col_frequency)
         half = (self.col_frequency > 0) | ((self.col_frequency == 0) & (self.row_frequency > 0))
         self.used = (radius < self.cutoff) & (radius > 0) & half
-        return np.fft.fft2(weighted)[self.used]
+        spectrum: Floats = np.fft.fft2(weighted)[self.used]
+        return spectrum
 
     def motion(self, before: Floats, after: Floats) -> tuple[Floats, float]:
         """Shift d with after(p) = before(p + d), and the mean cosine of the phases left."""
@@ -170,7 +174,7 @@ class Registered:
         return move, float(left.real.mean())
 
     def moved(self, image: Floats, move: Floats) -> tuple[Floats, Floats]:
-        """Values image(p + move) of the interpolating cubic B-spline, and where p + move is inside."""
+        """Values image(p + move) of the interpolating cubic B-spline, and where it is inside."""
         values = self.spline[0] @ image @ self.spline[1].T
         inside = []
         for axis, shift in enumerate(move):
@@ -264,8 +268,8 @@ class Kalman:
     """Recursive Gauss-Markov estimate of each pixel's gain and offset from blocks of frames.
 
     y = G r + O + e with the mean r of the neighbourhood of the corrected frame. A block of n frames
-    gives the normal equations of (G, O) by least squares. Their weight is n / (n V), V the variance of
-    the mean of e over a block, which the difference of the means over its halves gives.
+    gives the normal equations of (G, O) by least squares. Their weight is 1 / V, where V is n times
+    the variance of the mean of e over a block: the difference of the sums over its halves gives V.
     """
 
     def __init__(
@@ -311,17 +315,26 @@ class Kalman:
     def left(self) -> Floats:
         """Sum of the residuals so far in the block."""
         r, _, y, _ = self.sums
-        return y - self.state[0] * r - self.count * self.state[1]
+        residual: Floats = y - self.state[0] * r - self.count * self.state[1]
+        return residual
 
     def learn(self) -> None:
         """Combine the block with the estimate before it."""
         variance = np.mean((self.left() - 2 * self.first) ** 2) / self.block
         r, rr, y, ry = self.sums
-        information = np.stack([np.stack([rr, r], -1), np.stack([r, np.full_like(r, self.block)], -1)], -1)
+        information = np.stack(
+            [np.stack([rr, r], -1), np.stack([r, np.full_like(r, self.block)], -1)], -1
+        )
         mean = np.array([1.0, 0.0])[:, None, None]
         predicted = mean + self.keep * (self.state - mean)
         covariance = self.keep**2 * self.covariance + (1 - self.keep**2) * self.prior
-        left = np.stack([ry - predicted[0] * rr - predicted[1] * r, y - predicted[0] * r - self.block * predicted[1]], -1)
+        left = np.stack(
+            [
+                ry - predicted[0] * rr - predicted[1] * r,
+                y - predicted[0] * r - self.block * predicted[1],
+            ],
+            -1,
+        )
         self.covariance = np.linalg.inv(np.linalg.inv(covariance) + information / variance)
         change = np.einsum("...ij,...j->...i", self.covariance, left / variance)
         self.state = predicted + np.moveaxis(change, -1, 0)

@@ -34,11 +34,11 @@ class SceneCorrection:
     """Base of the corrections from the scene: gain and offset that each frame changes.
 
     Raw values v become y = (v − low) / (high − low) with the ends of `data_range`. The corrected
-    frame is X = gain · y + offset, in DN low + (high − low) · X. After every frame the mean of the gains
-    is 1 and that of the offsets 0. Coefficients are of single precision.
+    frame is X = gain · y + offset, in DN low + (high − low) · X. After every frame the mean of the
+    gains is 1 and that of the offsets 0. Coefficients are of single precision.
 
-    Frames with a value that is not finite, and frames of one value alone, such as a dropped frame of
-    zeros, are corrected but change no state. A value more than one span outside of the range is
+    Frames with a value that is not finite, and frames of one value alone, such as a dropped frame
+    of zeros, are corrected but change no state. A value more than one span outside of the range is
     refused.
     """
 
@@ -144,9 +144,9 @@ class SceneCorrection:
         Returns
         -------
         Polynomial
-            corrected = c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw values in
-            DN. A pixel of less than half the response of its neighbours is flagged ``DEAD``, with
-            the limit of `nuc.DefectLimits`.
+            corrected = c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw values
+            in DN. A pixel of less than half the response of its neighbours is flagged ``DEAD``,
+            with the limit of `nuc.DefectLimits`.
 
         Raises
         ------
@@ -155,8 +155,8 @@ class SceneCorrection:
         """
         if not self._learned():
             raise InputError(
-                f"{type(self).__name__} has learned nothing from {self.frames} frames that counted: "
-                f"{self._UNLEARNED}"
+                f"{type(self).__name__} has learned nothing, from {self.frames} frames that "
+                f"counted: {self._UNLEARNED}"
             )
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
         low, high = self._range
@@ -225,8 +225,8 @@ class SceneCorrection:
         Raises
         ------
         FileError
-            If the file cannot be read, is damaged, or holds the state of another method, size or of a
-            newer format.
+            If the file cannot be read, is damaged, or holds the state of another method, size or of
+            a newer format.
         """
         maps, content = read_state(path, cls.method, shape)
         return cls.resumed(path, maps, content, workers)
@@ -267,10 +267,12 @@ def _range_of(data_range: DTypeLike | DataRange) -> DataRange:
     if isinstance(data_range, tuple | list) and len(data_range) == 2:
         low, high = (number("data_range", value) for value in data_range)
         if not -np.inf < low < high < np.inf:
-            raise InputError(f"'data_range' is {data_range!r}, expected (low, high), finite, rising")
+            raise InputError(
+                f"'data_range' is {data_range!r}, expected (low, high), finite, rising"
+            )
         return low, high
     try:
-        limits = np.iinfo(np.dtype(data_range))  # type: ignore[arg-type]
+        limits = np.iinfo(np.dtype(data_range))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"'data_range' is {data_range!r}, expected (low, high) in DN, or whole numbers such as "

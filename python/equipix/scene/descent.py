@@ -52,8 +52,8 @@ class LocalMean(SceneCorrection):
     References
     ----------
     .. [1] D. A. Scribner, K. A. Sarkady, M. R. Kruer, J. T. Caulfield, J. D. Hunt, C. Herman,
-       "Adaptive nonuniformity correction for IR focal-plane arrays using neural networks", Proc. SPIE
-       1541 (1991) 100-109.
+       "Adaptive nonuniformity correction for IR focal-plane arrays using neural networks", Proc.
+       SPIE 1541 (1991) 100-109.
 
     Examples
     --------
@@ -123,8 +123,8 @@ class Gated(SceneCorrection):
 
     References
     ----------
-    .. [1] R. C. Hardie, F. Baxley, B. Brys, P. Hytla, "Scene-based nonuniformity correction with reduced
-       ghosting using a gated LMS algorithm", Optics Express 17 (2009) 14918-14933.
+    .. [1] R. C. Hardie, F. Baxley, B. Brys, P. Hytla, "Scene-based nonuniformity correction with
+       reduced ghosting using a gated LMS algorithm", Optics Express 17 (2009) 14918-14933.
     """
 
     method: ClassVar[str] = "gated"

@@ -46,9 +46,9 @@ class Registered(SceneCorrection):
     Notes
     -----
     The method of Zuo et al. [1]_, with both frames of a pair corrected. For two frames with
-    X₂(p) = X₁(p + d) the errors are E₂(p) = X₁(p + d) − X₂(p) and E₁(p) = X₂(p − d) − X₁(p), by a cubic
-    B-spline, less their means. Then g ← g + η (E₂ y₂ + E₁ y₁) and o ← o + η (E₂ + E₁). One shift holds
-    for the whole frame: rotation, parallax and moving objects are not modelled.
+    X₂(p) = X₁(p + d) the errors are E₂(p) = X₁(p + d) − X₂(p) and E₁(p) = X₂(p − d) − X₁(p), by a
+    cubic B-spline, less their means. Then g ← g + η (E₂ y₂ + E₁ y₁) and o ← o + η (E₂ + E₁). One
+    shift holds for the whole frame: rotation, parallax and moving objects are not modelled.
 
     References
     ----------

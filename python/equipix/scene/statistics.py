@@ -8,6 +8,7 @@ import numpy as np
 
 from equipix._check import number
 from equipix._native import SceneCorrection as Native
+from equipix.errors import EquipixError
 from equipix.scene.adaptive import SceneCorrection, whole_number
 
 if TYPE_CHECKING:
@@ -47,14 +48,15 @@ class ConstantStatistics(SceneCorrection):
     Notes
     -----
     The method of Harris and Chiang [1]_ with a square around each pixel in the place of the array.
-    With the mean m and the standard deviation s of a pixel over n frames, m̄ and s̄ their means over
-    the square, g = 1 + n/(n + prior) · (s̄/s − 1) and o = m̄ − g m. Patterns wider than the square are
-    not corrected: of white offsets 1/`width` remains.
+    With the mean m and the standard deviation s of a pixel over n frames, m̄ and s̄ their means
+    over the square, g = 1 + n/(n + prior) · (s̄/s − 1) and o = m̄ − g m. Patterns wider than the
+    square are not corrected: of white offsets 1/`width` remains.
 
     References
     ----------
-    .. [1] J. G. Harris, Y.-M. Chiang, "Nonuniformity correction of infrared image sequences using the
-       constant-statistics constraint", IEEE Transactions on Image Processing 8 (1999) 1148-1151.
+    .. [1] J. G. Harris, Y.-M. Chiang, "Nonuniformity correction of infrared image sequences using
+       the constant-statistics constraint", IEEE Transactions on Image Processing 8 (1999)
+       1148-1151.
     """
 
     method: ClassVar[str] = "constant-statistics"
@@ -116,15 +118,15 @@ class Kalman(SceneCorrection):
     Notes
     -----
     The method of Torres and Hayat [1]_ with the mean r of the corrected values in a square as the
-    scene: y − ½ = G (r − ½) + O + e. The frames of a block give normal equations of (G, O). The detail e
-    of neighbouring frames is correlated, so its variance follows from the difference between the
-    halves of a block, over the whole array. The variances include neither patterns wider than
-    the square nor a scene that differs from place to place.
+    scene: y − ½ = G (r − ½) + O + e. The frames of a block give normal equations of (G, O). The
+    detail e of neighbouring frames is correlated, so its variance follows from the difference
+    between the halves of a block, over the whole array. The variances include neither patterns
+    wider than the square nor a scene that differs from place to place.
 
     References
     ----------
-    .. [1] S. N. Torres, M. M. Hayat, "Kalman filtering for adaptive nonuniformity correction in infrared
-       focal-plane arrays", Journal of the Optical Society of America A 20 (2003) 470-480.
+    .. [1] S. N. Torres, M. M. Hayat, "Kalman filtering for adaptive nonuniformity correction in
+       infrared focal-plane arrays", Journal of the Optical Society of America A 20 (2003) 470-480.
     """
 
     method: ClassVar[str] = "kalman"
@@ -175,5 +177,6 @@ class Kalman(SceneCorrection):
 
     def _variances(self) -> tuple[Array, Array]:
         found = self._native.variances()
-        assert found is not None  # noqa: S101
+        if found is None:
+            raise EquipixError("the compiled part gave no variances: please report this")
         return found

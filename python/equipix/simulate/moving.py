@@ -58,9 +58,9 @@ class MovingScene:
 
     Frames are y = G x + O + noise of the scene x = b + contrast · S(p + c). S is a periodic random
     field of 1024×1024 cells with amplitude 1/f, unit rms, clipped at 2.5. It is sampled at the
-    position c by cubic B-splines. The speed is 1.5 + 1.5·sin(2πt/61) pixels a frame, and the direction
-    is a random walk of 0.1 rad a frame. The mean level b is a triangle from 0.25 to 0.75, 500 frames
-    each way. The defaults are the standard scene of the package's tests.
+    position c by cubic B-splines. The speed is 1.5 + 1.5·sin(2πt/61) pixels a frame, and the
+    direction is a random walk of 0.1 rad a frame. The mean level b is a triangle from 0.25 to 0.75,
+    500 frames each way. The defaults are the standard scene of the package's tests.
 
     Attributes
     ----------
@@ -96,7 +96,9 @@ class MovingScene:
     def __post_init__(self) -> None:
         """Refuse an array that the periodic field does not cover once."""
         if max(check_shape(self.shape)) > _FIELD - 4:
-            raise InputError(f"'shape' is {self.shape}, expected at most {_FIELD - 4} pixels a side")
+            raise InputError(
+                f"'shape' is {self.shape}, expected at most {_FIELD - 4} pixels a side"
+            )
 
     def _random(self, purpose: int) -> np.random.Generator:
         """Give the random numbers of one purpose: field, pattern, path or noise."""

@@ -43,10 +43,10 @@ impl PySceneCorrection {
     fn made(
         py: Python<'_>,
         shape: (usize, usize),
-        range: [f64; 2],
+        data_range: [f64; 2],
         options: &Options,
     ) -> PyResult<Self> {
-        let made = SceneCorrection::new(Shape::new(shape.0, shape.1), range, options);
+        let made = SceneCorrection::new(Shape::new(shape.0, shape.1), data_range, options);
         made.map(|made| Self(Mutex::new(made))).map_err(|error| errors::exception(py, &error))
     }
 
@@ -72,26 +72,26 @@ impl PySceneCorrection {
     fn local_mean(
         py: Python<'_>,
         shape: (usize, usize),
-        range: [f64; 2],
+        data_range: [f64; 2],
         step: f64,
         kernel: PyReadonlyArray2<'_, f64>,
     ) -> PyResult<Self> {
         let sizes = [kernel.shape()[0], kernel.shape()[1]];
         let kernel = kernel.as_slice()?.to_vec();
-        Self::made(py, shape, range, &Options::LocalMean { step, kernel, sizes })
+        Self::made(py, shape, data_range, &Options::LocalMean { step, kernel, sizes })
     }
 
     #[staticmethod]
     fn gated(
         py: Python<'_>,
         shape: (usize, usize),
-        range: [f64; 2],
+        data_range: [f64; 2],
         step: f64,
         width: usize,
         threshold: f64,
         texture: f64,
     ) -> PyResult<Self> {
-        Self::made(py, shape, range, &Options::Gated { step, width, threshold, texture })
+        Self::made(py, shape, data_range, &Options::Gated { step, width, threshold, texture })
     }
 
     #[staticmethod]
@@ -99,7 +99,7 @@ impl PySceneCorrection {
     fn registered(
         py: Python<'_>,
         shape: (usize, usize),
-        range: [f64; 2],
+        data_range: [f64; 2],
         step: f64,
         least_motion: f64,
         most_motion: usize,
@@ -107,20 +107,20 @@ impl PySceneCorrection {
         agreement: f64,
     ) -> PyResult<Self> {
         let options = Options::Registered { step, least_motion, most_motion, cutoff, agreement };
-        Self::made(py, shape, range, &options)
+        Self::made(py, shape, data_range, &options)
     }
 
     #[staticmethod]
     fn constant_statistics(
         py: Python<'_>,
         shape: (usize, usize),
-        range: [f64; 2],
+        data_range: [f64; 2],
         width: usize,
         window: u64,
         motion: f64,
         prior: u64,
     ) -> PyResult<Self> {
-        Self::made(py, shape, range, &Options::ConstantStatistics { width, window, motion, prior })
+        Self::made(py, shape, data_range, &Options::ConstantStatistics { width, window, motion, prior })
     }
 
     #[staticmethod]
@@ -128,7 +128,7 @@ impl PySceneCorrection {
     fn kalman(
         py: Python<'_>,
         shape: (usize, usize),
-        range: [f64; 2],
+        data_range: [f64; 2],
         width: usize,
         block: u64,
         motion: f64,
@@ -137,7 +137,7 @@ impl PySceneCorrection {
         memory: f64,
     ) -> PyResult<Self> {
         let options = Options::Kalman { width, block, motion, gain_spread, offset_spread, memory };
-        Self::made(py, shape, range, &options)
+        Self::made(py, shape, data_range, &options)
     }
 
     /// Corrects a frame into `corrected`, then learns from it; whether it counted.
