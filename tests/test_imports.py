@@ -56,7 +56,13 @@ LAYERS = (
 )
 """The Python package from the top down: a module imports from its own layer or from below."""
 
-INNER = {"simulate": ({"rig"}, {"accuracy", "camera", "staring", "store"}, {"blackbody", "signal"})}
+INNER = {
+    "simulate": (
+        {"rig"},
+        {"accuracy", "camera", "moving", "staring", "store"},
+        {"blackbody", "signal"},
+    )
+}
 """Folders whose files have an order of their own, from the top down like LAYERS."""
 
 LIBRARIES = {

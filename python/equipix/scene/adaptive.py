@@ -144,9 +144,9 @@ class SceneCorrection:
         Returns
         -------
         Polynomial
-            corrected = c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw values
-            in DN. A pixel of less than half the response of its neighbours is flagged ``DEAD``,
-            with the limit of `nuc.DefectLimits`.
+            Corrected frame c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw
+            values in DN. A pixel of less than half the response of its neighbours is flagged
+            ``DEAD``, with the limit of `nuc.DefectLimits`.
 
         Raises
         ------

@@ -105,8 +105,8 @@ class Gated(SceneCorrection):
         Change of the local mean, less the mean of the frame, above which a pixel is updated, on the
         scale [0, 1]. 0 switches the gate off.
     texture : float
-        k of the step η / (1 + k σ²) with the variance σ² of the corrected values in the square, on
-        the scale [0, 1]. With 1000 the pattern itself makes the first steps too short.
+        Factor k of the step η / (1 + k σ²) with the variance σ² of the corrected values in the
+        square, on the scale [0, 1]. With 1000 the pattern itself makes the first steps too short.
     workers : int, optional
         Number of threads; by default one for each processor.
 
