@@ -123,7 +123,7 @@ def draw(run: Run) -> None:
         axes.plot(frames, values, label=name)
     axes.axvspan(*run.moving.stop, color="0.9")
     axes.set(xlabel="frame", ylabel="residual pattern, rms", yscale="log")
-    axes.legend(fontsize="small", ncols=2)
+    axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1, 1))
     figure.savefig(FILE, dpi=110)
 
 
