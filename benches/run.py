@@ -20,6 +20,7 @@ import large
 import multiscale
 import numpy as np
 import response
+import scene
 import subpixel
 import uncertainty
 from peers import table as peers
@@ -45,6 +46,7 @@ def main(*, smoke: bool) -> None:
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
+    rows += scene.rows(shape=(48, 64), frames=3, passes=1) if smoke else scene.rows()
     rows += applying.rows(shapes=((48, 64), (24, 32)), repetitions=1) if smoke else applying.rows()
     rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
     table = markdown(rows, rates[0]["threads"])

@@ -41,6 +41,7 @@ PAGES = (
     "docs/infrared.md",
     "docs/method.md",
     "docs/nuc.md",
+    "docs/scene.md",
 )
 MODULES = [module.name for module in pkgutil.walk_packages(equipix.__path__, "equipix.")]
 

@@ -42,7 +42,7 @@ LAYERS = (
     {"pictures"},
     {"demo"},
     {"comparison", "experiment", "loading"},
-    {"calibration", "nuc"},
+    {"calibration", "nuc", "scene"},
     {"bolometer", "detector"},
     {"exposures", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
@@ -57,7 +57,13 @@ LAYERS = (
 )
 """The Python package from the top down: a module imports from its own layer or from below."""
 
-INNER = {"simulate": ({"rig"}, {"accuracy", "camera", "staring", "store"}, {"blackbody", "signal"})}
+INNER = {
+    "simulate": (
+        {"rig"},
+        {"accuracy", "camera", "moving", "staring", "store"},
+        {"blackbody", "signal"},
+    )
+}
 """Folders whose files have an order of their own, from the top down like LAYERS."""
 
 LIBRARIES = {
@@ -94,6 +100,7 @@ BESIDE = {
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
     "response": set[str](),
+    "scene": {"geometry"},
     "statistics": set[str](),
 }
 """Core modules beside the chain: they use these, and what is right of `geometry`."""

@@ -6,12 +6,14 @@ import multiprocessing
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 
 import equipix
+from equipix import scene
 
 CROSS = equipix.cross_pattern(2, 3)
 
@@ -63,6 +65,55 @@ def test_ctrl_c_stops_the_joint_fit_on_a_large_sensor(after_s):
     sensor.
     """
     assert seconds_to_stop(3000, 3000, "multiscale", after_s, fraction=0.25) < 0.5
+
+
+UPDATES = """
+import numpy as np
+from equipix import scene
+frame = np.random.default_rng(0).uniform(0, 1, (1000, 1000)).astype(np.float32)
+method = scene.Registered(frame.shape, (0, 1))
+print("ready", flush=True)
+try:
+    while True:
+        frame = np.roll(frame, 2, axis=1)
+        method.update(frame)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.timing
+def test_ctrl_c_stops_updates_from_the_scene():
+    with subprocess.Popen(
+        [sys.executable, "-c", UPDATES], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        start = time.monotonic()
+        assert process.stdout.readline() == "interrupted\n"
+        assert time.monotonic() - start < 0.5
+
+
+@pytest.mark.timing
+def test_an_update_from_the_scene_leaves_the_interpreter_free():
+    frame = np.random.default_rng(0).uniform(0, 1, (3000, 3000)).astype(np.float32)
+    method = scene.Registered(frame.shape, (0, 1), workers=1)
+    method.update(frame)
+    moved, seconds = np.roll(frame, 2, axis=1), []
+
+    def update():
+        start = time.monotonic()
+        method.update(moved)
+        seconds.append(time.monotonic() - start)
+
+    thread, times = threading.Thread(target=update), [time.monotonic()]
+    thread.start()
+    while thread.is_alive():
+        time.sleep(0.001)
+        times.append(time.monotonic())
+    thread.join()
+    assert np.diff(times).max() < seconds[0] / 2
 
 
 def calibrated(seed):

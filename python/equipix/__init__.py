@@ -13,7 +13,18 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import bolometer, detector, errors, lens, metrics, nuc, plan, simulate, uncertainty
+    from equipix import (
+        bolometer,
+        detector,
+        errors,
+        lens,
+        metrics,
+        nuc,
+        plan,
+        scene,
+        simulate,
+        uncertainty,
+    )
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
@@ -63,6 +74,7 @@ _MODULES = (
     "metrics",
     "nuc",
     "plan",
+    "scene",
     "simulate",
     "uncertainty",
 )
@@ -97,6 +109,7 @@ __all__ = [
     "metrics",
     "nuc",
     "plan",
+    "scene",
     "simulate",
     "uncertainty",
 ]

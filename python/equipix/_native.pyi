@@ -12,6 +12,7 @@ __all__ = [
     "Corrector",
     "Exposures",
     "Fit",
+    "SceneCorrection",
     "Uncertainty",
     "__version__",
     "average_files",
@@ -237,3 +238,61 @@ def planned_components(
     mask: NDArray[Any] | None,
 ) -> tuple[NDArray[Any], list[int], int]: ...
 def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> NDArray[Any]: ...
+
+@final
+class SceneCorrection:
+    """Gain and offset from the scene; it keeps the state of its method."""
+
+    @staticmethod
+    def local_mean(
+        shape: tuple[int, int], data_range: tuple[float, float], step: float, kernel: NDArray[Any]
+    ) -> SceneCorrection: ...
+    @staticmethod
+    def gated(
+        shape: tuple[int, int],
+        data_range: tuple[float, float],
+        step: float,
+        width: int,
+        threshold: float,
+        texture: float,
+    ) -> SceneCorrection: ...
+    @staticmethod
+    def registered(
+        shape: tuple[int, int],
+        data_range: tuple[float, float],
+        step: float,
+        least_motion: float,
+        most_motion: int,
+        cutoff: float,
+        agreement: float,
+    ) -> SceneCorrection: ...
+    @staticmethod
+    def constant_statistics(
+        shape: tuple[int, int],
+        data_range: tuple[float, float],
+        width: int,
+        window: int,
+        motion: float,
+        prior: int,
+    ) -> SceneCorrection: ...
+    @staticmethod
+    def kalman(
+        shape: tuple[int, int],
+        data_range: tuple[float, float],
+        width: int,
+        block: int,
+        motion: float,
+        gain_spread: float,
+        offset_spread: float,
+        memory: float,
+    ) -> SceneCorrection: ...
+    def update(
+        self, frame: NDArray[Any], corrected: NDArray[Any], *, workers: int | None
+    ) -> bool: ...
+    def frames(self) -> int: ...
+    def coefficients(self) -> tuple[NDArray[Any], NDArray[Any]]: ...
+    def variances(self) -> tuple[NDArray[Any], NDArray[Any]] | None: ...
+    def state(self) -> tuple[list[tuple[str, NDArray[Any]]], list[tuple[str, int]]]: ...
+    def restore(
+        self, maps: list[tuple[str, NDArray[Any]]], counts: list[tuple[str, int]]
+    ) -> None: ...

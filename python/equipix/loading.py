@@ -31,6 +31,8 @@ _NO_CORRECTIONS = {
     "bolometer.DynamicCorrection.load reads it, and its at(...) gives the correction at a state",
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
     "themselves: FrameStatistics.load reads them, equipix correct subtracts them as --dark",
+    "state of a correction from the scene": "equipix.scene.load reads it; its result() is a "
+    "correction",
 }
 """Kinds of files that are no corrections, and what they are."""
 

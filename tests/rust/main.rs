@@ -14,6 +14,7 @@ mod joint;
 mod laws;
 mod multiscale;
 mod response;
+mod scene;
 mod simulation;
 mod statistics;
 mod uncertainty;

@@ -21,6 +21,7 @@ COMMANDS = {
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
+    "scene": ("scene", "Learn gain and offset of each pixel from a moving scene."),
     "simulate": (
         "simulate",
         "Write the images of an experiment with a virtual camera, and its truth.",

@@ -4,6 +4,7 @@ from equipix.maps import block_means, relative_error
 from equipix.simulate import blackbody
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
+from equipix.simulate.moving import Frame, MovingScene
 from equipix.simulate.rig import Truth, VirtualExperiment, experiment
 from equipix.simulate.signal import (
     Beam,
@@ -20,6 +21,8 @@ from equipix.simulate.staring import StaringArray
 __all__ = [
     "Beam",
     "Camera",
+    "Frame",
+    "MovingScene",
     "StaringArray",
     "Truth",
     "VirtualExperiment",

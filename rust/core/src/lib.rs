@@ -141,6 +141,7 @@
 //! error           what can go wrong
 //!
 //! response        response curves from levels of a uniform source  (uses parallel and below)
+//! scene           gain and offset from a moving scene  (uses geometry and below)
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
 //! apply           corrections applied to frames                 (uses parallel and below)
@@ -205,6 +206,7 @@ mod random;
 mod reduced;
 pub mod response;
 mod ritz;
+pub mod scene;
 pub mod solve;
 pub mod statistics;
 pub mod sweep;

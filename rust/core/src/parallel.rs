@@ -177,6 +177,16 @@ impl Workers {
         });
     }
 
+    /// Calls `work(index, part)` for each part in parallel; the results stand in the order of the parts.
+    pub(crate) fn each<T: Send, R: Send>(
+        &self,
+        parts: Vec<T>,
+        work: impl Fn(usize, T) -> R + Sync + Send,
+    ) -> Vec<R> {
+        let work = |(index, part)| work(index, part);
+        self.pool.install(|| parts.into_par_iter().enumerate().map(work).collect())
+    }
+
     /// Like [`map_blocks`](Self::map_blocks) over two slices at once, cut into as many blocks.
     pub fn map_pairs<A, B, R>(
         &self,

@@ -17,6 +17,7 @@ mod fit;
 mod plan;
 mod response;
 mod run;
+mod scene;
 
 use pyo3::prelude::*;
 
@@ -40,6 +41,8 @@ mod _native {
     use crate::plan::planned_components;
     #[pymodule_export]
     use crate::response::fit_response;
+    #[pymodule_export]
+    use crate::scene::PySceneCorrection;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -1,0 +1,47 @@
+"""Updates of the corrections from the scene, for `make bench`."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+
+from equipix import scene
+from equipix.simulate import MovingScene
+
+SHAPE, FRAMES, PASSES = (512, 640), 24, 8
+FAST = ("local-mean", "gated")
+"""Methods of which 500 frames a second are wanted; of the others 100."""
+
+
+def rows(
+    *, shape: tuple[int, int] = SHAPE, frames: int = FRAMES, passes: int = PASSES
+) -> list[tuple[str, str, str, str]]:
+    """Measure an update of each method, and give the table's rows: work, wanted, got, how."""
+    moving = MovingScene(seed=1, shape=shape)
+    values = [
+        np.clip(2**14 + 2**13 * frame.values, 0, 2**16 - 1).astype(np.uint16)
+        for frame in moving.frames(frames)
+    ]
+    threads = len(os.sched_getaffinity(0))
+    found = []
+    for name, method in scene.METHODS.items():
+        made = method(shape, data_range=(2**14, 2**14 + 2**13))
+        seconds = [_seconds(made, frame) for _ in range(passes) for frame in values]
+        median = float(np.median(seconds))
+        found.append(
+            (
+                f"an update of scene {name}, {shape[1]}×{shape[0]}, 16 bits",
+                ">= 500 frames/s" if name in FAST else ">= 100 frames/s",
+                f"{1 / median:.0f} frames/s",
+                f"median of {len(seconds)}, {median * 1e3:.2f} ms, {threads} threads",
+            )
+        )
+    return found
+
+
+def _seconds(method: scene.SceneCorrection, frame: np.ndarray) -> float:
+    start = time.perf_counter()
+    method.update(frame)
+    return time.perf_counter() - start

@@ -1,0 +1,145 @@
+"""The command about corrections from the scene: scene."""
+
+from __future__ import annotations
+
+from inspect import signature
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from equipix.cli.options import Force, Json, Workers
+from equipix.cli.terminal import check_output, progress_bars, show_result
+from equipix.errors import InputError
+from equipix.io import SUFFIXES, find_files, refuse_inputs
+from equipix.pictures.canvas import check_picture, save_figure
+from equipix.pictures.scene import draw_sequence
+from equipix.scene import METHODS, SceneCorrection, load
+from equipix.scene.sequence import Sequence, run_sequence, sequence_format
+
+commands = typer.Typer()
+
+_SHOWN = 10
+"""Most points of the quality that are printed."""
+
+_TIFF = (".tif", ".tiff")
+
+
+@commands.callback()
+def _group() -> None: ...
+
+
+@commands.command(epilog="Example: equipix scene frames/*.tif -o nuc.tif --method registered")
+def scene(
+    source: Annotated[
+        list[str],
+        typer.Argument(help="Raw frames in order: image files or globs, many pages each."),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The correction: .tif or .npz.")],
+    method: Annotated[
+        Literal["local-mean", "gated", "registered", "constant-statistics", "kalman"],
+        typer.Option(help="How gain and offset follow from the frames."),
+    ] = "registered",
+    data_range: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Lowest and highest raw value in DN; that of whole numbers by default."),
+    ] = None,
+    step: Annotated[
+        float | None, typer.Option(help="Step of local-mean, gated and registered.")
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Neighbourhood of gated, constant-statistics and kalman.")
+    ] = None,
+    corrected: Annotated[
+        Path | None,
+        typer.Option(help="A .tif of all frames, each corrected by what was learned before it."),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="A frame before and after, and the roughness: .png, .pdf or .svg."),
+    ] = None,
+    state: Annotated[
+        Path | None, typer.Option(help="Save the state, so that --resume goes on: .tif or .npz.")
+    ] = None,
+    resume: Annotated[Path | None, typer.Option(help="A saved state to go on from.")] = None,
+    workers: Workers = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Learn gain and offset of each pixel from a moving scene."""
+    check_output(output, force=force, suffixes=SUFFIXES)
+    outputs = {corrected: _TIFF, state: SUFFIXES, picture: ()}
+    for path, suffixes in outputs.items():
+        if path is not None:
+            check_output(path, force=force, suffixes=suffixes)
+    if picture is not None:
+        check_picture(picture)
+    written = [output, *(path for path in outputs if path is not None)]
+    refuse_inputs(written, [*find_files(source), *([resume] if resume else [])])
+    options = {
+        name: value for name, value in (("step", step), ("width", width)) if value is not None
+    }
+    learning = _method(method, source, data_range, options, resume, workers)
+    with progress_bars() as progress:
+        done = run_sequence(learning, source, output=corrected, force=force, progress=progress)
+    result = learning.result()
+    result.save(output, force=force)
+    if state is not None:
+        learning.save(state, force=force)
+    if picture is not None:
+        save_figure(draw_sequence(done, result), picture, force=force)
+    show_result(_summary(output, learning, done), as_json=as_json)
+
+
+def _method(
+    name: str,
+    source: list[str],
+    data_range: tuple[float, float] | None,
+    options: dict[str, Any],
+    resume: Path | None,
+    workers: int | None,
+) -> SceneCorrection:
+    """Make the correction, or read its state."""
+    shape, dtype = sequence_format(source)
+    if resume is not None:
+        if options or data_range:
+            raise InputError(
+                "'resume' (--resume) brings range, step and width with it: leave out --data-range, "
+                "--step and --width"
+            )
+        found = load(resume, shape=shape, workers=workers)
+        if found.method != name:
+            raise InputError(f"{resume}: is of --method {found.method}, not of {name}: name that")
+        return found
+    if data_range is None and dtype.kind != "u":
+        raise InputError(
+            f"the frames are {dtype}, whose range is unknown: give 'data_range' (--data-range "
+            "LOW HIGH)"
+        )
+    known = signature(METHODS[name]).parameters
+    if unknown := [f"--{option}" for option in options if option not in known]:
+        raise InputError(f"--method {name} does not take {' and '.join(unknown)}: leave it out")
+    return METHODS[name](shape, data_range or np.dtype(dtype), workers=workers, **options)
+
+
+def _summary(output: Path, method: SceneCorrection, done: Sequence) -> dict[str, Any]:
+    """Frames, spreads of the coefficients, and quality over time."""
+    every = max(1, -(-len(done.points) // _SHOWN))
+    points = [*range(0, len(done.points) - 1, every), len(done.points) - 1]
+    return {
+        "output": str(output),
+        "method": method.method,
+        "frames": done.frames,
+        "frames_that_counted": method.frames,
+        "gain_rms": float(np.std(method.gain)),
+        "offset_rms": float(np.std(method.offset)),
+        "roughness": [
+            {
+                "frame": done.points[i],
+                "raw": round(done.raw[i], 5),
+                "corrected": round(done.corrected[i], 5),
+            }
+            for i in points
+        ],
+    }

@@ -1,0 +1,281 @@
+"""What all corrections from the scene have in common."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from equipix._check import as_array, check_shape, number, positive_workers
+from equipix._native import SceneCorrection as Native
+from equipix.correction.polynomial import Polynomial
+from equipix.errors import FileError, InputError
+from equipix.flags import set_bits
+from equipix.nuc.limits import DefectLimits
+from equipix.scene.saved import read_state, write_state
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from os import PathLike
+    from typing import Self
+
+    from numpy.typing import ArrayLike, DTypeLike
+
+    from equipix._types import Array
+
+DataRange = tuple[float, float]
+"""Lowest and highest raw value in DN."""
+
+_TAKEN = (np.uint8, np.uint16, np.float32, np.float64)
+"""Types that the compiled part takes as they are."""
+
+
+class SceneCorrection:
+    """Base of the corrections from the scene: gain and offset that each frame changes.
+
+    Raw values v become y = (v − low) / (high − low) with the ends of `data_range`. The corrected
+    frame is X = gain · y + offset, in DN low + (high − low) · X. After every frame the mean of the
+    gains is 1 and that of the offsets 0. Coefficients are of single precision.
+
+    Frames with a value that is not finite, and frames of one value alone, such as a dropped frame
+    of zeros, are corrected but change no state. A value more than one span outside of the range is
+    refused.
+    """
+
+    method: ClassVar[str] = ""
+    """Name of the method, as the command line takes it."""
+
+    _UNLEARNED: ClassVar[str] = "take frames first"
+    """What to do where no frame counted."""
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        data_range: DTypeLike | DataRange,
+        workers: int | None,
+        options: dict[str, Any],
+    ) -> None:
+        """Check what all methods take; `options` holds the keywords of the method."""
+        self._shape = check_shape(shape)
+        self._range = _range_of(data_range)
+        self._workers = positive_workers(workers)
+        self._options = options
+        self._native = self._made()
+
+    def _made(self) -> Native:
+        """Make the compiled correction of the options."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Short form: method, sizes and frames."""
+        rows, cols = self._shape
+        return f"<{type(self).__name__} of {rows} x {cols} pixels, {self.frames} frames>"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        return self._shape
+
+    @property
+    def data_range(self) -> DataRange:
+        """Lowest and highest raw value in DN, which become 0 and 1."""
+        return self._range
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keywords of the method, as JSON values."""
+        return dict(self._options)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that counted: of methods that need motion, those that moved."""
+        return self._native.frames()
+
+    @property
+    def gain(self) -> Array:
+        """Gain of each pixel, mean 1, shape (rows, cols), float32, read-only."""
+        return self._native.coefficients()[0]
+
+    @property
+    def offset(self) -> Array:
+        """Offset of each pixel in DN, mean 0, shape (rows, cols), float32.
+
+        It is that of the formula corrected = low + gain · (raw − low) + offset.
+        """
+        low, high = self._range
+        return self._native.coefficients()[1] * np.float32(high - low)
+
+    def update(self, frame: ArrayLike) -> Array:
+        """Correct a frame by the coefficients so far, then learn from it.
+
+        Parameters
+        ----------
+        frame : array_like, shape (rows, cols)
+            Raw frame in DN.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols), float32
+            The corrected frame in DN.
+
+        Raises
+        ------
+        InputError
+            If the frame has another shape, or a finite value more than one span outside of the
+            range; then nothing has changed.
+        """
+        raw = as_array("frame", frame, ndim=2)
+        if raw.shape != self._shape or raw.dtype == np.bool_:
+            raise InputError(
+                f"'frame' is {raw.dtype} of shape {raw.shape}, expected numbers of {self._shape}"
+            )
+        taken = raw if raw.dtype in _TAKEN else raw.astype(np.float64)
+        corrected = np.empty(self._shape, np.float32)
+        self._native.update(taken, corrected, workers=self._workers)
+        return corrected
+
+    def _learned(self) -> bool:
+        """Whether the coefficients have changed."""
+        return self.frames > 0
+
+    def result(self) -> Polynomial:
+        """Correction by the coefficients so far.
+
+        Returns
+        -------
+        Polynomial
+            Corrected frame c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw
+            values in DN. A pixel of less than half the response of its neighbours is flagged
+            ``DEAD``, with the limit of `nuc.DefectLimits`.
+
+        Raises
+        ------
+        InputError
+            If no frame counted: the scene never moved, or too few frames were taken.
+        """
+        if not self._learned():
+            raise InputError(
+                f"{type(self).__name__} has learned nothing, from {self.frames} frames that "
+                f"counted: {self._UNLEARNED}"
+            )
+        gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
+        low, high = self._range
+        flags = np.zeros(self._shape, np.uint32)
+        set_bits(flags, "dead", ~((gain > 0) & (gain <= 1 / DefectLimits.response)))
+        metadata = {
+            "scene": {
+                "method": self.method,
+                "options": self.options,
+                "data_range": list(self._range),
+                "frames": self.frames,
+            }
+        }
+        coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
+        return Polynomial(coefficients, flags, metadata)
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write the state to a file, from which `load` goes on with the same bytes.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        maps, counts = self._native.state()
+        content = {
+            "method": self.method,
+            "shape": list(self._shape),
+            "data_range": list(self._range),
+            "options": self._options,
+            "counts": dict(counts),
+        }
+        write_state(path, dict(maps), content, force=force)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | PathLike[str],
+        *,
+        shape: tuple[int, int] | None = None,
+        workers: int | None = None,
+    ) -> Self:
+        """Read a state that `save` wrote.
+
+        Parameters
+        ----------
+        path : str or path
+            The file.
+        shape : tuple of int, optional
+            Sizes of the sensor; a state of another size is refused.
+        workers : int, optional
+            Number of threads; by default one for each processor.
+
+        Returns
+        -------
+        SceneCorrection
+            In the state in which it was saved.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged, or holds the state of another method, size or of
+            a newer format.
+        """
+        maps, content = read_state(path, cls.method, shape)
+        return cls.resumed(path, maps, content, workers)
+
+    @classmethod
+    def resumed(
+        cls,
+        path: str | PathLike[str],
+        maps: Mapping[str, Array],
+        content: Mapping[str, Any],
+        workers: int | None,
+    ) -> Self:
+        """Make a correction of the parts of its file; the errors are those of `load`."""
+        try:
+            low, high = content["data_range"]
+            made = cls(
+                tuple(content["shape"]),
+                (float(low), float(high)),
+                workers=workers,
+                **content["options"],
+            )
+            counts = [(str(name), int(count)) for name, count in content["counts"].items()]
+            made._native.restore(list(maps.items()), counts)
+        except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
+            raise FileError(f"{path}: is damaged: {error}") from error
+        return made
+
+
+def whole_number(name: str, value: int) -> int:
+    """A whole number from 0, checked."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise InputError(f"'{name}' is {value!r}, expected a whole number")
+    return int(value)
+
+
+def _range_of(data_range: DTypeLike | DataRange) -> DataRange:
+    """Lowest and highest raw value: given, or those of whole numbers."""
+    if isinstance(data_range, tuple | list) and len(data_range) == 2:
+        low, high = (number("data_range", value) for value in data_range)
+        if not -np.inf < low < high < np.inf:
+            raise InputError(
+                f"'data_range' is {data_range!r}, expected (low, high), finite, rising"
+            )
+        return low, high
+    try:
+        limits = np.iinfo(np.dtype(data_range))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"'data_range' is {data_range!r}, expected (low, high) in DN, or whole numbers such as "
+            "'uint16'"
+        ) from error
+    return float(limits.min), float(limits.max)

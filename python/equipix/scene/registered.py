@@ -1,0 +1,87 @@
+"""Correction by pairs of frames: Registered."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from equipix._check import number
+from equipix._native import SceneCorrection as Native
+from equipix.scene.adaptive import SceneCorrection, whole_number
+
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
+
+    from equipix.scene.adaptive import DataRange
+
+
+class Registered(SceneCorrection):
+    """Gain and offset towards the other frame of a pair, moved by the shift between them.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Sizes of the sensor (rows, cols), 20 or more.
+    data_range : dtype or tuple of float
+        Lowest and highest raw value in DN, or the dtype of whole numbers.
+    step : float
+        Step η, below the stability bound 0.25.
+    least_motion : float
+        Shift in pixels below which the earlier frame of a pair waits for a later partner.
+    most_motion : int
+        Largest shift along an axis in pixels.
+    cutoff : float
+        Highest spatial frequency of the phase correlation in cycles per pixel. Above 0.1 the
+        pattern of the pixels, which stands still, decides the shift of usual scenes.
+    agreement : float
+        Least mean cosine of the phases that the shift leaves, 0 to 1; pairs below, as after a
+        change of scene, are not used.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+
+    Notes
+    -----
+    The method of Zuo et al. [1]_, with both frames of a pair corrected. For two frames with
+    X₂(p) = X₁(p + d) the errors are E₂(p) = X₁(p + d) − X₂(p) and E₁(p) = X₂(p − d) − X₁(p), by a
+    cubic B-spline, less their means. Then g ← g + η (E₂ y₂ + E₁ y₁) and o ← o + η (E₂ + E₁). One
+    shift holds for the whole frame: rotation, parallax and moving objects are not modelled.
+
+    References
+    ----------
+    .. [1] C. Zuo, Q. Chen, G. Gu, X. Sui, "Scene-based nonuniformity correction algorithm based on
+       interframe registration", Journal of the Optical Society of America A 28 (2011) 1164-1176.
+    """
+
+    method: ClassVar[str] = "registered"
+    _UNLEARNED: ClassVar[str] = (
+        "the scene never moved by 'least_motion', or no pair of frames agreed; take a moving scene"
+    )
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        data_range: DTypeLike | DataRange,
+        *,
+        step: float = 0.1,
+        least_motion: float = 0.5,
+        most_motion: int = 8,
+        cutoff: float = 0.1,
+        agreement: float = 0.3,
+        workers: int | None = None,
+    ) -> None:
+        """Begin with gain 1 and offset 0."""
+        options = {
+            "step": number("step", step),
+            "least_motion": number("least_motion", least_motion),
+            "most_motion": whole_number("most_motion", most_motion),
+            "cutoff": number("cutoff", cutoff),
+            "agreement": number("agreement", agreement),
+        }
+        super().__init__(shape, data_range, workers, options)
+
+    def _made(self) -> Native:
+        return Native.registered(self._shape, self._range, **self._options)

@@ -1,0 +1,74 @@
+"""The file of a state: named maps, and what else is remembered as JSON."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix.errors import FileError
+from equipix.io import check_format, load_pages, save_pages
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from os import PathLike
+
+    from equipix._types import Array
+
+KIND = "state of a correction from the scene"
+"""The kind in the metadata of the file."""
+
+FORMAT = 1
+"""Number of the file format; a file with a higher one is refused."""
+
+
+def write_state(
+    path: str | PathLike[str], maps: Mapping[str, Array], content: Mapping[str, Any], *, force: bool
+) -> None:
+    """Write a state; see `SceneCorrection.save`."""
+    save_pages(path, maps, {"format": FORMAT, "kind": KIND, **content}, force=force)
+
+
+def read_state(
+    path: str | PathLike[str], method: str | None, shape: tuple[int, int] | None
+) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Read the maps and the rest of a state.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    method : str, optional
+        The method that it must be of.
+    shape : tuple of int, optional
+        The sizes of the sensor that it must be of.
+
+    Returns
+    -------
+    maps : dict of str to ndarray
+        Maps by name, float32.
+    content : dict
+        Method, shape, range, options and counts.
+
+    Raises
+    ------
+    FileError
+        If it is not such a state, or is damaged.
+    """
+    maps, content = load_pages(path)
+    check_format(path, content, KIND, FORMAT)
+    missing = {"method", "shape", "data_range", "options", "counts"} - content.keys()
+    if missing:
+        raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")
+    if method is not None and content["method"] != method:
+        raise FileError(f"{path}: holds a state of '{content['method']}', expected '{method}'")
+    held = tuple(content["shape"])
+    if shape is not None and held != tuple(shape):
+        raise FileError(f"{path}: holds a state of a sensor {held}, expected {tuple(shape)}")
+    for name, values in maps.items():
+        if values.dtype != np.float32 or values.ndim != 2:
+            raise FileError(
+                f"{path}: is damaged: page '{name}' is {values.dtype} of shape {values.shape}, "
+                "expected float32 in two dimensions"
+            )
+    return maps, content

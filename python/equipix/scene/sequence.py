@@ -1,0 +1,171 @@
+"""A recorded sequence in files, through a correction from the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._check import check_progress
+from equipix.correction.files import warn_of_corrected
+from equipix.errors import FileError
+from equipix.io import (
+    find_files,
+    frame_format,
+    refuse_inputs,
+    refuse_saved,
+    stream_frames,
+    write_frames,
+    write_whole,
+)
+from equipix.metrics import roughness
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from equipix._types import Array, Progress
+    from equipix.scene.adaptive import SceneCorrection
+
+_POINTS = 50
+"""Most frames of which the quality is found."""
+
+_MARK = "corrected by equipix from the scene"
+"""Description of corrected frames; its beginning is that of all corrected frames."""
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """What a sequence went through.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames.
+    points : tuple of int
+        Frames, from 1, of which the quality was found.
+    raw, corrected : tuple of float
+        Roughness of these frames before and after correction, see `metrics.roughness`.
+    last : ndarray, shape (rows, cols)
+        The last frame with finite values, raw.
+    """
+
+    frames: int
+    points: tuple[int, ...]
+    raw: tuple[float, ...]
+    corrected: tuple[float, ...]
+    last: Array
+
+
+def sequence_format(source: list[str]) -> tuple[tuple[int, int], np.dtype[Any]]:
+    """Shape (rows, cols) and dtype of the first file's frames.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read, or is no file of raw frames.
+    """
+    first = find_files(source)[0]
+    refuse_saved(first)
+    (_, rows, cols), dtype = frame_format(first)
+    return (rows, cols), dtype
+
+
+def run_sequence(
+    method: SceneCorrection,
+    source: list[str],
+    *,
+    output: Path | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Sequence:
+    """Take the frames of files in order, holding a few at a time.
+
+    Parameters
+    ----------
+    method : SceneCorrection
+        The correction, which learns from the frames.
+    source : list of str
+        Image files or globs of raw frames.
+    output : path, optional
+        A .tif of all corrected frames, float32, each corrected by what was learned before it.
+    force : bool
+        Whether an existing output may be replaced.
+    progress : callable, optional
+        Called as ``progress(frames done, frames in all, "learning")``.
+
+    Returns
+    -------
+    Sequence
+        Number of frames, and quality over time.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read, holds frames of another shape, or the output cannot be written.
+    """
+    check_progress(progress)
+    files = find_files(source)
+    warn_of_corrected(files, "")
+    counts = [_count(file, method.shape) for file in files]
+    record = _Record(sum(counts))
+    frames = _corrected(method, files, record, progress)
+    if output is None:
+        for _ in frames:
+            pass
+    else:
+        refuse_inputs([output], files)
+        rows, cols = method.shape
+        with write_whole(output, force=force) as temporary:
+            nbytes = 4 * record.total * rows * cols
+            write_frames(temporary, frames, nbytes=nbytes, description=_MARK)
+    return record.sequence()
+
+
+def _count(file: Path, shape: tuple[int, int]) -> int:
+    """Count the frames of a file, which must be raw and of the sensor's shape."""
+    refuse_saved(file)
+    (count, *held), _ = frame_format(file)
+    if tuple(held) != shape:
+        raise FileError(f"{file}: holds frames of shape {tuple(held)}, expected {shape}")
+    return count
+
+
+class _Record:
+    """The quality of some frames, and the last frame."""
+
+    def __init__(self, total: int) -> None:
+        self.total, self.done = total, 0
+        self._every = max(1, -(-total // _POINTS))
+        self._points: list[tuple[int, float, float]] = []
+        self._last: Array | None = None
+
+    def add(self, raw: Array, corrected: Array) -> None:
+        """Take a frame before and after correction."""
+        self.done += 1
+        finite = bool(np.isfinite(corrected).all()) and np.ptp(raw) > 0
+        if finite:
+            self._last = raw
+        if finite and (self.done % self._every == 0 or self.done in (1, self.total)):
+            self._points.append((self.done, roughness(raw), roughness(corrected)))
+
+    def sequence(self) -> Sequence:
+        """What was recorded."""
+        if self._last is None:
+            raise FileError("no frame holds finite values that differ: nothing to learn from")
+        points, raw, corrected = zip(*self._points, strict=True) if self._points else ((), (), ())
+        return Sequence(self.done, points, raw, corrected, self._last.copy())
+
+
+def _corrected(
+    method: SceneCorrection, files: list[Path], record: _Record, progress: Progress | None
+) -> Iterator[Array]:
+    """Corrected frames, one after the other."""
+    for _, frames in stream_frames(files):
+        for raw in frames:
+            corrected = method.update(raw)
+            record.add(raw, corrected)
+            if progress is not None:
+                progress(record.done, record.total, "learning")
+            yield corrected

@@ -1,0 +1,132 @@
+//! Mean and deviation of each pixel over time made equal to those of its neighbourhood.
+//!
+//! J. G. Harris, Y.-M. Chiang, "Nonuniformity correction of infrared image sequences using the
+//! constant-statistics constraint", IEEE Transactions on Image Processing 8 (1999) 1148–1151; here with
+//! the neighbourhood in the place of the array, whose scene differs from place to place.
+
+use super::bands::{BAND, bands};
+use super::coefficients::Coefficients;
+use super::method::{Frame, Method};
+use super::motion::Motion;
+use super::neighbourhood::Squares;
+use super::options::{check_range, check_width};
+use super::state::State;
+use crate::error::Result;
+use crate::frames::Shape;
+use crate::parallel::Workers;
+
+/// Least deviation over time that a gain is divided by, in that of the neighbourhood: a dead pixel has 0.
+const LEAST_DEVIATION: f32 = 0.1;
+
+/// Least deviation of a neighbourhood: below it nothing has changed.
+const NOTHING: f32 = 1e-9;
+
+/// g = 1 + w (s̄/s − 1), o = m̄ − g m with the mean m and the deviation s of a pixel over time, and
+/// their means m̄ and s̄ over a square. w grows to 1 with the frames.
+#[derive(Debug)]
+pub(super) struct ConstantStatistics {
+    shape: Shape,
+    width: usize,
+    window: u64,
+    prior: u64,
+    motion: Motion,
+    mean: Vec<f32>,
+    variance: Vec<f32>,
+    /// √variance: made of it in every update.
+    deviation: Vec<f32>,
+}
+
+impl ConstantStatistics {
+    pub(super) fn new(
+        shape: Shape,
+        width: usize,
+        [window, prior]: [u64; 2],
+        motion: f64,
+    ) -> Result<Self> {
+        check_width(shape, width)?;
+        check_range("window", window as f64, [2.0, 1e12])?;
+        check_range("prior", prior as f64, [0.0, 1e12])?;
+        check_range("motion", motion, [0.0, 1.0])?;
+        let zeros = || vec![0.0; shape.len()];
+        let motion = Motion::new(shape, motion);
+        let (mean, variance, deviation) = (zeros(), zeros(), zeros());
+        Ok(Self { shape, width, window, prior, motion, mean, variance, deviation })
+    }
+
+    /// Adds a frame to the statistics of the pixels.
+    fn add(&mut self, raw: &[f32], workers: &Workers) {
+        let share = 1.0 / self.motion.frames.min(self.window) as f32;
+        let size = BAND * self.shape.cols;
+        let bands = bands!(size; &mut self.mean, &mut self.variance, &mut self.deviation);
+        workers.each(bands, |index, (means, variances, deviations)| {
+            let pixels = means.iter_mut().zip(variances).zip(deviations);
+            for (((mean, variance), deviation), y) in pixels.zip(&raw[index * size..]) {
+                let change = y - *mean;
+                *mean += share * change;
+                *variance = (1.0 - share) * (*variance + share * change * change);
+                *deviation = variance.sqrt();
+            }
+        });
+    }
+
+    /// Finds the coefficients that give each pixel the statistics of its neighbourhood.
+    fn equalise(&self, coefficients: &mut Coefficients, workers: &Workers) {
+        let (shape, cols) = (self.shape, self.shape.cols);
+        let known = self.motion.frames.min(self.window) as f32;
+        let trust = known / (known + self.prior as f32);
+        let row_of = |values: &'_ [f32], row: usize, line: &mut [f32]| {
+            line.copy_from_slice(&values[row * cols..(row + 1) * cols]);
+        };
+        let bands = bands!(BAND * cols; &mut coefficients.gain, &mut coefficients.offset);
+        workers.each(bands, |index, (gain, offset)| {
+            let first = index * BAND;
+            let mut means = Squares::new(shape, self.width, first, |row, line: &mut [f32]| {
+                row_of(&self.mean, row, line);
+            });
+            let mut deviations = Squares::new(shape, self.width, first, |row, line: &mut [f32]| {
+                row_of(&self.deviation, row, line);
+            });
+            let (mut mean, mut deviation) = (vec![0.0; cols], vec![0.0; cols]);
+            let rows = gain.chunks_mut(cols).zip(offset.chunks_mut(cols));
+            for (row, (gain, offset)) in rows.enumerate() {
+                means.next(&mut mean);
+                deviations.next(&mut deviation);
+                let start = (first + row) * cols;
+                for col in 0..cols {
+                    let wanted = deviation[col].max(NOTHING);
+                    let own = self.deviation[start + col].max(LEAST_DEVIATION * wanted);
+                    gain[col] = 1.0 + trust * (wanted / own - 1.0);
+                    offset[col] = mean[col] - gain[col] * self.mean[start + col];
+                }
+            }
+        });
+        coefficients.hold_gauge(workers);
+    }
+}
+
+impl Method for ConstantStatistics {
+    fn update(
+        &mut self,
+        frame: &Frame<'_>,
+        coefficients: &mut Coefficients,
+        workers: &Workers,
+    ) -> bool {
+        if !self.motion.moved(frame.shape, frame.raw, workers) {
+            return false;
+        }
+        self.add(frame.raw, workers);
+        if self.motion.frames > 1 {
+            self.equalise(coefficients, workers);
+        }
+        self.motion.frames > 1
+    }
+
+    fn state(&mut self) -> State<'_> {
+        let sizes = [self.shape.rows, self.shape.cols];
+        State::default()
+            .map("mean", sizes, &mut self.mean)
+            .map("variance", sizes, &mut self.variance)
+            .map("deviation", sizes, &mut self.deviation)
+            .and(self.motion.state())
+    }
+}

@@ -1,0 +1,49 @@
+//! What all methods have in common.
+
+use super::coefficients::Coefficients;
+use super::state::State;
+use crate::frames::Shape;
+use crate::parallel::Workers;
+
+/// A frame on the scale [0, 1], raw and corrected by the coefficients before it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Frame<'a> {
+    pub(super) shape: Shape,
+    pub(super) raw: &'a [f32],
+    pub(super) corrected: &'a [f32],
+    /// Mean of the corrected values.
+    pub(super) mean: f64,
+}
+
+impl<'a> Frame<'a> {
+    pub(super) fn row(&self, row: usize) -> (&'a [f32], &'a [f32]) {
+        let range = row * self.shape.cols..(row + 1) * self.shape.cols;
+        (&self.raw[range.clone()], &self.corrected[range])
+    }
+}
+
+/// A rule that changes the coefficients by a frame.
+pub(super) trait Method: std::fmt::Debug + Send + Sync {
+    /// Takes a frame; whether it counted.
+    fn update(
+        &mut self,
+        frame: &Frame<'_>,
+        coefficients: &mut Coefficients,
+        workers: &Workers,
+    ) -> bool;
+
+    /// All that is remembered beside the coefficients.
+    fn state(&mut self) -> State<'_>;
+
+    /// Variances of gain and offset, where the method has them.
+    fn variances(&self) -> Option<[Vec<f32>; 2]> {
+        None
+    }
+}
+
+/// The step of a pixel: shorter where the raw value is outside of [0, 1], so that step · (y² + 1) never
+/// exceeds the value that the stability bound assumes.
+#[inline(always)]
+pub(super) fn step_at(step: f32, y: f32) -> f32 {
+    step / (0.5 * (1.0 + y * y)).max(1.0)
+}

@@ -1,0 +1,139 @@
+"""Corrections from the scene by the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import scene
+from equipix.io import read_frames, write_frames
+from equipix.simulate import MovingScene
+
+SHAPE = (48, 64)
+COUNT = 90
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A sequence of 16 bits, as a file of many pages and as a folder of files."""
+    folder = tmp_path_factory.mktemp("scene")
+    moving = MovingScene(seed=4, shape=SHAPE)
+    frames = np.stack(
+        [np.rint(4000 + 8000 * frame.values) for frame in moving.frames(COUNT)]
+    ).astype(np.uint16)
+    write_frames(folder / "all.tif", frames, nbytes=frames.nbytes)
+    for index, frame in enumerate(frames):
+        write_frames(folder / f"frame{index:03}.tif", [frame], nbytes=frame.nbytes)
+    return folder, frames
+
+
+RANGE = ("--data-range", "4000", "12000")
+
+
+@pytest.mark.parametrize("name", [name for name in scene.METHODS if name != "kalman"])
+def test_a_sequence_gives_what_the_methods_give(run, recorded, tmp_path, name):
+    folder, frames = recorded
+    output, corrected = tmp_path / "nuc.tif", tmp_path / "corrected.tif"
+    options = ("--method", name, *RANGE, "--corrected", corrected, "--json")
+    status, out, err = run("scene", folder / "all.tif", "-o", output, *options)
+    assert (status, err) == (0, "")
+    method = scene.METHODS[name](SHAPE, (4000, 12_000))
+    wanted = [method.update(frame) for frame in frames]
+    np.testing.assert_array_equal(read_frames(corrected), wanted)
+    loaded = equipix.load(output)
+    np.testing.assert_array_equal(loaded.coefficients, method.result().coefficients)
+    shown = json.loads(out)
+    assert shown["frames"] == COUNT
+    assert shown["frames_that_counted"] == method.frames
+    first, last = shown["roughness"][0], shown["roughness"][-1]
+    assert (first["frame"], last["frame"]) == (1, COUNT)
+    # Before the first step nothing is corrected; the pattern of 10 % is most of the roughness.
+    assert first["corrected"] == pytest.approx(first["raw"], rel=1e-2)
+    assert last["corrected"] < 0.8 * last["raw"]
+
+
+def test_a_sequence_goes_on_from_a_saved_state(run, recorded, tmp_path):
+    folder, frames = recorded
+    halves = [
+        [folder / f"frame{index:03}.tif" for index in part]
+        for part in (range(40), range(40, COUNT))
+    ]
+    state, output = tmp_path / "state.npz", tmp_path / "nuc.npz"
+    first = ("--data-range", "4000", "12000", "--state", state)
+    assert run("scene", *halves[0], "-o", output, *first)[0] == 0
+    second = ("--resume", state, "--force")
+    assert run("scene", *halves[1], "-o", output, *second)[0] == 0
+    method = scene.Registered(SHAPE, (4000, 12_000))
+    for frame in frames:
+        method.update(frame)
+    np.testing.assert_array_equal(equipix.load(output).coefficients, method.result().coefficients)
+
+
+def test_the_picture_is_drawn_and_the_table_printed(run, recorded, tmp_path):
+    folder, _ = recorded
+    picture = tmp_path / "before-after.png"
+    options = ("--method", "gated", *RANGE, "--picture", picture)
+    status, out, _ = run("scene", folder / "frame*.tif", "-o", tmp_path / "nuc.tif", *options)
+    assert status == 0
+    assert "roughness" in out
+    assert picture.stat().st_size > 10_000
+
+
+def test_the_range_of_whole_numbers_is_that_of_their_type(run, recorded, tmp_path):
+    folder, _ = recorded
+    output = tmp_path / "nuc.tif"
+    assert run("scene", folder / "all.tif", "-o", output, "--method", "local-mean")[0] == 0
+    assert equipix.load(output).metadata["scene"]["data_range"] == [0, 65535]
+
+
+class TestRefusals:
+    def refused(self, result, *words):
+        status, out, err = result
+        assert (status, out) == (1, "")
+        assert err.count("\n") == 1
+        for word in words:
+            assert str(word) in err
+
+    def test_a_scene_that_never_moves(self, run, recorded, tmp_path):
+        write_frames(tmp_path / "still.tif", [recorded[1][0]] * 5, nbytes=1)
+        output = tmp_path / "nuc.tif"
+        self.refused(
+            run("scene", tmp_path / "still.tif", "-o", output), "the scene never moved", "moving"
+        )
+        assert not output.exists()
+
+    def test_too_few_frames_for_a_block(self, run, recorded, tmp_path):
+        folder, _ = recorded
+        arguments = (folder / "frame00*.tif", "-o", tmp_path / "nuc.tif", "--method", "kalman")
+        self.refused(run("scene", *arguments), "no block of moving frames is complete")
+
+    def test_options_that_do_not_fit(self, run, recorded, tmp_path):
+        folder, _ = recorded
+        arguments = ("scene", folder / "frame00*.tif", "-o", tmp_path / "nuc.tif")
+        self.refused(run(*arguments, "--width", "11"), "registered", "--width")
+        self.refused(run(*arguments, "--step", "0.3"), "'step' is 0.3", "0.2500")
+        self.refused(run(*arguments, "--corrected", tmp_path / "c.png"), ".tif")
+        floats = tmp_path / "floats.tif"
+        write_frames(floats, recorded[1][:3].astype(np.float32), nbytes=1)
+        self.refused(run("scene", floats, "-o", tmp_path / "nuc.tif"), "float32", "--data-range")
+
+    def test_a_state_that_does_not_fit(self, run, recorded, tmp_path):
+        folder, _ = recorded
+        scene.Gated((32, 32), "uint16").save(tmp_path / "small.npz")
+        scene.Gated(SHAPE, "uint16").save(tmp_path / "gated.npz")
+        arguments = ("scene", folder / "frame00*.tif", "-o", tmp_path / "nuc.tif", "--resume")
+        self.refused(run(*arguments, tmp_path / "small.npz"), "small.npz", "(32, 32)", "(48, 64)")
+        self.refused(run(*arguments, tmp_path / "gated.npz"), "gated.npz", "--method gated")
+        both = (tmp_path / "gated.npz", "--method", "gated", "--step", "0.1")
+        self.refused(run(*arguments, *both), "--resume", "--step")
+
+    def test_saved_files_and_outputs_among_the_inputs(self, run, recorded, tmp_path):
+        folder, _ = recorded
+        output = tmp_path / "nuc.tif"
+        assert run("scene", folder / "all.tif", "-o", output, "--method", "local-mean")[0] == 0
+        self.refused(run("scene", output, "-o", tmp_path / "other.tif"), "polynomial", "raw frames")
+        inside = ("scene", folder / "frame*.tif", "-o", folder / "frame000.tif", "--force")
+        self.refused(run(*inside), "frame000.tif")
