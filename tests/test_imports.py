@@ -43,7 +43,7 @@ LAYERS = (
     {"demo"},
     {"comparison", "experiment", "loading"},
     {"calibration", "nuc"},
-    {"exposures", "plan", "simulate"},
+    {"exposures", "hardware", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
@@ -90,6 +90,7 @@ CHAIN = (
 BESIDE = {
     "apply": set[str](),
     "centroid": {"connectivity"},
+    "fixed_point": set[str](),
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
     "response": set[str](),

@@ -13,7 +13,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from equipix import errors, lens, metrics, nuc, plan, simulate, uncertainty
+    from equipix import errors, hardware, lens, metrics, nuc, plan, simulate, uncertainty
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
     from equipix.calibration.history import History
@@ -55,7 +55,7 @@ _HOMES = {
 }
 """The module of each public name."""
 
-_MODULES = ("errors", "lens", "metrics", "nuc", "plan", "simulate", "uncertainty")
+_MODULES = ("errors", "hardware", "lens", "metrics", "nuc", "plan", "simulate", "uncertainty")
 """Public modules."""
 
 __all__ = [
@@ -79,6 +79,7 @@ __all__ = [
     "compare",
     "cross_pattern",
     "errors",
+    "hardware",
     "lens",
     "load",
     "measure_shift",
