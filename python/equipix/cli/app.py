@@ -21,6 +21,7 @@ COMMANDS = {
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
+    "hardware": ("hardware", "Write a correction as words for a camera's electronics."),
     "simulate": (
         "simulate",
         "Write the images of an experiment with a virtual camera, and its truth.",

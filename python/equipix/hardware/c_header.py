@@ -61,8 +61,14 @@ def encoded(content: Content) -> bytes:
         lines.append("};")
     product, offset, out = f.shifts
     rounding = _ROUNDING.format(bits=out, half=f"((int64_t)1 << {out - 1})") if out else ""
-    values = {"product": product, "offset": offset, "rounding": rounding, "base": f"({f.base})"}
-    lines.append(_APPLY.format(**values, largest=2**f.out_bits - 1))
+    apply = _APPLY.format(
+        product=product,
+        offset=offset,
+        rounding=rounding,
+        base=f"({f.base})",
+        largest=2**f.out_bits - 1,
+    )
+    lines.append(apply)
     return "\n".join([*lines, "#endif", ""]).encode()
 
 

@@ -43,7 +43,8 @@ def checksum(content: Content) -> int:
     """CRC-32 of the arrays as little-endian numbers of their types."""
     crc = 0
     for name, dtype in DTYPES.items():
-        crc = zlib.crc32(content.arrays()[name].astype(np.dtype(dtype).newbyteorder("<")), crc)
+        stored = content.arrays()[name].astype(np.dtype(dtype).newbyteorder("<"))
+        crc = zlib.crc32(stored.tobytes(), crc)
     return crc
 
 

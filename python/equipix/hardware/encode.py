@@ -103,7 +103,8 @@ def encode(
     steps : Steps
         Exponents of the steps.
     lowest : float
-        Corrected value in DN that the ADC must still see: pixels have a word of 0 or more there.
+        Corrected value in DN that the ADC must still see: pixels have a word of 0 or more there,
+        and the output is 0.
 
     Returns
     -------
@@ -122,6 +123,8 @@ def encode(
     o, g = offset[used], gain[used]
     _refuse_unresponsive(g)
     coarse_words, coarse = _coarse((lowest - o) / g, widths["dac_bits"], steps)
+    zero = int(np.floor(np.ldexp(lowest, -steps.out)))
+    o -= np.ldexp(float(zero), steps.out)
     pedestal = np.ldexp(coarse_words, coarse)
     gain_words, gain_exponent = _chosen(
         Words("gain", widths["gain_bits"], lowest=1), g, steps.gain, -40
@@ -144,10 +147,17 @@ def encode(
         gain=gain_exponent,
         out=steps.out,
         base=base,
+        zero=zero,
     )
     error = float((left + np.abs(g - rounded) * middle).max())
-    kinds = ((coarse_words, np.uint16), (offset_words, np.int16), (gain_words, np.uint16))
-    return Encoded(made, *(_spread(each, used, kind) for each, kind in kinds), flags, error)
+    return Encoded(
+        made,
+        _spread(coarse_words, used, np.uint16),
+        _spread(offset_words, used, np.int16),
+        _spread(gain_words, used, np.uint16),
+        flags,
+        error,
+    )
 
 
 def _refuse_unresponsive(gain: Floats) -> None:

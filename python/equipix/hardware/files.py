@@ -38,13 +38,14 @@ def read_content(path: str | PathLike[str]) -> Content:
     file = as_path("path", path)
     kind = _FORMATS[_suffix(file)]
     try:
-        return kind.decoded(file, file.read_bytes())
+        content: Content = kind.decoded(file, file.read_bytes())
     except FileError:
         raise
     except OSError as error:
         raise FileError(f"{file}: cannot be read: {error}") from error
     except (ArithmeticError, KeyError, LookupError, TypeError, ValueError) as error:
         raise FileError(f"{file}: is damaged or incomplete: {error}") from error
+    return content
 
 
 def _suffix(path: Path) -> str:

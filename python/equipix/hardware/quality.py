@@ -13,7 +13,6 @@ from equipix.flags import usable
 from equipix.hardware.table import Table
 from equipix.hardware.words import check_width
 from equipix.metrics import Correctability, correctability
-from equipix.metrics.moments import signed_root
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -37,8 +36,8 @@ class Quality:
     before, after : Correctability
         C of the correction in floating point, and of the table.
     added : float
-        Spatial noise that the words add, over the temporal noise: the root of the difference of
-        the squares of C, negative where the table has the smaller one.
+        Spatial noise that the words add, over the temporal noise: the rms over the pixels of the
+        difference of both mean images, less its mean.
     at_ends : int
         Words of usable pixels at either end of the ADC, probably beyond it.
     table : Table
@@ -90,20 +89,18 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     """
     raw = as_array("frames", frames, ndim=3)
     table = Table.of(correction, **options)
-    before = correctability(correction.correct(raw, flagged="nan"))
-    return _compared(table, raw, before)
-
-
-def _compared(table: Table, raw: Array, before: Correctability) -> Quality:
-    after = correctability(table.correct(raw))
+    exact = correction.correct(raw, flagged="nan")
+    before = correctability(exact)
     words = table.digitise(raw)[:, usable(table.flags)]
     at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
-    square = _square(after) - _square(before)
-    return Quality(before, after, signed_root(square), at_ends, table)
+    found = table.correct(raw)
+    return Quality(before, correctability(found), _added(found, exact, before), at_ends, table)
 
 
-def _square(found: Correctability) -> float:
-    return found.spatial_variance / found.temporal_variance
+def _added(found: Array, exact: Array, before: Correctability) -> float:
+    """Spread over the pixels of what the words change, over the temporal noise."""
+    change = (found.astype(np.float64) - exact).mean(axis=0)
+    return float(np.std(change[np.isfinite(change)]) / np.sqrt(before.temporal_variance))
 
 
 @dataclass(frozen=True)
@@ -166,7 +163,8 @@ def smallest_widths(
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
     Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
     raw = [as_array("levels", frames, ndim=3) for frames in levels]
-    before = [correctability(correction.correct(frames, flagged="nan")) for frames in raw]
+    exact = [correction.correct(frames, flagged="nan") for frames in raw]
+    before = [correctability(frames) for frames in exact]
 
     def worst(offset_bits: int, gain_bits: int) -> float:
         try:
@@ -174,16 +172,16 @@ def smallest_widths(
         except InputError:
             # Words of usable pixels do not fit: with 16 bits they did.
             return float("inf")
-        pairs = zip(raw, before, strict=True)
-        return max(_compared(table, frames, own).added for frames, own in pairs)
+        each = zip(raw, exact, before, strict=True)
+        return max(_added(table.correct(frames), own, noise) for frames, own, noise in each)
 
     found = {
         "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
         "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
         "both": {bits: worst(bits, bits) for bits in _WIDTHS},
     }
-    smallest = (_first(each.items(), added) for each in found.values())
-    return Widths(*smallest, found)
+    offset, gain, both = (_first(each.items(), added) for each in found.values())
+    return Widths(offset, gain, both, found)
 
 
 def _first(found: Iterable[tuple[int, float]], limit: float) -> int | None:

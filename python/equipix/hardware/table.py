@@ -68,7 +68,7 @@ class Table(ReadOnly):
         z = b + \mathrm{round}((g s_g x s_x + o s_o) / s_z)
 
     rounded half to even, and limited to the words of the ADC and of the output. The corrected value
-    is z times the step of the output, in DN.
+    is zero + z in steps of the output.
 
     Examples
     --------
@@ -80,7 +80,8 @@ class Table(ReadOnly):
     >>> table = hardware.Table.of(response, offset_bits=12, gain_bits=12)
     >>> frame = next(array.frames(10e6, 1, rng=9))
     >>> words = table.apply(table.digitise(frame))
-    >>> bool(abs(words - response.correct(frame)).max() < 0.5 + table.metadata["largest_error_dn"])
+    >>> difference = words * 2.0**table.format.out - response.correct(frame)
+    >>> bool(abs(difference).max() < 2**table.format.out / 2 + table.metadata["largest_error_dn"])
     True
     """
 
@@ -130,7 +131,7 @@ class Table(ReadOnly):
         adc_bits: int = 14,
         dac_bits: int = 8,
         offset_bits: int = 12,
-        gain_bits: int = 12,
+        gain_bits: int = 16,
         out_bits: int = 16,
         adc_step: float = 1.0,
         out_step: float | None = None,
@@ -150,8 +151,8 @@ class Table(ReadOnly):
         adc_bits, dac_bits, offset_bits, gain_bits, out_bits : int
             Widths of the words, 8 to 16.
         adc_step, out_step : float
-            DN of the correction in a step of the ADC and of the output, powers of two; that of the
-            output is that of the ADC unless given.
+            DN of the correction in a step of the ADC and of the output, powers of two. Unless
+            given, the output has the range of the ADC.
         dac_step, offset_step : float, optional
             DN in a step of the DAC and of the fine offset, powers of two. Unless given, the finest
             with which the words of all usable pixels fit.
@@ -159,7 +160,8 @@ class Table(ReadOnly):
             Step of the gain, a power of two; the finest that fits unless given.
         lowest : float
             Corrected value in DN that the ADC must still see: the DAC subtracts no more than
-            leaves each pixel a word of 0 there. Choose it some noise below the darkest scene.
+            leaves each pixel a word of 0 there, and the output 0 stands for it. Choose it some
+            noise below the darkest scene.
         linearise : tuple of float, optional
             Two raw values in DN. A correction of order 2 or 3 is replaced by a straight line
             between them, half of its sag aside; ``metadata["linearised"]`` has the sag.
@@ -188,7 +190,7 @@ class Table(ReadOnly):
             chosen_exponent("dac_step", dac_step),
             chosen_exponent("offset_step", offset_step),
             chosen_exponent("gain_step", gain_step),
-            adc if out_step is None else exponent_of("out_step", out_step),
+            adc + adc_bits - out_bits if out_step is None else exponent_of("out_step", out_step),
         )
         with naming_memory("making a table"):
             offset, gain, sag = line_of(correction, linearise)
@@ -213,7 +215,9 @@ class Table(ReadOnly):
         """Offset and gain that the words stand for, shape (2, rows, cols); NaN where unusable."""
         f = self.format
         gain = np.ldexp(self.gain.astype(np.float64), f.gain)
-        offset = np.ldexp(self.offset.astype(np.float64), f.offset) + np.ldexp(float(f.base), f.out)
+        offset = np.ldexp(self.offset.astype(np.float64), f.offset) + np.ldexp(
+            f.zero + float(f.base), f.out
+        )
         offset -= gain * np.ldexp(self.coarse.astype(np.float64), f.coarse)
         return np.where(usable(self.flags), np.stack([offset, gain]), np.nan)
 
@@ -319,7 +323,7 @@ class Table(ReadOnly):
 
         def formula(frame: Array, corrected: Array) -> None:
             words = self.apply(self.digitise(frame))
-            corrected[...] = np.ldexp(words.astype(np.float64), self.format.out)
+            corrected[...] = np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
 
         return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
 

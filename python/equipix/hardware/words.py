@@ -35,6 +35,8 @@ class Format:
         One step is 2 to this power, without a unit.
     base : int
         Output of the sum 0, in steps of the output; 32 bits.
+    zero : int
+        Corrected value of the output 0, in steps of the output; 32 bits.
 
     Raises
     ------
@@ -53,6 +55,7 @@ class Format:
     gain: int
     out: int
     base: int
+    zero: int = 0
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
@@ -62,8 +65,10 @@ class Format:
             value = getattr(self, name)
             if not isinstance(value, int) or abs(value) > _EXPONENT:
                 raise InputError(f"'{name}' is {value!r}, expected -{_EXPONENT} to {_EXPONENT}")
-        if not isinstance(self.base, int) or abs(self.base) >= 2**31:
-            raise InputError(f"'base' is {self.base!r}, expected a whole number of 32 bits")
+        for name in ("base", "zero"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or abs(value) >= 2**31:
+                raise InputError(f"'{name}' is {value!r}, expected a whole number of 32 bits")
 
     @property
     def arithmetic(self) -> tuple[int, int, int, int, int, int, int]:
