@@ -35,7 +35,7 @@ static inline uint16_t equipix_apply(uint16_t x, uint32_t p)
 }}
 """
 
-_ROUNDING = "sum = (sum + {half} - 1 + (sum >> {bits} & 1)) >> {bits}; /* half to even */"
+_ROUNDING = "sum = (sum + {half} - 1 + ((sum >> {bits}) & 1)) >> {bits}; /* half to even */"
 
 
 def encoded(content: Content) -> bytes:

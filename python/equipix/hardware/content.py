@@ -40,8 +40,8 @@ class Content(NamedTuple):
 
 
 def checksum(content: Content) -> int:
-    """CRC-32 of the arrays as little-endian numbers of their types."""
-    crc = 0
+    """CRC-32 of format and metadata, then of the arrays as little-endian numbers of their types."""
+    crc = zlib.crc32(json.dumps([asdict(content.format), content.metadata]).encode())
     for name, dtype in DTYPES.items():
         stored = content.arrays()[name].astype(np.dtype(dtype).newbyteorder("<"))
         crc = zlib.crc32(stored.tobytes(), crc)

@@ -133,31 +133,27 @@ def encode(
     rounded = np.ldexp(gain_words, gain_exponent)
     middle = np.ldexp(float(2 ** (widths["adc_bits"] - 1)), steps.adc)
     fine = o + g * pedestal + (g - rounded) * middle
-    base = int(np.rint(np.ldexp((fine.min() + fine.max()) / 2, -steps.out)))
-    fine -= np.ldexp(float(base), steps.out)
-    finest = min(gain_exponent + steps.adc, steps.out)
     words = Words("offset", widths["offset_bits"], signed=True)
-    offset_words, offset_exponent = _chosen(words, fine, steps.offset, finest)
-    left = np.abs(np.ldexp(offset_words, offset_exponent) - fine)
-    made = Format(
-        **widths,
-        adc=steps.adc,
-        coarse=coarse,
-        offset=offset_exponent,
-        gain=gain_exponent,
-        out=steps.out,
-        base=base,
-        zero=zero,
-    )
-    error = float((left + np.abs(g - rounded) * middle).max())
+    offset_words, exponent, base = _offsets(fine, words, steps, gain_exponent + steps.adc)
+    left = fine - np.ldexp(float(base), steps.out) - np.ldexp(offset_words, exponent)
+    exponents = {"adc": steps.adc, "coarse": coarse, "offset": exponent, "out": steps.out}
     return Encoded(
-        made,
+        Format(**widths, **exponents, gain=gain_exponent, base=base, zero=zero),
         _spread(coarse_words, used, np.uint16),
         _spread(offset_words, used, np.int16),
         _spread(gain_words, used, np.uint16),
         flags,
-        error,
+        float((np.abs(left) + np.abs(g - rounded) * middle).max()),
     )
+
+
+def _offsets(
+    values: Floats, words: Words, steps: Steps, product: int
+) -> tuple[Floats, int, int]:
+    """Words of the fine offset, their exponent, and the base in the middle of their values."""
+    base = int(np.rint(np.ldexp((values.min() + values.max()) / 2, -steps.out)))
+    values = values - np.ldexp(float(base), steps.out)
+    return *_chosen(words, values, steps.offset, min(product, steps.out)), base
 
 
 def _refuse_unresponsive(gain: Floats) -> None:

@@ -215,9 +215,8 @@ class Table(ReadOnly):
         """Offset and gain that the words stand for, shape (2, rows, cols); NaN where unusable."""
         f = self.format
         gain = np.ldexp(self.gain.astype(np.float64), f.gain)
-        offset = np.ldexp(self.offset.astype(np.float64), f.offset) + np.ldexp(
-            f.zero + float(f.base), f.out
-        )
+        offset = np.ldexp(self.offset.astype(np.float64), f.offset)
+        offset += np.ldexp(float(f.zero + f.base), f.out)
         offset -= gain * np.ldexp(self.coarse.astype(np.float64), f.coarse)
         return np.where(usable(self.flags), np.stack([offset, gain]), np.nan)
 
