@@ -271,6 +271,7 @@ def test_other_suffixes_are_refused(made, tmp_path):
         ({"adc_step": 0.3}, "'adc_step' is 0.3, expected a power of two"),
         ({"out_step": 0}, "'out_step' is 0, expected a power of two"),
         ({"lowest": float("nan")}, "'lowest' is nan"),
+        ({"out_step": 2.0**40, "adc_step": 2.0**-10}, "make sums of 65 bits, expected at most 58"),
     ],
 )
 def test_arguments_out_of_range_are_refused(made, options, words):
@@ -417,7 +418,9 @@ def test_arrays_of_a_table_fit_together(made):
 @pytest.mark.parametrize("by", ["offset", "gain"])
 def test_one_point_corrections_have_a_table(by):
     array = StaringArray.of("PtSi", SHAPE, rng=3)
-    response = nuc.fit([equipix.average(array.frames(9e6, 64, rng=1))], order=0, by=by)
+    dark = np.full(SHAPE, 300.0) if by == "gain" else None
+    level = equipix.average(array.frames(9e6, 64, rng=1), dark=dark)
+    response = nuc.fit([level], order=0, by=by)
     table = hardware.Table.of(response)
     frame = next(array.frames(9e6, 1, rng=2))
     away = np.abs(table.correct(frame) - response.correct(frame))

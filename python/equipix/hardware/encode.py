@@ -147,9 +147,7 @@ def encode(
     )
 
 
-def _offsets(
-    values: Floats, words: Words, steps: Steps, product: int
-) -> tuple[Floats, int, int]:
+def _offsets(values: Floats, words: Words, steps: Steps, product: int) -> tuple[Floats, int, int]:
     """Words of the fine offset, their exponent, and the base in the middle of their values."""
     base = int(np.rint(np.ldexp((values.min() + values.max()) / 2, -steps.out)))
     values = values - np.ldexp(float(base), steps.out)

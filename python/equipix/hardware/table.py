@@ -185,12 +185,15 @@ class Table(ReadOnly):
         if not np.isfinite(number("lowest", lowest)):
             raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
         adc = exponent_of("adc_step", adc_step)
+        out = chosen_exponent("out_step", out_step)
+        if out is None:
+            out = adc + widths["adc_bits"] - widths["out_bits"]
         steps = Steps(
             adc,
             chosen_exponent("dac_step", dac_step),
             chosen_exponent("offset_step", offset_step),
             chosen_exponent("gain_step", gain_step),
-            adc + adc_bits - out_bits if out_step is None else exponent_of("out_step", out_step),
+            out,
         )
         with naming_memory("making a table"):
             offset, gain, sag = line_of(correction, linearise)

@@ -20,6 +20,9 @@ _NARROWEST, _WIDEST = 8, 16
 _EXPONENT = 40
 """Steps are from 2^-40 to 2^40 DN."""
 
+_SUM_BITS = 58
+"""Most bits that a term of the sum may take."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
@@ -69,6 +72,14 @@ class Format:
             value = getattr(self, name)
             if not isinstance(value, int) or abs(value) >= 2**31:
                 raise InputError(f"'{name}' is {value!r}, expected a whole number of 32 bits")
+        product, offset, out = self.shifts
+        bits = max(32 + product, 16 + offset, out)
+        if bits > _SUM_BITS:
+            raise InputError(
+                f"the steps 2^{self.adc} (ADC), 2^{self.offset} (offset), 2^{self.gain} (gain) and "
+                f"2^{self.out} (output) make sums of {bits} bits, expected at most {_SUM_BITS}: "
+                "take steps that differ less"
+            )
 
     @property
     def arithmetic(self) -> tuple[int, int, int, int, int, int, int]:
@@ -149,9 +160,9 @@ class Words:
 
     def finest(self, values: Floats, not_below: int) -> int:
         """Return the exponent of the finest step with which the largest values fit."""
-        exponent = not_below
+        exponent, ends = not_below, np.array([values.min(), values.max()])
         largest = Words(self.name, self.bits, self.signed, -(2**self.bits), self.floor)
-        while exponent < _EXPONENT and largest.outside(values, exponent):
+        while exponent < _EXPONENT and largest.outside(ends, exponent):
             exponent += 1
         return exponent
 
