@@ -25,6 +25,7 @@ figures: $(BIN)/.built-release
 	$(BIN)/python docs/joint.py
 	$(BIN)/python docs/nuc.py
 	$(BIN)/python docs/drift.py
+	$(BIN)/python docs/hardware.py
 	$(BIN)/python docs/plan.py
 	$(BIN)/python docs/scene.py
 	$(BIN)/python docs/section3.py

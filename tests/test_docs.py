@@ -38,6 +38,7 @@ PAGES = (
     "CONTRIBUTING.md",
     "CHANGELOG.md",
     "docs/glossary.md",
+    "docs/hardware.md",
     "docs/infrared.md",
     "docs/method.md",
     "docs/nuc.md",

@@ -44,7 +44,7 @@ LAYERS = (
     {"comparison", "experiment", "loading"},
     {"calibration", "nuc", "scene"},
     {"bolometer", "detector"},
-    {"exposures", "plan", "simulate"},
+    {"exposures", "hardware", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
@@ -97,6 +97,7 @@ CHAIN = (
 BESIDE = {
     "apply": set[str](),
     "centroid": {"connectivity"},
+    "fixed_point": set[str](),
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
     "response": set[str](),

@@ -15,6 +15,8 @@ __all__ = [
     "SceneCorrection",
     "Uncertainty",
     "__version__",
+    "adapt_words",
+    "apply_words",
     "average_files",
     "common_fraction",
     "file_format",
@@ -44,6 +46,25 @@ class Accumulator:
     def add(self, frames: NDArray[Any]) -> None: ...
     def finish(self) -> _Statistics: ...
 
+def adapt_words(
+    frames: NDArray[Any],
+    gain: NDArray[Any],
+    offset: NDArray[Any],
+    out: NDArray[Any],
+    widths: Sequence[int],
+    step: int,
+    *,
+    workers: int | None,
+) -> None: ...
+def apply_words(
+    frames: NDArray[Any],
+    gain: NDArray[Any],
+    offset: NDArray[Any],
+    out: NDArray[Any],
+    arithmetic: tuple[int, int, int, int, int, int, int],
+    *,
+    workers: int | None,
+) -> tuple[int, int]: ...
 def average_files(
     paths: Sequence[str | PathLike[str]],
     saturation: float | None,

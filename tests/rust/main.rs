@@ -9,6 +9,7 @@ mod dense;
 mod descent;
 mod experiment;
 mod fit;
+mod fixed_point;
 mod fraction;
 mod joint;
 mod laws;

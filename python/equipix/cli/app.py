@@ -22,6 +22,7 @@ COMMANDS = {
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
     "scene": ("scene", "Learn gain and offset of each pixel from a moving scene."),
+    "hardware": ("hardware", "Write a correction as words for a camera's electronics."),
     "simulate": (
         "simulate",
         "Write the images of an experiment with a virtual camera, and its truth.",

@@ -7,6 +7,7 @@ checked against, so it shares no line with it.
 from equipix.reference.average import average
 from equipix.reference.connectivity import components
 from equipix.reference.descent import Solution, coordinate_descent
+from equipix.reference.fixed_point import adapt_words, apply_words
 from equipix.reference.joint import JointSolution, joint
 from equipix.reference.least_squares import solve_dense
 from equipix.reference.model import exposures, grid_cells, objective
@@ -19,6 +20,8 @@ __all__ = [
     "JointSolution",
     "MultiscaleSolution",
     "Solution",
+    "adapt_words",
+    "apply_words",
     "average",
     "components",
     "coordinate_descent",

@@ -145,6 +145,7 @@
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
 //! apply           corrections applied to frames                 (uses parallel and below)
+//! fixed_point     corrections and the adaptive loop in words    (uses parallel and below)
 //! centroid        a spot's centroid with its standard error     (uses connectivity)
 //! parts           the parts of a multiscale step, for a bench   (uses solve and below)
 //! ```
@@ -187,6 +188,7 @@ pub mod convergence;
 pub mod error;
 pub mod exposures;
 pub mod fit;
+pub mod fixed_point;
 pub mod frames;
 mod gauge;
 pub mod geometry;

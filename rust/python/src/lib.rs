@@ -14,6 +14,7 @@ mod data;
 mod errors;
 mod exposures;
 mod fit;
+mod fixed_point;
 mod plan;
 mod response;
 mod run;
@@ -37,6 +38,8 @@ mod _native {
     use crate::exposures::{PyExposures, common_fraction, needs_whole_shifts};
     #[pymodule_export]
     use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
+    #[pymodule_export]
+    use crate::fixed_point::{adapt_words, apply_words};
     #[pymodule_export]
     use crate::plan::planned_components;
     #[pymodule_export]

@@ -1,0 +1,194 @@
+"""How much quality C the words of a table cost, and which widths suffice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._check import as_array, naming_memory, number
+from equipix.errors import InputError
+from equipix.flags import usable
+from equipix.hardware.table import Table
+from equipix.hardware.words import check_width
+from equipix.metrics import Correctability, correctability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array
+    from equipix.correction.protocol import Correction
+
+_WIDTHS = range(8, 17)
+_BOTH = 16
+"""Width of the words that are not varied."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Quality C of a correction and of its table, the result of `quality`.
+
+    Attributes
+    ----------
+    before, after : Correctability
+        C of the correction in floating point, and of the table.
+    added : float
+        Spatial noise that the words add, over the temporal noise: the rms over the pixels of the
+        difference of both mean images, less its mean.
+    at_ends : int
+        Words of usable pixels at either end of the ADC, probably beyond it.
+    table : Table
+        The table.
+    """
+
+    before: Correctability
+    after: Correctability
+    added: float
+    at_ends: int
+    table: Table
+
+
+@naming_memory("quality of a table")
+def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Quality:
+    """Quality C of a correction before and after its coefficients become words.
+
+    Parameters
+    ----------
+    correction : Correction
+        The correction.
+    frames : array_like, shape (n, rows, cols)
+        Raw frames of one steady even level, two or more, as without the DAC.
+    **options : Any
+        Widths and steps, as of `Table.of`.
+
+    Returns
+    -------
+    Quality
+        Both C, and what the words add.
+
+    Raises
+    ------
+    InputError
+        As of `Table.of` and `equipix.metrics.correctability`.
+
+    Examples
+    --------
+    >>> import equipix
+    >>> from equipix import hardware, simulate
+    >>> array = simulate.StaringArray.of("InSb", (48, 64), rng=1)
+    >>> levels = [equipix.average(array.frames(e, 16, rng=k)) for k, e in enumerate((4e6, 16e6))]
+    >>> response = equipix.nuc.fit(levels, order=1)
+    >>> frames = list(array.frames(13e6, 16, rng=9))
+    >>> narrow = hardware.quality(response, frames, offset_bits=8, gain_bits=8)
+    >>> wide = hardware.quality(response, frames, offset_bits=14, gain_bits=14)
+    >>> narrow.added > 10 * wide.added
+    True
+    """
+    raw = as_array("frames", frames, ndim=3)
+    table = Table.of(correction, **options)
+    exact = correction.correct(raw, flagged="nan")
+    before = correctability(exact)
+    words = table.digitise(raw)[:, usable(table.flags)]
+    at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
+    found = table.correct(raw)
+    return Quality(before, correctability(found), _added(found, exact, before), at_ends, table)
+
+
+def _added(found: Array, exact: Array, before: Correctability) -> float:
+    """Spread over the pixels of what the words change, over the temporal noise."""
+    change = (found.astype(np.float64) - exact).mean(axis=0)
+    return float(np.std(change[np.isfinite(change)]) / np.sqrt(before.temporal_variance))
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Widths that suffice, the result of `smallest_widths`.
+
+    Attributes
+    ----------
+    offset_bits, gain_bits : int or None
+        The smallest width, the other memory having 16 bits; None if 16 bits do not suffice.
+    both_bits : int or None
+        The smallest width of both memories.
+    added : dict
+        By ``"offset"``, ``"gain"`` and ``"both"``, what each width from 8 to 16 bits adds at the
+        worst level, over the temporal noise; infinite where words of usable pixels do not fit.
+    """
+
+    offset_bits: int | None
+    gain_bits: int | None
+    both_bits: int | None
+    added: dict[str, dict[int, float]]
+
+
+@naming_memory("widths of a table")
+def smallest_widths(
+    correction: Correction,
+    levels: Sequence[ArrayLike],
+    *,
+    added: float = 0.1,
+    **options: Any,
+) -> Widths:
+    """Find the smallest widths of the memories that cost no more than a share of the noise.
+
+    Parameters
+    ----------
+    correction : Correction
+        The correction.
+    levels : sequence of array_like, shape (n, rows, cols) each
+        Raw frames of steady even levels; the worst one counts.
+    added : float
+        Largest spatial noise that the words may add, over the temporal noise. 0.1 raises a C of 1
+        to 1.005.
+    **options : Any
+        The other widths, and steps, as of `Table.of`.
+
+    Returns
+    -------
+    Widths
+        The widths, and what each of them adds.
+
+    Raises
+    ------
+    InputError
+        As of `quality`; or if `options` names a width that is sought.
+    """
+    if not number("added", added) > 0:
+        raise InputError(f"'added' is {added!r}, expected more than 0")
+    sought = {"offset_bits", "gain_bits"} & set(options)
+    if sought or not len(levels):
+        raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
+    Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
+    raw = [as_array("levels", frames, ndim=3) for frames in levels]
+    exact = [correction.correct(frames, flagged="nan") for frames in raw]
+    before = [correctability(frames) for frames in exact]
+
+    def worst(offset_bits: int, gain_bits: int) -> float:
+        try:
+            table = Table.of(correction, offset_bits=offset_bits, gain_bits=gain_bits, **options)
+        except InputError:
+            # Words of usable pixels do not fit: with 16 bits they did.
+            return float("inf")
+        each = zip(raw, exact, before, strict=True)
+        return max(_added(table.correct(frames), own, noise) for frames, own, noise in each)
+
+    found = {
+        "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
+        "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
+        "both": {bits: worst(bits, bits) for bits in _WIDTHS},
+    }
+    offset, gain, both = (_first(each.items(), added) for each in found.values())
+    return Widths(offset, gain, both, found)
+
+
+def _first(found: Iterable[tuple[int, float]], limit: float) -> int | None:
+    """Return the smallest width from which on none adds more than the limit."""
+    last = None
+    for bits, added in sorted(found, reverse=True):
+        if added > limit:
+            break
+        last = check_width("bits", bits)
+    return last

@@ -1,0 +1,360 @@
+"""A correction as words for a camera's electronics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+
+from equipix import _native
+from equipix._check import as_array, naming_memory, number, positive_workers
+from equipix._readonly import ReadOnly
+from equipix.correction.apply import apply
+from equipix.correction.protocol import check_correction
+from equipix.errors import InputError
+from equipix.flags import usable
+from equipix.hardware.content import DTYPES, Content
+from equipix.hardware.encode import Steps, encode, line_of, origin
+from equipix.hardware.files import write
+from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from numpy.typing import ArrayLike
+
+    from equipix._types import Array, Flagged, Floats
+    from equipix.correction.protocol import Correction
+
+
+class Applied(NamedTuple):
+    """Corrected words, and how many outputs were limited to 0 and to the largest word."""
+
+    words: Array
+    below: int
+    above: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(ReadOnly):
+    r"""Words of a correction: a coarse offset ahead of the ADC, fine offset and gain behind it.
+
+    Attributes
+    ----------
+    format : Format
+        Widths of the words and the steps that they stand for.
+    coarse : ndarray, shape (rows, cols), uint16
+        Words of the DAC, which the amplifier subtracts ahead of the ADC.
+    offset : ndarray, shape (rows, cols), int16
+        Words of the fine offset.
+    gain : ndarray, shape (rows, cols), uint16
+        Words of the gain; 0 is the code of a pixel that must not be used.
+    flags : ndarray, shape (rows, cols), uint32
+        Bits of `equipix.Flag`.
+    metadata : dict
+        Version, hash of the correction, largest error, as JSON values.
+
+    Raises
+    ------
+    InputError
+        If arrays do not fit together, or words do not fit their widths.
+
+    Notes
+    -----
+    With the word x of the ADC, the steps s and the gain g and offset o of a pixel,
+
+    .. math:: x = \mathrm{round}((y - D s_D) / s_x), \qquad
+        z = b + \mathrm{round}((g s_g x s_x + o s_o) / s_z)
+
+    rounded half to even, and limited to the words of the ADC and of the output. The corrected value
+    is zero + z in steps of the output.
+
+    Examples
+    --------
+    >>> import equipix
+    >>> from equipix import hardware, simulate
+    >>> array = simulate.StaringArray.of("InSb", (24, 32), rng=1)
+    >>> levels = [equipix.average(array.frames(e, 16, rng=k)) for k, e in enumerate((4e6, 16e6))]
+    >>> response = equipix.nuc.fit(levels, order=1)
+    >>> table = hardware.Table.of(response, offset_bits=12, gain_bits=12)
+    >>> frame = next(array.frames(10e6, 1, rng=9))
+    >>> words = table.apply(table.digitise(frame))
+    >>> difference = words * 2.0**table.format.out - response.correct(frame)
+    >>> bool(abs(difference).max() < 2**table.format.out / 2 + table.metadata["largest_error_dn"])
+    True
+    """
+
+    format: Format
+    coarse: Array
+    offset: Array
+    gain: Array
+    flags: Array
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
+        ReadOnly.__post_init__(self)
+        for name, dtype in DTYPES.items():
+            array = getattr(self, name)
+            if array.dtype != dtype or array.ndim != 2 or array.shape != self.gain.shape:
+                raise InputError(
+                    f"'{name}' is {array.dtype} of shape {array.shape}, expected "
+                    f"{np.dtype(dtype)} of {self.gain.shape}"
+                )
+        f = self.format
+        for name, bits in (
+            ("coarse", f.dac_bits),
+            ("offset", f.offset_bits - 1),
+            ("gain", f.gain_bits),
+        ):
+            words = getattr(self, name).astype(np.int32)
+            if np.any((words >= 2**bits) | (words < -(2**bits))):
+                raise InputError(f"'{name}' holds words of more than its width")
+        if np.any((self.gain == 0) != ~usable(self.flags)):
+            raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
+
+    def __repr__(self) -> str:
+        """Short form: sizes and widths."""
+        rows, cols = self.shape
+        f = self.format
+        return (
+            f"<Table of {rows} x {cols} pixels, DAC {f.dac_bits}, ADC {f.adc_bits}, offset "
+            f"{f.offset_bits}, gain {f.gain_bits}, output {f.out_bits} bits>"
+        )
+
+    @classmethod
+    def of(
+        cls,
+        correction: Correction,
+        *,
+        adc_bits: int = 14,
+        dac_bits: int = 8,
+        offset_bits: int = 12,
+        gain_bits: int = 16,
+        out_bits: int = 16,
+        adc_step: float = 1.0,
+        out_step: float | None = None,
+        dac_step: float | None = None,
+        offset_step: float | None = None,
+        gain_step: float | None = None,
+        lowest: float = 0.0,
+        linearise: tuple[float, float] | None = None,
+    ) -> Self:
+        """Words of a correction.
+
+        Parameters
+        ----------
+        correction : Correction
+            A calibration, a response of order up to 1, or any other with offset and gain. Pixels
+            flagged ``DO_NOT_USE`` or NaN get words of 0.
+        adc_bits, dac_bits, offset_bits, gain_bits, out_bits : int
+            Widths of the words, 8 to 16.
+        adc_step, out_step : float
+            DN of the correction in a step of the ADC and of the output, powers of two. Unless
+            given, the output has the range of the ADC.
+        dac_step, offset_step : float, optional
+            DN in a step of the DAC and of the fine offset, powers of two. Unless given, the finest
+            with which the words of all usable pixels fit.
+        gain_step : float, optional
+            Step of the gain, a power of two; the finest that fits unless given.
+        lowest : float
+            Corrected value in DN that the ADC must still see: the DAC subtracts no more than
+            leaves each pixel a word of 0 there, and the output 0 stands for it. Choose it some
+            noise below the darkest scene.
+        linearise : tuple of float, optional
+            Two raw values in DN. A correction of order 2 or 3 is replaced by a straight line
+            between them, half of its sag aside; ``metadata["linearised"]`` has the sag.
+
+        Returns
+        -------
+        Table
+            Its ``metadata["largest_error_dn"]`` bounds the error of rounded words, the rounding
+            of the ADC and of the output aside.
+
+        Raises
+        ------
+        InputError
+            If a width or a step is out of range, the correction is curved, or words of usable
+            pixels do not fit; the message has their number and the width that would hold them.
+        """
+        check_correction("correction", correction)
+        given = (adc_bits, dac_bits, offset_bits, gain_bits, out_bits)
+        names = ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits")
+        widths = {name: check_width(name, bits) for name, bits in zip(names, given, strict=True)}
+        if not np.isfinite(number("lowest", lowest)):
+            raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
+        adc = exponent_of("adc_step", adc_step)
+        out = chosen_exponent("out_step", out_step)
+        if out is None:
+            out = adc + widths["adc_bits"] - widths["out_bits"]
+        steps = Steps(
+            adc,
+            chosen_exponent("dac_step", dac_step),
+            chosen_exponent("offset_step", offset_step),
+            chosen_exponent("gain_step", gain_step),
+            out,
+        )
+        with naming_memory("making a table"):
+            offset, gain, sag = line_of(correction, linearise)
+            made = encode((offset, gain), correction.flags, widths, steps, float(lowest))
+        metadata = {
+            **origin(correction),
+            "lowest": float(lowest),
+            "largest_error_dn": made.largest_error,
+        }
+        if linearise is not None:
+            metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
+        return cls(made.format, made.coarse, made.offset, made.gain, made.flags, metadata)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.gain.shape
+        return rows, cols
+
+    @property
+    def coefficients(self) -> Floats:
+        """Offset and gain that the words stand for, shape (2, rows, cols); NaN where unusable."""
+        f = self.format
+        gain = np.ldexp(self.gain.astype(np.float64), f.gain)
+        offset = np.ldexp(self.offset.astype(np.float64), f.offset)
+        offset += np.ldexp(float(f.zero + f.base), f.out)
+        offset -= gain * np.ldexp(self.coarse.astype(np.float64), f.coarse)
+        return np.where(usable(self.flags), np.stack([offset, gain]), np.nan)
+
+    def digitise(self, frames: ArrayLike) -> Array:
+        """Words of the ADC behind the subtracting amplifier, for frames as without the DAC.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw values in DN of the correction, whole or not.
+
+        Returns
+        -------
+        ndarray, of the frames' shape, uint16
+            Rounded half to even and limited to the words of the ADC; 0 for a pixel that must not
+            be used.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, or a usable pixel is not finite.
+        """
+        raw = self._frames(frames)
+        f, used = self.format, usable(self.flags)
+        pedestal = np.ldexp(self.coarse.astype(np.float64), f.coarse)
+        words = np.empty(raw.shape, np.uint16)
+        for source, target in zip(_each(raw), _each(words), strict=True):
+            lost = int(np.count_nonzero(~np.isfinite(source) & used))
+            if lost:
+                raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
+            steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
+            target[...] = np.clip(steps, 0, f.largest_word)
+        return words
+
+    def apply(self, frames: ArrayLike, *, workers: int | None = None) -> Array:
+        """Corrected words, bit by bit as the electronics gives them.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols), uint8 or uint16
+            Words of the ADC, with the coarse words loaded into the DAC; `digitise` simulates them.
+        workers : int, optional
+            Threads; all processors unless given. The words are the same for any number.
+
+        Returns
+        -------
+        ndarray, of the frames' shape, uint16
+            Words of the output, 0 for a pixel that must not be used.
+
+        Raises
+        ------
+        InputError
+            If the shape or the dtype does not fit, or a word exceeds the largest of the ADC.
+        """
+        return self.applied(frames, workers=workers).words
+
+    def applied(self, frames: ArrayLike, *, workers: int | None = None) -> Applied:
+        """Like `apply`, with the numbers of outputs that were limited."""
+        raw = self._frames(frames)
+        if raw.dtype not in (np.uint8, np.uint16):
+            raise InputError(
+                f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
+                "table.digitise(frames) makes them of raw values"
+            )
+        words = np.ascontiguousarray(raw, np.uint16)
+        out = np.empty(words.shape, np.uint16)
+        stack = (-1, *self.shape)
+        below, above = _native.apply_words(
+            words.reshape(stack),
+            np.ascontiguousarray(self.gain),
+            np.ascontiguousarray(self.offset),
+            out.reshape(stack),
+            self.format.arithmetic,
+            workers=positive_workers(workers),
+        )
+        return Applied(out, below, above)
+
+    def correct(
+        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
+    ) -> Array:
+        """Raw frames as amplifier, ADC and table correct them, in DN.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames in DN, as without the DAC.
+        flagged : {"nan", "keep", "replace"}
+            The value of pixels flagged ``DO_NOT_USE``: NaN, the code 0, or the mean of the nearest
+            good pixels around.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32 or float64.
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of dtype float64 for float64 frames, else float32; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, `flagged` is unknown, or a usable pixel is not finite.
+        """
+
+        def formula(frame: Array, corrected: Array) -> None:
+            words = self.apply(self.digitise(frame))
+            corrected[...] = np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
+
+        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.hardware.read` reads bit by bit.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix names the format: .bin, .hex (for ``$readmemh``) or .h (C).
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        InputError
+            If the suffix is another.
+        """
+        arrays = (self.coarse, self.offset, self.gain, self.flags)
+        write(Content(self.format, *arrays, self.metadata), path, force=force)
+
+    def _frames(self, frames: ArrayLike) -> Array:
+        raw = as_array("frames", frames, ndim=(2, 3))
+        if raw.shape[-2:] != self.shape:
+            raise InputError(f"'frames' has shape {raw.shape}, the table {self.shape}")
+        return raw
+
+
+def _each(stack: Array) -> Array:
+    return stack[None] if stack.ndim == 2 else stack

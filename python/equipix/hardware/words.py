@@ -1,0 +1,195 @@
+"""Widths of words, the steps that they stand for, and how values become words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix._check import number
+from equipix.errors import InputError
+
+if TYPE_CHECKING:
+    from equipix._types import Floats
+
+_NARROWEST, _WIDEST = 8, 16
+"""Widths of words, in bits."""
+
+_EXPONENT = 40
+"""Steps are from 2^-40 to 2^40 DN."""
+
+_SUM_BITS = 58
+"""Most bits that a term of the sum may take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """Widths of the words in bits, and the powers of two that one step of each stands for.
+
+    Attributes
+    ----------
+    adc_bits, dac_bits, offset_bits, gain_bits, out_bits : int
+        Widths, 8 to 16. The words of the offset are signed, in two's complement.
+    adc, coarse, offset, out : int
+        One step is 2 to this power, in DN of the correction.
+    gain : int
+        One step is 2 to this power, without a unit.
+    base : int
+        Output of the sum 0, in steps of the output; 32 bits.
+    zero : int
+        Corrected value of the output 0, in steps of the output; 32 bits.
+
+    Raises
+    ------
+    InputError
+        If a width or an exponent is out of range.
+    """
+
+    adc_bits: int
+    dac_bits: int
+    offset_bits: int
+    gain_bits: int
+    out_bits: int
+    adc: int
+    coarse: int
+    offset: int
+    gain: int
+    out: int
+    base: int
+    zero: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range."""
+        for name in ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits"):
+            check_width(name, getattr(self, name))
+        for name in ("adc", "coarse", "offset", "gain", "out"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or abs(value) > _EXPONENT:
+                raise InputError(f"'{name}' is {value!r}, expected -{_EXPONENT} to {_EXPONENT}")
+        for name in ("base", "zero"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or abs(value) >= 2**31:
+                raise InputError(f"'{name}' is {value!r}, expected a whole number of 32 bits")
+        product, offset, out = self.shifts
+        bits = max(32 + product, 16 + offset, out)
+        if bits > _SUM_BITS:
+            raise InputError(
+                f"the steps 2^{self.adc} (ADC), 2^{self.offset} (offset), 2^{self.gain} (gain) and "
+                f"2^{self.out} (output) make sums of {bits} bits, expected at most {_SUM_BITS}: "
+                "take steps that differ less"
+            )
+
+    @property
+    def arithmetic(self) -> tuple[int, int, int, int, int, int, int]:
+        """Numbers that the compiled part needs."""
+        return (
+            self.adc_bits,
+            self.out_bits,
+            self.adc,
+            self.offset,
+            self.gain,
+            self.out,
+            self.base,
+        )
+
+    @property
+    def shifts(self) -> tuple[int, int, int]:
+        """Bits by which product and offset are raised, and their sum lowered, for the output."""
+        lowest = min(self.gain + self.adc, self.offset, self.out)
+        return self.gain + self.adc - lowest, self.offset - lowest, self.out - lowest
+
+    @property
+    def largest_word(self) -> int:
+        """Largest word of the ADC."""
+        return int(2**self.adc_bits - 1)
+
+
+def check_width(name: str, bits: object) -> int:
+    """Refuse a width out of range."""
+    whole = isinstance(bits, int | np.integer) and not isinstance(bits, bool)
+    if not whole or not _NARROWEST <= bits <= _WIDEST:  # type: ignore[operator]
+        raise InputError(f"'{name}' is {bits!r}, expected {_NARROWEST} to {_WIDEST} bits")
+    return int(bits)  # type: ignore[call-overload, no-any-return]
+
+
+def exponent_of(name: str, step: float) -> int:
+    """Return the exponent of a step, which must be a power of two."""
+    mantissa, exponent = math.frexp(number(name, step))
+    if mantissa != 1 / 2 or abs(exponent - 1) > _EXPONENT:
+        raise InputError(
+            f"'{name}' is {step!r}, expected a power of two from 2^-{_EXPONENT} to 2^{_EXPONENT}, "
+            "such as 0.25"
+        )
+    return exponent - 1
+
+
+def chosen_exponent(name: str, step: float | None) -> int | None:
+    """Return the exponent of a step; None where the finest one is to be found."""
+    return None if step is None else exponent_of(name, step)
+
+
+@dataclass(frozen=True)
+class Words:
+    """Words of one kind: how many bits they have, and which values of usable pixels they take."""
+
+    name: str
+    bits: int
+    signed: bool = False
+    lowest: int = 0
+    floor: bool = False
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """Lowest and highest word."""
+        if self.signed:
+            return -(2 ** (self.bits - 1)), 2 ** (self.bits - 1) - 1
+        return self.lowest, 2**self.bits - 1
+
+    def rounded(self, values: Floats, exponent: int) -> Floats:
+        """Values in whole steps: half to even, or the next below."""
+        steps = np.ldexp(values, -exponent)
+        return np.asarray(np.floor(steps) if self.floor else np.rint(steps))
+
+    def outside(self, values: Floats, exponent: int) -> int:
+        """Count the values that do not fit."""
+        low, high = self.limits
+        words = self.rounded(values, exponent)
+        return int(np.count_nonzero((words < low) | (words > high)))
+
+    def finest(self, values: Floats, not_below: int) -> int:
+        """Return the exponent of the finest step with which the largest values fit."""
+        exponent, ends = not_below, np.array([values.min(), values.max()])
+        largest = Words(self.name, self.bits, self.signed, -(2**self.bits), self.floor)
+        while exponent < _EXPONENT and largest.outside(ends, exponent):
+            exponent += 1
+        return exponent
+
+    def encoded(self, values: Floats, exponent: int) -> Floats:
+        """Round values to words, and refuse those of usable pixels that do not fit.
+
+        Raises
+        ------
+        InputError
+            With their number and the width that would hold them.
+        """
+        outside = self.outside(values, exponent)
+        if outside:
+            raise InputError(
+                f"'{self.name}_bits' is {self.bits}: the {self.name} words of {outside} usable "
+                f"pixels do not fit, with values from {values.min():.6g} to {values.max():.6g} and "
+                f"a step of 2^{exponent}: {self._remedy(values, exponent)}"
+            )
+        return self.rounded(values, exponent)
+
+    def _remedy(self, values: Floats, exponent: int) -> str:
+        wide = [
+            bits
+            for bits in range(self.bits + 1, _WIDEST + 1)
+            if not Words(self.name, bits, self.signed, self.lowest, self.floor).outside(
+                values, exponent
+            )
+        ]
+        others = f"another {self.name}_step, or flag these pixels"
+        return f"{wide[0]} bits would hold them; or take {others}" if wide else f"take {others}"

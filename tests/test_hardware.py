@@ -1,0 +1,429 @@
+"""Tables of words: against the reference, against the correction, to files and back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+
+import hardware as docs
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Flag, Polynomial, errors, hardware, nuc, reference
+from equipix.io import write_frames
+from equipix.simulate import StaringArray
+
+SHAPE = (24, 32)
+SUFFIXES = (".bin", ".hex", ".h")
+
+
+@pytest.fixture(scope="module")
+def made():
+    """An array, and its two-point correction with three bad pixels."""
+    array, response = docs.two_point(shape=SHAPE)
+    flags = np.zeros(SHAPE, np.uint32)
+    flags[2, 3] = Flag.DEAD | Flag.DO_NOT_USE
+    flags[5, 7] = Flag.HOT | Flag.DO_NOT_USE
+    flags[6, 1] = Flag.SATURATED
+    return array, response.with_flags(flags)
+
+
+def polynomial(*planes, flags=None, shape=(4, 5)):
+    full = [np.broadcast_to(np.asarray(plane, float), shape) for plane in planes]
+    return Polynomial(np.array(full), np.zeros(shape, np.uint32) if flags is None else flags)
+
+
+def words_of(table, count=3, rng=1):
+    shape = (count, *table.shape)
+    return np.random.default_rng(rng).integers(0, 2**table.format.adc_bits, shape, np.uint16)
+
+
+def by_reference(table, words):
+    f = table.format
+    return reference.apply_words(
+        words,
+        table.gain,
+        table.offset,
+        out_bits=f.out_bits,
+        exponents=(f.adc, f.offset, f.gain, f.out),
+        base=f.base,
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"gain_bits": 8, "offset_bits": 8, "out_bits": 8},
+        {"gain_bits": 11, "offset_bits": 9, "lowest": 700.0, "dac_bits": 12},
+        {"adc_bits": 10, "adc_step": 16.0, "out_step": 0.25, "lowest": -30.0},
+        {"out_step": 8.0, "offset_step": 0.5, "gain_step": 2.0**-12},
+    ],
+)
+def test_words_are_those_of_the_reference(made, options):
+    table = hardware.Table.of(made[1], **options)
+    words = words_of(table)
+    assert np.array_equal(table.apply(words, workers=2), by_reference(table, words))
+    assert np.array_equal(table.apply(words[0], workers=1), by_reference(table, words)[0])
+
+
+def exact_words(table, coefficients):
+    """Words of the output by the correction itself, before they are rounded or limited."""
+    f = table.format
+    raw = np.arange(2**f.adc_bits)[:, None, None] * 2.0**f.adc + table.coarse * 2.0**f.coarse
+    return raw, (coefficients[0] + coefficients[1] * raw) / 2.0**f.out - f.zero
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("lowest", [0.0, 37.5, 200.0])
+def test_wide_words_are_the_correction_within_half_a_step(seed, lowest):
+    rng = np.random.default_rng(seed)
+    gain, offset = rng.uniform(0.7, 1.3, SHAPE), rng.uniform(-200, 20, SHAPE)
+    correction = polynomial(offset, gain, shape=SHAPE)
+    table = hardware.Table.of(
+        correction, adc_bits=8, offset_bits=16, gain_bits=16, out_step=1.0, lowest=lowest
+    )
+    _, exact = exact_words(table, correction.coefficients)
+    words = np.arange(256, dtype=np.uint16)[:, None, None] + np.zeros(SHAPE, np.uint16)
+    found = table.apply(words)
+    inside = (exact > 0) & (exact < 2**16 - 1)
+    # A step of the gain is 2^-15, so 128 words from the middle its half makes 2^-9. Of 16 bits the
+    # fine offset spends 5 on what the DAC leaves.
+    limit = 0.5 + 2.0**-9 + 2.0 ** (table.format.offset - 1)
+    assert table.format.offset <= -10
+    assert np.abs(found - exact)[inside].max() <= limit
+    assert inside.mean() > 0.5
+    assert np.all(found[exact < -0.51] == 0)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 13])
+def test_narrow_words_are_off_by_no_more_than_their_steps(made, bits):
+    response = made[1]
+    table = hardware.Table.of(response, offset_bits=bits, gain_bits=bits, out_step=0.25)
+    f, used = table.format, table.gain > 0
+    _, exact = exact_words(table, response.coefficients)
+    middle = 2.0 ** (f.adc_bits - 1 + f.adc)
+    limit = (2.0**f.offset + 2.0**f.gain * middle) / 2 / 2.0**f.out
+    words = np.arange(0, 2**14, 37, dtype=np.uint16)[:, None, None] + np.zeros(SHAPE, np.uint16)
+    away = np.abs(table.apply(words) - exact[::37])
+    inside = used & (exact[::37] > 0) & (exact[::37] < 2**f.out_bits - 1)
+    largest = away[inside].max()
+    assert largest <= limit + 0.5
+    # The largest of 765 errors, spread evenly up to the limit, is close to it.
+    assert largest > 0.8 * limit
+    told = table.metadata["largest_error_dn"] / 2.0**f.out
+    assert largest - 0.5 <= told <= limit
+
+
+def test_the_steps_are_the_finest_that_fit(made):
+    table = hardware.Table.of(made[1], lowest=500.0)
+    f, used = table.format, table.gain > 0
+    assert table.gain.max() >= 2 ** (f.gain_bits - 1)
+    assert np.abs(table.offset[used].astype(int)).max() >= 2 ** (f.offset_bits - 2)
+    assert f.coarse == f.adc or table.coarse.max() >= 2 ** (f.dac_bits - 1)
+    # Pixels have a word from 0 on at the lowest value, and less than a step of the DAC.
+    raw = (500.0 - made[1].coefficients[0]) / made[1].coefficients[1]
+    left = (raw - table.coarse * 2.0**f.coarse)[used]
+    assert left.min() >= 0
+    assert left.max() < 2.0**f.coarse
+
+
+def test_the_dac_keeps_a_wide_spread_in_the_range_of_the_adc():
+    offset = np.random.default_rng(1).uniform(-3000, 0, SHAPE)
+    correction = polynomial(offset, 1.0, shape=SHAPE)
+    light = 3000.0
+    raw = light - offset
+    table = hardware.Table.of(correction, adc_bits=12, dac_bits=12, out_step=0.25)
+    off = hardware.Table.of(correction, adc_bits=12, dac_step=2.0**13, out_step=0.25)
+    # Rounding of the ADC, half a step, and of offset and output.
+    assert np.abs(table.correct(raw) - light).max() < 0.5 + 0.125 + 2.0**table.format.offset
+    assert (off.digitise(raw) == 4095).mean() > 0.5
+
+
+def test_coefficients_are_those_of_the_words(made):
+    table = hardware.Table.of(made[1], lowest=700.0, gain_bits=9)
+    raw = np.full(SHAPE, 3000.0)
+    offset, gain = table.coefficients
+    used = table.gain > 0
+    rounding = 2.0**table.format.adc / 2 * gain[used].max() + 2.0**table.format.out / 2
+    assert np.abs(offset + gain * raw - table.correct(raw))[used].max() <= rounding
+    assert np.isnan(offset[~used]).all()
+    assert isinstance(table, equipix.Correction)
+
+
+def test_pixels_that_must_not_be_used_have_the_code_0(made):
+    table = hardware.Table.of(made[1])
+    bad = (made[1].flags & Flag.DO_NOT_USE) != 0
+    assert bad.sum() >= 2
+    for words in (table.coarse, table.offset, table.gain):
+        assert not words[bad].any()
+    frame = np.full(SHAPE, 2000.0)
+    frame[2, 3] = np.nan
+    corrected = table.correct(frame)
+    assert np.array_equal(np.isnan(corrected), bad)
+    assert np.isfinite(table.correct(frame, flagged="replace")).all()
+    assert not table.apply(np.full(SHAPE, 900, np.uint16))[bad].any()
+
+
+def test_a_pixel_without_coefficients_is_flagged():
+    gain = np.ones((4, 5))
+    gain[1, 2] = np.nan
+    table = hardware.Table.of(polynomial(0.0, gain))
+    assert table.gain[1, 2] == 0
+    assert table.flags[1, 2] == Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE
+
+
+def same(one, other):
+    arrays = ("coarse", "offset", "gain", "flags")
+    equal = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in arrays)
+    dtypes = all(getattr(one, name).dtype == getattr(other, name).dtype for name in arrays)
+    return equal and dtypes and one.format == other.format and one.metadata == other.metadata
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("bits", [8, 11, 16])
+def test_files_come_back_bit_by_bit(made, tmp_path, suffix, bits):
+    widths = {"dac_bits": bits, "offset_bits": bits, "gain_bits": bits}
+    table = hardware.Table.of(made[1], lowest=300.0, **widths)
+    assert table.offset.min() < 0 < table.offset.max()
+    path = tmp_path / f"table{suffix}"
+    table.save(path)
+    assert same(hardware.read(path), table)
+    with pytest.raises(errors.FileError, match="exists already"):
+        table.save(path)
+    table.save(path, force=True)
+
+
+def test_a_memory_image_packs_a_word_a_pixel(made, tmp_path):
+    table = hardware.Table.of(made[1], dac_bits=8, offset_bits=12, gain_bits=12, lowest=300.0)
+    table.save(tmp_path / "table.hex")
+    lines = (tmp_path / "table.hex").read_text().splitlines()[2:]
+    assert len(lines) == SHAPE[0] * SHAPE[1]
+    word = int(lines[0], 16)
+    assert word >> 24 == table.coarse[0, 0]
+    assert (word >> 12) % 4096 == table.offset[0, 0] % 4096
+    assert word % 4096 == table.gain[0, 0]
+    assert lines[2 * 32 + 3] == f"00000000 // {table.flags[2, 3]:08x}"
+
+
+@pytest.mark.parametrize("out_bits", [8, 14, 16])
+def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, out_bits):
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    table = hardware.Table.of(made[1], out_bits=out_bits, gain_bits=12, offset_bits=10)
+    table.save(tmp_path / "table.h")
+    (tmp_path / "main.c").write_text(
+        '#include <stdio.h>\n#include "table.h"\n'
+        "int main(void) { uint16_t x; for (uint32_t i = 0; fread(&x, 2, 1, stdin) == 1; i++) {\n"
+        "    uint16_t z = equipix_apply(x, i % (EQUIPIX_ROWS * EQUIPIX_COLS));\n"
+        "    fwrite(&z, 2, 1, stdout); } return 0; }\n"
+    )
+    command = [compiler, "-Wall", "-Werror", "-Wno-unused-const-variable", "-Wno-unused-variable"]
+    program = tmp_path / "main"
+    subprocess.run([*command, tmp_path / "main.c", "-o", program], check=True)
+    words = words_of(table, 30)
+    done = subprocess.run([program], input=words.tobytes(), capture_output=True, check=True)
+    assert np.array_equal(np.frombuffer(done.stdout, np.uint16), table.apply(words).ravel())
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_damaged_files_are_refused_by_name(made, tmp_path, suffix):
+    path = tmp_path / f"table{suffix}"
+    hardware.Table.of(made[1]).save(path)
+    whole = path.read_bytes()
+
+    def refused(data, words):
+        path.write_bytes(data)
+        with pytest.raises(errors.FileError, match=rf"table\{suffix}: .*{words}"):
+            hardware.read(path)
+
+    refused(whole.replace(b'"version": 1', b'"version": 2'), "version 2, .* reads version 1")
+    refused(whole.replace(b'"rows": 24', b'"rows": 25'), "another size")
+    refused(whole[: len(whole) // 2], "incomplete|another size|holds no table")
+    refused(b"", "holds no table|incomplete")
+    refused(b"\xff\xfe" * 100, "holds no table|damaged")
+    gain = hardware.Table.of(made[1]).gain[0, 0]
+    if suffix == ".bin":
+        refused(whole.replace(gain.tobytes(), (gain - 1).tobytes(), 1), "checksum|damaged")
+    else:
+        text = f"{gain:04x}" if suffix == ".hex" else f"{gain},"
+        other = f"{gain - 1:04x}" if suffix == ".hex" else f"{gain - 1},"
+        assert text.encode() in whole
+        refused(whole.replace(text.encode(), other.encode(), 1), "checksum")
+
+
+def test_other_suffixes_are_refused(made, tmp_path):
+    with pytest.raises(errors.InputError, match=r"ends in none of \.bin, \.hex, \.h"):
+        hardware.Table.of(made[1]).save(tmp_path / "table.txt")
+    with pytest.raises(errors.FileError, match="cannot be read"):
+        hardware.read(tmp_path / "none.bin")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"gain_bits": 17}, "'gain_bits' is 17, expected 8 to 16"),
+        ({"adc_bits": 7}, "'adc_bits' is 7"),
+        ({"offset_bits": 9.5}, "'offset_bits' is 9.5"),
+        ({"adc_step": 0.3}, "'adc_step' is 0.3, expected a power of two"),
+        ({"out_step": 0}, "'out_step' is 0, expected a power of two"),
+        ({"lowest": float("nan")}, "'lowest' is nan"),
+        ({"out_step": 2.0**40, "adc_step": 2.0**-10}, "make sums of 65 bits, expected at most 58"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(made, options, words):
+    with pytest.raises(errors.InputError, match=words):
+        hardware.Table.of(made[1], **options)
+
+
+def test_values_that_do_not_fit_are_counted_with_the_width_that_would_hold_them():
+    gain = np.ones((4, 5))
+    gain[0, :3] = 2.5
+    with pytest.raises(errors.InputError, match=r"gain words of 3 usable pixels .* 11 bits would"):
+        hardware.Table.of(polynomial(0.0, gain), gain_bits=10, gain_step=2.0**-9)
+    offset = np.zeros((4, 5))
+    offset[1, 1], offset[2, 2] = -300.0, 300.0
+    correction = polynomial(offset, 1.0)
+    with pytest.raises(errors.InputError, match=r"offset words of 2 usable .* 10 bits would"):
+        hardware.Table.of(correction, offset_bits=8, offset_step=1.0, dac_step=1024.0)
+    with pytest.raises(errors.InputError, match="dac words of 1 usable .* 9 bits would hold"):
+        hardware.Table.of(correction, dac_step=1.0)
+    # Flagged pixels are coded, not counted.
+    flags = np.zeros((4, 5), np.uint32)
+    flags[1, 1] = flags[2, 2] = Flag.DO_NOT_USE
+    hardware.Table.of(polynomial(offset, 1.0, flags=flags), offset_bits=8, offset_step=1.0)
+
+
+def test_corrections_without_use_are_refused():
+    with pytest.raises(errors.InputError, match="no usable pixel"):
+        hardware.Table.of(polynomial(0.0, np.nan))
+    with pytest.raises(errors.InputError, match="gain of 0 or below in 20 usable pixels"):
+        hardware.Table.of(polynomial(0.0, -1.0))
+    with pytest.raises(errors.InputError, match="expected a correction"):
+        hardware.Table.of("response.tif")
+
+
+def test_a_curved_correction_needs_a_line():
+    correction = polynomial(10.0, 1.0, 1e-5)
+    with pytest.raises(errors.InputError, match="of order 2, .* order 1, or give 'linearise'"):
+        hardware.Table.of(correction)
+    table = hardware.Table.of(correction, linearise=(1000.0, 3000.0), out_step=2.0**-3, adc_bits=12)
+    # A parabola is c (h/2)² below its chord: 10 DN; half of it is left on either side.
+    assert table.metadata["linearised"]["sag_dn"] == pytest.approx(10.0, rel=1e-9)
+    for raw, left in ((1000, -5.0), (2000, 5.0), (3000, -5.0)):
+        frame = np.full((4, 5), raw, np.uint16)
+        found = table.correct(frame) - correction.correct(frame)
+        # Half a step of the output, and of the gain at 1048 words from the middle.
+        assert found == pytest.approx(np.full((4, 5), left), abs=2.0**-4 + 1048 * 2.0**-16 + 1e-3)
+
+
+def test_frames_that_do_not_fit_are_refused(made):
+    table = hardware.Table.of(made[1])
+    with pytest.raises(errors.InputError, match="has shape"):
+        table.apply(np.zeros((3, 3), np.uint16))
+    with pytest.raises(errors.InputError, match="expected uint8 or uint16 words"):
+        table.apply(np.zeros(SHAPE))
+    with pytest.raises(errors.InputError, match="holds 16384, above 16383"):
+        table.apply(np.full(SHAPE, 16384, np.uint16))
+    with pytest.raises(errors.InputError, match="usable pixels that are not finite"):
+        table.correct(np.full(SHAPE, np.inf))
+
+
+def test_outputs_that_are_limited_are_counted(made):
+    table = hardware.Table.of(made[1])
+    f = table.format
+    words = words_of(table)
+    used = table.gain > 0
+    exact = table.gain * 2.0**f.gain * words * 2.0**f.adc + table.offset * 2.0**f.offset
+    exact = np.rint(exact / 2.0**f.out) + f.base
+    found = table.applied(words)
+    assert found.below == (exact < 0)[:, used].sum()
+    assert found.above == (exact > 2**f.out_bits - 1)[:, used].sum() > 0
+
+
+def test_the_hash_is_that_of_the_correction(made):
+    one, other = (hardware.Table.of(made[1], gain_bits=bits).metadata["sha256"] for bits in (9, 16))
+    assert one == other
+    changed = polynomial(*(made[1].coefficients + 1e-9), shape=SHAPE, flags=made[1].flags)
+    assert hardware.Table.of(changed).metadata["sha256"] != one
+
+
+def test_the_cost_is_that_of_rounded_gains():
+    array, response = docs.two_point()
+    frames = docs.frames_of(array)[0]
+    for bits in (8, 10):
+        found = hardware.quality(response, frames, gain_bits=bits, offset_bits=16, lowest=1000.0)
+        table = found.table
+        step, gain = 2.0**table.format.gain, response.coefficients[1]
+        assert step == 2.0 ** (1 - bits)
+        word = table.digitise(frames).mean(axis=0)
+        error = np.std((word - 2**13) * (np.rint(gain / step) * step - gain))
+        noise = np.sqrt(found.before.temporal_variance)
+        # Rounding of 16 frames of the output, steps of 1/4 DN, and of the offset is far below.
+        assert found.added == pytest.approx(error / noise, rel=0.005)
+        assert found.after.ratio > found.before.ratio
+        assert found.at_ends == 0
+
+
+def test_the_smallest_width_is_the_first_that_suffices():
+    array, response = docs.two_point()
+    found = hardware.smallest_widths(response, docs.frames_of(array), lowest=docs.LOWEST)
+    for name, bits in (("gain", found.gain_bits), ("both", found.both_bits)):
+        assert found.added[name][bits] <= 0.1 < found.added[name][bits - 1]
+    # A bit less doubles the rounding of the gain.
+    assert found.added["gain"][9] == pytest.approx(2 * found.added["gain"][10], rel=0.1)
+    assert found.offset_bits == 8
+    with pytest.raises(errors.InputError, match="gain_bits"):
+        hardware.smallest_widths(response, docs.frames_of(array), gain_bits=9)
+
+
+def test_the_command_writes_a_table(made, tmp_path, run):
+    array, response = made
+    response.save(tmp_path / "response.npz")
+    frames = np.stack(list(array.frames(9e6, 8, rng=3)))
+    write_frames(tmp_path / "level.tif", frames, nbytes=frames.nbytes)
+    command = ["hardware", tmp_path / "response.npz", "-o", tmp_path / "table.hex"]
+    status, out, _ = run(*command, "--gain-bits", 12, "--lowest", 100, "--json")
+    assert status == 0
+    told = json.loads(out)
+    table = hardware.read(tmp_path / "table.hex")
+    assert same(table, hardware.Table.of(response, gain_bits=12, lowest=100.0))
+    assert told["bits"]["gain"] == 12
+    assert told["steps"]["gain"] == 2.0**table.format.gain
+    assert told["unusable_pixels"] == (table.gain == 0).sum()
+    status, _, error = run(*command)
+    assert status == 1
+    assert "--force" in error
+    status, out, _ = run(*command, "--force", "--json", "--frames", tmp_path / "level.tif")
+    cost = hardware.quality(response, frames)
+    assert json.loads(out)["C_of_table"] == pytest.approx(cost.after.ratio)
+    assert run(*command, "--force", "--gain-bits", 20)[0] == 1
+    assert "Example" in run("hardware", "--help")[1]
+
+
+def test_arrays_of_a_table_fit_together(made):
+    table = hardware.Table.of(made[1], gain_bits=12)
+    parts = {name: getattr(table, name) for name in ("coarse", "offset", "gain", "flags")}
+    with pytest.raises(errors.InputError, match="'offset' is int32"):
+        hardware.Table(table.format, **parts | {"offset": table.offset.astype(np.int32)})
+    with pytest.raises(errors.InputError, match="more than its width"):
+        hardware.Table(table.format, **parts | {"gain": table.gain + np.uint16(4096)})
+    with pytest.raises(errors.InputError, match="must be 0 where"):
+        hardware.Table(table.format, **parts | {"flags": np.zeros(SHAPE, np.uint32)})
+
+
+@pytest.mark.parametrize("by", ["offset", "gain"])
+def test_one_point_corrections_have_a_table(by):
+    array = StaringArray.of("PtSi", SHAPE, rng=3)
+    dark = np.full(SHAPE, 300.0) if by == "gain" else None
+    level = equipix.average(array.frames(9e6, 64, rng=1), dark=dark)
+    response = nuc.fit([level], order=0, by=by)
+    table = hardware.Table.of(response)
+    frame = next(array.frames(9e6, 1, rng=2))
+    away = np.abs(table.correct(frame) - response.correct(frame))
+    # Half a step of the output, and single precision of 7000 DN.
+    limit = 2.0**table.format.out / 2 + table.metadata["largest_error_dn"] + 7000 * 2.0**-22
+    assert np.nanmax(away) <= limit
