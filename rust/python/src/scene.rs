@@ -120,7 +120,12 @@ impl PySceneCorrection {
         motion: f64,
         prior: u64,
     ) -> PyResult<Self> {
-        Self::made(py, shape, data_range, &Options::ConstantStatistics { width, window, motion, prior })
+        Self::made(
+            py,
+            shape,
+            data_range,
+            &Options::ConstantStatistics { width, window, motion, prior },
+        )
     }
 
     #[staticmethod]
