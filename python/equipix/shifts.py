@@ -195,9 +195,8 @@ class Rounding(NamedTuple):
     def words(self) -> str:
         """What was rounded, and the limit."""
         return (
-            f"moves are rounded to whole pixels: the shift of exposure {self.exposure} (from 0) is "
-            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole, beside that of "
-            "exposure 0)"
+            f"shifts are rounded to whole pixels: that of exposure {self.exposure} (from 0) is "
+            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole)"
         )
 
 
