@@ -144,6 +144,12 @@ def check_shape(shape: tuple[int, int]) -> tuple[int, int]:
     return int(sizes[0]), int(sizes[1])
 
 
+def check_bit_depth(bits: int) -> None:
+    """Refuse bits of a simulated ADC that no camera has."""
+    if bits not in range(8, 17):
+        raise InputError(f"'bit_depth' is {bits!r}, expected 8 to 16")
+
+
 def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:

@@ -201,14 +201,16 @@ class Rounding(NamedTuple):
 
 
 def round_shifts(
-    shifts: ArrayLike, std: ArrayLike | None = None
+    shifts: Floats, origin: Floats, std: ArrayLike | None = None
 ) -> tuple[NDArray[np.int64], Rounding | None]:
-    """Shifts rounded to whole pixels, and the largest rounding that is noticeable.
+    """Shifts from an origin, rounded to whole pixels, and the largest rounding that is noticeable.
 
     Parameters
     ----------
-    shifts : array_like, shape (n, 2)
+    shifts : ndarray, shape (n, 2)
         Shifts (row, col) in pixels.
+    origin : ndarray, shape (2,)
+        What they count from.
     std : array_like, shape (n, 2), optional
         Their standard errors, in pixels; 0 unless given.
 
@@ -217,7 +219,8 @@ def round_shifts(
     whole : ndarray, shape (n, 2), int64
         The nearest whole shifts.
     rounding : Rounding or None
-        Where a shift is more than 0.02 pixel and more than three standard errors from whole.
+        Where a shift is more than 0.02 pixel and more than three standard errors from whole: it is
+        named as given.
 
     Raises
     ------
@@ -225,13 +228,13 @@ def round_shifts(
         If a shift is not a finite number.
     """
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
-    exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
+    exact = np.clip(as_shifts(shifts - origin), -_BEYOND, _BEYOND)
     whole = np.rint(exact)
     known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
     change = np.abs(exact - whole)
     change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
     worst = int(change.max(axis=1).argmax())
-    rounding = Rounding(worst, exact[worst].tolist()) if change[worst].any() else None
+    rounding = Rounding(worst, shifts[worst].tolist()) if change[worst].any() else None
     return whole.astype(np.int64), rounding
 
 

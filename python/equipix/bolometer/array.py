@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from equipix._check import as_array, check_shape, number
+from equipix._check import as_array, check_bit_depth, check_shape, number
 from equipix.bolometer.physics import exitance, integrated, kelvin_of
 from equipix.errors import InputError
 
@@ -142,8 +142,7 @@ class BolometerArray:
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_shape(self.shape)
-        if self.bit_depth not in range(8, 17):
-            raise InputError(f"'bit_depth' is {self.bit_depth!r}, expected 8 to 16")
+        check_bit_depth(self.bit_depth)
         for name in (
             *("reference_b_k", "bias_v", "pulse_s", "frame_s", "pitch_m", "f_number"),
             *("bandwidth_hz", "dn_per_v"),

@@ -104,9 +104,7 @@ class Positions(ReadOnly):
         if _native.common_fraction(self.shifts) is not None:
             return self
         first = self.shifts[0]
-        moves, rounding = round_shifts(self.shifts - first, std)
-        if rounding is not None:
-            rounding = rounding._replace(shift=self.shifts[rounding.exposure].tolist())
+        moves, rounding = round_shifts(self.shifts, first, std)
         return dataclasses.replace(self, shifts=first + moves, rounding=rounding)
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:

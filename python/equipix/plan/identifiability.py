@@ -109,12 +109,11 @@ def identify(
     if len(exact) < 2:
         raise InputError(f"'shifts' holds {len(exact)} exposures, expected at least two")
     # A part of a pixel that all shifts have in common moves the grid of the beam along.
-    whole, rounding = round_shifts(exact - (exact[0] - np.rint(exact[0])))
+    whole, rounding = round_shifts(exact, exact[0] - np.rint(exact[0]))
     if rounding is not None:
-        given = rounding._replace(shift=exact[rounding.exposure].tolist())
         first = np.round(exact[0], 3).tolist()
         warn(
-            f"{given.words}, the first is {first}: choose shifts that differ by whole pixels",
+            f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels",
             ShiftRoundingWarning,
         )
     masked = None if mask is None else as_mask(mask, (len(whole), *sizes))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from equipix._check import as_array
+from equipix._check import as_array, check_bit_depth
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,8 +83,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        if self.bit_depth not in range(8, 17):
-            raise InputError(f"'bit_depth' is {self.bit_depth!r}, expected 8 to 16")
+        check_bit_depth(self.bit_depth)
         for name in ("gain_dn_per_e", "full_well_e"):
             if not getattr(self, name) > 0:
                 raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")

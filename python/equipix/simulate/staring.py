@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from equipix._check import as_array, check_shape
+from equipix._check import as_array, check_bit_depth, check_shape
 from equipix.errors import InputError
 from equipix.simulate.blackbody import band_photons
 
@@ -131,8 +131,7 @@ class StaringArray:
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_shape(self.shape)
-        if self.bit_depth not in range(8, 17):
-            raise InputError(f"'bit_depth' is {self.bit_depth!r}, expected 8 to 16")
+        check_bit_depth(self.bit_depth)
         for name in ("doubling_k", "well_e", "band_start_um"):
             if not getattr(self, name) > 0:
                 raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
