@@ -219,7 +219,7 @@ mod tests {
     fn the_spline_goes_through_the_values_and_moves_them_by_whole_pixels() {
         let shape = Shape::new(75, 37);
         let values = image(shape);
-        for shift in [[0, 0], [3, -2], [-5, 4]] {
+        for shift in [[0_isize, 0], [3, -2], [-5, 4]] {
             let (result, way) = moved(shape, &values, shift.map(|shift| shift as f64));
             let [rows, cols] = way.inside;
             assert_eq!(
