@@ -69,7 +69,7 @@ def hardware(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write a correction as words for a camera's electronics: coarse offset, fine offset, gain."""
+    """Write a correction as words for a camera's electronics."""
     check_output(output, force=force, suffixes=SUFFIXES)
     refuse_inputs([output], [result])
     correction = load(result)
