@@ -222,3 +222,33 @@ impl Workers {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn is_inside() -> bool {
+        std::thread::current().name().is_some_and(|name| name.starts_with("equipix-"))
+    }
+
+    #[test]
+    fn one_work_at_a_time_enters_the_pool() {
+        let workers = Workers::new(NonZeroUsize::new(5)).unwrap();
+        let (seen, other) = workers.enter(|| {
+            let elsewhere = std::thread::scope(|scope| {
+                scope.spawn(|| workers.enter(|| (is_inside(), workers.map(9, |i| i)))).join()
+            });
+            (is_inside(), elsewhere.unwrap())
+        });
+        assert!(seen);
+        assert_eq!(other, (false, (0..9).collect()));
+    }
+
+    #[test]
+    fn the_next_enters_after_a_panic() {
+        let workers = Workers::new(NonZeroUsize::new(6)).unwrap();
+        let fails = std::panic::AssertUnwindSafe(|| workers.enter(|| panic!("as the test wants")));
+        assert!(std::panic::catch_unwind(fails).is_err());
+        assert!(workers.enter(is_inside));
+    }
+}
