@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import simulate
-from equipix.errors import InputError
+from equipix import Flag, simulate
+from equipix.errors import IdentifiabilityWarning, InputError
 from equipix.io import write_frames
 
 SHAPE = (80, 100)
@@ -120,6 +120,24 @@ def test_all_doors_lead_to_the_same_standard_deviations(tmp_path):
     files = equipix.Experiment.load(camera.experiment(tmp_path)).run(**options)
     # The files are kept as float32.
     np.testing.assert_allclose(files.sensitivity_std, averages.sensitivity_std, rtol=1e-4)
+
+
+def narrow(row, col):
+    return LEVEL * np.exp(-((row - 40) ** 2 + (col - 50) ** 2) / 25**2)
+
+
+def test_pixels_that_the_dark_leaves_unknown_are_flagged():
+    camera = Camera(4, beam=narrow)
+    with pytest.warns(IdentifiabilityWarning, match="average more dark frames"):
+        cal = equipix.calibrate(camera.statistics(), SHIFTS, uncertainty=True)
+    used = (cal.flags & Flag.DO_NOT_USE) == 0
+    assert cal.sensitivity[used].mean() == pytest.approx(1, abs=1e-9)
+    # 4 % by the noise of the pixel and its dark; what the beam's error adds is in the error bars.
+    std = cal.sensitivity_std[used]
+    assert np.quantile(std, 0.99) < 0.05
+    error = cal.sensitivity - camera.truth / camera.truth[used].mean()
+    # Of some thousand normal values one is beyond 5 in one time of 500.
+    assert abs(error[used] / std).max() < 5
 
 
 def test_functionals_of_a_noisy_dark():

@@ -14,6 +14,7 @@ from equipix.calibration.options import Options
 from equipix.calibration.orientation import OrientationTest
 from equipix.calibration.weights import Weighted
 from equipix.calibration.window_fit import WindowFit
+from equipix.defects import Findings
 from equipix.errors import ConvergenceWarning, MisfitWarning
 from equipix.exposures.options import FitOptions
 
@@ -33,7 +34,7 @@ GOOD = {
 
 def verdicts_on(*, variance=True, uncertainty=True, **found):
     """Verdicts on a fit that differs from a good one in what is given."""
-    exposures = SimpleNamespace(variance=np.ones(5) if variance else None)
+    exposures = SimpleNamespace(variance=np.ones(5) if variance else None, findings=Findings())
     weighted = Weighted(exposures, SimpleNamespace(**GOOD | found), None)
     options = Options(FitOptions(), uncertainty=uncertainty)
     return verdicts.on_fit(weighted, options, OrientationTest(), None, None)

@@ -7,6 +7,7 @@ import pytest
 
 import equipix
 from equipix import Flag, reference, simulate
+from equipix.errors import ConvergenceWarning
 
 CROSS = equipix.cross_pattern(11, 19)
 SMALL_CROSS = equipix.cross_pattern(3, 5)
@@ -121,6 +122,23 @@ class TestAlwaysAnAnswer:
         error = cal.sensitivity - truth / truth[good].mean()
         # 5 standard deviations of at most 4 %, as of others in this light.
         assert abs(error[good]).max() < 0.2
+
+    @pytest.mark.filterwarnings(
+        "ignore::equipix.errors.IdentifiabilityWarning",
+        "ignore:no standard deviations:equipix.errors.ConvergenceWarning",
+    )
+    def test_light_below_its_noise_ends_with_the_cause(self):
+        shape = (80, 100)
+        beam = simulate.gaussian_beam(shape, width=25)
+        # In the middle a measurement is 2.5 of its standard deviations.
+        frames, _ = experiment(shape, beam, noise=0.4)
+        with pytest.warns(ConvergenceWarning, match="too weak for its noise"):
+            cal = equipix.calibrate(frames, CROSS, variance=np.full(5, 0.4**2), uncertainty=True)
+        assert cal.is_partial
+        assert not cal.converged
+        # Some 2000 products, and the last step.
+        assert cal.sweeps < 4000
+        assert cal.sensitivity_std is None
 
     @pytest.mark.parametrize("noise", [0.15, 0.3, 0.45])
     def test_even_weak_light_needs_no_prior(self, noise):

@@ -51,6 +51,9 @@ class Findings(ReadOnly):
         Another response before than after some moment, as under dust that fell; or most of the
         measurements left out by a robust calibration. The fit flags them, and their sensitivity
         counts neither for its mean nor for its slope.
+    faint : ndarray of bool or None
+        Light so weak that the noise of the dark leaves M less known than in bright pixels; treated
+        likewise.
     """
 
     saturated: Bools | None = None
@@ -58,6 +61,14 @@ class Findings(ReadOnly):
     hot: Bools | None = None
     noisy: Bools | None = None
     contradictory: Bools | None = None
+    faint: Bools | None = None
+
+    @property
+    def unreliable(self) -> Bools | None:
+        """Pixels whose sensitivity counts neither for its mean nor for its slope."""
+        if self.contradictory is None or self.faint is None:
+            return self.faint if self.contradictory is None else self.contradictory
+        return self.contradictory | self.faint
 
 
 def refuse_saturated(

@@ -35,6 +35,7 @@ BITS = {
     "hot": Flag.HOT | Flag.DO_NOT_USE,
     "noisy": Flag.HOT | Flag.DO_NOT_USE,
     "contradictory": Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE,
+    "faint": Flag.UNRELIABLE_FLAT | Flag.DO_NOT_USE,
     "undetermined": Flag.NO_FLAT_FIELD | Flag.DO_NOT_USE,
     "falling": Flag.NONLINEAR | Flag.DO_NOT_USE,
     "nonlinear": Flag.NONLINEAR | Flag.DO_NOT_USE,

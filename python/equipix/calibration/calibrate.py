@@ -15,6 +15,7 @@ from equipix.calibration.error_bars import (
     with_dark_misfit,
     with_hidden_tilt,
 )
+from equipix.calibration.faint_pixels import without_faint_pixels
 from equipix.calibration.false_pixels import without_false_pixels
 from equipix.calibration.input_verdicts import on_input
 from equipix.calibration.lamp_drift import lamp_drift
@@ -263,6 +264,7 @@ def calibrated(
     verdicts.say(advice)
     weighted, frames = steadied(exposures, weighted_fit(exposures, options, start), options)
     weighted = without_false_pixels(weighted, options)
+    weighted = without_faint_pixels(weighted, options.fit)
     weighted, widths = widened(weighted, options)
     weighted = with_dark_misfit(weighted, options.fit)
     weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))

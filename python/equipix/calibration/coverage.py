@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix import _native
-from equipix.calibration.verdicts import Verdict
+from equipix.calibration.verdicts import TOO_WEAK, Verdict, fits_noise
 from equipix.flags import Flag, usable
 from equipix.shifts import whole_moves
 
@@ -49,10 +49,11 @@ def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> lis
 
 def _far(fit: Fit) -> str:
     """Return the words on a fit that ended far from its minimum."""
+    more = "allow more sweeps, or use larger shifts in a beam with more structure"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
-        f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): allow more sweeps, or "
-        "use larger shifts in a beam with more structure"
+        f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): "
+        f"{TOO_WEAK if fits_noise(fit) else more}"
     )
 
 

@@ -34,11 +34,11 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
 def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
     """Pixels of a much smaller and of a much larger response than their neighbours: dead, hot."""
     sensitivity = weighted.fit.sensitivity.astype(weighted.exposures.values.dtype, copy=False)
-    dead, hot = response_outliers(sensitivity, lambda: _std(weighted, options.workers))
+    dead, hot = response_outliers(sensitivity, lambda: std_of_pixels(weighted, options.workers))
     return dead | (sensitivity <= options.tolerance), hot
 
 
-def _std(weighted: Weighted, workers: int | None) -> Array:
+def std_of_pixels(weighted: Weighted, workers: int | None) -> Array:
     """Standard deviation of M, that of the beam left out: 1/√D.
 
     The noise of a dark adds at most v Σw/D, which it adds where all exposures show the same light.

@@ -44,6 +44,14 @@ _UNDETERMINED = 1e-4
 _NOT_FOUND = 0.1
 """Largest estimated error of M of a joint fit for which noise determines the errors."""
 
+_FEW = 0.01
+"""Share of pixels that more dark frames would help, below which it is not said."""
+
+TOO_WEAK = (
+    "the light is too weak for its noise: use more light or more frames, or mask pixels that "
+    "receive almost no light"
+)
+
 _DEGENERATE = 0.1
 """Share of the variance of a drift below which the error of its size is over three times larger."""
 
@@ -59,6 +67,7 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "components": IdentifiabilityWarning,
     "pattern": IdentifiabilityWarning,
     "tilt": IdentifiabilityWarning,
+    "faint": IdentifiabilityWarning,
     "dark": IdentifiabilityWarning,
     "misfit": MisfitWarning,
     "drift": DriftWarning,
@@ -162,6 +171,7 @@ def on_fit(
         _on_components(weighted.fit),
         _on_patterns(weighted.fit),
         _on_tilt(weighted.fit),
+        _on_faint(weighted.exposures),
         *_on_residuals(drift, misfit),
         _on_convergence(weighted.fit, options),
         _on_uncertainty(weighted.fit, options),
@@ -171,7 +181,13 @@ def on_fit(
 
 def is_too_far(fit: Fit) -> bool:
     """Whether a fit is too far from its minimum for standard deviations."""
-    return fit.is_joint and not float(fit.error_estimate[-1]) <= _NOT_FOUND
+    is_far = not float(fit.error_estimate[-1]) <= _NOT_FOUND
+    return fits_noise(fit) or (fit.is_joint and is_far)
+
+
+def fits_noise(fit: Fit) -> bool:
+    """Whether a fit went on without bringing M within its own size."""
+    return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
 
 
 def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
@@ -230,6 +246,18 @@ def _on_tilt(fit: Fit) -> Verdict | None:
     )
 
 
+def _on_faint(exposures: Exposures) -> Verdict | None:
+    faint = exposures.findings.faint
+    if faint is None or faint.mean() < _FEW:
+        return None
+    return Verdict(
+        "faint",
+        f"the noise of the dark leaves M of {np.count_nonzero(faint)} pixels in "
+        "weak light known to worse than 4 %, and four times worse than in bright pixels: they are "
+        "flagged UNRELIABLE_FLAT; average more dark frames",
+    )
+
+
 def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None:
     if dark is None:
         return None
@@ -261,8 +289,11 @@ def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
 def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
     if fit.ended == "converged":
         return None
-    remedy = ": allow more sweeps"
-    if fit.ended != "sweeps used":
+    if fits_noise(fit):
+        remedy = f": {TOO_WEAK}"
+    elif fit.ended == "sweeps used":
+        remedy = ": allow more sweeps"
+    else:
         remedy = (
             ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
             "almost no light"

@@ -224,7 +224,7 @@ class Exposures(ReadOnly):
             offset=self.offset,
             variance=self.variance,
             mask=self.mask,
-            unreliable=self.findings.contradictory,
+            unreliable=self.findings.unreliable,
             workers=options.workers,
             progress=options.progress,
         )

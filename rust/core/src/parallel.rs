@@ -5,6 +5,7 @@
 
 use std::collections::HashMap;
 use std::num::NonZeroUsize;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -68,6 +69,8 @@ impl pulp::NullaryFnOnce for Add<'_> {
 #[derive(Clone, Debug)]
 pub struct Workers {
     pool: Arc<rayon::ThreadPool>,
+    /// Whether a thread of the pool runs [`enter`](Workers::enter).
+    entered: Arc<AtomicBool>,
 }
 
 /// The pools of this process, by process id and number of threads.
@@ -76,6 +79,15 @@ pub struct Workers {
 /// parent's pools stay in the child's table untouched, since to drop one would wait for threads
 /// that the child does not have.
 static POOLS: Mutex<Option<HashMap<(u32, usize), Workers>>> = Mutex::new(None);
+
+/// Lets the next enter, also after a panic.
+struct Leave<'w>(&'w AtomicBool);
+
+impl Drop for Leave<'_> {
+    fn drop(&mut self) {
+        self.0.store(false, Ordering::Release);
+    }
+}
 
 impl Workers {
     /// The pool of `count` threads, started at its first use; `None` means every processor that
@@ -97,7 +109,7 @@ impl Workers {
             .thread_name(|index| format!("equipix-{index}"))
             .build()
             .map_err(|error| Error::Workers { workers: count, reason: error.to_string() })?;
-        let workers = Self { pool: Arc::new(pool) };
+        let workers = Self { pool: Arc::new(pool), entered: Arc::default() };
         pools.insert(key, workers.clone());
         Ok(workers)
     }
@@ -106,6 +118,19 @@ impl Workers {
     #[must_use]
     pub fn count(&self) -> usize {
         self.pool.current_num_threads()
+    }
+
+    /// Runs `work`, which consists of many short parallel steps, on a thread of the pool: the other threads
+    /// then wait for the next step awake, where to wake them takes as long as a step.
+    ///
+    /// One at a time. A thread that waits for the end of a step takes up whatever else there is to do. A
+    /// second long work would hold up the first until it has ended; so it stays on the thread that calls.
+    pub fn enter<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        if self.entered.swap(true, Ordering::Acquire) {
+            return work();
+        }
+        let _leave = Leave(&self.entered);
+        self.pool.install(work)
     }
 
     /// Calls `work` for 0, 1, … `count` − 1 in parallel; the results stand in that order.
@@ -205,5 +230,35 @@ impl Workers {
             let pairs = first.par_chunks_mut(one).zip(second.par_chunks_mut(other));
             pairs.enumerate().map(|(index, (first, second))| work(index, first, second)).collect()
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn is_inside() -> bool {
+        std::thread::current().name().is_some_and(|name| name.starts_with("equipix-"))
+    }
+
+    #[test]
+    fn one_work_at_a_time_enters_the_pool() {
+        let workers = Workers::new(NonZeroUsize::new(5)).unwrap();
+        let (seen, other) = workers.enter(|| {
+            let elsewhere = std::thread::scope(|scope| {
+                scope.spawn(|| workers.enter(|| (is_inside(), workers.map(9, |i| i)))).join()
+            });
+            (is_inside(), elsewhere.unwrap())
+        });
+        assert!(seen);
+        assert_eq!(other, (false, (0..9).collect()));
+    }
+
+    #[test]
+    fn the_next_enters_after_a_panic() {
+        let workers = Workers::new(NonZeroUsize::new(6)).unwrap();
+        let fails = std::panic::AssertUnwindSafe(|| workers.enter(|| panic!("as the test wants")));
+        assert!(std::panic::catch_unwind(fails).is_err());
+        assert!(workers.enter(is_inside));
     }
 }

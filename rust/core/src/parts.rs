@@ -67,6 +67,8 @@ pub fn multiscale<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<History> {
-    let (_, history, _) = solve::multiscale(exposures, options, None, workers, control)?;
-    Ok(history)
+    workers.enter(|| {
+        let (_, history, _) = solve::multiscale(exposures, options, None, workers, control)?;
+        Ok(history)
+    })
 }

@@ -56,7 +56,7 @@ impl PyBeam {
     ) -> PyResult<Py<PyArray2<f64>>> {
         let (borrowed, sensor) = (self.borrow(py), Shape::new(shape.0, shape.1));
         let beam = borrowed.view()?;
-        let light = run::interruptible(py, None, |_| {
+        let light = run::brief(py, |_| {
             let turned = self::rotation(rotation)?;
             Ok(beam.light(shift, turned, sensor, &Workers::new(workers)?))
         })?;
@@ -201,7 +201,8 @@ impl PyFit {
         let answers = run::interruptible(py, progress.as_ref(), |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
-                questions.ask(&Exposures::again(m, checked)?, &solution, &workers, control)
+                let exposures = Exposures::again(m, checked)?;
+                workers.enter(|| questions.ask(&exposures, &solution, &workers, control))
             })
         })?;
         PyUncertainty::new(py, answers, checked.sensor())

@@ -79,8 +79,8 @@ impl Fused {
         }
     }
 
-    /// Takes M, the light and the taps of the pass.
-    pub(super) fn renew<T: Real>(&mut self, pass: &Pass<'_, '_, T>) {
+    /// Takes M, the light and the taps of the pass, unless `control` asks to stop.
+    pub(super) fn renew<T: Real>(&mut self, pass: &Pass<'_, '_, T>, control: &Control) {
         let (count, cols) = (pass.exposures.count(), pass.exposures.sensor().cols);
         let (width, weight, light, is_uneven) =
             (self.width, self.weight, self.light, self.is_uneven);
@@ -95,6 +95,9 @@ impl Fused {
         pass.workers.map_blocks(&mut self.rows, CONVERTED_ROWS * length, |block, rows| {
             let mut workspace = pass.workspace();
             for (index, row) in rows.chunks_exact_mut(length).enumerate() {
+                if control.is_cancelled() {
+                    return;
+                }
                 let index = block * CONVERTED_ROWS + index;
                 pass.weigh_row(index, &mut workspace);
                 let (lights, rest) = pass.row(index).split_at(count * cols);

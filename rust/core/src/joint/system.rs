@@ -356,7 +356,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let Some(penalty) = &self.penalty else { return Ok(f64::INFINITY) };
         let fused = self.fused.get_or_insert_with(|| Fused::new(&self.pass, control));
         if !self.is_fused_anew {
-            fused.renew(&self.pass);
+            fused.renew(&self.pass, control);
+            control.check()?;
             self.is_fused_anew = true;
         }
         product.resize(x.len(), 0.0);

@@ -31,10 +31,12 @@ pub fn calibrate<T: Real>(
 ) -> Result<Fit> {
     refuse::check(exposures, options)?;
     start.map_or(Ok(()), |start| start.check(exposures))?;
-    let found = if exposures.are_whole() {
-        whole::minimise(exposures, options, start, workers, control)?
-    } else {
-        joint::minimise(exposures, options, start, workers, control)?
-    };
-    Ok(found.into_fit(exposures.unreliable(), workers))
+    workers.enter(|| {
+        let found = if exposures.are_whole() {
+            whole::minimise(exposures, options, start, workers, control)?
+        } else {
+            joint::minimise(exposures, options, start, workers, control)?
+        };
+        Ok(found.into_fit(exposures.unreliable(), workers))
+    })
 }

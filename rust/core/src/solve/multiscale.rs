@@ -37,6 +37,9 @@ const LONGEST: f64 = 4.0;
 /// Where steps lead nowhere, so many plain sweeps go on, which always do, and so many times.
 const RESCUE_SWEEPS: u64 = 32;
 const MOST_RESCUES: u32 = 8;
+/// Products after which the estimate must be below 1. Where it is not, the light is so weak that F falls for ever
+/// by fitting noise: all experiments known to converge are below 1 after half as many.
+const LOST: u64 = 2000;
 /// What linearising adds, a product of relative steps in M and in L, counts as this share of a step at most.
 const MOST_CURVED: f64 = 0.1;
 /// Products that an ordinary calibration takes: what progress is measured against at first.
@@ -206,16 +209,23 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             Some(Ended::Converged)
         } else if last.sweep >= self.limit {
             Some(Ended::SweepsUsed)
-        } else if settled || stuck || stalled(&self.looks, rounding) {
+        } else if settled || stuck || self.is_lost() || stalled(&self.looks, rounding) {
             Some(Ended::Stalled)
         } else {
             None
         }
     }
 
+    /// Whether many products have not brought M within its own size.
+    fn is_lost(&self) -> bool {
+        // An estimate that is no number is not below 1 either.
+        let is_far = |last: &Look| last.sweep >= LOST && !(last.error < 1.0);
+        self.looks.last().is_some_and(is_far)
+    }
+
     /// Where steps lead nowhere, some sweeps, which always do; whether it may go on.
     fn rescues(&mut self, control: &Control) -> Result<bool> {
-        if self.smallest.settled || self.rescues >= MOST_RESCUES {
+        if self.smallest.settled || self.is_lost() || self.rescues >= MOST_RESCUES {
             return Ok(false);
         }
         self.rescues += 1;
