@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 
     from equipix._types import Bools, Floats
 
+_ALIKE = 0.01
+"""Share of the range within which temperatures count as one: extrema of the highest polynomial, of
+order 8, are 0.038 of it apart or more, so no order resolves less."""
+
 Regressor: TypeAlias = Literal["temperature", "inverse"]
 """What the polynomials are of: the temperature, or one over the absolute temperature."""
 
@@ -98,6 +102,22 @@ class States:
     def temperatures(self) -> Floats:
         """Temperatures that differ, lowest first."""
         return np.unique(self.substrate_c)
+
+    @property
+    def groups(self) -> list[Floats]:
+        """Temperatures that differ, lowest first, those together that no order resolves."""
+        celsius = self.temperatures
+        width = _ALIKE * (celsius[-1] - celsius[0])
+        groups: list[Floats] = []
+        while celsius.size:
+            alike = celsius <= celsius[0] + width
+            groups.append(celsius[alike])
+            celsius = celsius[~alike]
+        return groups
+
+    def at_one_of(self, group: Floats) -> Bools:
+        """Which of the states are at one of some temperatures."""
+        return np.isin(self.substrate_c, group)
 
     @property
     def biases(self) -> Floats:
