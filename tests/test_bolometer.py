@@ -316,6 +316,7 @@ class TestRefusals:
             ({"bias_v": [2.0, 2.0]}, "'bias_v' has 2 entries, expected 4"),
             ({"substrate_c": [0, 1, 2, -300]}, "'substrate_c' holds -300 °C"),
             ({"substrate_c": [0, 1, 2, np.nan]}, "'substrate_c' holds nan °C"),
+            ({"substrate_c": [273.15, 283, 293, 303]}, "holds 273.15 °C, .* from kelvin"),
             ({"bias_v": [1, 1, 1, -1]}, "'bias_v' holds -1 V, expected finite volts above 0"),
             ({"order": 4}, "'order' 4 and 'bias_order' 0 have 5 coefficients, but 4 references"),
             ({"bias_order": 1, "order": 1}, "have 4 coefficients, .* 1 biases determine 2"),

@@ -20,6 +20,9 @@ _ALIKE = 0.01
 """Share of the range within which temperatures count as one: extrema of the highest polynomial, of
 order 8, are 0.038 of it apart or more, so no order resolves less."""
 
+_HOTTEST_C = 150.0
+"""Highest temperature of a substrate; what is above is probably in kelvin."""
+
 Regressor: TypeAlias = Literal["temperature", "inverse"]
 """What the polynomials are of: the temperature, or one over the absolute temperature."""
 
@@ -92,6 +95,12 @@ class States:
         if wrong.size:
             raise InputError(
                 f"'substrate_c' holds {wrong[0]:g} °C, expected more than {-ZERO_C} °C"
+            )
+        hot = celsius[celsius > _HOTTEST_C]
+        if hot.size:
+            raise InputError(
+                f"'substrate_c' holds {hot[0]:g} °C, expected at most {_HOTTEST_C:g}: subtract "
+                f"{ZERO_C} from kelvin"
             )
         wrong = volts[~((volts > 0) & (volts < np.inf))]
         if wrong.size:
