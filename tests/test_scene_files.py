@@ -89,6 +89,18 @@ def test_the_range_of_whole_numbers_is_that_of_their_type(run, recorded, tmp_pat
     assert equipix.load(output).metadata["scene"]["data_range"] == [0, 65535]
 
 
+def test_inspect_shows_how_it_was_learned(run, recorded, tmp_path):
+    folder, _ = recorded
+    output = tmp_path / "nuc.tif"
+    options = ("--method", "local-mean", *RANGE, "--json")
+    made = json.loads(run("scene", folder / "all.tif", "-o", output, *options)[1])
+    shown = json.loads(run("inspect", output, "--json")[1])
+    assert shown["scene_method"] == "local-mean"
+    assert shown["scene_data_range"] == [4000, 12000]
+    assert shown["scene_frames"] == made["frames_that_counted"] > 0
+    assert "scene method" in run("inspect", output)[1]
+
+
 class TestRefusals:
     def refused(self, result, *words):
         status, out, err = result
