@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -79,6 +80,7 @@ def test_the_picture_is_drawn_and_the_table_printed(run, recorded, tmp_path):
     status, out, _ = run("scene", folder / "frame*.tif", "-o", tmp_path / "nuc.tif", *options)
     assert status == 0
     assert "roughness" in out
+    assert re.search(r"frame 1, raw \d\.\d+, corrected \d\.\d+\n", out)
     assert picture.stat().st_size > 10_000
 
 
