@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import runpy
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -315,6 +316,7 @@ class TestRefusals:
             ({"bias_v": [2.0, 2.0]}, "'bias_v' has 2 entries, expected 4"),
             ({"substrate_c": [0, 1, 2, -300]}, "'substrate_c' holds -300 °C"),
             ({"substrate_c": [0, 1, 2, np.nan]}, "'substrate_c' holds nan °C"),
+            ({"substrate_c": [273.15, 283, 293, 303]}, "holds 273.15 °C, .* from kelvin"),
             ({"bias_v": [1, 1, 1, -1]}, "'bias_v' holds -1 V, expected finite volts above 0"),
             ({"order": 4}, "'order' 4 and 'bias_order' 0 have 5 coefficients, but 4 references"),
             ({"bias_order": 1, "order": 1}, "have 4 coefficients, .* 1 biases determine 2"),
@@ -367,3 +369,115 @@ def test_auto_takes_no_order_that_states_without_one_do_not_determine():
     shutter = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
     correction = bolometer.fit(shutter, celsius, volts)
     assert 1 <= correction.axes.order <= 3
+
+
+class TestOrderOfFewTemperatures:
+    """A plan of cold, room and hot, and what the noise of averages tells."""
+
+    @pytest.fixture
+    def array(self):
+        return bolometer.BolometerArray.of(SHAPE, rng=7)
+
+    @staticmethod
+    def left(array, correction, celsius):
+        """Spatial noise over the temperatures of the references, in DN."""
+        at = np.linspace(min(celsius), max(celsius), 9)
+        return np.mean([correction.at(each).correct(array.mean(each)).std() for each in at])
+
+    @pytest.mark.parametrize(
+        "celsius", [(0, 20, 40), (-20, 20, 60), (40, 0, 20), (0, 15, 40), (0, 19.99, 40)]
+    )
+    def test_three_tell_a_line_from_a_constant(self, array, celsius):
+        shutter = [array.mean(each) for each in celsius]
+        correction = bolometer.fit(shutter, celsius, 2.0)
+        constant, line = correction.metadata["prediction_errors"]
+        assert correction.axes.order == 1
+        assert line < 0.1 * constant
+        static = bolometer.fit(shutter, celsius, 2.0, order=0)
+        assert self.left(array, correction, celsius) < 0.2 * self.left(array, static, celsius)
+
+    def test_pixels_of_one_offset_need_no_line(self):
+        rng = np.random.default_rng(3)
+        offset = 1e4 + 100 * rng.standard_normal(SHAPE)
+        averages = [equipix.average(offset + rng.standard_normal((16, *SHAPE))) for _ in range(3)]
+        assert bolometer.fit(averages, [0, 20, 40], 2.0).axes.order == 0
+
+    def test_near_temperatures_are_held_out_together(self, array):
+        """Else that beside a neighbour is predicted by it, with any order."""
+        celsius = [0, 20, 20.1, 40]
+        shutter = [array.mean(each) for each in celsius]
+        correction = bolometer.fit(shutter, celsius, 2.0)
+        assert len(correction.metadata["prediction_errors"]) == 2
+        assert correction.axes.order == 1
+        with pytest.raises(errors.InputError, match=r"\[0.0, 40.0\] °C: give three"):
+            bolometer.fit(shutter[::3] * 2, [0, 40, 0.3, 40.2], 2.0)
+
+    def averages(self, array, celsius):
+        return [equipix.average(array.frames(t, 64, rng=k)) for k, t in enumerate(celsius)]
+
+    @pytest.mark.parametrize("count", [3, 4, 6, 8])
+    def test_too_few_are_told_where_the_noise_is_known(self, array, count):
+        celsius = np.linspace(-20, 60, count)
+        averages = self.averages(array, celsius)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            correction = bolometer.fit(averages, celsius, 2.0)
+        noise = np.sqrt(np.mean(array.temporal_noise(20.0) ** 2))
+        # The prediction warns at five times noise that is an eighth of a frame's.
+        assert bool(caught) == (self.left(array, correction, celsius) > noise)
+        for each in caught:
+            assert issubclass(each.category, errors.MisfitWarning)
+            assert "take references at more temperatures" in str(each.message)
+
+    def test_temperatures_of_other_references_are_told(self, array):
+        celsius, shuffled = [-20, 0, 20, 40, 60], [20, -20, 60, 0, 40]
+        averages = self.averages(array, celsius)
+        for given, message in (
+            (averages, "times the error that noise explains"),
+            ([each.mean for each in averages], "'substrate_c' explains nothing"),
+        ):
+            with pytest.warns(errors.MisfitWarning, match=message):
+                assert bolometer.fit(given, shuffled, 2.0).axes.order == 0
+        with pytest.warns(errors.MisfitWarning, match="all of 'substrate_c' is 20 °C"):
+            bolometer.fit(averages, [20.0] * 5, 2.0)
+        bolometer.fit(self.averages(array, [20.0] * 5), [20.0] * 5, 2.0)  # warnings are errors
+
+
+class TestSaturatedReferences:
+    SATURATED = Flag.SATURATED | Flag.DO_NOT_USE
+
+    def frames(self):
+        frames = np.random.default_rng(1).integers(20_000, 20_100, (5, *SHAPE), dtype=np.uint16)
+        frames += (100 * np.arange(5, dtype=np.uint16))[:, None, None]
+        return frames
+
+    @pytest.mark.parametrize("of", [list, np.stack])
+    def test_whole_numbers_at_the_top_of_their_type_are_flagged(self, of):
+        shutter = self.frames()
+        shutter[4, 2, 3] = shutter[:, 5, 6] = 65535
+        cold, hot = shutter + np.uint16(0), np.minimum(shutter, 60_000) + np.uint16(5000)
+        hot[1, 7, 8] = 65535
+        how = {"order": 1, "black_bodies": (of(list(cold)), of(list(hot)))}
+        found = bolometer.fit(of(list(shutter)), [0, 10, 20, 30, 40], 2.0, **how)
+        wanted = np.zeros(SHAPE, np.uint32)
+        wanted[2, 3] = wanted[5, 6] = wanted[7, 8] = self.SATURATED
+        np.testing.assert_array_equal(found.flags, wanted)
+        assert np.isnan(found.at(20.0).correct(shutter[2].astype(float))).sum() == 3
+
+    def test_one_saturated_sample_of_an_average_flags_the_pixel(self):
+        stacks = np.repeat(self.frames()[:, None], 3, axis=1)
+        stacks[1, 2, 4, 5] = 65535
+        averages = [equipix.average(each) for each in stacks]
+        found = bolometer.fit(averages, [0, 10, 20, 30, 40], 2.0, order=1)
+        assert found.flags[4, 5] == self.SATURATED
+        assert np.count_nonzero(found.flags) == 1
+
+    def test_many_values_at_the_highest_one_are_told(self):
+        shutter = self.frames().astype(float)
+        shutter[3, :4] = 65535.0
+        with pytest.warns(errors.SaturationWarning, match="128 values of 'shutter' at state 3 are"):
+            bolometer.fit(shutter, [0, 10, 20, 30, 40], 2.0, order=1)
+
+    def test_nothing_else_than_saturated_pixels_is_refused(self):
+        with pytest.raises(errors.InputError, match="below saturation"):
+            bolometer.fit(np.full((2, *SHAPE), 255, np.uint8), [0, 40], 2.0, order=1)

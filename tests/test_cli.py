@@ -314,6 +314,25 @@ def test_an_existing_output_is_refused_before_the_work(run, tmp_path, command):
     assert output.read_text() == "precious"
 
 
+def test_a_picture_and_a_folder_of_one_name_are_refused(run, tmp_path):
+    picture = tmp_path / "demo.png"
+    refused(run("demo", "-o", picture, "--keep", picture), picture, "named for two outputs")
+    assert not picture.exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("inspect", "none.npz"),
+        ("hardware", "none.npz", "-o", "table.bin"),
+        ("correct", "none.npz", "raw.tif", "-o", "out.tif"),
+    ],
+)
+def test_a_missing_correction_does_not_exist(run, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    refused(run(*arguments), "none.npz: does not exist")
+
+
 @pytest.mark.parametrize("name", ["no/folder/cal.tif", "cal.jpg", "cal"])
 def test_an_impossible_output_is_refused_before_the_work(run, tmp_path, name):
     refused(run("calibrate", "x.toml", "-o", tmp_path / name), tmp_path / name)

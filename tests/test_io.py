@@ -25,6 +25,7 @@ import equipix
 from equipix import FrameStatistics, io, simulate
 from equipix.errors import FileError, InputError
 from equipix.frames import load_statistics, save_statistics
+from equipix.io.checksum import checksum
 
 RNG = np.random.default_rng(20)
 WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)
@@ -393,7 +394,9 @@ def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: st
     if suffix != ".npz":
         with tifffile.TiffFile(path) as file:
             assert file.pages[1].tags["PageName"].value == "labels"
-            assert json.loads(file.pages[0].description) == metadata
+            described = json.loads(file.pages[0].description)
+            assert described.pop("crc32") == checksum(PAGES, metadata)
+            assert described == metadata
             # Any viewer shows the images of a stack one by one.
             stack = [page for page in file.pages if page.tags["PageName"].value == "stack"]
             assert [page.tags["PageNumber"].value for page in stack] == [(0, 3), (1, 3), (2, 3)]
@@ -565,3 +568,63 @@ def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> No
     tifffile.imwrite(tmp_path / "plain.tif", WIDE[0])
     with pytest.raises(FileError, match=r"plain\.tif"):
         io.load_pages(tmp_path / "plain.tif")
+
+
+def same_content(path: Path, wanted: tuple[dict[str, np.ndarray], dict[str, object]]) -> bool:
+    """Whether a file is refused by its name, or has the arrays and metadata that were written."""
+    try:
+        pages, metadata = io.load_pages(path)
+    except FileError as error:
+        return str(path) in str(error)
+    same = [
+        pages[name].tobytes() == array.tobytes() and pages[name].dtype == array.dtype
+        for name, array in wanted[0].items()
+    ]
+    # A flip in the name of the checksum leaves a number that nothing reads.
+    known = {key: metadata.get(key) for key in wanted[1]}
+    return all(same) and list(pages) == list(wanted[0]) and known == wanted[1]
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_a_flipped_byte_is_refused_or_changes_nothing(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"kept{suffix}"
+    metadata = {"format": 1, "kind": "response", "levels": [1.5, 2.25], "name": "Müller"}
+    io.save_pages(path, PAGES, metadata)
+    whole, rng = path.read_bytes(), np.random.default_rng(4)
+    text = whole.find(b'{"format"')
+    places = [*rng.integers(0, len(whole), 150), *range(text, text + len(json.dumps(metadata)))]
+    for place in places:
+        changed = bytearray(whole)
+        changed[place] ^= 1 << rng.integers(8)
+        path.write_bytes(changed)
+        assert same_content(path, (PAGES, metadata)), int(place)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_changed_arrays_or_metadata_differ_from_the_checksum(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"kept{suffix}"
+    io.save_pages(path, PAGES, {"level": 1.5})
+    whole = path.read_bytes()
+    pixel = PAGES["mean"].tobytes()[:8]
+    for old, new in ((pixel, bytes(8)), (b"labels", b"labelz")):
+        assert whole.count(old) >= 1
+        path.write_bytes(whole.replace(old, new))
+        with pytest.raises(FileError, match=f"kept{suffix}: "):
+            io.load_pages(path)
+    path.write_bytes(whole)
+    assert io.load_pages(path)[1] == {"level": 1.5}
+
+
+def test_a_file_without_a_checksum_is_read(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "old.tif") as file:
+        tags = [(285, "s", 0, "mean", True)]
+        file.write(PAGES["mean"], metadata=None, description='{"format": 1}', extratags=tags)
+    assert io.load_pages(tmp_path / "old.tif")[1] == {"format": 1}
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npz"])
+def test_a_missing_file_is_said_to_be_missing(tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(FileError, match=rf"none\{suffix}: .*(does not exist|No such file)"):
+        io.load_pages(tmp_path / f"none{suffix}")
+    with pytest.raises(FileError, match=rf"none\{suffix}: .*(does not exist|No such file)"):
+        io.saved_kind(tmp_path / f"none{suffix}")

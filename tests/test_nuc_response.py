@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, cli, errors, nuc
+from equipix import Flag, cli, errors, io, nuc
 
 SHAPE = (24, 32)
 LEVELS = (200.0, 1000.0, 2000.0, 3000.0)
@@ -78,10 +78,8 @@ class TestFile:
     def test_with_other_metadata_is_refused(self, response, tmp_path, change, message):
         path = tmp_path / "r.npz"
         response.save(path)
-        with np.load(path) as file:
-            pages = dict(file)
-        pages["metadata"] = np.array(json.dumps(json.loads(str(pages["metadata"])) | change))
-        np.savez(path, **pages)
+        pages, content = io.load_pages(path)
+        io.save_pages(path, pages, content | change, force=True)
         with pytest.raises(errors.FileError, match=message):
             equipix.load(path)
 
@@ -89,11 +87,13 @@ class TestFile:
     def test_with_a_page_missing_or_cut_is_refused(self, response, tmp_path, name):
         path = tmp_path / "r.npz"
         response.save(path)
-        with np.load(path) as file:
-            pages = dict(file)
-        for changed in (None, pages[name][:-1]):
+        pages, content = io.load_pages(path)
+        for changed in (None, pages[name][:-1], pages[name][..., :-1]):
+            if changed is not None and changed.size == 0:
+                continue  # no file holds an empty page
             rest = {key: page for key, page in pages.items() if key != name}
-            np.savez(path, **rest, **({} if changed is None else {name: changed}))
+            cut = rest if changed is None else rest | {name: changed}
+            io.save_pages(path, cut, content, force=True)
             with pytest.raises(errors.FileError, match="damaged"):
                 equipix.load(path)
 

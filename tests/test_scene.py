@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, errors, scene
+from equipix import Flag, errors, io, scene
 from equipix.reference import scene as reference
 from equipix.simulate import MovingScene
 
@@ -269,13 +269,12 @@ class TestEveryMethod:
     def test_a_damaged_state_is_refused(self, name, tmp_path):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        with np.load(tmp_path / "state.npz") as file:
-            pages = {key: file[key] for key in file.files}
+        pages, content = io.load_pages(tmp_path / "state.npz")
         lacking = {key: page for key, page in pages.items() if key != "offset"}
         cut = pages | {"gain": pages["gain"][:-1]}
         wrong = pages | {"gain": pages["gain"] + np.float32(np.nan)}
         for damaged, message in ((lacking, "lacks the map 'offset'"), (cut, "47"), (wrong, "NaN")):
-            np.savez(tmp_path / "damaged.npz", **damaged)
+            io.save_pages(tmp_path / "damaged.npz", damaged, content, force=True)
             with pytest.raises(errors.FileError, match=f"damaged.npz: is damaged: .*{message}"):
                 scene.load(tmp_path / "damaged.npz")
 

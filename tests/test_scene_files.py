@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -79,6 +80,7 @@ def test_the_picture_is_drawn_and_the_table_printed(run, recorded, tmp_path):
     status, out, _ = run("scene", folder / "frame*.tif", "-o", tmp_path / "nuc.tif", *options)
     assert status == 0
     assert "roughness" in out
+    assert re.search(r"frame 1, raw \d\.\d+, corrected \d\.\d+\n", out)
     assert picture.stat().st_size > 10_000
 
 
@@ -87,6 +89,18 @@ def test_the_range_of_whole_numbers_is_that_of_their_type(run, recorded, tmp_pat
     output = tmp_path / "nuc.tif"
     assert run("scene", folder / "all.tif", "-o", output, "--method", "local-mean")[0] == 0
     assert equipix.load(output).metadata["scene"]["data_range"] == [0, 65535]
+
+
+def test_inspect_shows_how_it_was_learned(run, recorded, tmp_path):
+    folder, _ = recorded
+    output = tmp_path / "nuc.tif"
+    options = ("--method", "local-mean", *RANGE, "--json")
+    made = json.loads(run("scene", folder / "all.tif", "-o", output, *options)[1])
+    shown = json.loads(run("inspect", output, "--json")[1])
+    assert shown["scene_method"] == "local-mean"
+    assert shown["scene_data_range"] == [4000, 12000]
+    assert shown["scene_frames"] == made["frames_that_counted"] > 0
+    assert "scene method" in run("inspect", output)[1]
 
 
 class TestRefusals:
@@ -127,8 +141,16 @@ class TestRefusals:
         arguments = ("scene", folder / "frame00*.tif", "-o", tmp_path / "nuc.tif", "--resume")
         self.refused(run(*arguments, tmp_path / "small.npz"), "small.npz", "(32, 32)", "(48, 64)")
         self.refused(run(*arguments, tmp_path / "gated.npz"), "gated.npz", "--method gated")
+        self.refused(run(*arguments, tmp_path / "none.npz"), "none.npz: does not exist")
         both = (tmp_path / "gated.npz", "--method", "gated", "--step", "0.1")
         self.refused(run(*arguments, *both), "--resume", "--step")
+
+    def test_frames_of_fewer_bits_than_the_state(self, run, recorded, tmp_path):
+        state, narrow = tmp_path / "state.npz", tmp_path / "narrow.tif"
+        write_frames(narrow, (recorded[1][:3] // 256).astype(np.uint8), nbytes=1)
+        scene.Registered(SHAPE, (0, 16383)).save(state)
+        arguments = ("scene", narrow, "-o", tmp_path / "nuc.tif", "--resume", state)
+        self.refused(run(*arguments), "state.npz", "uint8", "0 to 16383")
 
     def test_saved_files_and_outputs_among_the_inputs(self, run, recorded, tmp_path):
         folder, _ = recorded
@@ -137,3 +159,15 @@ class TestRefusals:
         self.refused(run("scene", output, "-o", tmp_path / "other.tif"), "polynomial", "raw frames")
         inside = ("scene", folder / "frame*.tif", "-o", folder / "frame000.tif", "--force")
         self.refused(run(*inside), "frame000.tif")
+
+    @pytest.mark.parametrize("option", ["--state", "--corrected"])
+    def test_two_outputs_of_one_name(self, run, recorded, tmp_path, option):
+        folder, _ = recorded
+        output, link = tmp_path / "nuc.tif", tmp_path / "link"
+        link.symlink_to(tmp_path)
+        for again in (output, tmp_path / "none/../nuc.tif", link / "nuc.tif"):
+            (tmp_path / "none").mkdir(exist_ok=True)
+            arguments = ("-o", output, option, again, "--force")
+            result = run("scene", folder / "frame00*.tif", *arguments)
+            self.refused(result, "nuc.tif", "named for two outputs")
+            assert not output.exists()

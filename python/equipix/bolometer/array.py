@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
@@ -195,6 +195,12 @@ class BolometerArray:
 
     def with_properties(self, **properties: Any) -> Self:
         """Return a copy with other values of some attributes."""
+        known = [each.name for each in fields(self)]
+        for name in properties:
+            if name not in known:
+                raise InputError(
+                    f"'{name}' is no attribute of a BolometerArray: expected {', '.join(known)}"
+                )
         return replace(self, **properties)
 
     @property

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import takewhile
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from equipix._check import check_word, described
 from equipix.bolometer.dynamic import DynamicCorrection
-from equipix.bolometer.references import bodies_of, flags_of, relative_response, stack_of
+from equipix.bolometer.held_out import HIGHEST, Form, HeldOut
+from equipix.bolometer.references import References, bodies_of, flags_of, relative_response
+from equipix.bolometer.solver import check_spread, solver_of
 from equipix.bolometer.states import Regressor, States
 from equipix.errors import InputError
 from equipix.flags import usable
@@ -23,18 +24,6 @@ if TYPE_CHECKING:
     from equipix._types import Bools, Floats
     from equipix.bolometer.states import Axes
     from equipix.frames import FrameStatistics
-
-_BETTER = 1e-3
-"""Relative fall of the prediction error that a higher order must bring."""
-
-_ROUNDING = 1e-12
-"""Prediction error of exact data, relative to the largest value."""
-
-_HIGHEST = 8
-"""Highest order in temperature."""
-
-_MOST_NOISE = 100.0
-"""Noise of a deviation between the references, over that of a reference."""
 
 
 def fit(
@@ -83,6 +72,14 @@ def fit(
         If shapes or numbers do not fit, the states do not determine the coefficients, or the black
         bodies do not differ.
 
+    Warns
+    -----
+    MisfitWarning
+        With "auto", if the references are averages and the best prediction is worse than five
+        times what their noise explains, or if temperature explains nothing.
+    SaturationWarning
+        If many values of a reference are exactly the highest one, and not known to saturate.
+
     Notes
     -----
     With ȳ the mean over usable pixels, d = y − ȳ before the shutter, and K = Δy/Δȳ − 1 with Δ the
@@ -94,13 +91,15 @@ def fit(
     as V² since it acts through the heat V²/R.
 
     With "auto" each temperature between the lowest and the highest is held out in turn, at all its
-    biases. The error is the median over usable pixels of the mean square difference to the
-    prediction by the others. The lowest order within 0.1 % of the smallest error is taken;
-    `metadata` has the errors.
+    biases; of three temperatures each. Temperatures within 1 % of the range are held out together.
+    The error is the median over usable pixels of the mean square difference to the prediction by
+    the others. The lowest order within 0.1 % of the smallest error is taken; `metadata` has the
+    errors.
 
     Pixels with a missing value in a reference, and masked ones, are flagged ``NO_FLAT_FIELD``,
-    those with less than half of the mean response ``DEAD``; they count in no mean. Without black
-    bodies no response is known, so no pixel is flagged ``DEAD``.
+    those with less than half of the mean response ``DEAD``, and those with a saturated sample in an
+    average, or the largest number of the type in an array of whole numbers, ``SATURATED``; they
+    count in no mean. Without black bodies no response is known, so no pixel is flagged ``DEAD``.
 
     References
     ----------
@@ -119,14 +118,14 @@ def fit(
     >>> bool(np.std(left) < 1e-4 * np.std(array.mean(10.0)))
     True
     """
-    values = stack_of("shutter", shutter)
-    states = States.of(substrate_c, bias_v, len(values))
+    taken = References.of("shutter", shutter)
+    states = States.of(substrate_c, bias_v, len(taken.values))
     powers = _bias_order(states, bias_order)
-    bodies = None if black_bodies is None else bodies_of(black_bodies, values.shape)
-    flags = flags_of(values, bodies, mask)
+    bodies = None if black_bodies is None else bodies_of(black_bodies, taken.values.shape)
+    flags = flags_of(taken, bodies, mask)
     check_word("regressor", regressor, get_args(Regressor))
-    form = Form(powers, regressor)
-    shown = Shown(values, states, usable(flags), form)
+    good, form = usable(flags), Form(powers, regressor)
+    shown = Shown(taken.values, states, good, form, taken.noise(good))
     chosen, errors = shown.order(order)
     axes, offset = shown.coefficients(chosen)
     level = shown.coefficients_of_mean(chosen)
@@ -141,27 +140,37 @@ def fit(
     }
     if bodies is None:
         return DynamicCorrection(offset, None, level, axes, axes, flags, metadata)
-    rise = Shown(relative_response(bodies[1] - bodies[0], shown.good), states, shown.good, form)
+    rise = _response(bodies, states, good, form)
     chosen, metadata["gain_prediction_errors"] = rise.order(order)
     gain_axes, gain = rise.coefficients(chosen)
     return DynamicCorrection(offset, gain, level, axes, gain_axes, flags, metadata)
 
 
-class Form(NamedTuple):
-    """What all fits have in common."""
-
-    bias_order: int
-    regressor: Regressor
+def _response(bodies: list[References], states: States, good: Bools, form: Form) -> Shown:
+    """Relative response of all pixels, and the noise of it."""
+    cold, hot = bodies
+    rise, noises = hot.values - cold.values, [each.noise(good) for each in bodies]
+    variance = None
+    if noises[0] is not None and noises[1] is not None:
+        variance = (noises[0] + noises[1]) / rise[:, good].mean(axis=1) ** 2
+    response = relative_response(rise, good)
+    return Shown(response, states, good, form, variance, is_offset=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Values of all pixels at some states, of which the deviation from the mean is fitted."""
+    """Values of all pixels at some states, of which the deviation from the mean is fitted.
+
+    `variance` is the mean of that of the values at each state, where it is known. The response of
+    stable pixels may need order 0, their offset does not.
+    """
 
     values: Floats
     states: States
     good: Bools
     form: Form
+    variance: Floats | None
+    is_offset: bool = True
 
     @property
     def mean(self) -> Floats:
@@ -176,86 +185,33 @@ class Shown:
     def coefficients(self, order: int) -> tuple[Axes, Floats]:
         """Coefficients of the deviation of each pixel, shape (terms, rows, cols)."""
         axes = self.states.axes(order, *self.form)
-        solver = _solver(axes, self.states)
-        _check_spread(axes, self.states, solver)
+        solver = solver_of(axes, self.states)
+        check_spread(axes, self.states, solver)
         return axes, np.tensordot(solver, self.deviation, 1)
 
     def coefficients_of_mean(self, order: int) -> Floats:
         """Coefficients of the mean of the array."""
         axes = self.states.axes(order, *self.form)
-        return np.asarray(_solver(axes, self.states) @ self.mean)
+        return np.asarray(solver_of(axes, self.states) @ self.mean)
 
     def order(self, order: int | Literal["auto"]) -> tuple[int, list[float] | None]:
         """Order that is given, or that which best predicts, and the prediction error of each."""
         if not (isinstance(order, str) and order == "auto"):
             return _checked_order(order), None
-        temperatures = self.states.temperatures
-        if len(temperatures) == 1:
+        held_out = self._held_out()
+        if len(self.states.groups) == 1:
+            held_out.warn_of_repeats()
             return 0, None
-        if len(temperatures) == 2:
-            raise InputError(
-                "'order' is 'auto', which holds out a temperature between the lowest and the "
-                f"highest, but 'substrate_c' has {temperatures.tolist()} °C: give three, or an "
-                "order"
-            )
+        chosen = held_out.chosen()
+        if self.is_offset:
+            held_out.warn_of_constant(chosen)
+        return chosen
+
+    def _held_out(self) -> HeldOut:
+        """Values of usable pixels, of which some are to be predicted."""
+        largest = float(np.abs(self.values[:, self.good]).max())
         deviation = self.deviation[:, self.good]
-        orders = range(1, min(_HIGHEST, len(temperatures) - 2) + 1)
-        held = takewhile(self._may_be_held_out, orders)
-        errors = [self._prediction_error(deviation, each) for each in (0, *held)]
-        enough = min(errors) * (1 + _BETTER)
-        enough += (_ROUNDING * float(np.abs(self.values[:, self.good]).max())) ** 2
-        return next(each for each, error in enumerate(errors) if error <= enough), errors
-
-    def _may_be_held_out(self, order: int) -> bool:
-        """Whether the states without any one temperature determine an order."""
-        axes = self.states.axes(order, *self.form)
-        others = [self.states.substrate_c != each for each in self.states.temperatures[1:-1]]
-        return all(_rank(axes, self.states.chosen(each)) == axes.terms for each in others)
-
-    def _prediction_error(self, deviation: Floats, order: int) -> float:
-        """Mean square error of predictions of temperatures held out, median over the pixels."""
-        axes, total = self.states.axes(order, *self.form), np.zeros(deviation.shape[1])
-        held = self.states.temperatures[1:-1]
-        for celsius in held:
-            out = self.states.substrate_c == celsius
-            solver = _solver(axes, self.states.chosen(~out))
-            one = self.states.chosen(out)
-            predicted = axes.basis(one.substrate_c, one.bias_v) @ (solver @ deviation[~out])
-            total += np.mean((deviation[out] - predicted) ** 2, axis=0)
-        return float(np.median(total)) / len(held)
-
-
-def _rank(axes: Axes, states: States) -> int:
-    """Number of coefficients that states determine."""
-    return int(np.linalg.matrix_rank(axes.basis(states.substrate_c, states.bias_v)))
-
-
-def _solver(axes: Axes, states: States) -> Floats:
-    """Matrix that makes coefficients of values by least squares, shape (terms, n)."""
-    rank = _rank(axes, states)
-    if rank < axes.terms:
-        raise InputError(
-            f"'order' {axes.order} and 'bias_order' {axes.bias_order} have {axes.terms} "
-            f"coefficients, but {len(states.substrate_c)} references at "
-            f"{len(states.temperatures)} temperatures and {len(states.biases)} biases determine "
-            f"{rank}: take more states, or lower orders"
-        )
-    return np.asarray(np.linalg.pinv(axes.basis(states.substrate_c, states.bias_v)))
-
-
-def _check_spread(axes: Axes, states: States, solver: Floats) -> None:
-    """Refuse states between which the noise of a reference is multiplied by much."""
-    celsius = np.linspace(*axes.substrate_c, 33)
-    noise = [
-        np.linalg.norm(axes.basis(celsius, np.full(len(celsius), volts)) @ solver, axis=1).max()
-        for volts in states.biases
-    ]
-    if max(noise) > _MOST_NOISE:
-        raise InputError(
-            f"'substrate_c' and 'bias_v' determine order {axes.order} with {max(noise):.3g} times "
-            f"the noise of a reference (limit {_MOST_NOISE:g}): take states further apart, or "
-            "lower orders"
-        )
+        return HeldOut(deviation, self.states, self.form, self.variance, largest)
 
 
 def _bias_order(states: States, given: int | None) -> int:
@@ -269,6 +225,6 @@ def _bias_order(states: States, given: int | None) -> int:
 
 def _checked_order(order: int | str) -> int:
     whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if not whole or not 0 <= int(order) <= _HIGHEST:
-        raise InputError(f"'order' is {described(order)}, expected 0 to {_HIGHEST} or 'auto'")
+    if not whole or not 0 <= int(order) <= HIGHEST:
+        raise InputError(f"'order' is {described(order)}, expected 0 to {HIGHEST} or 'auto'")
     return int(order)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equipix._check import as_array, check_shape
 from equipix.defects import DEAD_RESPONSE
-from equipix.errors import InputError
-from equipix.flags import set_bits
+from equipix.errors import InputError, SaturationWarning, warn
+from equipix.exposures.clipping import clipping
+from equipix.flags import Flag, set_bits
 from equipix.frames import FrameStatistics
 
 if TYPE_CHECKING:
@@ -20,47 +22,102 @@ if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
 
 
-def stack_of(name: str, given: ArrayLike | Sequence[FrameStatistics]) -> Floats:
-    """Mean frames of all states as one array (n, rows, cols)."""
-    if isinstance(given, FrameStatistics):
-        raise InputError(f"'{name}' is one FrameStatistics, expected a sequence: one a state")
+@dataclass(frozen=True, eq=False)
+class References:
+    """Mean frames of all states, what is known of their noise, and where they saturate.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, rows, cols), float64
+        The mean frames in DN.
+    variance : tuple of ndarray, or None
+        Variances of the means, where all references are averages.
+    saturated : ndarray, shape (rows, cols), bool
+        Pixels that are known to saturate in a reference.
+    """
+
+    values: Floats
+    variance: tuple[Floats, ...] | None
+    saturated: Bools
+
+    @classmethod
+    def of(cls, name: str, given: ArrayLike | Sequence[FrameStatistics]) -> References:
+        """Check the frames of all states, and warn of values that probably saturate."""
+        if isinstance(given, FrameStatistics):
+            raise InputError(f"'{name}' is one FrameStatistics, expected a sequence: one a state")
+        listed: list[Any] = list(given) if isinstance(given, list | tuple) else []
+        averages = [each for each in listed if isinstance(each, FrameStatistics)]
+        variance = None
+        if averages and len(averages) == len(listed):
+            variance = tuple(each.variance_of_mean for each in averages)
+        values = _stack(name, listed or given)
+        found = cls(values.astype(np.float64), variance, _at_the_top(values))
+        for each in averages:
+            found.saturated[each.saturated > 0] = True
+        found._warn(name)
+        return found
+
+    def noise(self, good: Bools) -> Floats | None:
+        """Mean variance of the means of usable pixels at each state, where it is known."""
+        if self.variance is None:
+            return None
+        noise = np.array([each[good].mean() for each in self.variance])
+        return noise if np.isfinite(noise).all() else None
+
+    def _warn(self, name: str) -> None:
+        """Warn of values at exactly the highest one."""
+        for k, frame in enumerate(self.values):
+            found = clipping(np.where(self.saturated, np.nan, frame))
+            if found is not None:
+                warn(
+                    f"{found.values} values of '{name}' at state {k} are exactly "
+                    f"{found.level:.10g}, the highest one: they probably saturate and count as "
+                    "valid: exclude their pixels by 'mask', or give averages with a 'saturation'",
+                    SaturationWarning,
+                )
+                return
+
+
+def _stack(name: str, given: Any) -> Array:
+    """Mean frames of all states as one array (n, rows, cols), in the type of the frames."""
     if isinstance(given, list | tuple):
-        frames: list[Any] = [
-            each.mean if isinstance(each, FrameStatistics) else each for each in given
-        ]
-        shapes = {np.shape(each) for each in frames}
+        given = [each.mean if isinstance(each, FrameStatistics) else each for each in given]
+        shapes = {np.shape(each) for each in given}
         if len(shapes) > 1:
             raise InputError(f"'{name}' has frames of {sorted(shapes)}, expected one shape")
-        return _checked_stack(name, frames)
-    return _checked_stack(name, given)
-
-
-def _checked_stack(name: str, given: Any) -> Floats:
-    """Array (n, rows, cols) of one frame or more."""
-    values = as_array(name, given, ndim=3).astype(np.float64)
+    values = as_array(name, given, ndim=3)
     check_shape((values.shape[1], values.shape[2]))
     if not len(values):
         raise InputError(f"'{name}' has no frames, expected one for each state")
     return values
 
 
-def bodies_of(given: Any, shape: tuple[int, ...]) -> list[Floats]:
+def _at_the_top(values: Array) -> Bools:
+    """Pixels at the largest number of a type of whole numbers in any frame."""
+    if values.dtype.kind not in "iu":
+        return np.zeros(values.shape[1:], bool)
+    return np.asarray((values == np.iinfo(values.dtype).max).any(axis=0))
+
+
+def bodies_of(given: Any, shape: tuple[int, ...]) -> list[References]:
     """Frames of the cold and the hot black body."""
     if not isinstance(given, list | tuple) or len(given) != 2:
         raise InputError("'black_bodies' is no pair, expected (cold, hot), each like 'shutter'")
-    bodies = [stack_of(f"black_bodies[{k}]", each) for k, each in enumerate(given)]
+    bodies = [References.of(f"black_bodies[{k}]", each) for k, each in enumerate(given)]
     for k, each in enumerate(bodies):
-        if each.shape != shape:
+        if each.values.shape != shape:
             raise InputError(
-                f"'black_bodies[{k}]' has shape {each.shape}, expected {shape} like 'shutter'"
+                f"'black_bodies[{k}]' has shape {each.values.shape}, expected {shape} like "
+                "'shutter'"
             )
     return bodies
 
 
-def flags_of(values: Floats, bodies: list[Floats] | None, mask: ArrayLike | None) -> Array:
-    """Flags of pixels without values, of masked ones, and of those that do not respond."""
-    shape = values.shape[1:]
-    unknown: Bools = np.asarray(~np.isfinite(values).all(axis=0))
+def flags_of(shutter: References, bodies: list[References] | None, mask: ArrayLike | None) -> Array:
+    """Flags of pixels without values, masked, saturated, or that do not respond."""
+    shape = shutter.saturated.shape
+    unknown: Bools = np.asarray(~np.isfinite(shutter.values).all(axis=0))
+    saturated = shutter.saturated.copy()
     if mask is not None:
         given = as_array("mask", mask, ndim=2)
         if given.dtype != np.bool_ or given.shape != shape:
@@ -70,14 +127,20 @@ def flags_of(values: Floats, bodies: list[Floats] | None, mask: ArrayLike | None
         unknown |= given
     flags, dead = np.zeros(shape, np.uint32), np.zeros(shape, bool)
     if bodies is not None:
-        unknown |= ~np.isfinite(np.stack(bodies)).all(axis=(0, 1))
-        if not unknown.all():
-            response = relative_response(bodies[1] - bodies[0], ~unknown).mean(axis=0)
-            dead = np.asarray(~unknown & ~(response >= DEAD_RESPONSE))
-    if (unknown | dead).all():
-        raise InputError("'shutter' has no pixel with a value at every state, expected some")
+        cold, hot = bodies
+        unknown |= ~np.isfinite([cold.values, hot.values]).all(axis=(0, 1))
+        saturated |= cold.saturated | hot.saturated
+        good = ~(unknown | saturated)
+        if good.any():
+            response = relative_response(hot.values - cold.values, good).mean(axis=0)
+            dead = np.asarray(good & ~(response >= DEAD_RESPONSE))
+    if (unknown | dead | saturated).all():
+        raise InputError(
+            "'shutter' has no pixel with a value at every state below saturation, expected some"
+        )
     set_bits(flags, "undetermined", unknown)
     set_bits(flags, "non_responding", dead)
+    flags[saturated] |= np.uint32(Flag.SATURATED | Flag.DO_NOT_USE)
     return flags
 
 

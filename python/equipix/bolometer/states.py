@@ -16,6 +16,13 @@ if TYPE_CHECKING:
 
     from equipix._types import Bools, Floats
 
+_ALIKE = 0.01
+"""Share of the range within which temperatures count as one: extrema of the highest polynomial, of
+order 8, are 0.038 of it apart or more, so no order resolves less."""
+
+_HOTTEST_C = 150.0
+"""Highest temperature of a substrate; what is above is probably in kelvin."""
+
 Regressor: TypeAlias = Literal["temperature", "inverse"]
 """What the polynomials are of: the temperature, or one over the absolute temperature."""
 
@@ -89,6 +96,12 @@ class States:
             raise InputError(
                 f"'substrate_c' holds {wrong[0]:g} °C, expected more than {-ZERO_C} °C"
             )
+        hot = celsius[celsius > _HOTTEST_C]
+        if hot.size:
+            raise InputError(
+                f"'substrate_c' holds {hot[0]:g} °C, expected at most {_HOTTEST_C:g}: subtract "
+                f"{ZERO_C} from kelvin"
+            )
         wrong = volts[~((volts > 0) & (volts < np.inf))]
         if wrong.size:
             raise InputError(f"'bias_v' holds {wrong[0]:g} V, expected finite volts above 0")
@@ -98,6 +111,22 @@ class States:
     def temperatures(self) -> Floats:
         """Temperatures that differ, lowest first."""
         return np.unique(self.substrate_c)
+
+    @property
+    def groups(self) -> list[Floats]:
+        """Temperatures that differ, lowest first, those together that no order resolves."""
+        celsius = self.temperatures
+        width = _ALIKE * (celsius[-1] - celsius[0])
+        groups: list[Floats] = []
+        while celsius.size:
+            alike = celsius <= celsius[0] + width
+            groups.append(celsius[alike])
+            celsius = celsius[~alike]
+        return groups
+
+    def at_one_of(self, group: Floats) -> Bools:
+        """Which of the states are at one of some temperatures."""
+        return np.isin(self.substrate_c, group)
 
     @property
     def biases(self) -> Floats:

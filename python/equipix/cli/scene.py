@@ -16,7 +16,7 @@ from equipix.io import SUFFIXES, find_files, refuse_inputs
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.scene import draw_sequence
 from equipix.scene import METHODS, SceneCorrection, load
-from equipix.scene.sequence import Sequence, run_sequence, sequence_format
+from equipix.scene.sequence import Sequence, check_range, run_sequence, sequence_format
 
 commands = typer.Typer()
 
@@ -111,6 +111,7 @@ def _method(
         found = load(resume, shape=shape, workers=workers)
         if found.method != name:
             raise InputError(f"{resume}: is of --method {found.method}, not of {name}: name that")
+        check_range(found.data_range, dtype, resume)
         return found
     if data_range is None and dtype.kind != "u":
         raise InputError(

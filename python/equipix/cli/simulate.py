@@ -12,6 +12,7 @@ from equipix.cli.options import Force, Json, Seed, Shape, Workers
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError
+from equipix.io import refuse_inputs
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.demo import draw_demo
 
@@ -57,6 +58,7 @@ def demo(
     check_output(output, force=force)
     if keep is not None:
         check_output(keep, force=force, folder=True)
+        refuse_inputs([output, keep], [])
     with (
         tempfile.TemporaryDirectory(prefix="equipix-") as scratch,
         progress_bars(announce=True) as progress,

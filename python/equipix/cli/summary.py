@@ -34,8 +34,17 @@ def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[s
         **_sensor(content),
         "shape": list(content.shape),
         "order": len(content.coefficients) - 1,
+        **_learned(content),
         "flagged_pixels": flagged(content),
     }
+
+
+def _learned(correction: Correction) -> dict[str, Any]:
+    """How a correction was learned from a scene, where it was."""
+    scene = correction.metadata.get("scene")
+    if not isinstance(scene, dict):
+        return {}
+    return {f"scene_{name}": scene.get(name) for name in ("method", "data_range", "frames")}
 
 
 def of_response(response: Response) -> dict[str, Any]:

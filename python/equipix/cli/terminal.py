@@ -145,7 +145,7 @@ def _words(value: Any) -> str:
         case []:
             return "none"
         case [dict(), *_]:
-            return "\n".join(": ".join(map(str, each.values())) for each in value)
+            return "\n".join(map(_row, value))
         case [float(), *_]:
             return ", ".join(f"{item:.6g}" for item in value)
         case [str(), *_]:
@@ -153,3 +153,10 @@ def _words(value: Any) -> str:
         case list() | tuple():
             return " × ".join(str(item) for item in value)
     return str(value)
+
+
+def _row(fields: dict[str, Any]) -> str:
+    """Words of a row: texts by themselves, such as a verdict's, and numbers with their names."""
+    if any(isinstance(each, str) for each in fields.values()):
+        return ": ".join(map(str, fields.values()))
+    return _words(fields)

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 _TAIL = 30.0
 """Widths below the band gap at which the absorption edge ends: e⁻³⁰ of the response."""
 
+_LONGEST_UM = 100.0
+"""Longest wavelength that is taken: what is above is probably in nanometres."""
+
 _STEEPEST_MEV, _WIDEST = 0.1, 0.05
 """Least width of the edge that the integral resolves, and the largest relative to the gap."""
 
@@ -65,6 +68,7 @@ class ShortPass:
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
         _check_above_0(self, "edge_um", "peak")
+        _check_um(self, "edge_um")
         if not _SLOPES[0] <= number("slope", self.slope) <= _SLOPES[1]:
             raise InputError(
                 f"'slope' is {self.slope!r}, expected {_SLOPES[0]} to {_SLOPES[1]}: wavelength of "
@@ -140,6 +144,7 @@ class HgCdTe:
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
         _check_above_0(self, "start_um", "cutoff_um", "detector_k")
+        _check_um(self, "start_um", "cutoff_um")
         if self.cutoff_um <= self.start_um:
             raise InputError(
                 f"'cutoff_um' is {self.cutoff_um!r}, expected more than 'start_um', {self.start_um}"
@@ -229,3 +234,13 @@ def _check_above_0(owner: object, *names: str) -> None:
         value = getattr(owner, name)
         if not 0 < number(name, value) < np.inf:
             raise InputError(f"'{name}' is {value!r}, expected a finite number above 0")
+
+
+def _check_um(owner: object, *names: str) -> None:
+    """Refuse wavelengths that no HgCdTe has, such as nanometres."""
+    for name in names:
+        value = getattr(owner, name)
+        if value > _LONGEST_UM:
+            raise InputError(
+                f"'{name}' is {value!r} µm, expected at most {_LONGEST_UM:g}: divide nm by 1000"
+            )

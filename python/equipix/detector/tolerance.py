@@ -24,6 +24,9 @@ _NODES = 16
 _SMALLEST, _EXACT = 1e-10, 1e-6
 """Spread of x at which the search begins, and the relative error at which it ends."""
 
+_COLDEST_K = 100.0
+"""Lowest temperature of a black body; what is below is probably in °C."""
+
 
 @dataclass(frozen=True)
 class Tolerance:
@@ -84,8 +87,8 @@ def composition_tolerance(
     Raises
     ------
     InputError
-        If a number is out of its range, or no spread that leaves every pixel a band gives as much
-        spatial as temporal noise.
+        If a number is out of its range, a temperature is below 100 K, or no spread that leaves
+        every pixel a band gives as much spatial as temporal noise.
 
     Notes
     -----
@@ -151,6 +154,16 @@ def _checked(
             raise InputError(f"'{name}' is {value!r}, expected a finite number above 0")
     if any(not 0 < each < np.inf for each in references):
         raise InputError(f"'references_k' is {references}, expected temperatures above 0 K")
+    for name, values in (
+        ("scene_k", [scene_k]),
+        ("filled_k", [filled]),
+        ("references_k", references),
+    ):
+        if min(values, default=np.inf) < _COLDEST_K:
+            raise InputError(
+                f"'{name}' is {min(values):g} K, expected {_COLDEST_K:g} or more: give kelvin, "
+                "which is °C + 273.15"
+            )
     check_word("by", by, get_args(By))
     if by == "gain" and len(references) != 1:
         raise InputError(f"'by' is 'gain', but there are {len(references)} references, expected 1")

@@ -10,11 +10,17 @@ import numpy as np
 from equipix._native import __version__
 from equipix.errors import InputError
 from equipix.flags import set_bits, usable
-from equipix.hardware.words import Format, Words
+from equipix.hardware.words import WIDEST, Format, Words
 
 if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.correction.protocol import Correction
+
+_FINEST_GAIN = -40
+"""Exponent of the finest step of a gain."""
+
+_NAMED = 3
+"""Most pixels that a message names."""
 
 _STEPS = 65
 """Raw values at which a straight line is compared with the curve that it replaces."""
@@ -126,9 +132,10 @@ def encode(
     zero = int(np.floor(np.ldexp(lowest, -steps.out)))
     o -= np.ldexp(float(zero), steps.out)
     pedestal = np.ldexp(coarse_words, coarse)
-    gain_words, gain_exponent = _chosen(
-        Words("gain", widths["gain_bits"], lowest=1), g, steps.gain, -40
-    )
+    gains = Words("gain", widths["gain_bits"], lowest=1)
+    if steps.gain is None:
+        _refuse_extreme(gains, g, used)
+    gain_words, gain_exponent = _chosen(gains, g, steps.gain, _FINEST_GAIN)
     # The offset takes up the rounding of the gain in the middle of the range of the ADC.
     rounded = np.ldexp(gain_words, gain_exponent)
     middle = np.ldexp(float(2 ** (widths["adc_bits"] - 1)), steps.adc)
@@ -163,6 +170,33 @@ def _refuse_unresponsive(gain: Floats) -> None:
             f"'correction' has a gain of 0 or below in {wrong} usable pixels, such as "
             f"{gain.min():.4g}, expected more than 0: flag them DO_NOT_USE"
         )
+
+
+def _refuse_extreme(words: Words, gain: Floats, used: Bools) -> None:
+    """Refuse gains that no step holds together, and name the fewer ones that are far from most."""
+    step = words.finest(gain, _FINEST_GAIN)
+    small = words.rounded(gain, step) < words.lowest
+    if not small.any():
+        return
+    far = small
+    if 2 * np.count_nonzero(small) > gain.size:
+        far = gain >= min(words.limits[1] * float(np.median(gain)), gain.max())
+    places = [tuple(each) for each in np.argwhere(used)[far].tolist()]
+    more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
+    raise InputError(
+        f"'gain_bits' is {words.bits}: no gain_step holds gains from {gain.min():.6g} to "
+        f"{gain.max():.6g}, of which {float(np.median(gain)):.6g} is the median. Flag DO_NOT_USE "
+        f"the pixels far from it: {', '.join(map(str, places[:_NAMED]))}{more}{_wider(words, gain)}"
+    )
+
+
+def _wider(words: Words, gain: Floats) -> str:
+    """Say how many bits would hold all gains."""
+    for bits in range(words.bits + 1, WIDEST + 1):
+        wider = Words(words.name, bits, lowest=words.lowest)
+        if not wider.outside(gain, wider.finest(gain, _FINEST_GAIN)):
+            return f"; or take {bits} gain_bits"
+    return ""
 
 
 def _coarse(pedestal: Floats, bits: int, steps: Steps) -> tuple[Floats, int]:

@@ -93,8 +93,20 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     before = correctability(exact)
     words = table.digitise(raw)[:, usable(table.flags)]
     at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
+    _refuse_clipped(raw, table, words, at_ends)
     found = table.correct(raw)
     return Quality(before, correctability(found), _added(found, exact, before), at_ends, table)
+
+
+def _refuse_clipped(raw: Array, table: Table, words: Array, at_ends: int) -> None:
+    """Refuse frames of which the ADC sees nothing."""
+    if at_ends == words.size:
+        form = table.format
+        raise InputError(
+            f"'frames' of {np.nanmin(raw):g} to {np.nanmax(raw):g} DN are beyond an ADC of "
+            f"'adc_bits' {form.adc_bits} and 'adc_step' {2.0**form.adc:g} in all usable pixels: "
+            f"all words are 0 or {form.largest_word}: take more bits, or a larger step"
+        )
 
 
 def _added(found: Array, exact: Array, before: Correctability) -> float:

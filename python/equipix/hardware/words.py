@@ -14,7 +14,7 @@ from equipix.errors import InputError
 if TYPE_CHECKING:
     from equipix._types import Floats
 
-_NARROWEST, _WIDEST = 8, 16
+_NARROWEST, WIDEST = 8, 16
 """Widths of words, in bits."""
 
 _EXPONENT = 40
@@ -109,8 +109,8 @@ class Format:
 def check_width(name: str, bits: object) -> int:
     """Refuse a width out of range."""
     whole = isinstance(bits, int | np.integer) and not isinstance(bits, bool)
-    if not whole or not _NARROWEST <= bits <= _WIDEST:  # type: ignore[operator]
-        raise InputError(f"'{name}' is {bits!r}, expected {_NARROWEST} to {_WIDEST} bits")
+    if not whole or not _NARROWEST <= bits <= WIDEST:  # type: ignore[operator]
+        raise InputError(f"'{name}' is {bits!r}, expected {_NARROWEST} to {WIDEST} bits")
     return int(bits)  # type: ignore[call-overload, no-any-return]
 
 
@@ -186,7 +186,7 @@ class Words:
     def _remedy(self, values: Floats, exponent: int) -> str:
         wide = [
             bits
-            for bits in range(self.bits + 1, _WIDEST + 1)
+            for bits in range(self.bits + 1, WIDEST + 1)
             if not Words(self.name, bits, self.signed, self.lowest, self.floor).outside(
                 values, exponent
             )

@@ -82,14 +82,18 @@ def as_path(name: str, value: object) -> Path:
 
 
 def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Refuse an output that is also an input.
+    """Refuse an output that is also an input, or another output.
 
     Raises
     ------
     FileError
-        If an output is one of the inputs, by whatever name.
+        If an output is one of the inputs or one of the other outputs, by whatever name.
     """
     taken = {path.resolve() for path in inputs}
+    named: set[Path] = set()
     for path in outputs:
         if path.resolve() in taken:
             raise FileError(f"{path}: is one of the inputs: name another output")
+        if path.resolve() in named:
+            raise FileError(f"{path}: is named for two outputs: name another for one of them")
+        named.add(path.resolve())

@@ -11,6 +11,7 @@ import numpy as np
 
 from equipix.errors import FileError, InputError
 from equipix.io import tiff
+from equipix.io.checksum import KEY, checksum
 from equipix.io.images import frame_format
 from equipix.io.names import as_path
 from equipix.io.reading import reading
@@ -41,7 +42,8 @@ def save_pages(
         Arrays by name, each kept in its own dtype: of shape (rows, cols), or a stack of shape
         (n, rows, cols), whose images are pages of their own in a TIFF.
     metadata : mapping
-        JSON values; in a TIFF they are the first page's description.
+        JSON values; in a TIFF they are the first page's description. A checksum of arrays and
+        metadata is added to them.
     force : bool, optional
         Replace a file that is there.
 
@@ -61,7 +63,7 @@ def save_pages(
                 f"page '{name}' is {array.dtype} of shape {array.shape}, expected numbers in two"
                 " dimensions or a stack of such images"
             )
-    description = json.dumps(dict(metadata))
+    description = json.dumps({**metadata, KEY: checksum(pages, metadata)})
     with write_whole(path, force=force) as temporary:
         write(temporary, pages, description)
 
@@ -84,7 +86,8 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     Raises
     ------
     FileError
-        If the file is not readable or was not written by `save_pages`.
+        If the file is not readable, was not written by `save_pages`, or differs from its checksum.
+        A file written before there were checksums has none.
     InputError
         If the suffix is unknown.
     """
@@ -102,7 +105,20 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
         raise FileError(
             f"{path}: holds neither a correction nor frame statistics: equipix did not write it"
         ) from error
+    if isinstance(metadata, dict) and KEY in metadata:
+        _check_sum(path, pages, metadata, metadata.pop(KEY))
     return pages, metadata
+
+
+def _check_sum(
+    path: Path, pages: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any], wanted: object
+) -> None:
+    """Refuse arrays and metadata that are not those that were written."""
+    if checksum(pages, metadata) != wanted:
+        raise FileError(
+            f"{path}: is damaged: its arrays or metadata differ from its checksum: use a copy, or "
+            "make it anew"
+        )
 
 
 def kind_of(path: Path) -> str | None:
@@ -218,6 +234,8 @@ def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) 
 
 def _check_npz(path: Path) -> None:
     """Refuse another kind of file before NumPy takes it for pickled objects."""
+    if not path.exists():
+        raise FileError(f"{path}: does not exist")
     if not zipfile.is_zipfile(path):
         raise FileError(f"{path}: is no .npz file, whatever its name says")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix._check import check_progress
 from equipix.correction.files import warn_of_corrected
-from equipix.errors import FileError
+from equipix.errors import FileError, InputError
 from equipix.io import (
     find_files,
     frame_format,
@@ -70,6 +70,22 @@ def sequence_format(source: list[str]) -> tuple[tuple[int, int], np.dtype[Any]]:
     refuse_saved(first)
     (_, rows, cols), dtype = frame_format(first)
     return (rows, cols), dtype
+
+
+def check_range(data_range: tuple[float, float], dtype: np.dtype[Any], state: Path) -> None:
+    """Refuse frames of whole numbers whose type does not reach half of the range of a state.
+
+    Raises
+    ------
+    InputError
+        With the file of the state, the type and the range.
+    """
+    low, high = data_range
+    if dtype.kind in "iu" and np.iinfo(dtype).max < (low + high) / 2:
+        raise InputError(
+            f"{state}: was learned from values of {low:g} to {high:g} DN, but the frames are "
+            f"{dtype}, up to {np.iinfo(dtype).max}: give frames of the same bits"
+        )
 
 
 def run_sequence(

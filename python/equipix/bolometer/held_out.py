@@ -1,0 +1,173 @@
+"""The order of a dynamic correction by predictions of temperatures that are held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from equipix.bolometer.solver import rank_of, solver_of
+from equipix.errors import InputError, MisfitWarning, warn
+
+if TYPE_CHECKING:
+    from equipix._types import Floats
+    from equipix.bolometer.states import Axes, Regressor, States
+
+HIGHEST = 8
+"""Highest order in temperature."""
+
+_BETTER = 1e-3
+"""Relative fall of the prediction error that a higher order must bring."""
+
+_ROUNDING = 1e-12
+"""Prediction error of exact data, relative to the largest value."""
+
+_MANY_SIGMAS = 5.0
+"""Prediction error over that of noise from which the polynomials do not follow the array."""
+
+
+class Form(NamedTuple):
+    """What all fits have in common."""
+
+    bias_order: int
+    regressor: Regressor
+
+
+class Chosen(NamedTuple):
+    """The order that predicts best, and the mean square error of each order."""
+
+    order: int
+    errors: list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Deviations of usable pixels, shape (n, pixels), to be predicted from other temperatures.
+
+    `variance` is that of a deviation at each state, shape (n,), where it is known; `largest` the
+    largest of the values, which sets their rounding.
+    """
+
+    deviation: Floats
+    states: States
+    form: Form
+    variance: Floats | None
+    largest: float
+
+    def chosen(self) -> Chosen:
+        """Lowest order within 0.1 % of the smallest error, with a warning where that is large.
+
+        Raises
+        ------
+        InputError
+            If there are two temperatures, so that the others of one that is held out are one.
+        """
+        self._refuse_two()
+        orders = range(1, min(HIGHEST, len(self.states.groups) - 2) + 1)
+        possible = [0, *takewhile(self._is_possible, orders)]
+        errors = [self._error(each) for each in possible]
+        enough = min(errors) * (1 + _BETTER) + self._rounding
+        order = next(each for each, error in enumerate(errors) if error <= enough)
+        self._warn(order, errors[order])
+        return Chosen(order, errors)
+
+    @property
+    def _rounding(self) -> float:
+        """Mean square error of exact data."""
+        return (_ROUNDING * self.largest) ** 2
+
+    def _held(self) -> list[Floats]:
+        """Temperatures to hold out: those between the ends, and the ends if there is but one.
+
+        The mean of two ends and the line through them predict the same halfway between them, so
+        that one temperature cannot tell orders 0 and 1 apart.
+        """
+        groups = self.states.groups
+        return groups if len(groups) == 3 else groups[1:-1]
+
+    def _is_possible(self, order: int) -> bool:
+        """Whether the states without any temperature that is held out determine an order."""
+        axes = self.states.axes(order, *self.form)
+        others = [~self.states.at_one_of(group) for group in self._held()]
+        return all(rank_of(axes, self.states.chosen(each)) == axes.terms for each in others)
+
+    def _error(self, order: int) -> float:
+        """Mean square error of the predictions, median over the pixels."""
+        axes, total = self.states.axes(order, *self.form), np.zeros(self.deviation.shape[1])
+        held = self._held()
+        for group in held:
+            out = self.states.at_one_of(group)
+            predicted = self._weights(axes, group) @ self.deviation[~out]
+            total += np.mean((self.deviation[out] - predicted) ** 2, axis=0)
+        return float(np.median(total)) / len(held)
+
+    def _weights(self, axes: Axes, group: Floats) -> Floats:
+        """Matrix that predicts the states of some temperatures from all others."""
+        out = self.states.at_one_of(group)
+        one, solver = self.states.chosen(out), solver_of(axes, self.states.chosen(~out))
+        return np.asarray(axes.basis(one.substrate_c, one.bias_v) @ solver)
+
+    def _error_of_noise(self, order: int, variance: Floats) -> float:
+        """Mean square error of the predictions that noise alone makes."""
+        axes, total, held = self.states.axes(order, *self.form), 0.0, self._held()
+        for group in held:
+            out = self.states.at_one_of(group)
+            of_prediction = self._weights(axes, group) ** 2 @ variance[~out]
+            total += float(np.mean(variance[out] + of_prediction))
+        return total / len(held)
+
+    def _warn(self, order: int, error: float) -> None:
+        """Warn of predictions that are worse than noise explains."""
+        if self.variance is None:
+            return
+        noise = self._error_of_noise(order, self.variance) + self._rounding
+        if error <= _MANY_SIGMAS**2 * noise:
+            return
+        warn(
+            f"order {order} predicts temperatures that are held out best, yet with "
+            f"{np.sqrt(error / noise):.3g} times the error that noise explains: take references at "
+            f"more temperatures than {len(self.states.groups)}, and see that each of 'substrate_c' "
+            "is that of its reference",
+            MisfitWarning,
+        )
+
+    def warn_of_repeats(self) -> None:
+        """Warn of references at one temperature that differ by more than noise explains."""
+        axes = self.states.axes(0, *self.form)
+        freedom = len(self.deviation) - axes.terms
+        if self.variance is None or freedom < 1:
+            return
+        basis = axes.basis(self.states.substrate_c, self.states.bias_v)
+        left = self.deviation - basis @ (solver_of(axes, self.states) @ self.deviation)
+        error = float(np.median((left**2).sum(axis=0))) / freedom
+        noise = float(self.variance.mean()) + self._rounding
+        if error > _MANY_SIGMAS**2 * noise:
+            warn(
+                f"the references differ by {np.sqrt(error / noise):.3g} times their noise, but all "
+                f"of 'substrate_c' is {self.states.substrate_c[0]:g} °C: see that each is the "
+                "temperature of its reference",
+                MisfitWarning,
+            )
+
+    def warn_of_constant(self, chosen: Chosen) -> None:
+        """Warn where temperatures explain nothing, and no noise is known that hides it."""
+        if chosen.order > 0 or self.variance is not None or chosen.errors[0] <= self._rounding:
+            return
+        warn(
+            "order 0 predicts temperatures that are held out best, with an error of "
+            f"{np.sqrt(chosen.errors[0]):.3g} DN rms, so 'substrate_c' explains nothing that the "
+            "references differ by: see that each is the temperature of its reference; averages in "
+            "their place tell how much of it is noise",
+            MisfitWarning,
+        )
+
+    def _refuse_two(self) -> None:
+        """Refuse to choose an order where one temperature would be predicted from one other."""
+        groups = self.states.groups
+        if len(groups) == 2:
+            raise InputError(
+                "'order' is 'auto', which holds out a temperature, but 'substrate_c' has "
+                f"{[float(group[0]) for group in groups]} °C: give three, or an order"
+            )
