@@ -52,14 +52,18 @@ def clipping(values: Array, crowded: float = _CROWDED) -> Clipping | None:
     clips them: then all above it are at it. Where most values are at it, an even scene does the
     same, and only the largest number of some bits is taken for a level.
     """
-    known = values[np.isfinite(values)]
+    # Most exposures are finite and end here: nothing is copied for them.
+    finite = values.size > 0 and np.isfinite([values.min(), values.max()]).all()
+    known = values if finite else values[np.isfinite(values)]
     if known.size <= _MANY:
         return None
     top = float(known.max())
     rounding = _ROUNDING * abs(top)
+    count = int(np.count_nonzero(known >= top - rounding))
+    if count < _MANY or top <= 0:
+        return None
     below = known[known < top - rounding]
-    count = known.size - below.size
-    if count < _MANY or not below.size or top <= 0:
+    if not below.size:
         return None
     width = max(_BELOW * top, top - float(below.max())) + rounding
     if count <= crowded * np.count_nonzero(below >= top - width):
