@@ -49,7 +49,10 @@ def checksum(content: Content) -> int:
 
 
 def header(content: Content) -> str:
-    """Everything but the arrays, as one line of JSON that ends no comment of C."""
+    """Everything but the arrays, as one line of JSON.
+
+    It is a comment in C: it neither begins nor ends one, and holds no trigraph.
+    """
     rows, cols = content.gain.shape
     told = {
         "kind": "equipix table",
@@ -60,7 +63,7 @@ def header(content: Content) -> str:
         "crc32": checksum(content),
         "metadata": content.metadata,
     }
-    return json.dumps(told).replace("/", "\\/")
+    return json.dumps(told).replace("*", "\\u002a").replace("?", "\\u003f")
 
 
 def read_header(path: Path, text: str) -> dict[str, Any]:
