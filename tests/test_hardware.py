@@ -361,6 +361,9 @@ def test_other_suffixes_are_refused(made, tmp_path):
         ({"adc_step": 0.3}, "'adc_step' is 0.3, expected a power of two"),
         ({"out_step": 0}, "'out_step' is 0, expected a power of two"),
         ({"lowest": float("nan")}, "'lowest' is nan"),
+        ({"lowest": 1e12}, "'lowest' is 1e\\+12 DN, expected less than 5.36871e\\+08 on either"),
+        ({"lowest": -1e12}, "'lowest' is -1e\\+12 DN"),
+        ({"lowest": 1e6, "dac_step": 4.0}, "'lowest' is 1e\\+06 DN, .* at most 1020 DN"),
         ({"out_step": 2.0**40, "adc_step": 2.0**-10}, "make sums of 65 bits, expected at most 58"),
     ],
 )
@@ -408,6 +411,37 @@ def test_a_curved_correction_needs_a_line():
         found = table.correct(frame) - correction.correct(frame)
         # Half a step of the output, and of the gain at 1048 words from the middle.
         assert found == pytest.approx(np.full((4, 5), left), abs=2.0**-4 + 1048 * 2.0**-16 + 1e-3)
+
+
+def test_the_line_of_a_cubic_leaves_half_of_its_sag_on_either_side():
+    # About the middle 2000 the cubic is c t (t² − h²) from its chord, with extremes of
+    # ∓ 2 c h³/(3√3): one on either side, so the chord itself is the best line. A parabola of -10 DN
+    # beside it moves the line.
+    c, h = 1e-8, 1000.0
+    for parabola in (0.0, -1e-5):
+        t = np.poly1d([1.0, -2000.0])
+        curve = c * t**3 + parabola * t**2 + np.poly1d([1.0, 0.0])
+        correction = polynomial(*curve.coeffs[::-1])
+        low, high = 1000.0, 3000.0
+        table = hardware.Table.of(
+            correction, linearise=(low, high), out_step=2.0**-3, adc_bits=12, offset_bits=16
+        )
+        offset, gain = table.coefficients[:, 0, 0]
+        raw = np.linspace(low, high, 65)
+        left = curve(raw) - offset - gain * raw
+        rounding = 2 * (2.0 ** (table.format.offset - 1) + 1048 * 2.0**-16)
+        assert left.max() == pytest.approx(-left.min(), abs=rounding)
+        sag = table.metadata["linearised"]["sag_dn"]
+        assert left.max() - left.min() == pytest.approx(sag, abs=rounding)
+        if not parabola:
+            # Between two of 65 values the cubic changes by 3 c h (h/64)² near its extremes at most.
+            assert sag == pytest.approx(4 * c * h**3 / 27**0.5, abs=2 * 3 * c * h * (h / 64) ** 2)
+
+
+@pytest.mark.parametrize("linearise", [(1,), 5, (1, 2, 3), (3, 1), ("a", 2), (0, float("inf"))])
+def test_a_range_of_a_line_is_two_rising_values(linearise):
+    with pytest.raises(errors.InputError, match="'linearise' is .*expected two rising raw values"):
+        hardware.Table.of(polynomial(10.0, 1.0, 1e-5), linearise=linearise)
 
 
 def test_frames_that_do_not_fit_are_refused(made):

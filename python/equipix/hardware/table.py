@@ -15,8 +15,9 @@ from equipix.correction.protocol import check_correction
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.hardware.content import DTYPES, Content
-from equipix.hardware.encode import Steps, encode, line_of, origin
+from equipix.hardware.encode import Steps, encode, origin
 from equipix.hardware.files import write
+from equipix.hardware.line import line_of
 from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
 
 if TYPE_CHECKING:
@@ -163,8 +164,10 @@ class Table(ReadOnly):
             leaves each pixel a word of 0 there, and the output 0 stands for it. Choose it some
             noise below the darkest scene.
         linearise : tuple of float, optional
-            Two raw values in DN. A correction of order 2 or 3 is replaced by a straight line
-            between them, half of its sag aside; ``metadata["linearised"]`` has the sag.
+            Two raw values in DN. Between them a straight line replaces a correction of order 2 or
+            3. It is parallel to the chord, and half of the sag away on either side:
+            ``metadata["linearised"]`` has the largest sag, the range of the deviations from the
+            chord at 65 raw values.
 
         Returns
         -------
