@@ -206,18 +206,22 @@ def print_loop() -> None:
     print(
         "step   seed  floats"
         + "".join(f"{b:7d}" for b in LOOP_WIDTHS)
-        + "  stops at  2 eta |E| law"
+        + "  stops at  lost at  frozen at"
     )
+    stops: dict[int, list[int | None]] = {exponent: [] for exponent in STEPS}
     for exponent in STEPS:
         for seed in SEEDS:
             found = falls(LOOP_WIDTHS, exponent=exponent, seed=seed)
             cells = "".join(f"{found.words[bits]:7.2f}" for bits in LOOP_WIDTHS)
+            stops[exponent].append(found.stops_at)
             lost, frozen = (lost_at(e, exponent) for e in (found.error, found.largest))
             print(
                 f"2^-{exponent}{seed:6d}{found.floats:9.2f}{cells}{found.stops_at!s:>10s}"
                 f"{lost:9d}{frozen:11d}",
                 flush=True,
             )
+    for exponent, bits in stops.items():
+        print(f"with the step 2^-{exponent} the loop stops converging at {bits} bits, by seed")
     print("stops at: fall below half of that in double precision")
     print("lost at: half a step of the memory is the rms change; frozen at: the largest change")
 

@@ -524,6 +524,14 @@ def test_the_command_writes_a_table(made, tmp_path, run):
     status, out, _ = run(*command, "--force", "--json", "--frames", tmp_path / "level.tif")
     cost = hardware.quality(response, frames)
     assert json.loads(out)["C_of_table"] == pytest.approx(cost.after.ratio)
+    widths = hardware.smallest_widths(response, [frames])
+    found = json.loads(out)["sufficient_bits"]
+    assert found == {
+        "offset": widths.offset_bits,
+        "gain": widths.gain_bits,
+        "both": widths.both_bits,
+    }
+    assert 8 < found["gain"] <= 16
     assert run(*command, "--force", "--gain-bits", 20)[0] == 1
     assert "Example" in run("hardware", "--help")[1]
 
