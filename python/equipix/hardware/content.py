@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from equipix.errors import FileError
+from equipix.errors import FileError, InputError
+from equipix.flags import usable
 from equipix.hardware.words import Format
 
 if TYPE_CHECKING:
@@ -37,6 +38,34 @@ class Content(NamedTuple):
     def arrays(self) -> dict[str, Array]:
         """Arrays by name."""
         return {name: getattr(self, name) for name in DTYPES}
+
+
+def check_words(content: Content) -> None:
+    """Refuse arrays that do not fit together.
+
+    Raises
+    ------
+    InputError
+        If a type or a size is another, or words do not fit their widths.
+    """
+    for name, dtype in DTYPES.items():
+        array = content.arrays()[name]
+        if array.dtype != dtype or array.ndim != 2 or array.shape != content.gain.shape:
+            raise InputError(
+                f"'{name}' is {array.dtype} of shape {array.shape}, expected "
+                f"{np.dtype(dtype)} of {content.gain.shape}"
+            )
+    f = content.format
+    for name, bits in (
+        ("coarse", f.dac_bits),
+        ("offset", f.offset_bits - 1),
+        ("gain", f.gain_bits),
+    ):
+        words = content.arrays()[name].astype(np.int32)
+        if np.any((words >= 2**bits) | (words < -(2**bits))):
+            raise InputError(f"'{name}' holds words of more than its width")
+    if np.any((content.gain == 0) != ~usable(content.flags)):
+        raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
 
 
 def checksum(content: Content) -> int:
