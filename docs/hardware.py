@@ -1,18 +1,23 @@
 """Print the tables of hardware.md: `make figures`, or ``python docs/hardware.py``.
 
-What words of a table cost in quality C, on simulated arrays whose truth is known, and the widths at
-which the adaptive loop stops converging, on a moving scene.
+What words of a table cost in quality C, on simulated arrays whose truth is known, and the width at
+which the adaptive loop stops converging, on the standard scene of `simulate.MovingScene`.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import equipix
-from equipix import hardware, nuc
-from equipix.simulate import StaringArray
+from equipix import hardware, nuc, reference
+from equipix.reference.scene import LocalMean, neighbours
+from equipix.simulate import MovingScene, StaringArray
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 SHAPE = (96, 128)
 LIGHTS = (3e6, 9.3e6, 14e6)
@@ -24,6 +29,14 @@ LOWEST = 1000.0
 
 WIDTHS = range(16, 7, -1)
 SCENE = (64, 64)
+MOVING = 2000
+"""Moving frames of the loop; the stop of the scene comes beside them."""
+
+SEEDS = (1, 2, 3)
+STEPS = (4, 6, 8)
+"""Steps of the loop are 2 to minus these powers."""
+
+LOOP_WIDTHS = range(12, 3, -1)
 ADC_BITS = 14
 
 
@@ -90,87 +103,127 @@ def print_coarse() -> None:
         )
 
 
-class Scene:
-    """A moving scene seen by an array whose gains and offsets differ, on [0, 1]."""
+@dataclass
+class Falls:
+    """Falls of the residual pattern, on one sequence with one step.
 
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        side = 256
-        f = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
-        f[0, 0] = np.inf
-        field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((side, side))) / f).real
-        self._field = np.clip(field / field.std(), -2.5, 2.5)
-        self.gain = 1 + 0.05 * rng.standard_normal(SCENE)
-        self.offset = 0.1 * rng.standard_normal(SCENE)
-        self._rng, self._angle, self._place = rng, 0.0, np.zeros(2)
-
-    def level(self, index: int) -> float:
-        """Mean light: a triangle from 0.25 to 0.75, 500 frames each way."""
-        return float(0.25 + 0.5 * (1 - abs((index % 1000) / 500 - 1)))
-
-    def frame(self, index: int) -> Any:
-        """The next frame, in words of the ADC; the scene moves by whole pixels."""
-        self._angle += 0.1 * self._rng.standard_normal()
-        speed = 1.5 + 1.5 * np.sin(2 * np.pi * index / 61)
-        self._place += speed * np.array([np.cos(self._angle), np.sin(self._angle)])
-        seen = np.roll(self._field, np.rint(self._place).astype(int), (0, 1))
-        light = self.level(index) + 0.1 * seen[: SCENE[0], : SCENE[1]]
-        y = self.gain * light + self.offset + 0.002 * self._rng.standard_normal(SCENE)
-        return np.clip(np.rint(y * 2**ADC_BITS), 0, 2**ADC_BITS - 1).astype(np.uint16)
-
-    def pattern(self, gain: Any, offset: Any, index: int) -> float:
-        """Residual pattern: rms of (gG − 1)b + gO + o, over mean(gG), less its mean."""
-        product = gain * self.gain
-        left = (product - 1) * self.level(index) + gain * self.offset + offset
-        return float((left / product.mean()).std())
-
-
-def falls(widths: list[int], count: int, *, step: float, seed: int) -> dict[int, float]:
-    """Fall of the residual pattern after `count` frames, by the width of both memories.
-
-    The width 0 stands for memories in double precision.
+    Attributes
+    ----------
+    floats : float
+        By `reference.scene.LocalMean`, in double precision.
+    words : dict
+        By the integer loop, for each width of both memories.
+    error : float
+        Rms of E over pixels and the last quarter of the frames, in double precision.
+    largest : float
+        Largest |E| of all frames with the memories as they start.
     """
-    scene = Scene(seed)
-    frames = np.stack([scene.frame(index) for index in range(count)])
-    gain, offset = np.ones(SCENE), np.zeros(SCENE)
-    start = scene.pattern(gain, offset, count - 1)
-    for frame in frames:
-        gain, offset = in_floats(frame / 2**ADC_BITS, gain, offset, step)
-    found = {0: start / scene.pattern(gain, offset, count - 1)}
-    for bits in widths:
+
+    floats: float
+    words: dict[int, float]
+    error: float
+    largest: float
+
+    @property
+    def stops_at(self) -> int | None:
+        """Widest memories whose pattern falls less than half as much as in double precision."""
+        return max(
+            (bits for bits, fall in self.words.items() if 2 * fall < self.floats), default=None
+        )
+
+
+def falls(widths: Iterable[int], *, exponent: int, seed: int, moving: int = MOVING) -> Falls:
+    """Falls of the residual pattern by the loop with the step 2^-exponent."""
+    scene = MovingScene(seed=seed, shape=SCENE)
+    sequence = list(scene.frames(moving + scene.stop[1] - scene.stop[0]))
+    level = sequence[-1].level
+    start = scene.residual_pattern(np.ones(SCENE), np.zeros(SCENE), level)
+    words = [digitised(frame.values) for frame in sequence]
+
+    def fall(gain: Any, offset: Any) -> float:
+        return start / scene.residual_pattern(gain, offset, level)
+
+    floats, error = in_floats(words, 2.0**-exponent)
+    raw = (word / 2**ADC_BITS for word in words)
+    return Falls(
+        fall(floats.gain, floats.offset),
+        {bits: fall(*in_words(words, bits, 2.0**-exponent)) for bits in widths},
+        error,
+        max(float(np.abs(around(y) - y).max()) for y in raw),
+    )
+
+
+def digitised(values: Any) -> Any:
+    """Values on [0, 1] as words of the ADC, those beyond it limited."""
+    return np.clip(np.rint(values * 2**ADC_BITS), 0, 2**ADC_BITS - 1).astype(np.uint16)
+
+
+def in_floats(words: list[Any], step: float) -> tuple[LocalMean, float]:
+    """The loop in double precision, and the rms of E over the last quarter of the frames."""
+    loop, squares = LocalMean(SCENE, step), []
+    for word in words:
+        y = word / 2**ADC_BITS
+        corrected = loop.gain * y + loop.offset
+        squares.append(np.mean((neighbours(corrected, loop.KERNEL) - corrected) ** 2))
+        loop.update(y)
+    return loop, float(np.sqrt(np.mean(squares[-len(squares) // 4 :])))
+
+
+def in_words(words: list[Any], bits: int, step: float) -> tuple[Any, Any]:
+    """Gain and offset of the loop with integer memories; `hardware.Adaptive` has 8 bits or more."""
+    if bits >= min(WIDTHS):
         loop = hardware.Adaptive(
             SCENE, adc_bits=ADC_BITS, gain_bits=bits, offset_bits=bits, step=step
         )
-        loop.update(frames, workers=1)
-        now = loop.gain / 2.0 ** (bits - 1), loop.offset / 2.0**bits
-        found[bits] = start / scene.pattern(*now, count - 1)
-    return found
+        loop.update(np.stack(words), workers=1)
+        return loop.gain / 2.0 ** (bits - 1), loop.offset / 2.0**bits
+    gain, offset = np.full(SCENE, 2 ** (bits - 1)), np.zeros(SCENE, int)
+    for word in words:
+        _, gain, offset = reference.adapt_words(
+            word, gain, offset, widths=(ADC_BITS, bits, bits), step=step
+        )
+    return gain / 2.0 ** (bits - 1), offset / 2.0**bits
 
 
-def in_floats(y: Any, gain: Any, offset: Any, step: float) -> tuple[Any, Any]:
-    """One frame of the loop in double precision."""
-    x = gain * y + offset
-    wide = np.pad(x, 1, mode="reflect")
-    error = (wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / 4 - x
-    gain, offset = gain + step * error * y, offset + step * error
-    return gain - gain.mean() + 1, offset - offset.mean()
+def around(values: Any) -> Any:
+    """Mean of the four neighbours, the opposite one in place of one beyond the edge."""
+    wide = np.pad(values, 1, mode="reflect")
+    return (wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / 4
 
 
-def stops(found: dict[int, float]) -> int | None:
-    """The widest memories whose pattern falls less than half as much as in double precision."""
-    bad = [bits for bits in found if bits and found[bits] < found[0] / 2]
-    return max(bad, default=None)
+def lost_at(error: float, exponent: int) -> int:
+    """Widest memories that lose a change of η·error: half a step, 2^-bits / 2, is not below it.
+
+    Steps of the offset are 2^-bits of the range. Those of the gain are twice as large, and its
+    changes η·E·y are smaller.
+    """
+    return int(np.floor(exponent - 1 - np.log2(error)))
 
 
 def print_loop() -> None:
-    """Fall of the pattern by width and step, three seeds."""
-    widths = list(WIDTHS)
-    print("step     seed   floats" + "".join(f"{bits:8d}" for bits in widths) + "   stops at")
-    for exponent in (4, 6, 8):
-        for seed in (1, 2, 3):
-            found = falls(widths, 2000, step=2.0**-exponent, seed=seed)
-            cells = "".join(f"{found[bits]:8.2f}" for bits in widths)
-            print(f"2^-{exponent}{seed:9d}{found[0]:9.2f}{cells}{stops(found)!s:>11s}")
+    """Fall of the pattern by width and step, and the width at which the loop stops converging."""
+    print(f"fall of the residual pattern after {MOVING} moving frames, the stop included")
+    print(
+        "step   seed  floats"
+        + "".join(f"{b:7d}" for b in LOOP_WIDTHS)
+        + "  stops at  lost at  frozen at"
+    )
+    stops: dict[int, list[int | None]] = {exponent: [] for exponent in STEPS}
+    for exponent in STEPS:
+        for seed in SEEDS:
+            found = falls(LOOP_WIDTHS, exponent=exponent, seed=seed)
+            cells = "".join(f"{found.words[bits]:7.2f}" for bits in LOOP_WIDTHS)
+            stops[exponent].append(found.stops_at)
+            lost, frozen = (lost_at(e, exponent) for e in (found.error, found.largest))
+            print(
+                f"2^-{exponent}{seed:6d}{found.floats:9.2f}{cells}{found.stops_at!s:>10s}"
+                f"{lost:9d}{frozen:11d}",
+                flush=True,
+            )
+    for exponent, bits in stops.items():
+        print(f"with the step 2^-{exponent} the loop stops converging at {bits} bits, by seed")
+    print("stops at: fall below half of that in double precision")
+    print("lost at: half a step of the memory is the rms change; frozen at: the largest change")
 
 
 if __name__ == "__main__":

@@ -208,25 +208,75 @@ def test_a_memory_image_packs_a_word_a_pixel(made, tmp_path):
     assert lines[2 * 32 + 3] == f"00000000 // {table.flags[2, 3]:08x}"
 
 
-@pytest.mark.parametrize("out_bits", [8, 14, 16])
-def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, out_bits):
+def compiled(folder, source):
+    """A program of C, compiled without a warning; the test is left out without a compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler")
+    (folder / "main.c").write_text(source)
+    command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([*command, folder / "main.c", "-o", folder / "main"], check=True)
+    return folder / "main"
+
+
+FILTER = """#include <stdio.h>
+#include "{name}.h"
+int main(void) {{
+    uint16_t x;
+    for (uint32_t i = 0; fread(&x, 2, 1, stdin) == 1; i++) {{
+        uint16_t z = equipix_{name}_apply(x, i % (EQUIPIX_{upper}_ROWS * EQUIPIX_{upper}_COLS));
+        fwrite(&z, 2, 1, stdout);
+    }}
+    return 0;
+}}
+"""
+
+
+@pytest.mark.parametrize("out_bits", [8, 14, 16])
+def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, out_bits):
     table = hardware.Table.of(made[1], out_bits=out_bits, gain_bits=12, offset_bits=10)
     table.save(tmp_path / "table.h")
-    (tmp_path / "main.c").write_text(
-        '#include <stdio.h>\n#include "table.h"\n'
-        "int main(void) { uint16_t x; for (uint32_t i = 0; fread(&x, 2, 1, stdin) == 1; i++) {\n"
-        "    uint16_t z = equipix_apply(x, i % (EQUIPIX_ROWS * EQUIPIX_COLS));\n"
-        "    fwrite(&z, 2, 1, stdout); } return 0; }\n"
-    )
-    command = [compiler, "-Wall", "-Werror", "-Wno-unused-const-variable", "-Wno-unused-variable"]
-    program = tmp_path / "main"
-    subprocess.run([*command, tmp_path / "main.c", "-o", program], check=True)
+    program = compiled(tmp_path, FILTER.format(name="table", upper="TABLE"))
     words = words_of(table, 30)
     done = subprocess.run([program], input=words.tobytes(), capture_output=True, check=True)
     assert np.array_equal(np.frombuffer(done.stdout, np.uint16), table.apply(words).ravel())
+
+
+def test_two_c_headers_go_into_one_program(made, tmp_path):
+    names = {"left": {"lowest": 700.0}, "right-2": {"gain_bits": 11, "out_bits": 14}}
+    tables = {name: hardware.Table.of(made[1], **options) for name, options in names.items()}
+    numbers = ("ROWS", "COLS", "ADC_BITS", "COARSE_BITS", "OFFSET_BITS", "GAIN_BITS", "OUT_BITS")
+    numbers += tuple(f"{n}_STEP_EXPONENT" for n in ("ADC", "COARSE", "OFFSET", "GAIN", "OUT"))
+    numbers += ("BASE", "ZERO")
+    source, wanted = "#include <stdio.h>\n", []
+    for name, table in tables.items():
+        table.save(tmp_path / f"{name}.h")
+        source += f'#include "{name}.h"\n'
+        f = table.format
+        wanted += [*SHAPE, f.adc_bits, f.dac_bits, f.offset_bits, f.gain_bits, f.out_bits]
+        wanted += [f.adc, f.coarse, f.offset, f.gain, f.out, f.base, f.zero]
+    macros = [f"EQUIPIX_{name}_{number}" for name in ("LEFT", "RIGHT_2") for number in numbers]
+    text = "".join(f'    printf("%d\\n", {macro});\n' for macro in macros)
+    calls = "    return equipix_left_apply(0, 0) + equipix_right_2_apply(0, 0) < 0;\n"
+    program = compiled(tmp_path, source + "int main(void) {\n" + text + calls + "}\n")
+    done = subprocess.run([program], capture_output=True, check=True, text=True)
+    assert [int(line) for line in done.stdout.split()] == wanted
+    # The output 0 is `lowest`, rounded down to a step.
+    assert np.ldexp(tables["left"].format.zero, tables["left"].format.out) == 700.0
+
+
+@pytest.mark.parametrize("sensor", ["/* a", "a */ b", "//", "??/", "\\", "é\n"])
+def test_no_name_of_a_sensor_breaks_a_comment(tmp_path, sensor):
+    kept = Polynomial(
+        np.stack([np.zeros((4, 5)), np.ones((4, 5))]),
+        np.zeros((4, 5), np.uint32),
+        metadata={"sensor": {"name": sensor}},
+    )
+    table = hardware.Table.of(kept)
+    for suffix in SUFFIXES:
+        table.save(tmp_path / f"table{suffix}")
+        assert hardware.read(tmp_path / f"table{suffix}").metadata["sensor"]["name"] == sensor
+    compiled(tmp_path, FILTER.format(name="table", upper="TABLE"))
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -255,6 +305,46 @@ def test_damaged_files_are_refused_by_name(made, tmp_path, suffix):
         refused(whole.replace(text.encode(), other.encode(), 1), "checksum")
 
 
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_cut_anywhere_is_refused_by_name(tmp_path, suffix):
+    flags = np.zeros((4, 5), np.uint32)
+    flags[3, 4] = Flag.DEAD | Flag.DO_NOT_USE
+    path = tmp_path / f"table{suffix}"
+    table = hardware.Table.of(polynomial(0.0, 1.0, flags=flags), gain_bits=8)
+    table.save(path)
+    whole = path.read_bytes()
+    # The last line feed of a text carries nothing.
+    least = len(whole) - (suffix != ".bin")
+    for size in range(least):
+        path.write_bytes(whole[:size])
+        with pytest.raises(errors.FileError, match=rf"table\{suffix}: "):
+            hardware.read(path)
+    path.write_bytes(whole[:least])
+    assert same(hardware.read(path), table)
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_memories_of_a_binary_file_are_aligned(made, tmp_path, bits):
+    table = hardware.Table.of(made[1], dac_bits=bits, offset_bits=bits, gain_bits=bits)
+    table = hardware.Table(
+        table.format,
+        *(getattr(table, name)[:5, :7] for name in ("coarse", "offset", "gain", "flags")),
+        metadata=table.metadata,
+    )
+    path = tmp_path / "table.bin"
+    table.save(path)
+    data = path.read_bytes()
+    at = 8 + int.from_bytes(data[4:8], "little")
+    for name, kind in (("coarse", "u"), ("offset", "i"), ("gain", "u"), ("flags", "u")):
+        words = getattr(table, name)
+        dtype = np.dtype(f"<{kind}{4 if name == 'flags' else 1 + (bits > 8)}")
+        assert at % 16 == 0
+        assert np.array_equal(np.frombuffer(data, dtype, 35, at).reshape(5, 7), words)
+        at += -(-35 * dtype.itemsize // 16) * 16
+    assert at == len(data)
+    assert same(hardware.read(path), table)
+
+
 def test_other_suffixes_are_refused(made, tmp_path):
     with pytest.raises(errors.InputError, match=r"ends in none of \.bin, \.hex, \.h"):
         hardware.Table.of(made[1]).save(tmp_path / "table.txt")
@@ -271,6 +361,9 @@ def test_other_suffixes_are_refused(made, tmp_path):
         ({"adc_step": 0.3}, "'adc_step' is 0.3, expected a power of two"),
         ({"out_step": 0}, "'out_step' is 0, expected a power of two"),
         ({"lowest": float("nan")}, "'lowest' is nan"),
+        ({"lowest": 1e12}, "'lowest' is 1e\\+12 DN, expected less than 5.36871e\\+08 on either"),
+        ({"lowest": -1e12}, "'lowest' is -1e\\+12 DN"),
+        ({"lowest": 1e6, "dac_step": 4.0}, "'lowest' is 1e\\+06 DN, .* at most 1020 DN"),
         ({"out_step": 2.0**40, "adc_step": 2.0**-10}, "make sums of 65 bits, expected at most 58"),
     ],
 )
@@ -318,6 +411,37 @@ def test_a_curved_correction_needs_a_line():
         found = table.correct(frame) - correction.correct(frame)
         # Half a step of the output, and of the gain at 1048 words from the middle.
         assert found == pytest.approx(np.full((4, 5), left), abs=2.0**-4 + 1048 * 2.0**-16 + 1e-3)
+
+
+def test_the_line_of_a_cubic_leaves_half_of_its_sag_on_either_side():
+    # About the middle 2000 the cubic is c t (t² − h²) from its chord, with extremes of
+    # ∓ 2 c h³/(3√3): one on either side, so the chord itself is the best line. A parabola of -10 DN
+    # beside it moves the line.
+    c, h = 1e-8, 1000.0
+    for parabola in (0.0, -1e-5):
+        t = np.poly1d([1.0, -2000.0])
+        curve = c * t**3 + parabola * t**2 + np.poly1d([1.0, 0.0])
+        correction = polynomial(*curve.coeffs[::-1])
+        low, high = 1000.0, 3000.0
+        table = hardware.Table.of(
+            correction, linearise=(low, high), out_step=2.0**-3, adc_bits=12, offset_bits=16
+        )
+        offset, gain = table.coefficients[:, 0, 0]
+        raw = np.linspace(low, high, 65)
+        left = curve(raw) - offset - gain * raw
+        rounding = 2 * (2.0 ** (table.format.offset - 1) + 1048 * 2.0**-16)
+        assert left.max() == pytest.approx(-left.min(), abs=rounding)
+        sag = table.metadata["linearised"]["sag_dn"]
+        assert left.max() - left.min() == pytest.approx(sag, abs=rounding)
+        if not parabola:
+            # Between two of 65 values the cubic changes by 3 c h (h/64)² near its extremes at most.
+            assert sag == pytest.approx(4 * c * h**3 / 27**0.5, abs=2 * 3 * c * h * (h / 64) ** 2)
+
+
+@pytest.mark.parametrize("linearise", [(1,), 5, (1, 2, 3), (3, 1), ("a", 2), (0, float("inf"))])
+def test_a_range_of_a_line_is_two_rising_values(linearise):
+    with pytest.raises(errors.InputError, match="'linearise' is .*expected two rising raw values"):
+        hardware.Table.of(polynomial(10.0, 1.0, 1e-5), linearise=linearise)
 
 
 def test_frames_that_do_not_fit_are_refused(made):
@@ -400,6 +524,14 @@ def test_the_command_writes_a_table(made, tmp_path, run):
     status, out, _ = run(*command, "--force", "--json", "--frames", tmp_path / "level.tif")
     cost = hardware.quality(response, frames)
     assert json.loads(out)["C_of_table"] == pytest.approx(cost.after.ratio)
+    widths = hardware.smallest_widths(response, [frames])
+    found = json.loads(out)["sufficient_bits"]
+    assert found == {
+        "offset": widths.offset_bits,
+        "gain": widths.gain_bits,
+        "both": widths.both_bits,
+    }
+    assert 8 < found["gain"] <= 16
     assert run(*command, "--force", "--gain-bits", 20)[0] == 1
     assert "Example" in run("hardware", "--help")[1]
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from equipix import errors, hardware, reference
+from equipix.reference.scene import LocalMean
 
 SHAPE = (17, 23)
 
@@ -89,15 +90,39 @@ def test_at_the_bound_of_the_step_a_chequered_pattern_does_not_grow():
     spread = loop.update(frames).astype(float).std(axis=(1, 2))
     assert spread[-1] < 0.1 * spread[0]
     # The law behind the bound: twice the step makes it grow, in double precision.
-    gain, offset = np.ones((16, 16)), np.zeros((16, 16))
+    floats = LocalMean((16, 16), 1.0)
     for frame in frames[:20]:
-        gain, offset = docs.in_floats(frame / 2**16, gain, offset, 1.0)
-    assert (gain * frames[0] / 2**16 + offset).std() > 10 * spread[0] / 2**16
+        floats.update(frame / 2**16)
+    assert (floats.gain * frames[0] / 2**16 + floats.offset).std() > 10 * spread[0] / 2**16
 
 
 def test_narrow_memories_stop_converging():
-    found = docs.falls([16, 14, 8], 800, step=2**-6, seed=1)
-    assert found[16] == pytest.approx(found[0], rel=0.02)
-    assert found[14] > 0.9 * found[0]
-    assert found[8] < found[0] / 2
-    assert docs.stops(found) == 8
+    found = docs.falls([16, 14, 8], exponent=6, seed=1, moving=800)
+    # LocalMean has the edge itself in place of a neighbour beyond it, in 6 % of the pixels.
+    assert found.words[16] == pytest.approx(found.floats, rel=0.06)
+    assert found.words[14] == pytest.approx(found.words[16], rel=0.02)
+    assert found.words[8] < found.floats / 2
+    assert found.stops_at == 8
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("exponent", [4, 6])
+def test_memories_are_frozen_where_half_a_step_is_the_largest_change(exponent, seed):
+    largest = docs.falls([], exponent=exponent, seed=seed, moving=200).largest
+    bits = docs.lost_at(largest, exponent)
+    found = docs.falls([bits, bits + 1, bits + 2], exponent=exponent, seed=seed, moving=200)
+    assert found.words[bits] == 1
+    # Twice the largest change of a narrower step: some offsets change.
+    assert found.words[bits + 1] != 1
+    assert found.words[bits + 2] > 1
+
+
+def test_the_loop_of_the_study_is_the_same_below_and_above_8_bits(monkeypatch):
+    words = [
+        docs.digitised(frame.values)
+        for frame in docs.MovingScene(seed=1, shape=docs.SCENE).frames(20)
+    ]
+    compiled = docs.in_words(words, 9, 2**-4)
+    monkeypatch.setattr(docs, "WIDTHS", range(16, 9, -1))
+    assert np.array_equal(docs.in_words(words, 9, 2**-4), compiled)
+    assert np.any(compiled[1] != 0)

@@ -10,6 +10,7 @@ mod descent;
 mod experiment;
 mod fit;
 mod fixed_point;
+mod fixed_point_limits;
 mod fraction;
 mod joint;
 mod laws;

@@ -13,13 +13,16 @@ from equipix.cli.options import Force, Json, Sensor
 from equipix.cli.terminal import check_output, show_result
 from equipix.correction.protocol import check_sensor
 from equipix.flags import usable
-from equipix.hardware import Table, quality
+from equipix.hardware import Table, quality, smallest_widths
 from equipix.hardware.files import SUFFIXES
 from equipix.io import find_files, read_frames, refuse_inputs, refuse_saved
 from equipix.loading import load
 
 if TYPE_CHECKING:
     from equipix.correction.protocol import Correction
+
+_SOUGHT = ("offset_bits", "gain_bits")
+"""Widths of which the smallest that suffice are sought."""
 
 commands = typer.Typer()
 
@@ -63,7 +66,9 @@ def hardware(
     ] = None,
     frames: Annotated[
         list[str] | None,
-        typer.Option(help="Raw frames of one steady even level: show what the words cost."),
+        typer.Option(
+            help="Raw frames of one steady even level: show the cost in C, and sufficient widths."
+        ),
     ] = None,
     sensor: Sensor = None,
     force: Force = False,
@@ -116,15 +121,23 @@ def _summary(table: Table) -> dict[str, Any]:
 
 
 def _cost(correction: Correction, source: list[str], options: dict[str, Any]) -> dict[str, Any]:
-    """Measure C of frames of one level, by the correction and by its table."""
+    """Measure C of frames of one level by correction and table, and the widths that suffice."""
     files = find_files(source)
     for file in files:
         refuse_saved(file)
     with naming_memory("measuring quality"):
-        found = quality(correction, read_frames(files), **options)
+        raw = read_frames(files)
+        found = quality(correction, raw, **options)
+        others = {name: value for name, value in options.items() if name not in _SOUGHT}
+        widths = smallest_widths(correction, [raw], **others)
     return {
         "C": found.before.ratio,
         "C_of_table": found.after.ratio,
         "added_noise": found.added,
         "words_at_ends_of_adc": found.at_ends,
+        "sufficient_bits": {
+            "offset": widths.offset_bits,
+            "gain": widths.gain_bits,
+            "both": widths.both_bits,
+        },
     }

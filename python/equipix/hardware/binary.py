@@ -1,9 +1,10 @@
 """Tables as binary files: the memories one behind the other, for a loader.
 
-All numbers are little-endian. After the magic ``EQXT`` come, as 32-bit numbers, the length of the
-header and the header itself, one line of JSON; then the words of the coarse offset, the fine
-offset and the gain, row by row, as one byte each where the width is 8 bits, else two; then the
-flags, four bytes a pixel.
+All numbers are little-endian. After the magic ``EQXT`` come the length of the header, a 32-bit
+number, and the header itself, one line of JSON padded with spaces; then the words of the coarse
+offset, the fine offset and the gain, row by row, as one byte each where the width is 8 bits, else
+two; then the flags, four bytes a pixel. Each of these four memories starts at a multiple of 16
+bytes, so that a loader can map it; zeros fill the gaps.
 """
 
 from __future__ import annotations
@@ -24,33 +25,52 @@ if TYPE_CHECKING:
 
 _MAGIC = b"EQXT"
 
+_LENGTH = struct.Struct("<I")
+"""Length of the header."""
 
-def encoded(content: Content) -> bytes:
+_FIXED = len(_MAGIC) + _LENGTH.size
+"""Bytes ahead of the header."""
+
+_ALIGNED = 16
+"""Each memory starts at a multiple of this, in bytes."""
+
+
+def encoded(content: Content, _name: str) -> bytes:
     """Bytes of a file."""
-    told = header(content).encode()
-    stored = _stored(content.format)
-    parts = [content.arrays()[name].astype(dtype).tobytes() for name, dtype in stored.items()]
-    return b"".join([_MAGIC, struct.pack("<I", len(told)), told, *parts])
+    text = header(content).encode()
+    text = text.ljust(_aligned(_FIXED + len(text)) - _FIXED)
+    parts = [_MAGIC, _LENGTH.pack(len(text)), text]
+    for name, dtype in _stored(content.format).items():
+        memory = content.arrays()[name].astype(dtype).tobytes()
+        parts.append(memory.ljust(_aligned(len(memory)), b"\0"))
+    return b"".join(parts)
 
 
 def decoded(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     if data[:4] != _MAGIC:
         raise FileError(f"{path}: holds no table that equipix has written")
-    start = 8 + int(struct.unpack_from("<I", data, 4)[0])
-    told = read_header(path, data[8:start].decode())
-    size, stored = int(told["rows"]) * int(told["cols"]), _stored(Format(**told["format"]))
-    wanted = start + size * sum(dtype.itemsize for dtype in stored.values())
+    if len(data) < _FIXED:
+        raise FileError(f"{path}: holds {len(data)} bytes, less than the header: incomplete")
+    start = _FIXED + int(_LENGTH.unpack_from(data, len(_MAGIC))[0])
+    fields = read_header(path, data[_FIXED:start].decode())
+    size, stored = int(fields["rows"]) * int(fields["cols"]), _stored(Format(**fields["format"]))
+    wanted = start + sum(_aligned(size * dtype.itemsize) for dtype in stored.values())
     if len(data) != wanted:
         raise FileError(
-            f"{path}: holds {len(data)} bytes, expected {wanted} for {told['rows']} x "
-            f"{told['cols']} pixels: of another size, or incomplete"
+            f"{path}: holds {len(data)} bytes, expected {wanted} for {fields['rows']} x "
+            f"{fields['cols']} pixels: of another size, or incomplete"
         )
     arrays: dict[str, Array] = {}
     for name, dtype in stored.items():
         arrays[name] = np.frombuffer(data, dtype, size, start)
-        start += size * dtype.itemsize
-    return made(path, told, arrays)
+        start += _aligned(size * dtype.itemsize)
+    return made(path, fields, arrays)
+
+
+def _aligned(size: int) -> int:
+    """Next multiple of the alignment."""
+    return -(-size // _ALIGNED) * _ALIGNED
 
 
 def _stored(widths: Format) -> dict[str, np.dtype[np.generic]]:

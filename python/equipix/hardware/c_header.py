@@ -14,23 +14,41 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from equipix._types import Array
+    from equipix.hardware.words import Format
 
 _FIRST = "/* equipix table: "
 
 _TYPES = {"coarse": "uint16_t", "offset": "int16_t", "gain": "uint16_t", "flags": "uint32_t"}
 
+_NUMBERS = {
+    "adc_bits": "ADC_BITS",
+    "dac_bits": "COARSE_BITS",
+    "offset_bits": "OFFSET_BITS",
+    "gain_bits": "GAIN_BITS",
+    "out_bits": "OUT_BITS",
+    "adc": "ADC_STEP_EXPONENT",
+    "coarse": "COARSE_STEP_EXPONENT",
+    "offset": "OFFSET_STEP_EXPONENT",
+    "gain": "GAIN_STEP_EXPONENT",
+    "out": "OUT_STEP_EXPONENT",
+    "base": "BASE",
+    "zero": "ZERO",
+}
+"""Macro of each number of the format."""
+
 _A_LINE = 16
 """Words in a line."""
 
 _APPLY = """
-/* Output word of pixel p for the word x of the ADC; shifts of negative numbers are arithmetic. */
-static inline uint16_t equipix_apply(uint16_t x, uint32_t p)
+/* Output word z of pixel p for the word x of the ADC; (z + {upper}_ZERO) steps of the output are
+   the corrected value in DN. Right shifts of negative numbers must be arithmetic. */
+static inline uint16_t {lower}_apply(uint16_t x, uint32_t p)
 {{
-    if (equipix_gain[p] == 0) return 0; /* a pixel that must not be used */
-    int64_t sum = (int64_t)equipix_gain[p] * x * ((int64_t)1 << {product})
-                + (int64_t)equipix_offset[p] * ((int64_t)1 << {offset});
+    if ({lower}_gain[p] == 0) return 0; /* a pixel that must not be used */
+    int64_t sum = (int64_t){lower}_gain[p] * x * ((int64_t)1 << {product})
+                + (int64_t){lower}_offset[p] * ((int64_t)1 << {offset});
     {rounding}
-    int64_t z = {base} + sum;
+    int64_t z = {upper}_BASE + sum;
     return (uint16_t)(z < 0 ? 0 : z > {largest} ? {largest} : z);
 }}
 """
@@ -38,52 +56,77 @@ static inline uint16_t equipix_apply(uint16_t x, uint32_t p)
 _ROUNDING = "sum = (sum + {half} - 1 + ((sum >> {bits}) & 1)) >> {bits}; /* half to even */"
 
 
-def encoded(content: Content) -> bytes:
-    """Bytes of a file."""
-    f = content.format
-    rows, cols = content.gain.shape
+def encoded(content: Content, name: str) -> bytes:
+    """Bytes of a file, whose C names begin with ``equipix_`` and its name."""
+    lower = "equipix_" + re.sub(r"\W", "_", name, flags=re.ASCII).lower()
+    upper = lower.upper()
     lines = [
         f"{_FIRST}{header(content)} */",
-        "#ifndef EQUIPIX_TABLE_H",
-        "#define EQUIPIX_TABLE_H",
+        f"#ifndef {upper}_H",
+        f"#define {upper}_H",
         "#include <stdint.h>",
-        f"#define EQUIPIX_ROWS {rows}",
-        f"#define EQUIPIX_COLS {cols}",
-        *(
-            f"#define EQUIPIX_{name.upper()}_STEP_EXPONENT ({getattr(f, name)})"
-            for name in ("adc", "coarse", "offset", "gain", "out")
-        ),
+        *_macros(content, upper),
+        *_arrays(content, lower),
+        _function(content.format, lower),
+        _last(upper),
     ]
+    return "\n".join([*lines, ""]).encode()
+
+
+def _macros(content: Content, upper: str) -> list[str]:
+    """Sizes of the sensor, widths, exponents of the steps, and constants."""
+    rows, cols = content.gain.shape
+    numbers = {name: getattr(content.format, key) for key, name in _NUMBERS.items()}
+    everything = {"ROWS": rows, "COLS": cols} | numbers
+    return [f"#define {upper}_{name} ({value})" for name, value in everything.items()]
+
+
+def _arrays(content: Content, lower: str) -> list[str]:
+    """Words of all pixels, row by row."""
+    lines = []
     for name, values in content.arrays().items():
-        lines.append(f"static const {_TYPES[name]} equipix_{name}[{values.size}] = {{")
         texts = [str(value) for value in values.ravel().tolist()]
+        lines.append(f"static const {_TYPES[name]} {lower}_{name}[{values.size}] = {{")
         lines += [",".join(texts[i : i + _A_LINE]) + "," for i in range(0, len(texts), _A_LINE)]
         lines.append("};")
+    return lines
+
+
+def _function(f: Format, lower: str) -> str:
+    """Correct a word with whole numbers, as `Table.apply` does."""
     product, offset, out = f.shifts
-    rounding = _ROUNDING.format(bits=out, half=f"((int64_t)1 << {out - 1})") if out else ""
-    apply = _APPLY.format(
+    return _APPLY.format(
+        lower=lower,
+        upper=lower.upper(),
         product=product,
         offset=offset,
-        rounding=rounding,
-        base=f"({f.base})",
+        rounding=_ROUNDING.format(bits=out, half=f"((int64_t)1 << {out - 1})") if out else "",
         largest=2**f.out_bits - 1,
     )
-    lines.append(apply)
-    return "\n".join([*lines, "#endif", ""]).encode()
+
+
+def _last(upper: str) -> str:
+    """Last line, by which a file is known to be whole."""
+    return f"#endif /* {upper}_H */"
 
 
 def decoded(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     text = data.decode()
-    first = text.split("\n", 1)[0]
+    first = text.split("\n", 1)[0].rstrip()
     if not first.startswith(_FIRST):
         raise FileError(f"{path}: holds no table that equipix has written")
-    told = read_header(path, first.removeprefix(_FIRST).removesuffix(" */"))
-    arrays: dict[str, Array] = {}
-    for name in DTYPES:
-        body = re.search(rf"equipix_{name}\[\d+\] = {{\n(.*?)}};", text, re.DOTALL)
-        if body is None:
-            raise FileError(f"{path}: has no words of '{name}': incomplete")
-        words = body[1].replace("\n", "").rstrip(",").split(",")
-        arrays[name] = np.array([int(word) for word in words], np.int64)
-    return made(path, told, arrays)
+    fields = read_header(path, first.removeprefix(_FIRST).removesuffix(" */"))
+    guard = re.search(r"^#ifndef (\w+)_H\s*$", text, re.MULTILINE)
+    if guard is None or not text.rstrip().endswith(_last(guard[1])):
+        raise FileError(f"{path}: has no last line '#endif' with its guard: incomplete")
+    return made(path, fields, {name: _words(path, text, name) for name in DTYPES})
+
+
+def _words(path: Path, text: str, name: str) -> Array:
+    """Words of one array."""
+    body = re.search(rf"_{name}\[\d+\] = {{\s*(.*?)}};", text, re.DOTALL)
+    if body is None:
+        raise FileError(f"{path}: has no words of '{name}': incomplete")
+    words = re.sub(r"\s", "", body[1]).rstrip(",").split(",")
+    return np.array([int(word) for word in words], np.int64)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from equipix.errors import FileError
+from equipix.errors import FileError, InputError
+from equipix.flags import usable
 from equipix.hardware.words import Format
 
 if TYPE_CHECKING:
@@ -39,6 +40,34 @@ class Content(NamedTuple):
         return {name: getattr(self, name) for name in DTYPES}
 
 
+def check_words(content: Content) -> None:
+    """Refuse arrays that do not fit together.
+
+    Raises
+    ------
+    InputError
+        If a type or a size is another, or words do not fit their widths.
+    """
+    for name, dtype in DTYPES.items():
+        array = content.arrays()[name]
+        if array.dtype != dtype or array.ndim != 2 or array.shape != content.gain.shape:
+            raise InputError(
+                f"'{name}' is {array.dtype} of shape {array.shape}, expected "
+                f"{np.dtype(dtype)} of {content.gain.shape}"
+            )
+    f = content.format
+    for name, bits in (
+        ("coarse", f.dac_bits),
+        ("offset", f.offset_bits - 1),
+        ("gain", f.gain_bits),
+    ):
+        words = content.arrays()[name].astype(np.int32)
+        if np.any((words >= 2**bits) | (words < -(2**bits))):
+            raise InputError(f"'{name}' holds words of more than its width")
+    if np.any((content.gain == 0) != ~usable(content.flags)):
+        raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
+
+
 def checksum(content: Content) -> int:
     """CRC-32 of format and metadata, then of the arrays as little-endian numbers of their types."""
     crc = zlib.crc32(json.dumps([asdict(content.format), content.metadata]).encode())
@@ -49,7 +78,10 @@ def checksum(content: Content) -> int:
 
 
 def header(content: Content) -> str:
-    """Everything but the arrays, as one line of JSON that ends no comment of C."""
+    """Everything but the arrays, as one line of JSON.
+
+    It is a comment in C: it neither begins nor ends one, and holds no trigraph.
+    """
     rows, cols = content.gain.shape
     told = {
         "kind": "equipix table",
@@ -60,7 +92,7 @@ def header(content: Content) -> str:
         "crc32": checksum(content),
         "metadata": content.metadata,
     }
-    return json.dumps(told).replace("/", "\\/")
+    return json.dumps(told).replace("*", "\\u002a").replace("?", "\\u003f")
 
 
 def read_header(path: Path, text: str) -> dict[str, Any]:

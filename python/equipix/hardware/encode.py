@@ -22,8 +22,8 @@ _FINEST_GAIN = -40
 _NAMED = 3
 """Most pixels that a message names."""
 
-_STEPS = 65
-"""Raw values at which a straight line is compared with the curve that it replaces."""
+_ZERO_LIMIT = 2**31
+"""The output 0 stands for fewer steps than this."""
 
 
 class Steps(NamedTuple):
@@ -47,50 +47,6 @@ class Encoded(NamedTuple):
     largest_error: float
     """Largest difference to the line of a usable pixel over the range of the ADC, in DN, before
     the output is rounded."""
-
-
-def line_of(
-    correction: Correction, linearise: tuple[float, float] | None
-) -> tuple[Floats, Floats, float]:
-    """Offset and gain of each pixel; the largest deviation of the line from the curve, in DN.
-
-    Raises
-    ------
-    InputError
-        If the correction is curved and `linearise` is not given, or names no range.
-    """
-    planes = np.asarray(correction.coefficients, np.float64)
-    if len(planes) < 2:
-        raise InputError("'correction' has no gain, expected coefficients of order 1 or more")
-    if linearise is None:
-        if len(planes) > 2 and np.nan_to_num(planes[2:]).any():
-            raise InputError(
-                f"'correction' is of order {len(planes) - 1}, but a table of gain and offset holds "
-                "order 1: fit a response of order 1, or give 'linearise' (--linearise), two raw "
-                "values in DN between which a straight line takes the place of the curve"
-            )
-        return planes[0], planes[1], 0.0
-    low, high = (float(each) for each in linearise)
-    if not (np.isfinite([low, high]).all() and low < high):
-        raise InputError(f"'linearise' is {linearise!r}, expected two rising raw values in DN")
-    ends = [_curve(planes, value) for value in (low, high)]
-    gain = (ends[1] - ends[0]) / (high - low)
-    offset = ends[0] - gain * low
-    away = [
-        np.abs(_curve(planes, value) - offset - gain * value)[usable(correction.flags)]
-        for value in np.linspace(low, high, _STEPS)
-    ]
-    largest = float(np.nanmax(away)) if np.isfinite(away).any() else 0.0
-    # Half of the largest deviation of a parabola is left on either side.
-    middle = _curve(planes, (low + high) / 2) - offset - gain * (low + high) / 2
-    return offset + middle / 2, gain, largest
-
-
-def _curve(planes: Floats, raw: float) -> Floats:
-    total = np.zeros(planes.shape[1:])
-    for plane in planes[::-1]:
-        total = total * raw + plane
-    return total
 
 
 def encode(
@@ -128,30 +84,47 @@ def encode(
     used = usable(flags)
     o, g = offset[used], gain[used]
     _refuse_unresponsive(g)
-    coarse_words, coarse = _coarse((lowest - o) / g, widths["dac_bits"], steps)
-    zero = int(np.floor(np.ldexp(lowest, -steps.out)))
-    o -= np.ldexp(float(zero), steps.out)
-    pedestal = np.ldexp(coarse_words, coarse)
+    zero = _zero(lowest, steps)
+    coarse_words, coarse = _coarse((lowest - o) / g, widths["dac_bits"], steps, lowest)
     gains = Words("gain", widths["gain_bits"], lowest=1)
     if steps.gain is None:
         _refuse_extreme(gains, g, used)
     gain_words, gain_exponent = _chosen(gains, g, steps.gain, _FINEST_GAIN)
     # The offset takes up the rounding of the gain in the middle of the range of the ADC.
-    rounded = np.ldexp(gain_words, gain_exponent)
     middle = np.ldexp(float(2 ** (widths["adc_bits"] - 1)), steps.adc)
-    fine = o + g * pedestal + (g - rounded) * middle
+    rounding = (g - np.ldexp(gain_words, gain_exponent)) * middle
+    fine = o - np.ldexp(float(zero), steps.out) + g * np.ldexp(coarse_words, coarse) + rounding
     words = Words("offset", widths["offset_bits"], signed=True)
     offset_words, exponent, base = _offsets(fine, words, steps, gain_exponent + steps.adc)
-    left = fine - np.ldexp(float(base), steps.out) - np.ldexp(offset_words, exponent)
+    lost = fine - np.ldexp(float(base), steps.out) - np.ldexp(offset_words, exponent)
     exponents = {"adc": steps.adc, "coarse": coarse, "offset": exponent, "out": steps.out}
+    found = Format(**widths, **exponents, gain=gain_exponent, base=base, zero=zero)
     return Encoded(
-        Format(**widths, **exponents, gain=gain_exponent, base=base, zero=zero),
+        found,
         _spread(coarse_words, used, np.uint16),
         _spread(offset_words, used, np.int16),
         _spread(gain_words, used, np.uint16),
         flags,
-        float((np.abs(left) + np.abs(g - rounded) * middle).max()),
+        float((np.abs(lost) + np.abs(rounding)).max()),
     )
+
+
+def _zero(lowest: float, steps: Steps) -> int:
+    """Value of the output 0 in its steps.
+
+    Raises
+    ------
+    InputError
+        If it does not fit 32 bits.
+    """
+    zero = float(np.floor(np.ldexp(lowest, -steps.out)))
+    if abs(zero) >= _ZERO_LIMIT:
+        step = 2.0**steps.out
+        raise InputError(
+            f"'lowest' is {lowest:g} DN, expected less than {_ZERO_LIMIT * step:g} on either side "
+            f"of 0: the output counts from it in steps of {step:g} DN, with 32 bits"
+        )
+    return int(zero)
 
 
 def _offsets(values: Floats, words: Words, steps: Steps, product: int) -> tuple[Floats, int, int]:
@@ -199,10 +172,18 @@ def _wider(words: Words, gain: Floats) -> str:
     return ""
 
 
-def _coarse(pedestal: Floats, bits: int, steps: Steps) -> tuple[Floats, int]:
+def _coarse(pedestal: Floats, bits: int, steps: Steps, lowest: float) -> tuple[Floats, int]:
     """Words of the DAC: at most what the pixel gives at the lowest corrected value."""
     words = Words("dac", bits, floor=True)
-    return _chosen(words, np.maximum(pedestal, 0), steps.coarse, steps.adc)
+    values = np.maximum(pedestal, 0)
+    if steps.coarse is not None and words.outside(values, steps.coarse) == values.size:
+        most = np.ldexp(float(2**bits - 1), steps.coarse)
+        raise InputError(
+            f"'lowest' is {lowest:g} DN, where all usable pixels give {values.min():.6g} DN or "
+            f"more, but the DAC subtracts at most {most:g} DN: take a smaller 'lowest', or a "
+            "larger 'dac_step'"
+        )
+    return _chosen(words, values, steps.coarse, steps.adc)
 
 
 def _chosen(words: Words, values: Floats, exponent: int | None, finest: int) -> tuple[Floats, int]:

@@ -22,7 +22,8 @@ SUFFIXES = tuple(_FORMATS)
 
 def write(content: Content, path: str | PathLike[str], *, force: bool) -> None:
     """Write a file, which appears whole or not at all."""
-    data = _FORMATS[_suffix(as_path("path", path))].encoded(content)
+    file = as_path("path", path)
+    data = _FORMATS[_suffix(file)].encoded(content, file.stem)
     with write_whole(path, force=force) as temporary:
         temporary.write_bytes(data)
 
@@ -43,7 +44,7 @@ def read_content(path: str | PathLike[str]) -> Content:
         raise
     except OSError as error:
         raise FileError(f"{file}: cannot be read: {error}") from error
-    except (ArithmeticError, KeyError, LookupError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise FileError(f"{file}: is damaged or incomplete: {error}") from error
     return content
 

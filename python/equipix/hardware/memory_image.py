@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _FIRST = "// equipix table: "
 
 
-def encoded(content: Content) -> bytes:
+def encoded(content: Content, _name: str) -> bytes:
     """Bytes of a file."""
     f = content.format
     offset = content.offset.astype(np.int64) & (2**f.offset_bits - 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -174,18 +174,11 @@ def smallest_widths(
     if sought or not len(levels):
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
     Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
-    raw = [as_array("levels", frames, ndim=3) for frames in levels]
-    exact = [correction.correct(frames, flagged="nan") for frames in raw]
-    before = [correctability(frames) for frames in exact]
+    measured = [_level(correction, frames) for frames in levels]
 
     def worst(offset_bits: int, gain_bits: int) -> float:
-        try:
-            table = Table.of(correction, offset_bits=offset_bits, gain_bits=gain_bits, **options)
-        except InputError:
-            # Words of usable pixels do not fit: with 16 bits they did.
-            return float("inf")
-        each = zip(raw, exact, before, strict=True)
-        return max(_added(table.correct(frames), own, noise) for frames, own, noise in each)
+        widths = {"offset_bits": offset_bits, "gain_bits": gain_bits}
+        return _worst(correction, measured, widths | options)
 
     found = {
         "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
@@ -194,6 +187,30 @@ def smallest_widths(
     }
     offset, gain, both = (_first(each.items(), added) for each in found.values())
     return Widths(offset, gain, both, found)
+
+
+class _Level(NamedTuple):
+    """Frames of one level, the same corrected in floating point, and their C."""
+
+    raw: Array
+    exact: Array
+    before: Correctability
+
+
+def _level(correction: Correction, frames: ArrayLike) -> _Level:
+    raw = as_array("levels", frames, ndim=3)
+    exact = correction.correct(raw, flagged="nan")
+    return _Level(raw, exact, correctability(exact))
+
+
+def _worst(correction: Correction, levels: list[_Level], options: dict[str, Any]) -> float:
+    """Most that words add over all levels; infinite where those of usable pixels do not fit."""
+    try:
+        table = Table.of(correction, **options)
+    except InputError:
+        # With 16 bits they fit.
+        return float("inf")
+    return max(_added(table.correct(raw), exact, before) for raw, exact, before in levels)
 
 
 def _first(found: Iterable[tuple[int, float]], limit: float) -> int | None:

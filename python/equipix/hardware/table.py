@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from equipix import _native
-from equipix._check import as_array, naming_memory, number, positive_workers
+from equipix._check import as_array, positive_workers
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply
-from equipix.correction.protocol import check_correction
 from equipix.errors import InputError
 from equipix.flags import usable
-from equipix.hardware.content import DTYPES, Content
-from equipix.hardware.encode import Steps, encode, line_of, origin
+from equipix.hardware.content import Content, check_words
 from equipix.hardware.files import write
-from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
+from equipix.hardware.making import content_of
+from equipix.hardware.signal import Applied, applied, digitised
+from equipix.hardware.words import Format
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -26,14 +25,6 @@ if TYPE_CHECKING:
 
     from equipix._types import Array, Flagged, Floats
     from equipix.correction.protocol import Correction
-
-
-class Applied(NamedTuple):
-    """Corrected words, and how many outputs were limited to 0 and to the largest word."""
-
-    words: Array
-    below: int
-    above: int
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,24 +86,7 @@ class Table(ReadOnly):
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
         ReadOnly.__post_init__(self)
-        for name, dtype in DTYPES.items():
-            array = getattr(self, name)
-            if array.dtype != dtype or array.ndim != 2 or array.shape != self.gain.shape:
-                raise InputError(
-                    f"'{name}' is {array.dtype} of shape {array.shape}, expected "
-                    f"{np.dtype(dtype)} of {self.gain.shape}"
-                )
-        f = self.format
-        for name, bits in (
-            ("coarse", f.dac_bits),
-            ("offset", f.offset_bits - 1),
-            ("gain", f.gain_bits),
-        ):
-            words = getattr(self, name).astype(np.int32)
-            if np.any((words >= 2**bits) | (words < -(2**bits))):
-                raise InputError(f"'{name}' holds words of more than its width")
-        if np.any((self.gain == 0) != ~usable(self.flags)):
-            raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
+        check_words(self._content)
 
     def __repr__(self) -> str:
         """Short form: sizes and widths."""
@@ -163,8 +137,10 @@ class Table(ReadOnly):
             leaves each pixel a word of 0 there, and the output 0 stands for it. Choose it some
             noise below the darkest scene.
         linearise : tuple of float, optional
-            Two raw values in DN. A correction of order 2 or 3 is replaced by a straight line
-            between them, half of its sag aside; ``metadata["linearised"]`` has the sag.
+            Two raw values in DN. Between them a straight line replaces a correction of order 2 or
+            3. It is parallel to the chord, and half of the sag away on either side:
+            ``metadata["linearised"]`` has the largest sag, the range of the deviations from the
+            chord at 65 raw values.
 
         Returns
         -------
@@ -178,34 +154,23 @@ class Table(ReadOnly):
             If a width or a step is out of range, the correction is curved, or words of usable
             pixels do not fit; the message has their number and the width that would hold them.
         """
-        check_correction("correction", correction)
-        given = (adc_bits, dac_bits, offset_bits, gain_bits, out_bits)
-        names = ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits")
-        widths = {name: check_width(name, bits) for name, bits in zip(names, given, strict=True)}
-        if not np.isfinite(number("lowest", lowest)):
-            raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
-        adc = exponent_of("adc_step", adc_step)
-        out = chosen_exponent("out_step", out_step)
-        if out is None:
-            out = adc + widths["adc_bits"] - widths["out_bits"]
-        steps = Steps(
-            adc,
-            chosen_exponent("dac_step", dac_step),
-            chosen_exponent("offset_step", offset_step),
-            chosen_exponent("gain_step", gain_step),
-            out,
-        )
-        with naming_memory("making a table"):
-            offset, gain, sag = line_of(correction, linearise)
-            made = encode((offset, gain), correction.flags, widths, steps, float(lowest))
-        metadata = {
-            **origin(correction),
-            "lowest": float(lowest),
-            "largest_error_dn": made.largest_error,
+        widths = {
+            "adc_bits": adc_bits,
+            "dac_bits": dac_bits,
+            "offset_bits": offset_bits,
+            "gain_bits": gain_bits,
+            "out_bits": out_bits,
         }
-        if linearise is not None:
-            metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
-        return cls(made.format, made.coarse, made.offset, made.gain, made.flags, metadata)
+        steps = {
+            "dac_step": dac_step,
+            "offset_step": offset_step,
+            "gain_step": gain_step,
+            "out_step": out_step,
+        }
+        content = content_of(
+            correction, widths, steps, adc_step=adc_step, lowest=lowest, linearise=linearise
+        )
+        return cls(*content)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -243,16 +208,7 @@ class Table(ReadOnly):
             If a shape does not fit, or a usable pixel is not finite.
         """
         raw = self._frames(frames)
-        f, used = self.format, usable(self.flags)
-        pedestal = np.ldexp(self.coarse.astype(np.float64), f.coarse)
-        words = np.empty(raw.shape, np.uint16)
-        for source, target in zip(_each(raw), _each(words), strict=True):
-            lost = int(np.count_nonzero(~np.isfinite(source) & used))
-            if lost:
-                raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
-            steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
-            target[...] = np.clip(steps, 0, f.largest_word)
-        return words
+        return digitised(raw, self.coarse, usable(self.flags), self.format)
 
     def apply(self, frames: ArrayLike, *, workers: int | None = None) -> Array:
         """Corrected words, bit by bit as the electronics gives them.
@@ -279,23 +235,7 @@ class Table(ReadOnly):
     def applied(self, frames: ArrayLike, *, workers: int | None = None) -> Applied:
         """Like `apply`, with the numbers of outputs that were limited."""
         raw = self._frames(frames)
-        if raw.dtype not in (np.uint8, np.uint16):
-            raise InputError(
-                f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
-                "table.digitise(frames) makes them of raw values"
-            )
-        words = np.ascontiguousarray(raw, np.uint16)
-        out = np.empty(words.shape, np.uint16)
-        stack = (-1, *self.shape)
-        below, above = _native.apply_words(
-            words.reshape(stack),
-            np.ascontiguousarray(self.gain),
-            np.ascontiguousarray(self.offset),
-            out.reshape(stack),
-            self.format.arithmetic,
-            workers=positive_workers(workers),
-        )
-        return Applied(out, below, above)
+        return applied(raw, self.gain, self.offset, self.format, positive_workers(workers))
 
     def correct(
         self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
@@ -346,15 +286,15 @@ class Table(ReadOnly):
         InputError
             If the suffix is another.
         """
+        write(self._content, path, force=force)
+
+    @property
+    def _content(self) -> Content:
         arrays = (self.coarse, self.offset, self.gain, self.flags)
-        write(Content(self.format, *arrays, self.metadata), path, force=force)
+        return Content(self.format, *arrays, self.metadata)
 
     def _frames(self, frames: ArrayLike) -> Array:
         raw = as_array("frames", frames, ndim=(2, 3))
         if raw.shape[-2:] != self.shape:
             raise InputError(f"'frames' has shape {raw.shape}, the table {self.shape}")
         return raw
-
-
-def _each(stack: Array) -> Array:
-    return stack[None] if stack.ndim == 2 else stack
