@@ -324,6 +324,45 @@ def test_local_mean_diverges_above_the_bound_and_not_below():
         assert (size[-1] > size[0]) == grows
 
 
+@pytest.mark.parametrize("move", [(0.5, 0.5), (0.0, 0.5), (1.5, 1.5), (0.05, 0.05), (-2.3, 3.7)])
+def test_the_operator_of_registered_is_symmetric_with_eigenvalues_up_to_four(move):
+    """Of offsets alone: the step changes them by −η (S − 1)ᵀ M (S − 1) o."""
+    shape = (10, 12)
+    method = reference.Registered(shape, 1.0, 0.5, 8)
+    columns = []
+    for unit in np.eye(120):
+        method.offset = unit.reshape(shape)
+        zeros = np.zeros(shape)
+        error = method.error(zeros, zeros, np.array(move))
+        columns.append((method.transposed(error, np.array(move)) - error).ravel())
+    operator = np.array(columns).T
+    rounding = 120 * 4 * 2.0**-52
+    np.testing.assert_allclose(operator, operator.T, atol=rounding)
+    values = np.linalg.eigvalsh(operator)
+    assert -rounding < values[0]
+    assert values[-1] < 4
+
+
+@pytest.mark.parametrize("options", [{"step": 0.1}, {"step": 0.249}])
+@pytest.mark.parametrize("move", [(1.5, 1.5), (0.5, 0.5)])
+def test_an_even_pan_leaves_the_fall(move, options):
+    """A shift that never changes: errors at the edges would grow with one-sided differences."""
+    moving = MovingScene(seed=1, shape=(32, 40))
+    noise = np.random.default_rng(8)
+    method = made("registered", moving.shape, **options)
+    left = []
+    for index in range(4000):
+        level = 0.5 - 0.25 * np.cos(0.01 * index)
+        light = level + 0.1 * moving.scene(np.array([7.0, 11.0]) + index * np.array(move))
+        values = moving.gain * light + moving.offset
+        method.update(values + 0.002 * noise.standard_normal(moving.shape))
+        if index in (999, 3999):
+            left.append(moving.residual_pattern(method.gain, method.offset, 0.5))
+    # Noise and the scene between the samples change the pattern by a part of itself. It doubled
+    # here, and reached seven times its size, where the operator was not symmetric.
+    assert left[1] < 1.5 * left[0]
+
+
 @pytest.mark.parametrize("name", ["gated", "constant-statistics", "kalman"])
 @pytest.mark.parametrize("width", [1, 10, 49])
 def test_a_width_out_of_range_is_refused(name, width):

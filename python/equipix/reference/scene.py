@@ -130,15 +130,20 @@ class Registered:
 
     def learn(self, first: Floats, second: Floats, move: Floats) -> None:
         """Change the coefficients by both frames of a pair."""
-        gain, offset = self.gain.copy(), self.offset.copy()
-        for here, there, way in ((second, first, move), (first, second, -move)):
-            target, inside = self.moved(self.gain * there + self.offset, way)
-            error = np.where(inside, target - (self.gain * here + self.offset), 0)
-            error[inside] -= error[inside].mean()
-            change = steps(self.step, here) * error
-            gain += change * here
-            offset += change
-        self.gain, self.offset = held(gain, offset)
+        error = self.error(first, second, move)
+        other = steps(self.step, second) * error
+        one = steps(self.step, first) * self.transposed(error, move)
+        gain, offset = other * second - one * first, other - one
+        self.gain, self.offset = held(self.gain + gain, self.offset + offset)
+
+    def error(self, first: Floats, second: Floats, move: Floats) -> Floats:
+        """Difference of a pair where the moved frame is inside, less its mean; 0 elsewhere."""
+        rows, cols = self.matrices(move)
+        moved = rows @ (self.gain * first + self.offset) @ cols.T
+        inside = np.outer(rows.any(1), cols.any(1))
+        error = np.where(inside, moved - (self.gain * second + self.offset), 0)
+        error[inside] -= error[inside].mean()
+        return error
 
     def spectrum(self, image: Floats) -> Floats:
         """Low frequencies of an image under a Hann window, one of each pair ±f, f apart."""
@@ -173,15 +178,22 @@ class Registered:
         left = phase * np.exp(-1j * (move @ waves))
         return move, float(left.real.mean())
 
-    def moved(self, image: Floats, move: Floats) -> tuple[Floats, Floats]:
-        """Values image(p + move) of the interpolating cubic B-spline, and where it is inside."""
-        values = self.spline[0] @ image @ self.spline[1].T
-        inside = []
-        for axis, shift in enumerate(move):
-            values = np.moveaxis(_along_first(np.moveaxis(values, axis, 0), shift), 0, axis)
-            places = np.arange(image.shape[axis]) + shift
-            inside.append((places >= 0) & (places <= image.shape[axis] - 1))
-        return values, np.outer(*inside)
+    def transposed(self, image: Floats, move: Floats) -> Floats:
+        """Sᵀ of an image that is 0 where the moved frame is not inside."""
+        rows, cols = self.matrices(move)
+        return rows.T @ image @ cols
+
+    def matrices(self, move: Floats) -> tuple[Floats, Floats]:
+        """Matrices S of a move along both axes: image(p + move) by the interpolating cubic B-spline.
+
+        Rows of pixels p for which p + move is not inside are 0.
+        """
+        found = []
+        for spline, shift in zip(self.spline, move, strict=True):
+            places = np.arange(len(spline)) + shift
+            inside = (places >= 0) & (places <= len(spline) - 1)
+            found.append(inside[:, None] * _along_first(spline, shift))
+        return found[0], found[1]
 
 
 def _sampling(size: int) -> Floats:

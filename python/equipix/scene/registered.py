@@ -46,8 +46,9 @@ class Registered(SceneCorrection):
     Notes
     -----
     The method of Zuo et al. [1]_, with both frames of a pair corrected. For two frames with
-    X₂(p) = X₁(p + d) the errors are E₂(p) = X₁(p + d) − X₂(p) and E₁(p) = X₂(p − d) − X₁(p), by a
-    cubic B-spline, less their means. Then g ← g + η (E₂ y₂ + E₁ y₁) and o ← o + η (E₂ + E₁). One
+    X₂(p) = X₁(p + d) the difference is E(p) = X₁(p + d) − X₂(p) = S X₁ − X₂, by a cubic B-spline,
+    less its mean. The step is that of steepest descent of ΣE²: g ← g + η (E y₂ − (Sᵀ E) y₁) and
+    o ← o + η (E − Sᵀ E) with the transpose Sᵀ, so no sequence of frames makes errors grow. One
     shift holds for the whole frame: rotation, parallax and moving objects are not modelled.
 
     References

@@ -26,6 +26,7 @@ mod kalman;
 mod local_mean;
 mod method;
 mod motion;
+mod moved;
 mod neighbourhood;
 mod options;
 mod registered;

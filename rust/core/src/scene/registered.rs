@@ -7,22 +7,24 @@
 use super::bands::{BAND, bands};
 use super::coefficients::Coefficients;
 use super::method::{Frame, Method, step_at};
+use super::moved::{Move, difference, transposed};
 use super::options::check_range;
 use super::shift::PhaseCorrelation;
 use super::spectrum::{Spectrum, Transform};
-use super::spline::{Move, difference, prefilter};
+use super::spline::prefilter;
 use super::stability::check_step;
 use super::state::State;
 use crate::error::{Error, Result};
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
-/// Both differences of a pair, X₁(p + d) − X₂(p) and X₂(p − d) − X₁(p), are −L X of the stacked frames with
-/// ‖L‖ ≤ 2, since a moved spline is no longer than the image. Both change the same coefficients, which doubles
-/// max(y² + 1): η < 2 / (2 · 2 · 2).
+/// The difference E = S X₁ − X₂ of a pair is [S, −1] of the stacked frames, and X₂ changes by η E, X₁ by
+/// −η Sᵀ E: the exact gradient of ‖E‖²/2, so the operator is symmetric and not negative. A moved spline is no
+/// longer than its image but for 1.7 % at an edge, so the norm of [S, −1] squared is 2; both frames change the
+/// same coefficients, which doubles max(y² + 1): η < 2 / (2 · 2 · 2).
 const BOUND: f64 = 0.25;
 
-/// g ← g + η (E₂ y₂ + E₁ y₁), o ← o + η (E₂ + E₁) with the differences E of a pair, less their mean.
+/// g ← g + η (E y₂ − (Sᵀ E) y₁), o ← o + η (E − Sᵀ E) with the difference E = S X₁ − X₂ of a pair, less its mean.
 #[derive(Debug)]
 pub(super) struct Registered {
     shape: Shape,
@@ -45,7 +47,8 @@ struct Scratch {
     corrected: Vec<f32>,
     along: Vec<f32>,
     coefficients: Vec<f32>,
-    errors: [Vec<f32>; 2],
+    error: Vec<f32>,
+    transposed: Vec<f32>,
 }
 
 impl Registered {
@@ -81,7 +84,8 @@ impl Registered {
                 corrected: empty(),
                 along: empty(),
                 coefficients: empty(),
-                errors: [empty(), empty()],
+                error: empty(),
+                transposed: empty(),
             },
         })
     }
@@ -94,35 +98,27 @@ impl Registered {
         coefficients: &mut Coefficients,
         workers: &Workers,
     ) {
-        let (shape, cols, step) = (self.shape, self.shape.cols, self.step);
-        let Scratch { corrected, along, coefficients: spline, errors } = &mut self.scratch;
-        let before = &self.before[..];
+        let (shape, step) = (self.shape, self.step);
+        let Scratch { corrected, along, coefficients: spline, error, transposed: back } =
+            &mut self.scratch;
+        let (before, way) = (&self.before[..], Move::new(shape, shift));
         coefficients.apply(before, corrected, workers);
-        let ways = [Move::new(shape, shift), Move::new(shape, shift.map(|shift| -shift))];
-        let (first, second) = (&corrected[..], frame.corrected);
-        let images = [(first, second), (second, first)];
-        let mut means = [0.0; 2];
-        for (i, (there, own)) in images.into_iter().enumerate() {
-            prefilter(shape, there, along, spline, workers);
-            means[i] = difference(shape, spline, own, &ways[i], &mut errors[i], workers);
-        }
-        let raws = [frame.raw, before];
-        let bands = bands!(BAND * cols; &mut coefficients.gain, &mut coefficients.offset);
+        prefilter(shape, corrected, along, spline, workers);
+        difference(shape, spline, frame.corrected, &way, error, workers);
+        transposed(shape, error, &way, [spline, along], back, workers);
+        let size = BAND * shape.cols;
+        let bands = bands!(size; &mut coefficients.gain, &mut coefficients.offset);
         workers.each(bands, |index, (gain, offset)| {
-            let rows = gain.chunks_mut(cols).zip(offset.chunks_mut(cols));
-            for (row, (gain, offset)) in rows.enumerate() {
-                let row = index * BAND + row;
-                for i in (0..2).filter(|i| ways[*i].inside[0].contains(&row)) {
-                    let columns = ways[i].inside[1].clone();
-                    let [raw, error] =
-                        [raws[i], &errors[i]].map(|image| &image[row * cols..][columns.clone()]);
-                    let own = gain[columns.clone()].iter_mut().zip(&mut offset[columns.clone()]);
-                    for ((gain, offset), (y, error)) in own.zip(raw.iter().zip(error)) {
-                        let change = step_at(step, *y) * (error - means[i]);
-                        *gain += change * y;
-                        *offset += change;
-                    }
-                }
+            let start = index * size;
+            let (first, second) = (&before[start..], &frame.raw[start..]);
+            let changes = error[start..].iter().zip(&back[start..]);
+            let frames = first.iter().zip(second).zip(changes);
+            for ((gain, offset), ((y1, y2), (error, back))) in
+                gain.iter_mut().zip(offset).zip(frames)
+            {
+                let (one, other) = (step_at(step, *y1) * back, step_at(step, *y2) * error);
+                *gain += other * y2 - one * y1;
+                *offset += other - one;
             }
         });
         coefficients.hold_gauge(workers);
