@@ -109,6 +109,7 @@ class Registered:
         self.gain, self.offset = np.ones(shape), np.zeros(shape)
         self.step, self.least, self.most = step, least_motion, most_motion
         self.cutoff, self.agreement = cutoff, agreement
+        self.usual, self.pairs = 0.0, 0
         self.before: tuple[Floats, Floats] | None = None
         self.spline = [np.linalg.inv(_sampling(size)) for size in shape]
         self.moves: list[tuple[float, float]] = []
@@ -122,19 +123,46 @@ class Registered:
             return
         move, agreement = self.motion(self.before[1], spectrum)
         self.moves.append(tuple(move))
-        if agreement < self.agreement or np.max(np.abs(move)) > self.most:
-            self.before = (y, spectrum)
-        elif np.hypot(*move) >= self.least:
+        if np.hypot(*move) < self.least and agreement >= self.least_agreement():
+            return
+        if agreement >= self.least_agreement() and np.max(np.abs(move)) <= self.most:
             self.learn(self.before[0], y, move)
-            self.before = (y, spectrum)
+        self.before = (y, spectrum)
 
     def learn(self, first: Floats, second: Floats, move: Floats) -> None:
         """Change the coefficients by both frames of a pair."""
         error = self.error(first, second, move)
+        if not self.takes(np.sum(error**2) / np.count_nonzero(error)):
+            return
         other = steps(self.step, second) * error
         one = steps(self.step, first) * self.transposed(error, move)
         gain, offset = other * second - one * first, other - one
         self.gain, self.offset = held(self.gain + gain, self.offset + offset)
+
+    def takes(self, square: float) -> bool:
+        """Whether a pair's mean square difference is at most four times that of earlier pairs."""
+        limit = 4 * self.usual
+        usual = self.pairs == 0 or square <= limit
+        self.pairs += 1
+        self.usual += ((square if usual else limit) - self.usual) / min(self.pairs, 16)
+        return usual
+
+    def least_agreement(self) -> float:
+        """Mean cosine that unrelated frames exceed at their best shift in 1 % of the cases.
+
+        Chernoff's bound of n / 2.88 independent phases, over the independent shifts searched.
+        """
+        shifts = max(np.pi * ((2 * self.most + 1) * self.cutoff) ** 2, 1)
+        wanted = np.log(shifts / 0.01) * 2.88 / np.count_nonzero(self.used)
+        cosines = np.cos(2 * np.pi * np.arange(1024) / 1024)
+        low, high = 0.0, 1e3
+        for _ in range(60):
+            middle = (low + high) / 2
+            weights = np.exp(middle * (cosines - 1))
+            mean = np.average(cosines, weights=weights)
+            rate = middle * (mean - 1) - np.log(weights.mean())
+            low, high = (middle, high) if rate < wanted else (low, middle)
+        return max(self.agreement, float(mean))
 
     def error(self, first: Floats, second: Floats, move: Floats) -> Floats:
         """Difference of a pair where the moved frame is inside, less its mean; 0 elsewhere."""
@@ -184,7 +212,7 @@ class Registered:
         return rows.T @ image @ cols
 
     def matrices(self, move: Floats) -> tuple[Floats, Floats]:
-        """Matrices S of a move along both axes: image(p + move) by the interpolating cubic B-spline.
+        """Matrices S of a move along both axes: image(p + move) by the cubic B-spline.
 
         Rows of pixels p for which p + move is not inside are 0.
         """

@@ -1,7 +1,7 @@
 //! Images moved by a fraction of a pixel, S, and the transposed move Sᵀ.
 
 use super::bands::{fold, mirrored};
-use super::coefficients::sum;
+use super::coefficients::{sum, sum_of_squares};
 use super::spline::{prefilter, scale_edges};
 use crate::frames::Shape;
 use crate::geometry::Taps;
@@ -70,6 +70,19 @@ impl Move {
         }
     }
 
+    /// Calls `found` for the pixels p for which p + d is within two pixels of a pixel.
+    pub(super) fn near(&self, shape: Shape, pixel: usize, mut found: impl FnMut(usize)) {
+        let place = [pixel / shape.cols, pixel % shape.cols];
+        let ends = |axis: usize, size: usize| {
+            let centre = place[axis] as isize - self.whole[axis];
+            let clamp = |end: isize| end.clamp(0, size as isize) as usize;
+            clamp(centre - 2)..clamp(centre + 3)
+        };
+        for row in ends(0, shape.rows) {
+            ends(1, shape.cols).for_each(|col| found(row * shape.cols + col));
+        }
+    }
+
     /// Adds the rows of an image, times their taps, that a row of coefficients contributes to.
     #[inline(always)]
     fn gather(&self, shape: Shape, image: &[f32], row: usize, line: &mut [f32]) {
@@ -134,20 +147,40 @@ pub(super) fn transposed(
     scale_edges(shape, result, 0.5);
 }
 
+/// The later frame of a pair, and the pixels that are left out.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Own<'a> {
+    pub(super) values: &'a [f32],
+    pub(super) left_out: Option<&'a [bool]>,
+}
+
+impl Own<'_> {
+    /// Writes 0 for the pixels that are left out, of some from `start` on, and counts them.
+    fn clear(&self, start: usize, values: &mut [f32]) -> usize {
+        let Some(left_out) = self.left_out else { return 0 };
+        let mut count = 0;
+        for (value, _) in values.iter_mut().zip(&left_out[start..]).filter(|(_, out)| **out) {
+            *value = 0.0;
+            count += 1;
+        }
+        count
+    }
+}
+
 /// Writes moved − own, less its mean, where the moved image is inside, and 0 elsewhere. The mean is a change
-/// of the level between frames, which is no pattern.
+/// of the level between frames, which is no pattern. The mean square of what is written inside is given.
 pub(super) fn difference(
     shape: Shape,
     coefficients: &[f32],
-    own: &[f32],
+    own: Own<'_>,
     way: &Move,
     difference: &mut [f32],
     workers: &Workers,
-) {
+) -> f64 {
     let cols = shape.cols;
     let [rows, columns] = &way.inside;
     let sums = workers.map_blocks(difference, BAND * cols, |index, band| {
-        let (mut padded, mut total) = (vec![0.0; cols + 3], 0.0);
+        let (mut padded, mut total, mut count) = (vec![0.0; cols + 3], 0.0, 0);
         band.fill(0.0);
         for (row, values) in band.chunks_mut(cols).enumerate() {
             let row = index * BAND + row;
@@ -156,22 +189,30 @@ pub(super) fn difference(
             }
             pulp::Arch::new().dispatch(|| way.row(shape, coefficients, row, &mut padded, values));
             let values = &mut values[columns.clone()];
-            for (value, own) in values.iter_mut().zip(&own[row * cols..][columns.clone()]) {
+            for (value, own) in values.iter_mut().zip(&own.values[row * cols..][columns.clone()]) {
                 *value -= own;
             }
+            count += values.len() - own.clear(row * cols + columns.start, values);
             total += sum(values);
         }
-        [total]
+        [total, count as f64]
     });
-    let [total] = fold(sums);
-    let mean = (total / (rows.len() * columns.len()).max(1) as f64) as f32;
-    workers.map_blocks(difference, BAND * cols, |index, band| {
+    let [total, count] = fold(sums);
+    let count = count.max(1.0);
+    let mean = (total / count) as f32;
+    let squares = workers.map_blocks(difference, BAND * cols, |index, band| {
+        let mut squares = 0.0;
         for (row, values) in band.chunks_mut(cols).enumerate() {
             if rows.contains(&(index * BAND + row)) {
-                values[columns.clone()].iter_mut().for_each(|value| *value -= mean);
+                let values = &mut values[columns.clone()];
+                values.iter_mut().for_each(|value| *value -= mean);
+                own.clear((index * BAND + row) * cols + columns.start, values);
+                squares += sum_of_squares(values);
             }
         }
+        [squares]
     });
+    fold(squares)[0] / count
 }
 
 #[cfg(test)]

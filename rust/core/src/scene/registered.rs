@@ -7,7 +7,7 @@
 use super::bands::{BAND, bands};
 use super::coefficients::Coefficients;
 use super::method::{Frame, Method, step_at};
-use super::moved::{Move, difference, transposed};
+use super::moved::{Move, Own, difference, transposed};
 use super::options::check_range;
 use super::shift::PhaseCorrelation;
 use super::spectrum::{Spectrum, Transform};
@@ -24,6 +24,15 @@ use crate::parallel::Workers;
 /// same coefficients, which doubles max(y² + 1): η < 2 / (2 · 2 · 2).
 const BOUND: f64 = 0.25;
 
+/// A pair whose difference is larger than that of earlier pairs by this factor is not used. Up to it a frame
+/// of another scene adds √3 times their rms, √2 σ of a pattern σ, to the difference: by a step of 0.1 the
+/// pattern grows to √(1 + (0.1 · √3 · √2)²) σ, 3 %.
+const ALIEN: f64 = 2.0;
+
+/// Pairs over which the mean square of the difference is kept. One that is not used counts with the limit
+/// instead, so that after a lasting change pairs are used again.
+const REMEMBERED: f64 = 16.0;
+
 /// g ← g + η (E y₂ − (Sᵀ E) y₁), o ← o + η (E − Sᵀ E) with the difference E = S X₁ − X₂ of a pair, less its mean.
 #[derive(Debug)]
 pub(super) struct Registered {
@@ -31,6 +40,7 @@ pub(super) struct Registered {
     step: f32,
     least_motion: f64,
     most_motion: f64,
+    /// The least that is asked for, and that chance does not give.
     agreement: f64,
     transform: Transform,
     correlation: PhaseCorrelation,
@@ -38,6 +48,7 @@ pub(super) struct Registered {
     before: Vec<f32>,
     spectrum: Spectrum,
     frames: u64,
+    usual: Usual,
     scratch: Scratch,
 }
 
@@ -49,6 +60,26 @@ struct Scratch {
     coefficients: Vec<f32>,
     error: Vec<f32>,
     transposed: Vec<f32>,
+}
+
+/// Mean square of the differences of earlier pairs, and their number.
+#[derive(Debug, Default)]
+struct Usual {
+    square: f32,
+    pairs: u64,
+}
+
+impl Usual {
+    /// Whether the difference of a pair is one that earlier pairs had.
+    fn takes(&mut self, square: f64) -> bool {
+        let limit = ALIEN * ALIEN * f64::from(self.square);
+        let usual = self.pairs == 0 || square <= limit;
+        self.pairs += 1;
+        let counted = if usual { square } else { limit };
+        let share = 1.0 / (self.pairs as f64).min(REMEMBERED);
+        self.square += (share * (counted - f64::from(self.square))) as f32;
+        usual
+    }
 }
 
 impl Registered {
@@ -67,6 +98,7 @@ impl Registered {
         }
         check_range("least_motion", least_motion, [0.0, most_motion as f64])?;
         let transform = Transform::new(shape, cutoff);
+        let correlation = PhaseCorrelation::new(&transform, cutoff, most_motion);
         let empty = || vec![0.0; shape.len()];
         let amplitudes = transform.sizes().iter().product();
         Ok(Self {
@@ -74,12 +106,13 @@ impl Registered {
             step: step as f32,
             least_motion,
             most_motion: most_motion as f64,
-            agreement,
-            correlation: PhaseCorrelation::new(&transform, cutoff, most_motion),
+            agreement: agreement.max(correlation.chance(cutoff)),
+            correlation,
             transform,
             before: empty(),
             spectrum: Spectrum { re: vec![0.0; amplitudes], im: vec![0.0; amplitudes] },
             frames: 0,
+            usual: Usual::default(),
             scratch: Scratch {
                 corrected: empty(),
                 along: empty(),
@@ -90,21 +123,27 @@ impl Registered {
         })
     }
 
-    /// Changes the coefficients by both frames of a pair, the later one shifted by `shift`.
+    /// Changes the coefficients by both frames of a pair, the later one shifted by `shift`, if its difference
+    /// is one that earlier pairs had.
     fn learn(
         &mut self,
         frame: &Frame<'_>,
         shift: [f64; 2],
         coefficients: &mut Coefficients,
         workers: &Workers,
-    ) {
+    ) -> bool {
         let (shape, step) = (self.shape, self.step);
         let Scratch { corrected, along, coefficients: spline, error, transposed: back } =
             &mut self.scratch;
         let (before, way) = (&self.before[..], Move::new(shape, shift));
         coefficients.apply(before, corrected, workers);
         prefilter(shape, corrected, along, spline, workers);
-        difference(shape, spline, frame.corrected, &way, error, workers);
+        let left_out = saturated(frame, before, &way);
+        let own = Own { values: frame.corrected, left_out: left_out.as_deref() };
+        let square = difference(shape, spline, own, &way, error, workers);
+        if !self.usual.takes(square) {
+            return false;
+        }
         transposed(shape, error, &way, [spline, along], back, workers);
         let size = BAND * shape.cols;
         let bands = bands!(size; &mut coefficients.gain, &mut coefficients.offset);
@@ -122,7 +161,22 @@ impl Registered {
             }
         });
         coefficients.hold_gauge(workers);
+        true
     }
+}
+
+/// Pixels of the later frame that are saturated, or whose place in the earlier one is within two pixels of
+/// such a pixel; none if there is no such pixel.
+fn saturated(frame: &Frame<'_>, before: &[f32], way: &Move) -> Option<Vec<bool>> {
+    let earlier = |y: &f32| *y >= frame.saturation;
+    if frame.left_out.is_none() && !before.iter().any(earlier) {
+        return None;
+    }
+    let mut found: Vec<bool> = frame.raw.iter().map(earlier).collect();
+    for (pixel, _) in before.iter().enumerate().filter(|(_, y)| earlier(y)) {
+        way.near(frame.shape, pixel, |place| found[place] = true);
+    }
+    Some(found)
 }
 
 impl Method for Registered {
@@ -139,17 +193,21 @@ impl Method for Registered {
             let [row, col] = shift.pixels;
             let far = row.abs().max(col.abs()) > self.most_motion;
             replace = far || shift.agreement < self.agreement;
-            used = !replace && row.hypot(col) >= self.least_motion;
-            if used {
-                self.learn(frame, shift.pixels, coefficients, workers);
+            if !replace && row.hypot(col) >= self.least_motion {
+                used = self.learn(frame, shift.pixels, coefficients, workers);
+                replace = true;
             }
         }
-        if used || replace {
+        if replace {
             self.before.copy_from_slice(frame.raw);
             self.spectrum = spectrum;
             self.frames += 1;
         }
         used
+    }
+
+    fn width(&self) -> usize {
+        1
     }
 
     fn state(&mut self) -> State<'_> {
@@ -159,6 +217,8 @@ impl Method for Registered {
             .map("before", sizes, &mut self.before)
             .map("spectrum_real", amplitudes, &mut self.spectrum.re)
             .map("spectrum_imaginary", amplitudes, &mut self.spectrum.im)
+            .squares("usual", [1, 1], std::slice::from_mut(&mut self.usual.square))
             .count("frames_before", &mut self.frames)
+            .count("pairs", &mut self.usual.pairs)
     }
 }
