@@ -348,7 +348,7 @@ def test_an_even_pan_never_lets_a_pattern_grow(move):
     """Of the reference, without scene and noise: there one-sided differences grew at any step."""
     moving = MovingScene(seed=1, shape=(20, 24), stop=(0, 0))
     method = reference.Registered(moving.shape, 0.249, 0.5, 8)
-    method.usual = np.inf
+    method.usual = 1e9
     size = [1.0]
     for index in range(2000):
         first, second = (
@@ -365,12 +365,12 @@ def test_an_even_pan_leaves_the_fall():
     noise = np.random.default_rng(8)
     method = made("registered", moving.shape)
     left = []
-    for index in range(3000):
+    for index in range(1500):
         level = 0.5 - 0.25 * np.cos(0.01 * index)
         light = level + 0.1 * moving.scene(np.array([7.0, 11.0]) + index * np.array([1.5, 1.5]))
         values = moving.gain * light + moving.offset
         method.update(values + 0.002 * noise.standard_normal(moving.shape))
-        if index in (499, 2999):
+        if index in (499, 1499):
             left.append(moving.residual_pattern(method.gain, method.offset, 0.5))
     assert left[1] < left[0]
 
@@ -449,24 +449,24 @@ def test_a_lasting_change_of_the_frames_is_taken_in_the_end(settled):
     assert method.frames > before
 
 
-@pytest.mark.parametrize(
-    ("name", "least"),
-    [("local-mean", 0.7), ("gated", 0.7), ("registered", 0.7), ("kalman", 0.7)],
-)
-@pytest.mark.parametrize("limit", [0.75])
-def test_saturated_pixels_are_not_learned_from(name, limit, least):
-    """The fall keeps most of its size; where clipped values count, it loses more than half."""
-    moving = MovingScene(seed=1, shape=(64, 64))
-    falls = {}
-    for saturation in (None, limit):
-        plain, clipped = (made(name, moving.shape, saturation=s) for s in (None, saturation))
-        for frame in moving.frames(700):
-            plain.update(frame.values)
-            clipped.update(np.minimum(frame.values, limit))
-        left = [moving.residual_pattern(m.gain, m.offset, 0.4) for m in (plain, clipped)]
-        falls[saturation] = left[0] / left[1]
-    print(name, falls)
-    assert falls[limit] > falls[None]
+@pytest.mark.parametrize("name", NAMES)
+def test_saturated_pixels_are_not_learned_from(name):
+    """At a limit that the bright half of the levels reaches, most of what clipping costs is kept."""
+    moving, limit = MovingScene(seed=1, shape=(64, 64), stop=(0, 0)), 0.75
+    plain, blind = made(name, (64, 64)), made(name, (64, 64))
+    aware = made(name, (64, 64), saturation=limit)
+    for frame in moving.frames(500):
+        clipped = np.minimum(frame.values, limit)
+        plain.update(frame.values)
+        blind.update(clipped)
+        aware.update(clipped)
+    left = [
+        moving.residual_pattern(method.gain, method.offset, 0.4) for method in (plain, blind, aware)
+    ]
+    lost = [np.log(each / left[0]) for each in left[1:]]
+    print(name, np.round(left, 4), np.exp(lost))
+    assert lost[0] > np.log(1.5)
+    assert lost[1] < lost[0] / 2
 
 
 def test_whole_numbers_saturate_at_the_top_of_their_type():
