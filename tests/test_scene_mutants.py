@@ -1,7 +1,7 @@
 """Mutants of the corrections from the scene fail what the corrections meet.
 
-The NumPy reference on a small moving scene, with one fault each. The compiled methods agree with the
-reference to rounding, see test_scene.py, so a fault of theirs is one against it.
+The NumPy reference on a small moving scene, with one fault each. The compiled methods agree with
+the reference to rounding, see test_scene.py, so a fault of theirs is one against it.
 """
 
 from __future__ import annotations
