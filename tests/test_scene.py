@@ -83,6 +83,37 @@ class TestStandardScene:
         assert abs(run[name]["response"] - 1) < 0.01
 
 
+REQUIRED = {
+    "local-mean": (5, 8, 0),
+    "gated": (6, 6, 0),
+    "registered": (12, 18, 1.8),
+    "constant-statistics": (8, 12, 2.5),
+    "kalman": (8, 12, 2.5),
+}
+"""Falls of the pattern after 500 and 2000 moving frames, and of the gain error after 2000."""
+
+
+@pytest.mark.parametrize(("seed", "count"), [(1, 2000), (2, 500), (3, 500)])
+def test_the_falls_on_a_part_of_the_standard_scene(seed, count):
+    """Of 96x96 pixels, for time; ``python docs/scene.py --check`` has all, of three seeds."""
+    moving = MovingScene(seed=seed, shape=(96, 96))
+    methods = {name: made(name, moving.shape) for name in NAMES}
+    ones = np.ones(moving.shape)
+    for index, frame in enumerate(moving.frames(count + 100)):
+        for method in methods.values():
+            method.update(frame.values)
+        if index not in (599, 2099):
+            continue
+        raw = moving.residual_pattern(ones, 0 * ones, frame.level)
+        for name, method in methods.items():
+            fall = raw / moving.residual_pattern(method.gain, method.offset, frame.level)
+            assert fall >= REQUIRED[name][index // 2099], (name, index)
+    if count == 2000:
+        for name, method in methods.items():
+            gains = moving.gain_error(ones) / moving.gain_error(method.gain)
+            assert gains >= REQUIRED[name][2], name
+
+
 def test_a_level_that_changes_during_a_stop_updates_nothing():
     moving = MovingScene(seed=3, shape=(96, 96), stop=(60, 110), running=True)
     methods = {name: made(name, moving.shape) for name in NAMES[1:]}
@@ -168,10 +199,11 @@ def test_the_standard_deviations_of_kalman_are_those_of_its_errors():
 
     gain = detail(method.gain - 1 / moving.gain)
     offset = detail(method.offset + moving.offset / moving.gain)
-    # 600 moving frames are 12 blocks, with one estimate of the variance each: the mean errs by
-    # √(2/12) if the pixels of a block had one error in common, the rest being the scene's own.
-    assert 0.6 < gain / np.sqrt(np.mean(method.gain_std**2)) < 1.6
-    assert 0.6 < offset / np.sqrt(np.mean(method.offset_std**2)) < 1.6
+    # 600 moving frames are 12 blocks, with one estimate of the variance each, which errs by √(2/12)
+    # if the pixels of a block had one error in common, and the standard deviation by half of it:
+    # 0.2, of which this is twice.
+    assert 0.6 < gain / np.sqrt(np.mean(method.gain_std**2)) < 1.4
+    assert 0.6 < offset / np.sqrt(np.mean(method.offset_std**2)) < 1.4
 
 
 @pytest.mark.parametrize("name", NAMES)

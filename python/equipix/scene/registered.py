@@ -35,8 +35,7 @@ class Registered(SceneCorrection):
     agreement : float
         Least mean cosine of the phases that the shift leaves, 0 to 1; pairs below, as after a
         change of scene, are not used. On small arrays, of few phases, at least what the best shift
-        between unrelated frames exceeds in 1 % of them is asked for: 0.29 at 128×128, 0.65 at
-        48×64.
+        between unrelated frames exceeds in 1 % of them is asked for: 0.36 at 96×96, 0.62 at 48×64.
     saturation : float, optional
         Raw value in DN from which a pixel is saturated and does not learn; by default the largest
         whole number of the frames' dtype, and none for floats.

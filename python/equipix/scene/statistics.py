@@ -128,7 +128,8 @@ class Kalman(SceneCorrection):
     scene: y − ½ = G (r − ½) + O + e. The frames of a block give normal equations of (G, O). The
     detail e of neighbouring frames is correlated, so its variance follows from the difference
     between the halves of a block, over the whole array. The variances include neither patterns
-    wider than the square nor a scene that differs from place to place.
+    wider than the square, nor a scene that differs from place to place, nor the errors of r: at a
+    contrast of 1 % the errors are 1.6 times the standard deviations.
 
     References
     ----------

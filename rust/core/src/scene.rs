@@ -176,8 +176,8 @@ impl SceneCorrection {
         let Some(mean) = self.correct(frame, corrected, workers)? else { return Ok(false) };
         let saturation =
             saturation.map_or(f32::INFINITY, |level| ((level - self.low) / self.span) as f32);
-        let left_out =
-            saturation::left_out(shape, &self.raw, saturation, self.method.width(), workers);
+        let rule = (self.method.width(), self.method.leaves_out_saturated());
+        let left_out = saturation::left_out(shape, &self.raw, saturation, rule, workers);
         let frame = Frame {
             shape,
             raw: &self.raw,

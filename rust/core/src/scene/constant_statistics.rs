@@ -136,6 +136,11 @@ impl Method for ConstantStatistics {
         self.width
     }
 
+    /// Pixels that are compared need the same frames: one that lacks its bright ones has another mean.
+    fn leaves_out_saturated(&self) -> bool {
+        false
+    }
+
     fn state(&mut self) -> State<'_> {
         let sizes = [self.shape.rows, self.shape.cols];
         State::default()

@@ -45,6 +45,11 @@ pub(super) trait Method: std::fmt::Debug + Send + Sync {
     /// Rows and columns of the neighbourhood of a pixel, odd.
     fn width(&self) -> usize;
 
+    /// Whether saturated pixels do not learn, or only pixels with too many of them in the neighbourhood.
+    fn leaves_out_saturated(&self) -> bool {
+        true
+    }
+
     /// All that is remembered beside the coefficients.
     fn state(&mut self) -> State<'_>;
 

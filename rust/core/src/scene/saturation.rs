@@ -9,12 +9,12 @@ use crate::parallel::Workers;
 /// saturated is less than this in 3×3, and leaves its neighbours to learn.
 const MOST: f32 = 0.125;
 
-/// The pixels that are saturated, or have too many such pixels in their neighbourhood; none if no pixel is.
+/// The pixels that are saturated, if `own`, or have too many such pixels in their neighbourhood; none if no pixel is.
 pub(super) fn left_out(
     shape: Shape,
     raw: &[f32],
     saturation: f32,
-    width: usize,
+    (width, own): (usize, bool),
     workers: &Workers,
 ) -> Option<Vec<bool>> {
     if !saturation.is_finite() || !raw.iter().any(|y| *y >= saturation) {
@@ -31,9 +31,9 @@ pub(super) fn left_out(
         let mut share = vec![0.0; cols];
         for (row, found) in found.chunks_mut(cols).enumerate() {
             shares.next(&mut share);
-            let own = &raw[(index * BAND + row) * cols..];
-            for ((found, share), y) in found.iter_mut().zip(&share).zip(own) {
-                *found = *y >= saturation || *share > MOST;
+            let values = &raw[(index * BAND + row) * cols..];
+            for ((found, share), y) in found.iter_mut().zip(&share).zip(values) {
+                *found = (own && *y >= saturation) || *share > MOST;
             }
         }
     });
@@ -49,14 +49,18 @@ mod tests {
         let shape = Shape::new(40, 30);
         let workers = Workers::new(std::num::NonZeroUsize::new(2)).unwrap();
         let mut raw = vec![0.5; shape.len()];
-        assert_eq!(left_out(shape, &raw, 1.0, 3, &workers), None);
+        assert_eq!(left_out(shape, &raw, 1.0, (3, true), &workers), None);
         raw[5 * 30 + 7] = 1.0;
         raw[20 * 30 + 8] = 1.2;
         raw[20 * 30 + 10] = 1.0;
-        let found = left_out(shape, &raw, 1.0, 3, &workers).unwrap();
+        let found = left_out(shape, &raw, 1.0, (3, true), &workers).unwrap();
         let pixels: Vec<_> =
             (0..shape.len()).filter(|i| found[*i]).map(|i| (i / 30, i % 30)).collect();
         assert_eq!(pixels, [(5, 7), (19, 9), (20, 8), (20, 9), (20, 10), (21, 9)]);
-        assert_eq!(left_out(shape, &raw, f32::INFINITY, 3, &workers), None);
+        let found = left_out(shape, &raw, 1.0, (3, false), &workers).unwrap();
+        let pixels: Vec<_> =
+            (0..shape.len()).filter(|i| found[*i]).map(|i| (i / 30, i % 30)).collect();
+        assert_eq!(pixels, [(19, 9), (20, 9), (21, 9)]);
+        assert_eq!(left_out(shape, &raw, f32::INFINITY, (3, true), &workers), None);
     }
 }

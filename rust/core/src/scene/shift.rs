@@ -179,3 +179,63 @@ fn concentrated(s: f64) -> [f64; 2] {
     let mean = moment / sum;
     [mean, s * (mean - 1.0) - (sum / PLACES as f64).ln()]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::Shape;
+
+    fn waves(shape: Shape, [top, left]: [f64; 2]) -> Vec<f32> {
+        let wave = |row: f64, col: f64, k: usize| {
+            let k = k as f64;
+            let (u, v) = (
+                0.06 * (2.4 * k).cos() * (1.0 + 0.5 * k),
+                0.06 * (2.4 * k).sin() * (1.0 + 0.5 * k),
+            );
+            (u * row + v * col + 1.7 * k).cos() / (1.0 + k)
+        };
+        let value = |row: f64, col: f64| (0..12).map(|k| wave(row, col, k)).sum::<f64>();
+        (0..shape.len())
+            .map(|i| value((i / shape.cols) as f64 + top, (i % shape.cols) as f64 + left) as f32)
+            .collect()
+    }
+
+    #[test]
+    fn shifts_are_found_to_a_fraction_of_a_pixel() {
+        let shape = Shape::new(96, 128);
+        let workers = Workers::new(std::num::NonZeroUsize::new(2)).unwrap();
+        let transform = Transform::new(shape, 0.1);
+        let correlation = PhaseCorrelation::new(&transform, 0.1, 8);
+        let spectrum = |place| {
+            let image = waves(shape, place);
+            let mean = image.iter().sum::<f32>() / shape.len() as f32;
+            transform.of(&image, mean, &workers)
+        };
+        for wanted in [[0.5, -1.5], [2.5, 0.5], [-0.5, 3.5]] {
+            let found = correlation.shift(
+                &spectrum([20.0, 30.0]),
+                &spectrum([20.0 + wanted[0], 30.0 + wanted[1]]),
+                &workers,
+            );
+            let error = (found.pixels[0] - wanted[0]).hypot(found.pixels[1] - wanted[1]);
+            // Whole pixels would err by √½; the scene that enters at the edges counts little under the window.
+            assert!(error < 0.35, "{wanted:?}: {found:?}");
+            assert!(found.agreement > correlation.chance(0.1), "{found:?}");
+        }
+    }
+
+    #[test]
+    fn chance_agrees_with_the_normal_law_of_many_phases_and_stays_below_one() {
+        let chance = |side: usize| {
+            let transform = Transform::new(Shape::new(side, side), 0.1);
+            let correlation = PhaseCorrelation::new(&transform, 0.1, 8);
+            (correlation.chance(0.1), correlation.entries.len() as f64)
+        };
+        let (found, phases) = chance(512);
+        let searched = std::f64::consts::PI * 1.7 * 1.7;
+        let wanted = ((searched / 0.01).ln() * CORRELATED / phases).sqrt();
+        // The rate is A² (1 + A²/4 + …) of the mean cosine A.
+        assert!((found / wanted - 1.0).abs() < found * found);
+        assert!(chance(24).0 < 1.0 && chance(24).0 > chance(64).0);
+    }
+}
