@@ -185,42 +185,30 @@ mod tests {
     use super::*;
     use crate::frames::Shape;
 
-    fn waves(shape: Shape, [top, left]: [f64; 2]) -> Vec<f32> {
-        let wave = |row: f64, col: f64, k: usize| {
-            let k = k as f64;
-            let (u, v) = (
-                0.06 * (2.4 * k).cos() * (1.0 + 0.5 * k),
-                0.06 * (2.4 * k).sin() * (1.0 + 0.5 * k),
-            );
-            (u * row + v * col + 1.7 * k).cos() / (1.0 + k)
-        };
-        let value = |row: f64, col: f64| (0..12).map(|k| wave(row, col, k)).sum::<f64>();
-        (0..shape.len())
-            .map(|i| value((i / shape.cols) as f64 + top, (i % shape.cols) as f64 + left) as f32)
-            .collect()
-    }
-
     #[test]
     fn shifts_are_found_to_a_fraction_of_a_pixel() {
-        let shape = Shape::new(96, 128);
         let workers = Workers::new(std::num::NonZeroUsize::new(2)).unwrap();
-        let transform = Transform::new(shape, 0.1);
+        let transform = Transform::new(Shape::new(96, 128), 0.1);
         let correlation = PhaseCorrelation::new(&transform, 0.1, 8);
-        let spectrum = |place| {
-            let image = waves(shape, place);
-            let mean = image.iter().sum::<f32>() / shape.len() as f32;
-            transform.of(&image, mean, &workers)
+        let count = transform.sizes().iter().product::<usize>();
+        let part = |i: usize, factor: usize| ((i * factor) % 1009) as f32 / 505.0 - 1.0;
+        let before = Spectrum {
+            re: (0..count).map(|i| part(i, 7919)).collect(),
+            im: (0..count).map(|i| part(i, 6007)).collect(),
         };
-        for wanted in [[0.5, -1.5], [2.5, 0.5], [-0.5, 3.5]] {
-            let found = correlation.shift(
-                &spectrum([20.0, 30.0]),
-                &spectrum([20.0 + wanted[0], 30.0 + wanted[1]]),
-                &workers,
-            );
+        for wanted in [[0.5, -1.5], [2.4, 0.6], [-0.3, 3.7]] {
+            let moved = |i: usize| {
+                let value = [f64::from(before.re[i]), f64::from(before.im[i])];
+                turned(value, transform.frequency(i), wanted.map(|shift: f64| -shift))
+            };
+            let after = Spectrum {
+                re: (0..count).map(|i| moved(i)[0] as f32).collect(),
+                im: (0..count).map(|i| moved(i)[1] as f32).collect(),
+            };
+            let found = correlation.shift(&before, &after, &workers);
             let error = (found.pixels[0] - wanted[0]).hypot(found.pixels[1] - wanted[1]);
-            // Whole pixels would err by √½; the scene that enters at the edges counts little under the window.
-            assert!(error < 0.35, "{wanted:?}: {found:?}");
-            assert!(found.agreement > correlation.chance(0.1), "{found:?}");
+            // Amplitudes are above 1e-3, so phases err by 1e-4 at most, over frequencies near 0.3 a pixel.
+            assert!(error < 1e-4 / 0.3, "{wanted:?}: {found:?}");
         }
     }
 
