@@ -1,16 +1,15 @@
-"""Measure the corrections from the scene: ``python docs/scene.py``, or with ``--long``.
+"""Measure the corrections from the scene: ``python docs/scene.py``.
 
 On the standard scene of `simulate.MovingScene`, for each method and seed, the script prints
 
 - how many times smaller the residual pattern is than before correction, after 500 and 2000 moving
   frames, the stop included, and the same of the gain error;
-- how many times larger the pattern is after the stop than before it, both at the level before the
-  stop, with the level paused and running;
-- with ``--long``, of the first seed alone, the mean of gain times true gain after 20 000 frames,
-and
-  the pattern then over that after 2000.
+- how many times larger the pattern is after the stop than before it, with the level paused, with it
+  running at the level before the stop, and with it running at the level of each moment.
 
-scene.png shows the residual pattern against the frame.
+``--check`` ends with an error where a figure misses what is required. ``--long`` prints, of the
+first seed alone, the mean of gain times true gain after 20 000 frames, and the pattern then over
+that after 2000. scene.png shows the residual pattern against the frame.
 """
 
 from __future__ import annotations
@@ -28,6 +27,14 @@ FILE = Path(__file__).parent / "scene.png"
 SEEDS = (1, 2, 3)
 MOVING = (500, 2000)
 LONG = 20_000
+REQUIRED = {
+    "local-mean": (5, 8, 0),
+    "gated": (6, 6, 0),
+    "registered": (12, 18, 1.8),
+    "constant-statistics": (8, 12, 2.5),
+    "kalman": (8, 12, 2.5),
+}
+"""Least falls of the pattern after 500 and 2000 moving frames, and of the gain error after 2000."""
 EVERY = 20
 """Frames between two points of the picture."""
 
@@ -49,14 +56,16 @@ class Run:
         self.left: dict[str, list[float]] = {name: [] for name in self.methods}
         self.gains: dict[str, list[float]] = {name: [] for name in self.methods}
         self.stop: dict[str, list[float]] = {name: [] for name in self.methods}
-        before = moving.stop[0] - 1
+        before, level = moving.stop[0] - 1, 0.0
         for index, frame in enumerate(moving.frames(frames)):
             for method in self.methods.values():
                 method.update(frame.values)
-            at = frame.level if index <= before else at  # noqa: F821
-            if index in (before, moving.stop[1] - 1):
-                for name in self.methods:
-                    self.stop[name].append(self.pattern(name, at))
+            if index == before:
+                self.note_stop(frame.level)
+                level = frame.level
+            if index == moving.stop[1] - 1:
+                self.note_stop(level)
+                self.note_stop(frame.level)
             if index % EVERY == EVERY - 1:
                 self.note(frame.level)
 
@@ -64,6 +73,11 @@ class Run:
         """Residual pattern that a method leaves at a level."""
         method = self.methods[name]
         return self.moving.residual_pattern(method.gain, method.offset, level)
+
+    def note_stop(self, level: float) -> None:
+        """Keep the pattern of all methods before or after the stop, at a level."""
+        for name in self.methods:
+            self.stop[name].append(self.pattern(name, level))
 
     def note(self, level: float) -> None:
         """Keep the pattern and the gain error of all methods."""
@@ -81,10 +95,10 @@ class Run:
         first = self.moving.gain_error(np.ones(self.moving.shape))
         return [*falls, first / self.gains[name][points[-1]]]
 
-    def growth(self, name: str) -> float:
-        """Pattern after the stop over that before it."""
-        before, after = self.stop[name]
-        return after / before
+    def growth(self, name: str) -> tuple[float, float]:
+        """Pattern after the stop over that before it: at the level before it, and that of now."""
+        before, after, now = self.stop[name]
+        return after / before, now / before
 
     def drift(self, name: str) -> tuple[float, float]:
         """Mean of gain times true gain at the end, and the pattern over that after 2000."""
@@ -94,23 +108,47 @@ class Run:
         return mean, self.left[name][-1] / self.left[name][point]
 
 
-def main(*, long: bool) -> None:
-    """Print the table and draw the picture."""
-    shown = []
-    print(f"{'method':20} seed  500   2000  gain  stop paused, running" + long * "   mean  drift")
+def main(*, long: bool, check: bool) -> int:
+    """Print the table and draw the picture; give the number of figures that miss."""
+    shown, missed = [], 0
+    print(f"{'method':20} seed  500   2000  gain  stop paused, running, at its level", end="")
+    print("   mean  drift" if long else "")
     for seed in SEEDS[:1] if long else SEEDS:
         paused = Run(MovingScene(seed=seed), LONG if long else MOVING[-1] + 100)
         running = Run(MovingScene(seed=seed, running=True), 350)
         shown.append(paused)
         for name in paused.methods:
-            first, second, gain = paused.falls(name)
-            line = f"{name:20} {seed:3} {first:6.2f} {second:6.2f} {gain:5.2f}"
-            line += f" {paused.growth(name):8.3f} {running.growth(name):8.3f}"
-            if long:
-                mean, drift = paused.drift(name)
-                line += f"    {mean:.4f} {drift:5.2f}"
-            print(line, flush=True)
+            falls = paused.falls(name)
+            growth = (paused.growth(name)[0], *running.growth(name))
+            drift = paused.drift(name) if long else ()
+            print(line(name, seed, falls, growth, drift), flush=True)
+            missed += misses(name, falls, growth[:2], drift)
     draw(shown[0])
+    return missed if check else 0
+
+
+def line(
+    name: str, seed: int, falls: list[float], growth: tuple[float, ...], drift: tuple[float, ...]
+) -> str:
+    """Give a line of the table."""
+    first, second, gain = falls
+    words = f"{name:20} {seed:3} {first:6.2f} {second:6.2f} {gain:5.2f} "
+    words += " ".join(f"{value:8.3f}" for value in growth)
+    return words + "".join(f"   {value:.4f}" for value in drift)
+
+
+def misses(
+    name: str, falls: list[float], growth: tuple[float, ...], drift: tuple[float, ...]
+) -> int:
+    """Count the figures that miss what is required; the level of each moment has no requirement."""
+    if name == "gate off":
+        return sum(value < 2 for value in growth)
+    missed = sum(got < wanted for got, wanted in zip(falls, REQUIRED[name], strict=True))
+    if name != "local-mean":
+        missed += sum(value >= 1.1 for value in growth)
+    if drift:
+        missed += (abs(drift[0] - 1) >= 0.01) + (drift[1] > 1.3)
+    return missed
 
 
 def draw(run: Run) -> None:
@@ -128,4 +166,4 @@ def draw(run: Run) -> None:
 
 
 if __name__ == "__main__":
-    main(long="--long" in sys.argv[1:])
+    sys.exit(main(long="--long" in sys.argv[1:], check="--check" in sys.argv[1:]))

@@ -103,6 +103,19 @@ def test_inspect_shows_how_it_was_learned(run, recorded, tmp_path):
     assert "scene method" in run("inspect", output)[1]
 
 
+def test_frames_that_are_dropped_leave_points_of_the_others(run, recorded, tmp_path):
+    frames = recorded[1][:80].copy()
+    frames[0] = 0
+    frames[1::2] = 0
+    write_frames(tmp_path / "dropped.tif", frames, nbytes=1)
+    arguments = ("-o", tmp_path / "nuc.tif", "--method", "local-mean", *RANGE, "--json")
+    status, out, _ = run("scene", tmp_path / "dropped.tif", *arguments)
+    assert status == 0
+    shown = json.loads(out)
+    assert (shown["frames"], shown["usable_frames"], shown["frames_that_counted"]) == (80, 39, 39)
+    assert [point["frame"] for point in shown["roughness"]] == [79]
+
+
 class TestRefusals:
     def refused(self, result, *words):
         status, out, err = result
@@ -118,6 +131,24 @@ class TestRefusals:
             run("scene", tmp_path / "still.tif", "-o", output), "the scene never moved", "moving"
         )
         assert not output.exists()
+
+    def test_no_corrected_frames_are_left_of_a_scene_that_never_moves(
+        self, run, recorded, tmp_path
+    ):
+        write_frames(tmp_path / "still.tif", [recorded[1][0]] * 5, nbytes=1)
+        corrected = tmp_path / "corrected.tif"
+        arguments = ("-o", tmp_path / "nuc.tif", "--corrected", corrected)
+        self.refused(run("scene", tmp_path / "still.tif", *arguments), "the scene never moved")
+        assert not corrected.exists()
+
+    def test_a_frame_out_of_range_is_named(self, run, recorded, tmp_path):
+        frames = recorded[1][:5].copy()
+        frames[3, 4, 5] = 60_000
+        write_frames(tmp_path / "bright.tif", frames, nbytes=1)
+        arguments = ("-o", tmp_path / "nuc.tif", *RANGE)
+        self.refused(
+            run("scene", tmp_path / "bright.tif", *arguments), "bright.tif", "frame 4", "range"
+        )
 
     def test_too_few_frames_for_a_block(self, run, recorded, tmp_path):
         folder, _ = recorded

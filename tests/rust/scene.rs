@@ -131,8 +131,10 @@ fn made(options: &Options) -> SceneCorrection {
 
 fn learn(scene: &mut SceneCorrection, frames: &[Vec<f32>], count: usize) -> u64 {
     let (workers, mut corrected) = (workers(count), vec![0.0; SHAPE.len()]);
-    frames.iter().filter(|frame| scene.update(frame, &mut corrected, &workers).unwrap()).count()
-        as u64
+    frames
+        .iter()
+        .filter(|frame| scene.update(frame, &mut corrected, None, &workers).unwrap())
+        .count() as u64
 }
 
 fn frames(count: usize) -> (Scene, Vec<Vec<f32>>) {
@@ -210,8 +212,8 @@ fn unusable_frames_change_nothing() {
         assert_eq!(learn(&mut scene, &[vec![0.5; SHAPE.len()]], 2), 0);
         let (mut frame, mut corrected) = (last.clone(), vec![0.0; SHAPE.len()]);
         frame[700] = 2.5;
-        assert!(scene.update(&frame, &mut corrected, &workers(2)).is_err());
-        assert!(scene.update(&frame[1..], &mut corrected, &workers(2)).is_err());
+        assert!(scene.update(&frame, &mut corrected, None, &workers(2)).is_err());
+        assert!(scene.update(&frame[1..], &mut corrected, None, &workers(2)).is_err());
         assert_eq!(scene.snapshot(), before);
     }
 }

@@ -45,6 +45,10 @@ def scene(
         tuple[float, float] | None,
         typer.Option(help="Lowest and highest raw value in DN; that of whole numbers by default."),
     ] = None,
+    saturation: Annotated[
+        float | None,
+        typer.Option(help="Raw value from which a pixel is saturated; that of whole numbers."),
+    ] = None,
     step: Annotated[
         float | None, typer.Option(help="Step of local-mean, gated and registered.")
     ] = None,
@@ -78,7 +82,9 @@ def scene(
     written = [output, *(path for path in outputs if path is not None)]
     refuse_inputs(written, [*find_files(source), *([resume] if resume else [])])
     options = {
-        name: value for name, value in (("step", step), ("width", width)) if value is not None
+        name: value
+        for name, value in (("step", step), ("width", width), ("saturation", saturation))
+        if value is not None
     }
     learning = _method(method, source, data_range, options, resume, workers)
     with progress_bars() as progress:
@@ -105,8 +111,8 @@ def _method(
     if resume is not None:
         if options or data_range:
             raise InputError(
-                "'resume' (--resume) brings range, step and width with it: leave out --data-range, "
-                "--step and --width"
+                "'resume' (--resume) brings its options with it: leave out --data-range, "
+                "--saturation, --step and --width"
             )
         found = load(resume, shape=shape, workers=workers)
         if found.method != name:
@@ -132,6 +138,7 @@ def _summary(output: Path, method: SceneCorrection, done: Sequence) -> dict[str,
         "output": str(output),
         "method": method.method,
         "frames": done.frames,
+        "usable_frames": method.frames_taken,
         "frames_that_counted": method.frames,
         "gain_rms": float(np.std(method.gain)),
         "offset_rms": float(np.std(method.offset)),

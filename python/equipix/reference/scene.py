@@ -109,6 +109,7 @@ class Registered:
         self.gain, self.offset = np.ones(shape), np.zeros(shape)
         self.step, self.least, self.most = step, least_motion, most_motion
         self.cutoff, self.agreement = cutoff, agreement
+        self.usual, self.pairs = 0.0, 0
         self.before: tuple[Floats, Floats] | None = None
         self.spline = [np.linalg.inv(_sampling(size)) for size in shape]
         self.moves: list[tuple[float, float]] = []
@@ -122,23 +123,55 @@ class Registered:
             return
         move, agreement = self.motion(self.before[1], spectrum)
         self.moves.append(tuple(move))
-        if agreement < self.agreement or np.max(np.abs(move)) > self.most:
-            self.before = (y, spectrum)
-        elif np.hypot(*move) >= self.least:
+        if np.hypot(*move) < self.least and agreement >= self.least_agreement():
+            return
+        if agreement >= self.least_agreement() and np.max(np.abs(move)) <= self.most:
             self.learn(self.before[0], y, move)
-            self.before = (y, spectrum)
+        self.before = (y, spectrum)
 
     def learn(self, first: Floats, second: Floats, move: Floats) -> None:
         """Change the coefficients by both frames of a pair."""
-        gain, offset = self.gain.copy(), self.offset.copy()
-        for here, there, way in ((second, first, move), (first, second, -move)):
-            target, inside = self.moved(self.gain * there + self.offset, way)
-            error = np.where(inside, target - (self.gain * here + self.offset), 0)
-            error[inside] -= error[inside].mean()
-            change = steps(self.step, here) * error
-            gain += change * here
-            offset += change
-        self.gain, self.offset = held(gain, offset)
+        error = self.error(first, second, move)
+        if not self.takes(np.sum(error**2) / np.count_nonzero(error)):
+            return
+        other = steps(self.step, second) * error
+        one = steps(self.step, first) * self.transposed(error, move)
+        gain, offset = other * second - one * first, other - one
+        self.gain, self.offset = held(self.gain + gain, self.offset + offset)
+
+    def takes(self, square: float) -> bool:
+        """Whether a pair's mean square difference is at most four times that of earlier pairs."""
+        limit = 4 * self.usual
+        usual = self.pairs == 0 or square <= limit
+        self.pairs += 1
+        self.usual += ((square if usual else limit) - self.usual) / min(self.pairs, 16)
+        return usual
+
+    def least_agreement(self) -> float:
+        """Mean cosine that unrelated frames exceed at their best shift in 1 % of the cases.
+
+        Chernoff's bound of n / 2.88 independent phases, over the independent shifts searched.
+        """
+        shifts = max(np.pi * ((2 * self.most + 1) * self.cutoff) ** 2, 1)
+        wanted = np.log(shifts / 0.01) * 2.88 / np.count_nonzero(self.used)
+        cosines = np.cos(2 * np.pi * np.arange(1024) / 1024)
+        low, high = 0.0, 1e3
+        for _ in range(60):
+            middle = (low + high) / 2
+            weights = np.exp(middle * (cosines - 1))
+            mean = np.average(cosines, weights=weights)
+            rate = middle * (mean - 1) - np.log(weights.mean())
+            low, high = (middle, high) if rate < wanted else (low, middle)
+        return max(self.agreement, float(mean))
+
+    def error(self, first: Floats, second: Floats, move: Floats) -> Floats:
+        """Difference of a pair where the moved frame is inside, less its mean; 0 elsewhere."""
+        rows, cols = self.matrices(move)
+        moved = rows @ (self.gain * first + self.offset) @ cols.T
+        inside = np.outer(rows.any(1), cols.any(1))
+        error = np.where(inside, moved - (self.gain * second + self.offset), 0)
+        error[inside] -= error[inside].mean()
+        return error
 
     def spectrum(self, image: Floats) -> Floats:
         """Low frequencies of an image under a Hann window, one of each pair ±f, f apart."""
@@ -173,15 +206,22 @@ class Registered:
         left = phase * np.exp(-1j * (move @ waves))
         return move, float(left.real.mean())
 
-    def moved(self, image: Floats, move: Floats) -> tuple[Floats, Floats]:
-        """Values image(p + move) of the interpolating cubic B-spline, and where it is inside."""
-        values = self.spline[0] @ image @ self.spline[1].T
-        inside = []
-        for axis, shift in enumerate(move):
-            values = np.moveaxis(_along_first(np.moveaxis(values, axis, 0), shift), 0, axis)
-            places = np.arange(image.shape[axis]) + shift
-            inside.append((places >= 0) & (places <= image.shape[axis] - 1))
-        return values, np.outer(*inside)
+    def transposed(self, image: Floats, move: Floats) -> Floats:
+        """Sᵀ of an image that is 0 where the moved frame is not inside."""
+        rows, cols = self.matrices(move)
+        return rows.T @ image @ cols
+
+    def matrices(self, move: Floats) -> tuple[Floats, Floats]:
+        """Matrices S of a move along both axes: image(p + move) by the cubic B-spline.
+
+        Rows of pixels p for which p + move is not inside are 0.
+        """
+        found = []
+        for spline, shift in zip(self.spline, move, strict=True):
+            places = np.arange(len(spline)) + shift
+            inside = (places >= 0) & (places <= len(spline) - 1)
+            found.append(inside[:, None] * _along_first(spline, shift))
+        return found[0], found[1]
 
 
 def _sampling(size: int) -> Floats:

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from equipix._check import as_array, check_shape, number, positive_workers
+from equipix._check import as_array, as_level, check_shape, number, positive_workers
 from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
-from equipix.errors import FileError, InputError
+from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.flags import set_bits
-from equipix.nuc.limits import DefectLimits
+from equipix.scene.dead import unresponsive
 from equipix.scene.saved import read_state, write_state
 
 if TYPE_CHECKING:
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 DataRange = tuple[float, float]
 """Lowest and highest raw value in DN."""
 
+_FEW = 0.1
+"""Share of the frames that counted below which `result` warns."""
+
 _TAKEN = (np.uint8, np.uint16, np.float32, np.float64)
 """Types that the compiled part takes as they are."""
 
@@ -37,9 +40,12 @@ class SceneCorrection:
     frame is X = gain · y + offset, in DN low + (high − low) · X. After every frame the mean of the
     gains is 1 and that of the offsets 0. Coefficients are of single precision.
 
-    Frames with a value that is not finite, and frames of one value alone, such as a dropped frame
-    of zeros, are corrected but change no state. A value more than one span outside of the range is
-    refused.
+    Frames with a value that is not finite, and frames of which half of the rows or more hold one
+    value each, such as frames that were lost or cut, are corrected but change no state. A value
+    more than one span outside of the range is refused.
+
+    Values from `saturation` on, by default the largest whole number of the frames' dtype, do not
+    change their pixels, nor the pixels with more than an eighth of such values around them.
     """
 
     method: ClassVar[str] = ""
@@ -52,12 +58,14 @@ class SceneCorrection:
         self,
         shape: tuple[int, int],
         data_range: DTypeLike | DataRange,
+        saturation: float | None,
         workers: int | None,
         options: dict[str, Any],
     ) -> None:
         """Check what all methods take; `options` holds the keywords of the method."""
         self._shape = check_shape(shape)
         self._range = _range_of(data_range)
+        self._saturation = as_level(saturation)
         self._workers = positive_workers(workers)
         self._options = options
         self._native = self._made()
@@ -90,6 +98,16 @@ class SceneCorrection:
     def frames(self) -> int:
         """Number of frames that counted: of methods that need motion, those that moved."""
         return self._native.frames()
+
+    @property
+    def frames_taken(self) -> int:
+        """Number of usable frames that were given, whether they counted or not."""
+        return self._native.taken()
+
+    @property
+    def saturation(self) -> float | None:
+        """Saturation level in DN that was given."""
+        return self._saturation
 
     @property
     def gain(self) -> Array:
@@ -131,22 +149,18 @@ class SceneCorrection:
             )
         taken = raw if raw.dtype in _TAKEN else raw.astype(np.float64)
         corrected = np.empty(self._shape, np.float32)
-        self._native.update(taken, corrected, workers=self._workers)
+        level = self._saturation
+        if level is None and raw.dtype.kind in "iu":
+            level = float(np.iinfo(raw.dtype).max)
+        self._native.update(taken, corrected, saturation=level, workers=self._workers)
         return corrected
 
     def _learned(self) -> bool:
         """Whether the coefficients have changed."""
         return self.frames > 0
 
-    def result(self) -> Polynomial:
-        """Correction by the coefficients so far.
-
-        Returns
-        -------
-        Polynomial
-            Corrected frame c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw
-            values in DN. A pixel of less than half the response of its neighbours is flagged
-            ``DEAD``, with the limit of `nuc.DefectLimits`.
+    def check_learned(self) -> None:
+        """Refuse to give a result where no frame counted.
 
         Raises
         ------
@@ -158,20 +172,54 @@ class SceneCorrection:
                 f"{type(self).__name__} has learned nothing, from {self.frames} frames that "
                 f"counted: {self._UNLEARNED}"
             )
+
+    def result(self) -> Polynomial:
+        """Correction by the coefficients so far.
+
+        Returns
+        -------
+        Polynomial
+            Corrected frame c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw
+            values in DN. A pixel that varies over the frames by less than half of what its
+            neighbours do is flagged ``DEAD``, from 51 frames on, and one of a gain above 2.
+
+        Warns
+        -----
+        UnusedInputWarning
+            If less than a tenth of the usable frames counted.
+
+        Raises
+        ------
+        InputError
+            If no frame counted: the scene never moved, or too few frames were taken.
+        """
+        self.check_learned()
+        self._warn_of_few()
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
         low, high = self._range
         flags = np.zeros(self._shape, np.uint32)
-        set_bits(flags, "dead", ~((gain > 0) & (gain <= 1 / DefectLimits.response)))
+        set_bits(flags, "dead", unresponsive(gain, self._native.deviation(), self.frames_taken))
         metadata = {
             "scene": {
                 "method": self.method,
                 "options": self.options,
                 "data_range": list(self._range),
+                "saturation": self._saturation,
                 "frames": self.frames,
+                "frames_taken": self.frames_taken,
             }
         }
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
         return Polynomial(coefficients, flags, metadata)
+
+    def _warn_of_few(self) -> None:
+        """Warn where so few frames counted that the scene moved hardly, or was not seen to."""
+        if self.frames < _FEW * self.frames_taken:
+            warn(
+                f"{self.frames} of {self.frames_taken} frames counted: the scene moved hardly, or "
+                "its contrast is too low for its motion to be seen beside the pattern",
+                UnusedInputWarning,
+            )
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `load` goes on with the same bytes.
@@ -193,6 +241,7 @@ class SceneCorrection:
             "method": self.method,
             "shape": list(self._shape),
             "data_range": list(self._range),
+            "saturation": self._saturation,
             "options": self._options,
             "counts": dict(counts),
         }
@@ -240,15 +289,19 @@ class SceneCorrection:
         workers: int | None,
     ) -> Self:
         """Make a correction of the parts of its file; the errors are those of `load`."""
+        positive_workers(workers)
         try:
             low, high = content["data_range"]
             made = cls(
                 tuple(content["shape"]),
                 (float(low), float(high)),
+                saturation=content["saturation"],
                 workers=workers,
                 **content["options"],
             )
-            counts = [(str(name), int(count)) for name, count in content["counts"].items()]
+            counts = [
+                (str(name), whole_number(name, count)) for name, count in content["counts"].items()
+            ]
             made._native.restore(list(maps.items()), counts)
         except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
             raise FileError(f"{path}: is damaged: {error}") from error

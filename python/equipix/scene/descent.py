@@ -32,6 +32,9 @@ class LocalMean(SceneCorrection):
         Step η, below the stability bound 1/λ (Notes).
     kernel : array_like, shape (odd, odd)
         Weights of the neighbours; they are divided by their sum.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
 
@@ -76,12 +79,13 @@ class LocalMean(SceneCorrection):
         *,
         step: float = 0.02,
         kernel: ArrayLike = FOUR,
+        saturation: float | None = None,
         workers: int | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
         weights = as_array("kernel", kernel, ndim=2).astype(np.float64)
         options = {"step": number("step", step), "kernel": weights.tolist()}
-        super().__init__(shape, data_range, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options)
 
     def _made(self) -> Native:
         kernel = np.array(self._options["kernel"], np.float64)
@@ -107,6 +111,9 @@ class Gated(SceneCorrection):
     texture : float
         Factor k of the step η / (1 + k σ²) with the variance σ² of the corrected values in the
         square, on the scale [0, 1]. With 1000 the pattern itself makes the first steps too short.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
 
@@ -118,8 +125,8 @@ class Gated(SceneCorrection):
     Notes
     -----
     The method of Hardie et al. [1]_, with the mean of the frame taken off the local mean, so that a
-    change of the level alone updates nothing. T less that mean is kept for each pixel from its
-    last update.
+    change of the level alone updates hardly anything. T less that mean is kept for each pixel from
+    its last update.
 
     References
     ----------
@@ -141,6 +148,7 @@ class Gated(SceneCorrection):
         width: int = 11,
         threshold: float = 0.02,
         texture: float = 100.0,
+        saturation: float | None = None,
         workers: int | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
@@ -150,7 +158,7 @@ class Gated(SceneCorrection):
             "threshold": number("threshold", threshold),
             "texture": number("texture", texture),
         }
-        super().__init__(shape, data_range, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options)
 
     def _made(self) -> Native:
         return Native.gated(self._shape, self._range, **self._options)

@@ -26,7 +26,7 @@ class Registered(SceneCorrection):
     step : float
         Step η, below the stability bound 0.25.
     least_motion : float
-        Shift in pixels below which the earlier frame of a pair waits for a later partner.
+        Shift in pixels below which the earlier frame of a pair is kept for a later one.
     most_motion : int
         Largest shift along an axis in pixels.
     cutoff : float
@@ -34,7 +34,11 @@ class Registered(SceneCorrection):
         pattern of the pixels, which stands still, decides the shift of usual scenes.
     agreement : float
         Least mean cosine of the phases that the shift leaves, 0 to 1; pairs below, as after a
-        change of scene, are not used.
+        change of scene, are not used. On small arrays, of few phases, at least what the best shift
+        between unrelated frames exceeds in 1 % of them is asked for: 0.36 at 96×96, 0.62 at 48×64.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
 
@@ -46,8 +50,9 @@ class Registered(SceneCorrection):
     Notes
     -----
     The method of Zuo et al. [1]_, with both frames of a pair corrected. For two frames with
-    X₂(p) = X₁(p + d) the errors are E₂(p) = X₁(p + d) − X₂(p) and E₁(p) = X₂(p − d) − X₁(p), by a
-    cubic B-spline, less their means. Then g ← g + η (E₂ y₂ + E₁ y₁) and o ← o + η (E₂ + E₁). One
+    X₂(p) = X₁(p + d) the difference is E(p) = X₁(p + d) − X₂(p) = S X₁ − X₂, by a cubic B-spline,
+    less its mean. The step is that of steepest descent of ΣE²: g ← g + η (E y₂ − (Sᵀ E) y₁) and
+    o ← o + η (E − Sᵀ E) with the transpose Sᵀ, so no sequence of frames makes errors grow. One
     shift holds for the whole frame: rotation, parallax and moving objects are not modelled.
 
     References
@@ -71,6 +76,7 @@ class Registered(SceneCorrection):
         most_motion: int = 8,
         cutoff: float = 0.1,
         agreement: float = 0.3,
+        saturation: float | None = None,
         workers: int | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
@@ -81,7 +87,7 @@ class Registered(SceneCorrection):
             "cutoff": number("cutoff", cutoff),
             "agreement": number("agreement", agreement),
         }
-        super().__init__(shape, data_range, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options)
 
     def _made(self) -> Native:
         return Native.registered(self._shape, self._range, **self._options)

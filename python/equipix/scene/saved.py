@@ -57,12 +57,14 @@ def read_state(
     """
     maps, content = load_pages(path)
     check_format(path, content, KIND, FORMAT)
-    missing = {"method", "shape", "data_range", "options", "counts"} - content.keys()
+    missing = {"method", "shape", "data_range", "saturation", "options", "counts"} - content.keys()
     if missing:
         raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")
     if method is not None and content["method"] != method:
         raise FileError(f"{path}: holds a state of '{content['method']}', expected '{method}'")
-    held = tuple(content["shape"])
+    held = _sizes(path, content["shape"])
+    if not isinstance(content["method"], str):
+        raise FileError(f"{path}: is damaged: 'method' is {content['method']!r}")
     if shape is not None and held != tuple(shape):
         raise FileError(f"{path}: holds a state of a sensor {held}, expected {tuple(shape)}")
     for name, values in maps.items():
@@ -72,3 +74,14 @@ def read_state(
                 "expected float32 in two dimensions"
             )
     return maps, content
+
+
+def _sizes(path: str | PathLike[str], shape: Any) -> tuple[int, int]:
+    """Rows and columns of the sensor, from the file."""
+    if (
+        isinstance(shape, list)
+        and len(shape) == 2
+        and all(isinstance(size, int) and not isinstance(size, bool) for size in shape)
+    ):
+        return shape[0], shape[1]
+    raise FileError(f"{path}: is damaged: 'shape' is {shape!r}, expected two whole numbers")

@@ -120,6 +120,8 @@ def run_sequence(
     ------
     FileError
         If a file cannot be read, holds frames of another shape, or the output cannot be written.
+    InputError
+        If a frame is refused, or no frame counted; then no output is left.
     """
     check_progress(progress)
     files = find_files(source)
@@ -136,6 +138,7 @@ def run_sequence(
         with write_whole(output, force=force) as temporary:
             nbytes = 4 * record.total * rows * cols
             write_frames(temporary, frames, nbytes=nbytes, description=_MARK)
+            method.check_learned()
     return record.sequence()
 
 
@@ -155,32 +158,40 @@ class _Record:
         self.total, self.done = total, 0
         self._every = max(1, -(-total // _POINTS))
         self._points: list[tuple[int, float, float]] = []
-        self._last: Array | None = None
+        self._last: tuple[int, Array, Array] | None = None
 
     def add(self, raw: Array, corrected: Array) -> None:
         """Take a frame before and after correction."""
         self.done += 1
         finite = bool(np.isfinite(corrected).all()) and np.ptp(raw) > 0
         if finite:
-            self._last = raw
-        if finite and (self.done % self._every == 0 or self.done in (1, self.total)):
+            self._last = (self.done, raw, corrected)
+        if finite and (self.done % self._every == 0 or self.done == 1):
             self._points.append((self.done, roughness(raw), roughness(corrected)))
 
     def sequence(self) -> Sequence:
         """What was recorded."""
         if self._last is None:
             raise FileError("no frame holds finite values that differ: nothing to learn from")
-        points, raw, corrected = zip(*self._points, strict=True) if self._points else ((), (), ())
-        return Sequence(self.done, points, raw, corrected, self._last.copy())
+        number, last, after = self._last
+        if not self._points or self._points[-1][0] != number:
+            self._points.append((number, roughness(last), roughness(after)))
+        points, raw, corrected = zip(*self._points, strict=True)
+        return Sequence(self.done, points, raw, corrected, last.copy())
 
 
 def _corrected(
     method: SceneCorrection, files: list[Path], record: _Record, progress: Progress | None
 ) -> Iterator[Array]:
     """Corrected frames, one after the other."""
-    for _, frames in stream_frames(files):
+    for path, frames in stream_frames(files):
         for raw in frames:
-            corrected = method.update(raw)
+            try:
+                corrected = method.update(raw)
+            except InputError as error:
+                raise InputError(
+                    f"{path}: frame {record.done + 1} of the sequence: {error}"
+                ) from error
             record.add(raw, corrected)
             if progress is not None:
                 progress(record.done, record.total, "learning")

@@ -37,6 +37,9 @@ class ConstantStatistics(SceneCorrection):
         on the scale [0, 1]. Only frames that moved count.
     prior : int
         Number of moving frames at which half of a gain's deviation from 1 is believed.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
 
@@ -71,6 +74,7 @@ class ConstantStatistics(SceneCorrection):
         window: int = 4000,
         motion: float = 0.004,
         prior: int = 100,
+        saturation: float | None = None,
         workers: int | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
@@ -80,7 +84,7 @@ class ConstantStatistics(SceneCorrection):
             "motion": number("motion", motion),
             "prior": whole_number("prior", prior),
         }
-        super().__init__(shape, data_range, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options)
 
     def _made(self) -> Native:
         return Native.constant_statistics(self._shape, self._range, **self._options)
@@ -107,6 +111,9 @@ class Kalman(SceneCorrection):
     memory : float
         Moving frames over which gains and offsets drift: their correlation after n frames is
         exp(−n/memory).
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
 
@@ -121,7 +128,8 @@ class Kalman(SceneCorrection):
     scene: y − ½ = G (r − ½) + O + e. The frames of a block give normal equations of (G, O). The
     detail e of neighbouring frames is correlated, so its variance follows from the difference
     between the halves of a block, over the whole array. The variances include neither patterns
-    wider than the square nor a scene that differs from place to place.
+    wider than the square, nor a scene that differs from place to place, nor the errors of r: at a
+    contrast of 1 % the errors are 1.6 times the standard deviations.
 
     References
     ----------
@@ -145,6 +153,7 @@ class Kalman(SceneCorrection):
         gain_spread: float = 0.05,
         offset_spread: float = 0.1,
         memory: float = 1e6,
+        saturation: float | None = None,
         workers: int | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
@@ -156,7 +165,7 @@ class Kalman(SceneCorrection):
             "offset_spread": number("offset_spread", offset_spread),
             "memory": number("memory", memory),
         }
-        super().__init__(shape, data_range, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options)
 
     def _made(self) -> Native:
         return Native.kalman(self._shape, self._range, **self._options)

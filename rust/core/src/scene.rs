@@ -22,13 +22,16 @@ mod bands;
 mod coefficients;
 mod constant_statistics;
 mod gated;
+mod history;
 mod kalman;
 mod local_mean;
 mod method;
 mod motion;
+mod moved;
 mod neighbourhood;
 mod options;
 mod registered;
+mod saturation;
 mod shift;
 mod spectrum;
 mod spline;
@@ -42,6 +45,7 @@ use bands::{BAND, bands, fold};
 use coefficients::{Coefficients, sum};
 use constant_statistics::ConstantStatistics;
 use gated::Gated;
+use history::History;
 use kalman::Kalman;
 use local_mean::LocalMean;
 use method::{Frame, Method};
@@ -53,19 +57,21 @@ use crate::frames::{Sample, Shape};
 use crate::memory;
 use crate::parallel::Workers;
 
-/// Most bytes for each pixel: those of `Kalman`, ten values of the estimate and eight others, or of
+/// Most bytes for each pixel: those of `Kalman`, ten values of the estimate and ten others, or of
 /// `Registered`.
-const BYTES: u64 = 96;
+const BYTES: u64 = 104;
 
 /// A correction that learns from the scene.
 #[derive(Debug)]
 pub struct SceneCorrection {
-    low: f32,
-    span: f32,
+    low: f64,
+    span: f64,
     coefficients: Coefficients,
     method: Box<dyn Method>,
-    /// Frames that changed what is remembered.
+    /// Frames that changed what is remembered, and usable ones in all.
     frames: u64,
+    taken: u64,
+    history: History,
     raw: Vec<f32>,
     corrected: Vec<f32>,
 }
@@ -78,19 +84,24 @@ impl SceneCorrection {
     /// stability bound; [`Error::Memory`].
     pub fn new(shape: Shape, [low, high]: [f64; 2], options: &Options) -> Result<Self> {
         options::check_shape(shape)?;
-        if !(low.is_finite() && high.is_finite() && high > low) {
-            let problem = format!("is ({low}, {high}), expected two numbers, the second larger");
+        let single = |span: f64| span.is_finite() && span as f32 > 0.0 && (span as f32).is_finite();
+        if !(single(high - low) && low.is_finite()) {
+            let problem = format!(
+                "is ({low}, {high}), expected two numbers, the second larger by a number of single precision"
+            );
             return Err(Error::value("range", problem));
         }
         memory::check(shape.len() as u64 * BYTES, || {
             format!("a correction from the scene of {shape}")
         })?;
         Ok(Self {
-            low: low as f32,
-            span: (high - low) as f32,
+            low,
+            span: high - low,
             method: method(shape, options)?,
             coefficients: Coefficients::new(shape),
             frames: 0,
+            taken: 0,
+            history: History::new(shape),
             raw: vec![0.0; shape.len()],
             corrected: vec![0.0; shape.len()],
         })
@@ -126,10 +137,23 @@ impl SceneCorrection {
         self.frames
     }
 
+    /// Number of usable frames that were given, whether they counted or not.
+    #[must_use]
+    pub const fn taken(&self) -> u64 {
+        self.taken
+    }
+
+    /// Standard deviation of each pixel over the usable frames, on the scale [0, 1].
+    #[must_use]
+    pub fn deviation(&self) -> Vec<f32> {
+        self.history.deviation()
+    }
+
     /// Corrects a frame by the coefficients before it, then learns from it; whether it counted.
     ///
-    /// A frame that holds a value which is not finite, or one value alone, counts for nothing and changes no
-    /// state. Nor do, of methods that need motion, frames in which the scene has not moved.
+    /// A frame that holds a value which is not finite, or of which half of the rows or more hold one value
+    /// each, as one that was lost or cut, counts for nothing and changes no state. Nor do, of methods that need motion, frames in which the scene has not moved.
+    /// Pixels from the raw value `saturation` on do not learn, nor do those with many of them around.
     ///
     /// # Errors
     /// [`Error::Shape`] if the frame or `corrected` is of another size; [`Error::Value`] if it holds a finite
@@ -138,6 +162,7 @@ impl SceneCorrection {
         &mut self,
         frame: &[T],
         corrected: &mut [f32],
+        saturation: Option<f64>,
         workers: &Workers,
     ) -> Result<bool> {
         let shape = self.shape();
@@ -149,8 +174,21 @@ impl SceneCorrection {
             });
         }
         let Some(mean) = self.correct(frame, corrected, workers)? else { return Ok(false) };
-        let frame = Frame { shape, raw: &self.raw, corrected: &self.corrected, mean };
+        let saturation =
+            saturation.map_or(f32::INFINITY, |level| ((level - self.low) / self.span) as f32);
+        let rule = (self.method.width(), self.method.leaves_out_saturated());
+        let left_out = saturation::left_out(shape, &self.raw, saturation, rule, workers);
+        let frame = Frame {
+            shape,
+            raw: &self.raw,
+            corrected: &self.corrected,
+            mean,
+            saturation,
+            left_out: left_out.as_deref(),
+        };
         let used = self.method.update(&frame, &mut self.coefficients, workers);
+        self.taken += 1;
+        self.history.add(&self.raw, self.taken, workers);
         self.frames += u64::from(used);
         Ok(used)
     }
@@ -167,28 +205,32 @@ impl SceneCorrection {
     ) -> Result<Option<f64>> {
         let (low, span, size) = (self.low, self.span, BAND * self.shape().cols);
         let (gain, offset) = (&self.coefficients.gain, &self.coefficients.offset);
-        let first = frame[0].to_f64();
+        let cols = self.shape().cols;
         let bands = bands!(size; &mut self.raw, &mut self.corrected, corrected);
         let found = workers.each(bands, |index, (raw, own, out)| {
             let start = index * size;
-            let maps = gain[start..].iter().zip(&offset[start..]);
-            let given = frame[start..].iter().zip(maps);
-            let results = raw.iter_mut().zip(own.iter_mut()).zip(out);
-            let (mut differs, mut outside) = (false, false);
-            for ((value, (gain, offset)), ((raw, own), out)) in given.zip(results) {
-                let value = value.to_f64();
-                differs |= value != first;
-                *raw = (value as f32 - low) / span;
-                outside |= !(-1.0..=2.0).contains(raw);
-                *own = gain * *raw + offset;
-                *out = low + span * *own;
+            let maps = gain[start..].chunks(cols).zip(offset[start..].chunks(cols));
+            let given = frame[start..].chunks(cols).zip(maps);
+            let results = raw.chunks_mut(cols).zip(own.chunks_mut(cols)).zip(out.chunks_mut(cols));
+            let (mut flat, mut outside) = (0_u32, false);
+            for ((values, (gain, offset)), ((raw, own), out)) in given.zip(results) {
+                let (first, mut differs) = (values[0].to_f64(), false);
+                for (col, value) in values.iter().enumerate() {
+                    let value = value.to_f64();
+                    let y = (value - low) / span;
+                    differs |= value != first;
+                    outside |= value.is_finite() && !(-1.0..=2.0).contains(&y);
+                    raw[col] = y as f32;
+                    own[col] = gain[col] * raw[col] + offset[col];
+                    out[col] = (low + span * f64::from(own[col])) as f32;
+                }
+                flat += u32::from(!differs);
             }
-            // A sum is finite if all its terms are, and they are not above 1e308.
-            let total = sum(own);
-            [total, f64::from(u8::from(differs)), f64::from(u8::from(outside))]
+            // A sum is finite if all its terms are: those that are not outside are small.
+            [sum(own), f64::from(flat), f64::from(u8::from(outside))]
         });
-        let [total, differing, outside] = fold(found);
-        if total.is_finite() && outside > 0.0 {
+        let [total, flat, outside] = fold(found);
+        if outside > 0.0 {
             let problem = format!(
                 "holds values more than one span outside of the range ({low}, {}): give the range of \
                  the raw values",
@@ -196,7 +238,8 @@ impl SceneCorrection {
             );
             return Err(Error::value("frame", problem));
         }
-        Ok((total.is_finite() && differing > 0.0).then_some(total / self.raw.len() as f64))
+        let usable = total.is_finite() && 2.0 * flat < self.shape().rows as f64;
+        Ok(usable.then_some(total / self.raw.len() as f64))
     }
 
     fn state(&mut self) -> State<'_> {
@@ -204,7 +247,10 @@ impl SceneCorrection {
         let own = State::default()
             .map("gain", sizes, &mut self.coefficients.gain)
             .map("offset", sizes, &mut self.coefficients.offset)
-            .count("frames", &mut self.frames);
+            .map("history_mean", sizes, &mut self.history.mean)
+            .squares("history_variance", sizes, &mut self.history.variance)
+            .count("frames", &mut self.frames)
+            .count("taken", &mut self.taken);
         own.and(self.method.state())
     }
 

@@ -59,10 +59,13 @@ impl PySceneCorrection {
         py: Python<'_>,
         frame: &PyReadonlyArray2<'_, T>,
         corrected: &mut PyReadwriteArray2<'_, f32>,
+        saturation: Option<f64>,
         workers: Option<NonZeroUsize>,
     ) -> PyResult<bool> {
         let (frame, corrected) = (frame.as_slice()?, corrected.as_slice_mut()?);
-        run::brief(py, |_| self.lock().update(frame, corrected, &Workers::new(workers)?))
+        run::brief(py, |_| {
+            self.lock().update(frame, corrected, saturation, &Workers::new(workers)?)
+        })
     }
 }
 
@@ -146,49 +149,64 @@ impl PySceneCorrection {
     }
 
     /// Corrects a frame into `corrected`, then learns from it; whether it counted.
-    #[pyo3(signature = (frame, corrected, *, workers))]
+    #[pyo3(signature = (frame, corrected, *, saturation, workers))]
     fn update(
         &self,
         py: Python<'_>,
         frame: PyFrame<'_>,
         mut corrected: PyReadwriteArray2<'_, f32>,
+        saturation: Option<f64>,
         workers: Option<NonZeroUsize>,
     ) -> PyResult<bool> {
         match frame {
-            PyFrame::U8(frame) => self.learn(py, &frame, &mut corrected, workers),
-            PyFrame::U16(frame) => self.learn(py, &frame, &mut corrected, workers),
-            PyFrame::F32(frame) => self.learn(py, &frame, &mut corrected, workers),
-            PyFrame::F64(frame) => self.learn(py, &frame, &mut corrected, workers),
+            PyFrame::U8(frame) => self.learn(py, &frame, &mut corrected, saturation, workers),
+            PyFrame::U16(frame) => self.learn(py, &frame, &mut corrected, saturation, workers),
+            PyFrame::F32(frame) => self.learn(py, &frame, &mut corrected, saturation, workers),
+            PyFrame::F64(frame) => self.learn(py, &frame, &mut corrected, saturation, workers),
         }
     }
 
     /// Number of frames that counted.
-    fn frames(&self) -> u64 {
-        self.lock().frames()
+    fn frames(&self, py: Python<'_>) -> PyResult<u64> {
+        run::brief(py, |_| Ok(self.lock().frames()))
+    }
+
+    /// Number of usable frames that were given.
+    fn taken(&self, py: Python<'_>) -> PyResult<u64> {
+        run::brief(py, |_| Ok(self.lock().taken()))
+    }
+
+    /// Standard deviation of each pixel over the usable frames, on the scale [0, 1].
+    fn deviation(&self, py: Python<'_>) -> PyResult<Map> {
+        let (found, shape) = run::brief(py, |_| {
+            let scene = self.lock();
+            Ok((scene.deviation(), scene.shape()))
+        })?;
+        image(py, found, shape)
     }
 
     /// Gain of each pixel, and offset on the scale [0, 1].
     fn coefficients(&self, py: Python<'_>) -> PyResult<(Map, Map)> {
-        let (gain, offset, shape) = {
+        let (gain, offset, shape) = run::brief(py, |_| {
             let scene = self.lock();
-            (scene.gain().to_vec(), scene.offset().to_vec(), scene.shape())
-        };
+            Ok((scene.gain().to_vec(), scene.offset().to_vec(), scene.shape()))
+        })?;
         Ok((image(py, gain, shape)?, image(py, offset, shape)?))
     }
 
     /// Variances of gain and offset, of a method that has them.
     fn variances(&self, py: Python<'_>) -> PyResult<Option<(Map, Map)>> {
-        let (found, shape) = {
+        let (found, shape) = run::brief(py, |_| {
             let scene = self.lock();
-            (scene.variances(), scene.shape())
-        };
+            Ok((scene.variances(), scene.shape()))
+        })?;
         let Some([gain, offset]) = found else { return Ok(None) };
         Ok(Some((image(py, gain, shape)?, image(py, offset, shape)?)))
     }
 
     /// All that is remembered: maps and counts by name.
     fn state(&self, py: Python<'_>) -> PyResult<(Vec<(String, Map)>, Vec<(String, u64)>)> {
-        let Snapshot { maps, counts } = self.lock().snapshot();
+        let Snapshot { maps, counts } = run::brief(py, |_| Ok(self.lock().snapshot()))?;
         let map = |(name, sizes, values): (String, [usize; 2], Vec<f32>)| {
             PyResult::Ok((name, values.into_pyarray(py).reshape(sizes)?.unbind()))
         };
@@ -207,7 +225,6 @@ impl PySceneCorrection {
             PyResult::Ok((name, sizes, values.as_slice()?.to_vec()))
         };
         let maps = maps.into_iter().map(map).collect::<PyResult<_>>()?;
-        let restored = self.lock().restore(&Snapshot { maps, counts });
-        restored.map_err(|error| errors::exception(py, &error))
+        run::brief(py, |_| self.lock().restore(&Snapshot { maps, counts }))
     }
 }

@@ -63,15 +63,25 @@ impl Coefficients {
 
 /// The sum of values in single precision.
 pub(super) fn sum(values: &[f32]) -> f64 {
+    sum_of(values, |value| value)
+}
+
+/// The sum of the squares of values.
+pub(super) fn sum_of_squares(values: &[f32]) -> f64 {
+    sum_of(values, |value| value * value)
+}
+
+#[inline(always)]
+fn sum_of(values: &[f32], term: impl Fn(f64) -> f64) -> f64 {
     const LANES: usize = 16;
     let (chunks, rest) = values.as_chunks::<LANES>();
     let mut sums = [0.0_f64; LANES];
     for chunk in chunks {
         for (sum, value) in sums.iter_mut().zip(chunk) {
-            *sum += f64::from(*value);
+            *sum += term(f64::from(*value));
         }
     }
-    sums.iter().sum::<f64>() + rest.iter().map(|value| f64::from(*value)).sum::<f64>()
+    sums.iter().sum::<f64>() + rest.iter().map(|value| term(f64::from(*value))).sum::<f64>()
 }
 
 #[cfg(test)]

@@ -30,6 +30,8 @@ pub(super) struct ConstantStatistics {
     window: u64,
     prior: u64,
     motion: Motion,
+    /// Frames of each pixel.
+    counts: Vec<f32>,
     mean: Vec<f32>,
     variance: Vec<f32>,
     /// √variance: made of it in every update.
@@ -50,17 +52,25 @@ impl ConstantStatistics {
         let zeros = || vec![0.0; shape.len()];
         let motion = Motion::new(shape, motion);
         let (mean, variance, deviation) = (zeros(), zeros(), zeros());
-        Ok(Self { shape, width, window, prior, motion, mean, variance, deviation })
+        let counts = zeros();
+        Ok(Self { shape, width, window, prior, motion, counts, mean, variance, deviation })
     }
 
     /// Adds a frame to the statistics of the pixels.
-    fn add(&mut self, raw: &[f32], workers: &Workers) {
-        let share = 1.0 / self.motion.frames.min(self.window) as f32;
+    fn add(&mut self, frame: &Frame<'_>, workers: &Workers) {
+        let window = self.window as f32;
         let size = BAND * self.shape.cols;
-        let bands = bands!(size; &mut self.mean, &mut self.variance, &mut self.deviation);
-        workers.each(bands, |index, (means, variances, deviations)| {
-            let pixels = means.iter_mut().zip(variances).zip(deviations);
-            for (((mean, variance), deviation), y) in pixels.zip(&raw[index * size..]) {
+        let bands =
+            bands!(size; &mut self.mean, &mut self.variance, &mut self.deviation, &mut self.counts);
+        workers.each(bands, |index, (means, variances, deviations, counts)| {
+            let pixels = means.iter_mut().zip(variances).zip(deviations.iter_mut().zip(counts));
+            let frames = pixels.zip(&frame.raw[index * size..]).enumerate();
+            for (pixel, (((mean, variance), (deviation, count)), y)) in frames {
+                if frame.left_out.is_some_and(|out| out[index * size + pixel]) {
+                    continue;
+                }
+                *count = (*count + 1.0).min(window);
+                let share = 1.0 / *count;
                 let change = y - *mean;
                 *mean += share * change;
                 *variance = (1.0 - share) * (*variance + share * change * change);
@@ -72,8 +82,7 @@ impl ConstantStatistics {
     /// Finds the coefficients that give each pixel the statistics of its neighbourhood.
     fn equalise(&self, coefficients: &mut Coefficients, workers: &Workers) {
         let (shape, cols) = (self.shape, self.shape.cols);
-        let known = self.motion.frames.min(self.window) as f32;
-        let trust = known / (known + self.prior as f32);
+        let prior = self.prior as f32;
         let row_of = |values: &'_ [f32], row: usize, line: &mut [f32]| {
             line.copy_from_slice(&values[row * cols..(row + 1) * cols]);
         };
@@ -93,6 +102,8 @@ impl ConstantStatistics {
                 deviations.next(&mut deviation);
                 let start = (first + row) * cols;
                 for col in 0..cols {
+                    let known = self.counts[start + col];
+                    let trust = known / (known + prior).max(1.0);
                     let wanted = deviation[col].max(NOTHING);
                     let own = self.deviation[start + col].max(LEAST_DEVIATION * wanted);
                     gain[col] = 1.0 + trust * (wanted / own - 1.0);
@@ -114,19 +125,29 @@ impl Method for ConstantStatistics {
         if !self.motion.moved(frame.shape, frame.raw, workers) {
             return false;
         }
-        self.add(frame.raw, workers);
+        self.add(frame, workers);
         if self.motion.frames > 1 {
             self.equalise(coefficients, workers);
         }
         self.motion.frames > 1
     }
 
+    fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Pixels that are compared need the same frames: one that lacks its bright ones has another mean.
+    fn leaves_out_saturated(&self) -> bool {
+        false
+    }
+
     fn state(&mut self) -> State<'_> {
         let sizes = [self.shape.rows, self.shape.cols];
         State::default()
+            .squares("counts", sizes, &mut self.counts)
             .map("mean", sizes, &mut self.mean)
-            .map("variance", sizes, &mut self.variance)
-            .map("deviation", sizes, &mut self.deviation)
+            .squares("variance", sizes, &mut self.variance)
+            .squares("deviation", sizes, &mut self.deviation)
             .and(self.motion.state())
     }
 }

@@ -90,6 +90,9 @@ impl Method for Gated {
                 }
                 let (raw, corrected) = frame.row(index * BAND + row);
                 for col in 0..cols {
+                    if frame.leaves_out(index * BAND + row, col) {
+                        continue;
+                    }
                     let (y, scene) = (raw[col], mean[col]);
                     let variance = (square[col] - scene * scene).max(0.0);
                     let changed = (scene - seen[col]).abs() > threshold;
@@ -109,6 +112,10 @@ impl Method for Gated {
             coefficients.hold_gauge(workers);
         }
         changed > 0.0
+    }
+
+    fn width(&self) -> usize {
+        self.width
     }
 
     fn state(&mut self) -> State<'_> {

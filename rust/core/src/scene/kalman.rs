@@ -35,8 +35,9 @@ const LEAST_RESPONSE: f64 = 0.1;
 /// The estimate of one pixel: G, O and the variances of G, of O, and their covariance.
 type Estimate = [f32; 5];
 
-/// Σ (r − ½), Σ (r − ½)², Σ (y − ½), Σ (r − ½)(y − ½) over a block, and Σ residual over its first half.
-type Sums = [f32; 5];
+/// Σ (r − ½), Σ (r − ½)², Σ (y − ½), Σ (r − ½)(y − ½) over a block, Σ residual over its first half, and the
+/// frames.
+type Sums = [f32; 6];
 
 #[derive(Debug)]
 pub(super) struct Kalman {
@@ -82,7 +83,7 @@ impl Kalman {
             spread,
             kept: (-(block as f64) / memory).exp(),
             estimates: vec![first; shape.len()],
-            sums: vec![[0.0; 5]; shape.len()],
+            sums: vec![[0.0; 6]; shape.len()],
             count: 0,
             blocks: 0,
         })
@@ -97,7 +98,7 @@ impl Kalman {
             }
         };
         self.count += 1;
-        let (half, count) = (2 * self.count == self.block, self.count as f32);
+        let half = 2 * self.count == self.block;
         let bands = bands!(BAND * cols; &mut self.sums, &mut self.estimates);
         workers.each(bands, |index, (sums, estimates)| {
             let mut means = Squares::new(shape, width, index * BAND, centred);
@@ -107,10 +108,13 @@ impl Kalman {
                 means.next(&mut mean);
                 let raw = frame.row(index * BAND + row).0;
                 for (col, sums) in sums.iter_mut().enumerate() {
-                    let (r, y) = (mean[col], raw[col] - MIDDLE);
-                    *sums = [sums[0] + r, sums[1] + r * r, sums[2] + y, sums[3] + r * y, sums[4]];
+                    if !frame.leaves_out(index * BAND + row, col) {
+                        let (r, y) = (mean[col], raw[col] - MIDDLE);
+                        let terms = [r, r * r, y, r * y, 0.0, 1.0];
+                        sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+                    }
                     if half {
-                        sums[4] = left(sums, &estimates[col], count);
+                        sums[4] = left(sums, &estimates[col]);
                     }
                 }
             }
@@ -122,13 +126,19 @@ impl Kalman {
         let (size, count) = (BAND * self.shape.cols, self.block as f32);
         let bands = bands!(size; &mut self.sums, &mut self.estimates);
         let squares = workers.each(bands, |_, (sums, estimates)| {
-            let change = |sums: &Sums, estimate: &Estimate| {
-                f64::from(left(sums, estimate, count) - 2.0 * sums[4])
-            };
-            [sums.iter().zip(estimates).map(|(s, e)| change(s, e).powi(2)).sum()]
+            let full = sums.iter().zip(estimates).filter(|(sums, _)| sums[5] == count);
+            let squares =
+                full.map(|(s, e)| [f64::from(left(s, e) - 2.0 * s[4]).powi(2), 1.0]).collect();
+            fold(squares)
         });
-        let [squares] = fold(squares);
-        let variance = squares / (self.shape.len() as u64 * self.block) as f64;
+        // A pixel that lacks frames has halves that differ by more than the detail.
+        let [squares, full] = fold(squares);
+        if full == 0.0 {
+            self.sums.fill([0.0; 6]);
+            self.count = 0;
+            return;
+        }
+        let variance = squares / (full * self.block as f64);
         let bands = bands!(
             size; &mut self.sums, &mut self.estimates, &mut coefficients.gain,
             &mut coefficients.offset
@@ -138,12 +148,12 @@ impl Kalman {
             let coefficients = gain.iter_mut().zip(offset);
             let pixels = sums.iter_mut().zip(estimates).zip(coefficients);
             for ((sums, estimate), (gain, offset)) in pixels {
-                let estimated = combined(sums, estimate, f64::from(count), variance, kept, spread);
+                let estimated = combined(sums, estimate, variance, kept, spread);
                 *estimate = estimated.map(|value| value as f32);
                 let inverse = 1.0 / estimated[0].max(LEAST_RESPONSE);
                 *gain = inverse as f32;
                 *offset = (0.5 - (0.5 + estimated[1]) * inverse) as f32;
-                *sums = [0.0; 5];
+                *sums = [0.0; 6];
             }
         });
         let taken = coefficients.hold_gauge(workers);
@@ -159,8 +169,8 @@ impl Kalman {
 }
 
 /// Sum of the residuals of a block so far.
-fn left(sums: &Sums, estimate: &Estimate, count: f32) -> f32 {
-    sums[2] - estimate[0] * sums[0] - count * estimate[1]
+fn left(sums: &Sums, estimate: &Estimate) -> f32 {
+    sums[2] - estimate[0] * sums[0] - sums[5] * estimate[1]
 }
 
 /// The estimate after a block: that before it, carried on as a Gauss-Markov process, and the block's normal
@@ -168,12 +178,11 @@ fn left(sums: &Sums, estimate: &Estimate, count: f32) -> f32 {
 fn combined(
     sums: &Sums,
     estimate: &Estimate,
-    count: f64,
     variance: f64,
     kept: f64,
     spread: [f64; 2],
 ) -> [f64; 5] {
-    let [r, rr, y, ry, _] = sums.map(f64::from);
+    let [r, rr, y, ry, _, count] = sums.map(f64::from);
     let [gain, offset, gg, oo, go] = estimate.map(f64::from);
     let (gain, offset) = (1.0 + kept * (gain - 1.0), kept * offset);
     let (square, fresh) = (kept * kept, 1.0 - kept * kept);
@@ -220,12 +229,17 @@ impl Method for Kalman {
         true
     }
 
+    fn width(&self) -> usize {
+        self.width
+    }
+
     fn state(&mut self) -> State<'_> {
         let sizes = [self.shape.rows, 5 * self.shape.cols];
+        let sums = [self.shape.rows, 6 * self.shape.cols];
         State::default()
             .map("estimates", sizes, self.estimates.as_flattened_mut())
-            .map("sums", sizes, self.sums.as_flattened_mut())
-            .count("count", &mut self.count)
+            .map("sums", sums, self.sums.as_flattened_mut())
+            .count_below("count", &mut self.count, self.block)
             .count("blocks", &mut self.blocks)
             .and(self.motion.state())
     }

@@ -60,6 +60,9 @@ impl Method for LocalMean {
                 self.kernel.mean(image, row, &mut padded, &mut target);
                 let (raw, corrected) = frame.row(row);
                 for col in 0..cols {
+                    if frame.leaves_out(row, col) {
+                        continue;
+                    }
                     let y = raw[col];
                     let change = step_at(self.step, y) * (target[col] - corrected[col]);
                     gain[col] += change * y;
@@ -69,6 +72,10 @@ impl Method for LocalMean {
         });
         coefficients.hold_gauge(workers);
         true
+    }
+
+    fn width(&self) -> usize {
+        self.kernel.width()
     }
 
     fn state(&mut self) -> State<'_> {

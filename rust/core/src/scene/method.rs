@@ -13,9 +13,19 @@ pub(super) struct Frame<'a> {
     pub(super) corrected: &'a [f32],
     /// Mean of the corrected values.
     pub(super) mean: f64,
+    /// Raw value from which a pixel is saturated.
+    pub(super) saturation: f32,
+    /// Pixels that do not learn: saturated ones, and ones with too many of them in the neighbourhood.
+    pub(super) left_out: Option<&'a [bool]>,
 }
 
 impl<'a> Frame<'a> {
+    /// Whether a pixel does not learn.
+    #[inline(always)]
+    pub(super) fn leaves_out(&self, row: usize, col: usize) -> bool {
+        self.left_out.is_some_and(|out| out[row * self.shape.cols + col])
+    }
+
     pub(super) fn row(&self, row: usize) -> (&'a [f32], &'a [f32]) {
         let range = row * self.shape.cols..(row + 1) * self.shape.cols;
         (&self.raw[range.clone()], &self.corrected[range])
@@ -31,6 +41,14 @@ pub(super) trait Method: std::fmt::Debug + Send + Sync {
         coefficients: &mut Coefficients,
         workers: &Workers,
     ) -> bool;
+
+    /// Rows and columns of the neighbourhood of a pixel, odd.
+    fn width(&self) -> usize;
+
+    /// Whether saturated pixels do not learn, or only pixels with too many of them in the neighbourhood.
+    fn leaves_out_saturated(&self) -> bool {
+        true
+    }
 
     /// All that is remembered beside the coefficients.
     fn state(&mut self) -> State<'_>;

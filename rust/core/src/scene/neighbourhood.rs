@@ -43,6 +43,11 @@ impl Kernel {
         Self { sizes, weights: weights.iter().map(|weight| *weight as f32).collect() }
     }
 
+    /// Rows and columns of a square that holds it.
+    pub(super) fn width(&self) -> usize {
+        self.sizes[0].max(self.sizes[1])
+    }
+
     /// The weighted mean of the neighbours for each pixel of a row.
     pub(super) fn mean(
         &self,

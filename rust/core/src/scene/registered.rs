@@ -7,28 +7,40 @@
 use super::bands::{BAND, bands};
 use super::coefficients::Coefficients;
 use super::method::{Frame, Method, step_at};
+use super::moved::{Move, Own, difference, transposed};
 use super::options::check_range;
 use super::shift::PhaseCorrelation;
 use super::spectrum::{Spectrum, Transform};
-use super::spline::{Move, difference, prefilter};
+use super::spline::prefilter;
 use super::stability::check_step;
 use super::state::State;
 use crate::error::{Error, Result};
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
-/// Both differences of a pair, X₁(p + d) − X₂(p) and X₂(p − d) − X₁(p), are −L X of the stacked frames with
-/// ‖L‖ ≤ 2, since a moved spline is no longer than the image. Both change the same coefficients, which doubles
-/// max(y² + 1): η < 2 / (2 · 2 · 2).
+/// The difference E = S X₁ − X₂ of a pair is [S, −1] of the stacked frames, and X₂ changes by η E, X₁ by
+/// −η Sᵀ E: the exact gradient of ‖E‖²/2, so the operator is symmetric and not negative. A moved spline is no
+/// longer than its image but for 1.7 % at an edge, so the norm of [S, −1] squared is 2; both frames change the
+/// same coefficients, which doubles max(y² + 1): η < 2 / (2 · 2 · 2).
 const BOUND: f64 = 0.25;
 
-/// g ← g + η (E₂ y₂ + E₁ y₁), o ← o + η (E₂ + E₁) with the differences E of a pair, less their mean.
+/// A pair whose difference is larger than that of earlier pairs by this factor is not used. Up to it a frame
+/// of another scene adds √3 times their rms, √2 σ of a pattern σ, to the difference: by a step of 0.1 the
+/// pattern grows to √(1 + (0.1 · √3 · √2)²) σ, 3 %.
+const ALIEN: f64 = 2.0;
+
+/// Pairs over which the mean square of the difference is kept. One that is not used counts with the limit
+/// instead, so that after a lasting change pairs are used again.
+const REMEMBERED: f64 = 16.0;
+
+/// g ← g + η (E y₂ − (Sᵀ E) y₁), o ← o + η (E − Sᵀ E) with the difference E = S X₁ − X₂ of a pair, less its mean.
 #[derive(Debug)]
 pub(super) struct Registered {
     shape: Shape,
     step: f32,
     least_motion: f64,
     most_motion: f64,
+    /// The least that is asked for, and that chance does not give.
     agreement: f64,
     transform: Transform,
     correlation: PhaseCorrelation,
@@ -36,6 +48,7 @@ pub(super) struct Registered {
     before: Vec<f32>,
     spectrum: Spectrum,
     frames: u64,
+    usual: Usual,
     scratch: Scratch,
 }
 
@@ -45,7 +58,28 @@ struct Scratch {
     corrected: Vec<f32>,
     along: Vec<f32>,
     coefficients: Vec<f32>,
-    errors: [Vec<f32>; 2],
+    error: Vec<f32>,
+    transposed: Vec<f32>,
+}
+
+/// Mean square of the differences of earlier pairs, and their number.
+#[derive(Debug, Default)]
+struct Usual {
+    square: f32,
+    pairs: u64,
+}
+
+impl Usual {
+    /// Whether the difference of a pair is one that earlier pairs had.
+    fn takes(&mut self, square: f64) -> bool {
+        let limit = ALIEN * ALIEN * f64::from(self.square);
+        let usual = self.pairs == 0 || square <= limit;
+        self.pairs += 1;
+        let counted = if usual { square } else { limit };
+        let share = 1.0 / (self.pairs as f64).min(REMEMBERED);
+        self.square += (share * (counted - f64::from(self.square))) as f32;
+        usual
+    }
 }
 
 impl Registered {
@@ -64,6 +98,7 @@ impl Registered {
         }
         check_range("least_motion", least_motion, [0.0, most_motion as f64])?;
         let transform = Transform::new(shape, cutoff);
+        let correlation = PhaseCorrelation::new(&transform, cutoff, most_motion);
         let empty = || vec![0.0; shape.len()];
         let amplitudes = transform.sizes().iter().product();
         Ok(Self {
@@ -71,62 +106,77 @@ impl Registered {
             step: step as f32,
             least_motion,
             most_motion: most_motion as f64,
-            agreement,
-            correlation: PhaseCorrelation::new(&transform, cutoff, most_motion),
+            agreement: agreement.max(correlation.chance(cutoff)),
+            correlation,
             transform,
             before: empty(),
             spectrum: Spectrum { re: vec![0.0; amplitudes], im: vec![0.0; amplitudes] },
             frames: 0,
+            usual: Usual::default(),
             scratch: Scratch {
                 corrected: empty(),
                 along: empty(),
                 coefficients: empty(),
-                errors: [empty(), empty()],
+                error: empty(),
+                transposed: empty(),
             },
         })
     }
 
-    /// Changes the coefficients by both frames of a pair, the later one shifted by `shift`.
+    /// Changes the coefficients by both frames of a pair, the later one shifted by `shift`, if its difference
+    /// is one that earlier pairs had.
     fn learn(
         &mut self,
         frame: &Frame<'_>,
         shift: [f64; 2],
         coefficients: &mut Coefficients,
         workers: &Workers,
-    ) {
-        let (shape, cols, step) = (self.shape, self.shape.cols, self.step);
-        let Scratch { corrected, along, coefficients: spline, errors } = &mut self.scratch;
-        let before = &self.before[..];
+    ) -> bool {
+        let (shape, step) = (self.shape, self.step);
+        let Scratch { corrected, along, coefficients: spline, error, transposed: back } =
+            &mut self.scratch;
+        let (before, way) = (&self.before[..], Move::new(shape, shift));
         coefficients.apply(before, corrected, workers);
-        let ways = [Move::new(shape, shift), Move::new(shape, shift.map(|shift| -shift))];
-        let (first, second) = (&corrected[..], frame.corrected);
-        let images = [(first, second), (second, first)];
-        let mut means = [0.0; 2];
-        for (i, (there, own)) in images.into_iter().enumerate() {
-            prefilter(shape, there, along, spline, workers);
-            means[i] = difference(shape, spline, own, &ways[i], &mut errors[i], workers);
+        prefilter(shape, corrected, along, spline, workers);
+        let left_out = saturated(frame, before, &way);
+        let own = Own { values: frame.corrected, left_out: left_out.as_deref() };
+        let square = difference(shape, spline, own, &way, error, workers);
+        if !self.usual.takes(square) {
+            return false;
         }
-        let raws = [frame.raw, before];
-        let bands = bands!(BAND * cols; &mut coefficients.gain, &mut coefficients.offset);
+        transposed(shape, error, &way, [spline, along], back, workers);
+        let size = BAND * shape.cols;
+        let bands = bands!(size; &mut coefficients.gain, &mut coefficients.offset);
         workers.each(bands, |index, (gain, offset)| {
-            let rows = gain.chunks_mut(cols).zip(offset.chunks_mut(cols));
-            for (row, (gain, offset)) in rows.enumerate() {
-                let row = index * BAND + row;
-                for i in (0..2).filter(|i| ways[*i].inside[0].contains(&row)) {
-                    let columns = ways[i].inside[1].clone();
-                    let [raw, error] =
-                        [raws[i], &errors[i]].map(|image| &image[row * cols..][columns.clone()]);
-                    let own = gain[columns.clone()].iter_mut().zip(&mut offset[columns.clone()]);
-                    for ((gain, offset), (y, error)) in own.zip(raw.iter().zip(error)) {
-                        let change = step_at(step, *y) * (error - means[i]);
-                        *gain += change * y;
-                        *offset += change;
-                    }
-                }
+            let start = index * size;
+            let (first, second) = (&before[start..], &frame.raw[start..]);
+            let changes = error[start..].iter().zip(&back[start..]);
+            let frames = first.iter().zip(second).zip(changes);
+            for ((gain, offset), ((y1, y2), (error, back))) in
+                gain.iter_mut().zip(offset).zip(frames)
+            {
+                let (one, other) = (step_at(step, *y1) * back, step_at(step, *y2) * error);
+                *gain += other * y2 - one * y1;
+                *offset += other - one;
             }
         });
         coefficients.hold_gauge(workers);
+        true
     }
+}
+
+/// Pixels of the later frame that are saturated, or whose place in the earlier one is within two pixels of
+/// such a pixel; none if there is no such pixel.
+fn saturated(frame: &Frame<'_>, before: &[f32], way: &Move) -> Option<Vec<bool>> {
+    let earlier = |y: &f32| *y >= frame.saturation;
+    if frame.left_out.is_none() && !before.iter().any(earlier) {
+        return None;
+    }
+    let mut found: Vec<bool> = frame.raw.iter().map(earlier).collect();
+    for (pixel, _) in before.iter().enumerate().filter(|(_, y)| earlier(y)) {
+        way.near(frame.shape, pixel, |place| found[place] = true);
+    }
+    Some(found)
 }
 
 impl Method for Registered {
@@ -143,17 +193,21 @@ impl Method for Registered {
             let [row, col] = shift.pixels;
             let far = row.abs().max(col.abs()) > self.most_motion;
             replace = far || shift.agreement < self.agreement;
-            used = !replace && row.hypot(col) >= self.least_motion;
-            if used {
-                self.learn(frame, shift.pixels, coefficients, workers);
+            if !replace && row.hypot(col) >= self.least_motion {
+                used = self.learn(frame, shift.pixels, coefficients, workers);
+                replace = true;
             }
         }
-        if used || replace {
+        if replace {
             self.before.copy_from_slice(frame.raw);
             self.spectrum = spectrum;
             self.frames += 1;
         }
         used
+    }
+
+    fn width(&self) -> usize {
+        1
     }
 
     fn state(&mut self) -> State<'_> {
@@ -163,6 +217,8 @@ impl Method for Registered {
             .map("before", sizes, &mut self.before)
             .map("spectrum_real", amplitudes, &mut self.spectrum.re)
             .map("spectrum_imaginary", amplitudes, &mut self.spectrum.im)
+            .squares("usual", [1, 1], std::slice::from_mut(&mut self.usual.square))
             .count("frames_before", &mut self.frames)
+            .count("pairs", &mut self.usual.pairs)
     }
 }

@@ -17,6 +17,23 @@ const SMALL: f64 = 1e-9;
 /// Least amplitude of a cross spectrum that has a phase.
 const NOTHING: f64 = 1e-30;
 
+/// Frames that show different scenes are taken for a pair this often, at most.
+const FALSE_ALARMS: f64 = 0.01;
+
+/// Phases for each independent one: Hann windows correlate the amplitudes of neighbouring frequencies by 2/3
+/// and 1/6, the phase factors of the cross spectrum by 0.308 and 0.017 along an axis, and 0.128, 0.0076 and
+/// 0.0005 across: 1 + 4·0.308 + 4·0.017 + 4·0.128 + 8·0.0076 + 4·0.0005.
+const CORRELATED: f64 = 2.88;
+
+/// Largest parameter s of the bound: there A is 1 − 1/2000.
+const MOST_SHARP: f64 = 1e3;
+
+/// Most halvings of the interval of s.
+const STEPS_OF_CHANCE: usize = 60;
+
+/// Places of the mean over a phase: exp(s cos) is 1/√s = 0.03 rad wide at least.
+const PLACES: usize = 1024;
+
 /// The frequencies of which the phases are used, one of each pair ±f, and the largest whole shift.
 #[derive(Debug)]
 pub(super) struct PhaseCorrelation {
@@ -40,6 +57,28 @@ impl PhaseCorrelation {
         let used = |[u, v]: [f64; 2]| (v > 0.0 || u > 0.0) && u.hypot(v) < largest;
         let entries = (0..lines * cols).map(|entry| (entry, transform.frequency(entry)));
         Self { most: most as isize, entries: entries.filter(|(_, f)| used(*f)).collect() }
+    }
+
+    /// The mean cosine that the best shift between frames of different scenes exceeds with the probability
+    /// `FALSE_ALARMS`.
+    ///
+    /// Of n independent phases it exceeds A(s) = I₁(s)/I₀(s) with a probability of at most
+    /// exp(−n (s A(s) − ln I₀(s))), Chernoff's bound. The search covers (2 most + 1)² · π cutoff² independent
+    /// shifts.
+    pub(super) fn chance(&self, cutoff: f64) -> f64 {
+        let side = 2.0 * self.most as f64 + 1.0;
+        let searched = (std::f64::consts::PI * (side * cutoff).powi(2)).max(1.0);
+        let wanted = (searched / FALSE_ALARMS).ln() * CORRELATED / self.entries.len() as f64;
+        let (mut low, mut high) = (0.0, MOST_SHARP);
+        for _ in 0..STEPS_OF_CHANCE {
+            let middle = 0.5 * (low + high);
+            let [mean, rate] = concentrated(middle);
+            (low, high) = if rate < wanted { (middle, high) } else { (low, middle) };
+            if high - low < SMALL * mean {
+                break;
+            }
+        }
+        concentrated(high)[0]
     }
 
     /// The shift with the largest Σ cos(phase − f·d).
@@ -126,4 +165,65 @@ fn phase(before: &Spectrum, after: &Spectrum, entry: usize) -> [f64; 2] {
 fn turned([re, im]: [f64; 2], [u, v]: [f64; 2], [row, col]: [f64; 2]) -> [f64; 2] {
     let (sin, cos) = (u * row + v * col).sin_cos();
     [re * cos + im * sin, im * cos - re * sin]
+}
+
+/// A(s) and s A(s) − ln I₀(s), from means of exp(s (cos − 1)) over a phase.
+fn concentrated(s: f64) -> [f64; 2] {
+    let (mut sum, mut moment) = (0.0, 0.0);
+    for place in 0..PLACES {
+        let cos = (2.0 * std::f64::consts::PI * place as f64 / PLACES as f64).cos();
+        let weight = (s * (cos - 1.0)).exp();
+        sum += weight;
+        moment += weight * cos;
+    }
+    let mean = moment / sum;
+    [mean, s * (mean - 1.0) - (sum / PLACES as f64).ln()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::Shape;
+
+    #[test]
+    fn shifts_are_found_to_a_fraction_of_a_pixel() {
+        let workers = Workers::new(std::num::NonZeroUsize::new(2)).unwrap();
+        let transform = Transform::new(Shape::new(96, 128), 0.1);
+        let correlation = PhaseCorrelation::new(&transform, 0.1, 8);
+        let count = transform.sizes().iter().product::<usize>();
+        let part = |i: usize, factor: usize| ((i * factor) % 1009) as f32 / 505.0 - 1.0;
+        let before = Spectrum {
+            re: (0..count).map(|i| part(i, 7919)).collect(),
+            im: (0..count).map(|i| part(i, 6007)).collect(),
+        };
+        for wanted in [[0.5, -1.5], [2.4, 0.6], [-0.3, 3.7]] {
+            let moved = |i: usize| {
+                let value = [f64::from(before.re[i]), f64::from(before.im[i])];
+                turned(value, transform.frequency(i), wanted.map(|shift: f64| -shift))
+            };
+            let after = Spectrum {
+                re: (0..count).map(|i| moved(i)[0] as f32).collect(),
+                im: (0..count).map(|i| moved(i)[1] as f32).collect(),
+            };
+            let found = correlation.shift(&before, &after, &workers);
+            let error = (found.pixels[0] - wanted[0]).hypot(found.pixels[1] - wanted[1]);
+            // Amplitudes are above 1e-3, so phases err by 1e-4 at most, over frequencies near 0.3 a pixel.
+            assert!(error < 1e-4 / 0.3, "{wanted:?}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn chance_agrees_with_the_normal_law_of_many_phases_and_stays_below_one() {
+        let chance = |side: usize| {
+            let transform = Transform::new(Shape::new(side, side), 0.1);
+            let correlation = PhaseCorrelation::new(&transform, 0.1, 8);
+            (correlation.chance(0.1), correlation.entries.len() as f64)
+        };
+        let (found, phases) = chance(512);
+        let searched = std::f64::consts::PI * 1.7 * 1.7;
+        let wanted = ((searched / 0.01).ln() * CORRELATED / phases).sqrt();
+        // The rate is A² (1 + A²/4 + …) of the mean cosine A.
+        assert!((found / wanted - 1.0).abs() < found * found);
+        assert!(chance(24).0 < 1.0 && chance(24).0 > chance(64).0);
+    }
 }
