@@ -34,6 +34,8 @@ pub(crate) enum PyFrame<'py> {
 }
 
 type Map = Py<PyArray2<f32>>;
+/// Maps and counts, by name.
+type State = (Vec<(String, Map)>, Vec<(String, u64)>);
 
 /// A correction that learns from the scene.
 #[pyclass(frozen, module = "equipix._native", name = "SceneCorrection")]
@@ -205,7 +207,7 @@ impl PySceneCorrection {
     }
 
     /// All that is remembered: maps and counts by name.
-    fn state(&self, py: Python<'_>) -> PyResult<(Vec<(String, Map)>, Vec<(String, u64)>)> {
+    fn state(&self, py: Python<'_>) -> PyResult<State> {
         let Snapshot { maps, counts } = run::brief(py, |_| Ok(self.lock().snapshot()))?;
         let map = |(name, sizes, values): (String, [usize; 2], Vec<f32>)| {
             PyResult::Ok((name, values.into_pyarray(py).reshape(sizes)?.unbind()))

@@ -10,7 +10,7 @@ use crate::frames::Shape;
 use crate::parallel::Workers;
 
 /// √3 − 2.
-const POLE: f32 = -0.267_949_19;
+const POLE: f32 = -0.267_949_2;
 
 /// Steps after which the start of the recursion is forgotten.
 const REACH: usize = 14;

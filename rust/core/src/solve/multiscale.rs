@@ -218,8 +218,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
 
     /// Whether many products have not brought M within its own size.
     fn is_lost(&self) -> bool {
-        // An estimate that is no number is not below 1 either.
-        let is_far = |last: &Look| last.sweep >= LOST && !(last.error < 1.0);
+        let is_far = |last: &Look| last.sweep >= LOST && (last.error >= 1.0 || last.error.is_nan());
         self.looks.last().is_some_and(is_far)
     }
 
