@@ -481,3 +481,32 @@ class TestSaturatedReferences:
     def test_nothing_else_than_saturated_pixels_is_refused(self):
         with pytest.raises(errors.InputError, match="below saturation"):
             bolometer.fit(np.full((2, *SHAPE), 255, np.uint8), [0, 40], 2.0, order=1)
+
+
+def test_the_mask_of_clipped_values_ends_the_warning():
+    array = bolometer.BolometerArray.of((24, 32), rng=1)
+    frames = [array.mean(each) for each in (-20, 0, 20, 40, 60)]
+    level = np.quantile(frames[4], 0.9)
+    clipped = frames[4] >= level
+    frames[4] = np.minimum(frames[4], level)
+    with pytest.warns(errors.SaturationWarning, match="exclude their pixels by 'mask'"):
+        bolometer.fit(frames, [-20, 0, 20, 40, 60], NOMINAL, order=3)
+    correction = bolometer.fit(frames, [-20, 0, 20, 40, 60], NOMINAL, order=3, mask=clipped)
+    np.testing.assert_array_equal((correction.flags & Flag.DO_NOT_USE) == 0, ~clipped)
+
+
+def test_averages_beside_whole_numbers_leave_saturation_in_sight():
+    array = bolometer.BolometerArray.of((24, 32), rng=1)
+    frames = [np.rint(array.mean(each)).astype(np.uint16) for each in (-20, 0, 20, 40, 60)]
+    frames[4][3, 5] = 65535
+    mixed = [equipix.average(np.stack([frames[0]] * 2)), *frames[1:]]
+    correction = bolometer.fit(mixed, [-20, 0, 20, 40, 60], NOMINAL, order=3)
+    assert correction.flags[3, 5] & Flag.SATURATED
+
+
+def test_states_that_determine_one_order_alone_say_so():
+    array = bolometer.BolometerArray.of((24, 32), rng=1)
+    celsius, volts = [0, 20, 40, 0, 40], [2.0, 2.0, 2.0, 2.05, 2.05]
+    frames = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
+    with pytest.warns(errors.MisfitWarning, match="determine no order above 0"):
+        bolometer.fit(frames, celsius, volts)

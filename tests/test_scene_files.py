@@ -202,3 +202,10 @@ class TestRefusals:
             result = run("scene", folder / "frame00*.tif", *arguments)
             self.refused(result, "nuc.tif", "named for two outputs")
             assert not output.exists()
+
+    def test_two_outputs_of_one_name_beside_the_correction(self, run, recorded, tmp_path):
+        both = tmp_path / "both.tif"
+        arguments = ("-o", tmp_path / "nuc.tif", "--state", both, "--corrected", both, "--force")
+        result = run("scene", recorded[0] / "frame00*.tif", *arguments)
+        self.refused(result, "both.tif", "named for two outputs")
+        assert not both.exists()

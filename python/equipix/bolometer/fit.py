@@ -125,6 +125,9 @@ def fit(
     flags = flags_of(taken, bodies, mask)
     check_word("regressor", regressor, get_args(Regressor))
     good, form = usable(flags), Form(powers, regressor)
+    taken.warn_of_clipping("shutter", good)
+    for k, body in enumerate(bodies or ()):
+        body.warn_of_clipping(f"black_bodies[{k}]", good)
     shown = Shown(taken.values, states, good, form, taken.noise(good))
     chosen, errors = shown.order(order)
     axes, offset = shown.coefficients(chosen)

@@ -70,7 +70,10 @@ class HeldOut:
         errors = [self._error(each) for each in possible]
         enough = min(errors) * (1 + _BETTER) + self._rounding
         order = next(each for each, error in enumerate(errors) if error <= enough)
-        self._warn(order, errors[order])
+        if len(errors) == 1:
+            self._warn_of_one()
+        else:
+            self._warn(order, errors[order])
         return Chosen(order, errors)
 
     @property
@@ -133,6 +136,15 @@ class HeldOut:
             MisfitWarning,
         )
 
+    def _warn_of_one(self) -> None:
+        """Warn where the states determine no order but 0."""
+        warn(
+            f"'order' is 'auto', but {len(self.states.groups)} temperatures with these biases "
+            "determine no order above 0 where one is held out: take references at more states, or "
+            "give 'order' and 'bias_order'",
+            MisfitWarning,
+        )
+
     def warn_of_repeats(self) -> None:
         """Warn of references at one temperature that differ by more than noise explains."""
         axes = self.states.axes(0, *self.form)
@@ -153,7 +165,12 @@ class HeldOut:
 
     def warn_of_constant(self, chosen: Chosen) -> None:
         """Warn where temperatures explain nothing, and no noise is known that hides it."""
-        if chosen.order > 0 or self.variance is not None or chosen.errors[0] <= self._rounding:
+        if (
+            chosen.order > 0
+            or len(chosen.errors) == 1
+            or self.variance is not None
+            or chosen.errors[0] <= self._rounding
+        ):
             return
         warn(
             "order 0 predicts temperatures that are held out best, with an error of "

@@ -51,10 +51,10 @@ class References:
         if averages and len(averages) == len(listed):
             variance = tuple(each.variance_of_mean for each in averages)
         values = _stack(name, listed or given)
-        found = cls(values.astype(np.float64), variance, _at_the_top(values))
-        for each in averages:
-            found.saturated[each.saturated > 0] = True
-        found._warn(name)
+        found = cls(values.astype(np.float64), variance, np.zeros(values.shape[1:], bool))
+        for each in listed or values:
+            at_top = each.saturated > 0 if isinstance(each, FrameStatistics) else _at_the_top(each)
+            found.saturated[at_top] = True
         return found
 
     def noise(self, good: Bools) -> Floats | None:
@@ -64,10 +64,10 @@ class References:
         noise = np.array([each[good].mean() for each in self.variance])
         return noise if np.isfinite(noise).all() else None
 
-    def _warn(self, name: str) -> None:
-        """Warn of values at exactly the highest one."""
+    def warn_of_clipping(self, name: str, good: Bools) -> None:
+        """Warn of values of usable pixels at exactly the highest one."""
         for k, frame in enumerate(self.values):
-            found = clipping(np.where(self.saturated, np.nan, frame))
+            found = clipping(np.where(good, frame, np.nan))
             if found is not None:
                 warn(
                     f"{found.values} values of '{name}' at state {k} are exactly "
@@ -92,11 +92,12 @@ def _stack(name: str, given: Any) -> Array:
     return values
 
 
-def _at_the_top(values: Array) -> Bools:
-    """Pixels at the largest number of a type of whole numbers in any frame."""
-    if values.dtype.kind not in "iu":
-        return np.zeros(values.shape[1:], bool)
-    return np.asarray((values == np.iinfo(values.dtype).max).any(axis=0))
+def _at_the_top(given: ArrayLike) -> Bools:
+    """Pixels of a frame at the largest number of its type of whole numbers."""
+    frame = np.asanyarray(given)
+    if frame.dtype.kind not in "iu":
+        return np.zeros(frame.shape, bool)
+    return np.asarray(frame == np.iinfo(frame.dtype).max)
 
 
 def bodies_of(given: Any, shape: tuple[int, ...]) -> list[References]:

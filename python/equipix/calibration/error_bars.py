@@ -206,8 +206,8 @@ def incomplete_searches(count: int) -> str:
     return (
         f"{count} of the searches for standard deviations ended early: the measurements barely "
         "constrain some pattern of the sensitivity, and standard deviations that it is part of are "
-        "too small: they may lie in weak light (mask it), or the shifts are too regular or too "
-        "uncertain (see equipix.plan.error_budget)"
+        "too small. The pattern may lie in weak light (mask it), or the shifts are too regular or "
+        "too uncertain (see equipix.plan.error_budget)"
     )
 
 

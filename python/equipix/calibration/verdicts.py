@@ -45,11 +45,12 @@ _NOT_FOUND = 0.1
 """Largest estimated error of M of a joint fit for which noise determines the errors."""
 
 _FEW = 0.01
-"""Share of pixels that more dark frames would help, below which it is not said."""
+"""Smallest share of faint pixels that gives a verdict."""
 
 TOO_WEAK = (
-    "the light is too weak for its noise: use more light or more frames, or mask pixels that "
-    "receive almost no light"
+    "the light is too weak for its noise, or the measurements contradict each other: use more "
+    "light or more frames, mask pixels that receive almost no light, and see that the shifts are "
+    "those of the frames"
 )
 
 _DEGENERATE = 0.1

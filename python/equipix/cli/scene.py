@@ -73,13 +73,13 @@ def scene(
 ) -> None:
     """Learn gain and offset of each pixel from a moving scene."""
     check_output(output, force=force, suffixes=SUFFIXES)
-    outputs = {corrected: _TIFF, state: SUFFIXES, picture: ()}
-    for path, suffixes in outputs.items():
+    others = [(corrected, _TIFF), (state, SUFFIXES), (picture, ())]
+    for path, suffixes in others:
         if path is not None:
             check_output(path, force=force, suffixes=suffixes)
     if picture is not None:
         check_picture(picture)
-    written = [output, *(path for path in outputs if path is not None)]
+    written = [output, *(path for path, _ in others if path is not None)]
     refuse_inputs(written, [*find_files(source), *([resume] if resume else [])])
     options = {
         name: value

@@ -105,7 +105,8 @@ def _refuse_clipped(raw: Array, table: Table, words: Array, at_ends: int) -> Non
         raise InputError(
             f"'frames' of {np.nanmin(raw):g} to {np.nanmax(raw):g} DN are beyond an ADC of "
             f"'adc_bits' {form.adc_bits} and 'adc_step' {2.0**form.adc:g} in all usable pixels: "
-            f"all words are 0 or {form.largest_word}: take more bits, or a larger step"
+            f"all words are 0 or {form.largest_word}: take an ADC that holds the range of the "
+            "frames, or see that their offset is that of the correction"
         )
 
 

@@ -63,6 +63,8 @@ def save_pages(
                 f"page '{name}' is {array.dtype} of shape {array.shape}, expected numbers in two"
                 " dimensions or a stack of such images"
             )
+    if KEY in metadata:
+        raise InputError(f"'metadata' has a key {KEY!r}, which is that of the checksum: rename it")
     description = json.dumps({**metadata, KEY: checksum(pages, metadata)})
     with write_whole(path, force=force) as temporary:
         write(temporary, pages, description)

@@ -120,13 +120,15 @@ impl Workers {
         self.pool.current_num_threads()
     }
 
-    /// Runs `work`, which consists of many short parallel steps, on a thread of the pool: the other threads
-    /// then wait for the next step awake, where to wake them takes as long as a step.
+    /// Runs `work`, which consists of many short parallel steps, on a thread of the pool. The other threads
+    /// then stay awake between two steps; to wake them takes as long as a short step.
     ///
-    /// One at a time. A thread that waits for the end of a step takes up whatever else there is to do. A
-    /// second long work would hold up the first until it has ended; so it stays on the thread that calls.
+    /// Only one caller at a time. A thread that waits for the end of a step runs other jobs of the pool
+    /// meanwhile, and a second long work would delay the first until it has ended: it stays on the thread of its
+    /// caller, as does the work of a pool of one thread.
     pub fn enter<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
-        if self.entered.swap(true, Ordering::Acquire) {
+        // The only thread of a pool must stay free for what other callers ask.
+        if self.count() == 1 || self.entered.swap(true, Ordering::Acquire) {
             return work();
         }
         let _leave = Leave(&self.entered);
@@ -252,6 +254,12 @@ mod tests {
         });
         assert!(seen);
         assert_eq!(other, (false, (0..9).collect()));
+    }
+
+    #[test]
+    fn a_pool_of_one_thread_stays_free() {
+        let workers = Workers::new(NonZeroUsize::new(1)).unwrap();
+        assert!(!workers.enter(is_inside));
     }
 
     #[test]
