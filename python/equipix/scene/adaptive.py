@@ -183,15 +183,15 @@ class SceneCorrection:
             values in DN. A pixel that varies over the frames by less than half of what its
             neighbours do is flagged ``DEAD``, from 51 frames on, and one of a gain above 2.
 
-        Warns
-        -----
-        UnusedInputWarning
-            If less than a tenth of the usable frames counted.
-
         Raises
         ------
         InputError
             If no frame counted: the scene never moved, or too few frames were taken.
+
+        Warns
+        -----
+        UnusedInputWarning
+            If less than a tenth of the usable frames counted.
         """
         self.check_learned()
         self._warn_of_few()
