@@ -351,3 +351,15 @@ def reference_raster():
         [(0, 0), (1, 0.2), (-1, -0.3), (0.15, 1), (-0.2, -1)]
         + [(0.7, 0.7), (-0.8, 0.6), (0.6, -0.75), (-0.65, -0.8)]
     )
+
+
+@pytest.mark.filterwarnings("ignore:the exposures determine only")
+@pytest.mark.parametrize("name", ["narrow beam", "laser beam", "round vignetting", "dark corner"])
+def test_a_dark_without_noise_flags_nothing_more(name):
+    """The rule for the noise of the dark is that of the solver."""
+    shape, beam, shifts = EXPERIMENTS[name]
+    frames, _ = experiment(shape, beam, shifts)
+    variance = np.full(5, 1e-6)
+    without = equipix.calibrate(frames, shifts, variance=variance)
+    exact = equipix.calibrate(frames, shifts, variance=variance, dark_variance=0)
+    np.testing.assert_array_equal(exact.flags, without.flags)

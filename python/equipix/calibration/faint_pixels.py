@@ -39,8 +39,8 @@ def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
     exposures = weighted.exposures
     if exposures.dark_variance is None:
         return weighted
-    faint = _faint(std_of_pixels(weighted, options.workers))
-    faint &= weighted.fit.flags.reshape(faint.shape) == 0
+    without, with_dark = std_of_pixels(weighted, options.workers)
+    faint = _faint(with_dark) & ~_faint(without) & (weighted.fit.flags == 0)
     if not faint.any():
         return weighted
     findings = dataclasses.replace(exposures.findings, faint=faint)
@@ -49,7 +49,7 @@ def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
 
 
 def _faint(std: Array) -> Bools:
-    """Pixels known to worse than 4 %, and four times worse than a bright pixel."""
+    """Pixels known to worse than 4 %, and four times worse than a bright one, as in `prior.rs`."""
     known = std[np.isfinite(std)]
     lit = known[known <= _LIT]
     lit = lit if lit.size >= _FEWEST else known

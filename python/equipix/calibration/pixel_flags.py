@@ -10,8 +10,9 @@ from equipix.defects import response_outliers
 from equipix.flags import set_bits
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
     from equipix.calibration.weights import Weighted
+    from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 
 
@@ -34,21 +35,34 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
 def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
     """Pixels of a much smaller and of a much larger response than their neighbours: dead, hot."""
     sensitivity = weighted.fit.sensitivity.astype(weighted.exposures.values.dtype, copy=False)
-    dead, hot = response_outliers(sensitivity, lambda: std_of_pixels(weighted, options.workers))
+    dead, hot = response_outliers(sensitivity, lambda: std_of_pixels(weighted, options.workers)[1])
     return dead | (sensitivity <= options.tolerance), hot
 
 
-def std_of_pixels(weighted: Weighted, workers: int | None) -> Array:
-    """Standard deviation of M, that of the beam left out: 1/√D.
+def _weights(exposures: Exposures) -> Floats:
+    """Sum of the weights of each pixel, one exposure at a time: large sensors must fit."""
+    total = np.zeros(exposures.shape)
+    for k, values in enumerate(exposures.values):
+        used = np.isfinite(values)
+        if exposures.mask is not None:
+            used &= ~(exposures.mask[k] if exposures.mask.ndim == 3 else exposures.mask)
+        variance = 1.0 if exposures.variance is None else exposures.variance[k]
+        total += np.divide(1.0, variance, where=used, out=np.zeros(exposures.shape))
+    return total
 
-    The noise of a dark adds at most v Σw/D, which it adds where all exposures show the same light.
+
+def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array]:
+    """Standard deviation of M without and with the noise of the dark, the beam's error left out.
+
+    It is 1/√D. The noise of a dark adds at most v Σw/D, which it adds where all exposures show the
+    same light.
     """
     exposures = weighted.exposures
     information = weighted.fit.information(workers=workers)
-    variance: float | Array = weighted.noise_variance
-    if exposures.dark_variance is not None:
-        ones = np.where(np.isfinite(exposures.values), 1.0, np.nan)
-        weights = np.nansum(exposures.weighted_squares(ones), axis=0)
-        variance = variance + exposures.dark_variance * weights
+    variance = weighted.noise_variance
     with np.errstate(divide="ignore"):
-        return np.asarray(1 / np.sqrt(information / variance))
+        without = np.asarray(1 / np.sqrt(information / variance))
+        if exposures.dark_variance is None:
+            return without, without
+        total = variance + exposures.dark_variance * _weights(exposures)
+        return without, np.asarray(1 / np.sqrt(information / total))
