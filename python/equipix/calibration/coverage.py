@@ -60,10 +60,8 @@ def _far(fit: Fit) -> str:
 def _wanted(exposures: Exposures) -> Bools:
     """Pixels that the caller has not masked: with a usable value, or found bad or saturated."""
     wanted = np.zeros(exposures.shape, bool)
-    for k, values in enumerate(exposures.values):
-        mask = exposures.mask
-        masked = False if mask is None else mask[k] if mask.ndim == 3 else mask
-        wanted |= np.isfinite(values) & ~np.asarray(masked)
+    for k in range(len(exposures)):
+        wanted |= exposures.usable(k)
     for found in vars(exposures.findings).values():
         if found is not None:
             wanted |= found

@@ -42,11 +42,9 @@ def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
 def _weights(exposures: Exposures) -> Floats:
     """Sum of the weights of each pixel, one exposure at a time: large sensors must fit."""
     total = np.zeros(exposures.shape)
-    for k, values in enumerate(exposures.values):
-        used = np.isfinite(values)
-        if exposures.mask is not None:
-            used &= ~(exposures.mask[k] if exposures.mask.ndim == 3 else exposures.mask)
+    for k in range(len(exposures)):
         variance = 1.0 if exposures.variance is None else exposures.variance[k]
+        used = exposures.usable(k)
         total += np.divide(1.0, variance, where=used, out=np.zeros(exposures.shape))
     return total
 
