@@ -3,7 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 SOURCES := $(shell find rust python -name '*.rs' -o -name '*.py') Cargo.toml Cargo.lock pyproject.toml
 
-.PHONY: demo test bench figures docs lint audit build clean
+# Share of the seeds or parameter sets of each study that `make test` runs.
+STUDIES ?= 0.1
+
+.PHONY: demo test study bench figures docs lint audit build clean
 
 demo: $(BIN)/.built-release
 	$(BIN)/equipix demo --force
@@ -11,7 +14,11 @@ demo: $(BIN)/.built-release
 test: $(BIN)/.built-ci
 	cargo test --locked
 	$(BIN)/python -m pytest -m timing
-	$(BIN)/python -m pytest -m "not timing" -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m "not timing" -n 2 --dist worksteal --study-share $(STUDIES)
+
+study: $(BIN)/.built-ci
+	$(BIN)/python -m pytest -m study -n 2 --dist worksteal --study-share 1 \
+		--study-record docs/studies.md
 
 bench: $(BIN)/.built-release $(BIN)/.installed-bench
 	$(BIN)/python benches/run.py
