@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, errors, nuc
+from equipix import Flag, errors, nuc, simulate
 from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
@@ -182,6 +182,44 @@ class TestTheArrayAsReference:
         found = nuc.find_defects(response, stack)
         assert places(found.flags, Flag.HOT) - places(response.flags, Flag.HOT) == {(5, 5)}
         assert found.counts["noisy"] == 1
+
+
+class TestRegions:
+    """A median of a block is that of bad pixels where they fill most of it."""
+
+    @pytest.mark.parametrize(
+        "region",
+        [np.s_[20:32, 36:48], np.s_[16:32, 32:48], np.s_[32:41], np.s_[:24, :24], np.s_[:, -9:]],
+        ids=["12x12", "16x16", "nine rows", "a corner", "nine columns"],
+    )
+    def test_a_dead_region_is_found_and_no_good_pixel_beside_it(self, region):
+        shape, rng = (72, 96), np.random.default_rng(11)
+        dead = np.zeros(shape, bool)
+        dead[region] = True
+        truth = np.where(dead, 0.0, 1 + 0.02 * rng.standard_normal(shape))
+        lights = np.linspace(500.0, 3500.0, 5)[:, None, None]
+        levels = lights * truth + rng.standard_normal((5, *shape))
+        response = nuc.fit(levels, order=1, variance=np.ones(5))
+        for flags in (response.flags, nuc.find_defects(response).flags):
+            np.testing.assert_array_equal((flags & Flag.DO_NOT_USE) != 0, dead)
+
+    def test_a_calibration_finds_it(self):
+        shifts, rng = equipix.cross_pattern(11, 19), np.random.default_rng(11)
+        truth = 1 + 0.02 * rng.standard_normal((72, 96))
+        truth[20:32, 36:48] = 0
+        beams = simulate.exposures(truth, simulate.gaussian_beam((72, 96)), shifts)
+        noisy = 3000 * beams + rng.standard_normal(beams.shape)
+        found = equipix.calibrate(noisy, shifts, variance=np.ones(5))
+        np.testing.assert_array_equal((found.flags & Flag.DO_NOT_USE) != 0, truth == 0)
+
+    def test_a_hot_region_is_found(self):
+        rng = np.random.default_rng(12)
+        truth = 1 + 0.02 * rng.standard_normal(SHAPE)
+        truth[18:30, 34:46] *= 3
+        hot = np.argwhere(truth > 2).tolist()
+        lights = np.linspace(500.0, 3500.0, 5)[:, None, None]
+        response = nuc.fit(lights * truth, order=1)
+        assert np.argwhere(response.flags & Flag.HOT).tolist() == hot
 
 
 class TestLimits:

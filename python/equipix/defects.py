@@ -31,6 +31,10 @@ DEAD_RESPONSE = 0.5
 """Response relative to the neighbours below which a pixel is dead."""
 
 _BLOCK = 16
+"""Side of the blocks of pixels whose median is what is usual there."""
+
+_AROUND = 5
+"""Side of the square of blocks that a block is compared with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +213,9 @@ def response_outliers(
     Returns
     -------
     dead, hot : ndarray of bool, shape (rows, cols)
-        Of the two kinds; the neighbours' sensitivity is the median of a block of 16×16 pixels.
+        Of the two kinds; the neighbours' sensitivity is the median of a block of 16×16 pixels, or
+        of the 5×5 blocks around where that is below half or above twice theirs: of a region of
+        bad pixels that fills most of a block.
     """
     dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
     with np.errstate(invalid="ignore"):
@@ -217,7 +223,7 @@ def response_outliers(
         lowest, highest = (f.reduce(sensitivity, axis=None) for f in (np.fmin, np.fmax))
         if not lowest < max(least, DEAD_RESPONSE) * highest:
             return dead, hot
-    usual, deviation = _block_medians(sensitivity), std()
+    usual, deviation = _usual(sensitivity), std()
     for found, sign, limit in ((dead, -1, least), (hot, 1, 1 / DEAD_RESPONSE)):
         beyond = sign * (sensitivity - limit * usual).ravel()
         suspects = np.flatnonzero(beyond > 0)
@@ -227,10 +233,37 @@ def response_outliers(
 
 def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
     """Take for each pixel the median of the 16×16 block that it lies in."""
+    return _of_pixels(_medians(image), image.shape)
+
+
+def _usual(image: NDArray[Any]) -> NDArray[Any]:
+    """Block medians, but of an odd block the median of the 5×5 blocks around.
+
+    A block is odd where its median is below half or above twice that of the blocks around: most of
+    its pixels are bad. In steep light every block may be so, hence this is for responses alone.
+    """
+    medians, reach = _medians(image), _AROUND // 2
+    padded = np.pad(medians, reach, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (_AROUND, _AROUND))
+    around = _nanmedian(windows, axis=(2, 3))
+    odd = (medians < DEAD_RESPONSE * around) | (medians * DEAD_RESPONSE > around)
+    return _of_pixels(np.where(odd, around, medians), image.shape)
+
+
+def _medians(image: NDArray[Any]) -> NDArray[Any]:
+    """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
     rows, cols = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
-    blocks = padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK)
+    return _nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
+
+
+def _of_pixels(blocks: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Spread values of blocks over their pixels."""
+    return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[: shape[0], : shape[1]]
+
+
+def _nanmedian(values: NDArray[Any], axis: tuple[int, ...]) -> NDArray[Any]:
+    """Median of the values that are numbers; NaN where there is none."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
-        medians: NDArray[Any] = np.nanmedian(blocks, axis=(1, 3))
-    return medians.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:rows, :cols]
+        return np.asarray(np.nanmedian(values, axis=axis))
