@@ -118,17 +118,17 @@ class TestAgainstSimulatedExperiments:
 
     SHAPE = (120, 160)
 
+    @pytest.mark.study
     @pytest.mark.parametrize(
         ("free", "fractional", "masked", "sensors"),
         [(True, False, 0, 4), (True, False, 0.02, 4), (False, True, 0, 2), (False, True, 0.02, 2)],
         ids=["free", "free, masked", "between pixels", "between pixels, masked"],
     )
-    def test_z_scores(self, free, fractional, masked, sensors):
-        squares = [
-            self.mean_squares(seed, free, fractional, masked, 200 // sensors)
-            for seed in range(sensors)
-        ]
-        check_scores(squares)
+    def test_z_scores(self, free, fractional, masked, sensors, draws, figure):
+        def mean_squares(seed, experiments):
+            return self.mean_squares(seed, free, fractional, masked, experiments)
+
+        check_scores(mean_squares, sensors, len(draws(200)), figure)
 
     def mean_squares(self, seed, free, fractional, masked, experiments):
         rng = np.random.default_rng([seed, 46, int(100 * masked)])
@@ -142,9 +142,10 @@ class TestAgainstSimulatedExperiments:
         options = {"flux": "fit"} if free else {}
         return mean_square_scores(clean, shifts, truth, used, experiments, rng, **options)
 
-    def test_z_scores_of_refined_shifts(self):
+    @pytest.mark.study
+    def test_z_scores_of_refined_shifts(self, draws, figure):
         squares = []
-        for seed in range(40):
+        for seed in draws(40):
             rng = np.random.default_rng([seed, 47])
             shifts = between(CROSS, rng)
             sensitivity = simulate.paper_sensitivity(self.SHAPE, rng=rng)
@@ -158,14 +159,17 @@ class TestAgainstSimulatedExperiments:
             error = cal.shifts - shifts
             squares.append(np.sum(((error - error.mean(axis=0)) / std) ** 2) / 10)
         # 40 × 5 shifts along two axes, of which four are free: 4 % a standard error of the rms.
-        assert np.sqrt(np.mean(squares)) == pytest.approx(1, abs=0.1)
+        z, limit = np.sqrt(np.mean(squares)), 0.1 * np.sqrt(40 / len(squares))
+        figure("z of refined shifts", z, f"1 ± {limit:.2f}")
+        assert z == pytest.approx(1, abs=limit)
 
-    def test_drift_is_in_the_tilt_of_a_monitored_lamp(self):
+    @pytest.mark.study
+    def test_drift_is_in_the_tilt_of_a_monitored_lamp(self, draws, figure):
         shape, shifts = (60, 80), equipix.cross_pattern(5, 7)
         clean = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts)
         rng = np.random.default_rng(48)
         scores = []
-        for index in range(150):
+        for index in draws(150):
             flux = np.exp(1e-3 * rng.standard_normal(5))
             frames = clean * flux[:, None, None] + 1e-4 * rng.standard_normal(clean.shape)
             cal = equipix.calibrate(
@@ -179,7 +183,9 @@ class TestAgainstSimulatedExperiments:
                 std = cal.tilt_std
             scores.append(cal.tilt / std)
         # 150 pairs: 4 % a standard error of the rms, and three of them.
-        assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1, abs=0.13)
+        z, limit = np.sqrt(np.mean(np.square(scores))), 0.13 * np.sqrt(150 / len(scores))
+        figure("z of the tilt under a monitored lamp that drifts", z, f"1 ± {limit:.2f}")
+        assert z == pytest.approx(1, abs=limit)
 
 
 def shift_std_of(cal):

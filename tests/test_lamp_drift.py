@@ -42,31 +42,42 @@ def estimated(seed, drift, shifts=SEVEN, **options):
     return lamp_drift(weighted, sampled(weighted)), error, flux
 
 
-def test_fluxes_without_drift_scatter_as_noise_does():
-    """Probabilities of 100 right experiments are even: Kolmogorov's limit of 1e-3 is 1.95/√100."""
-    found = np.sort([estimated(seed, 0.0)[0].probability for seed in range(100)])
-    ranks = (np.arange(100) + 0.5) / 100
-    assert np.abs(found - ranks).max() < 1.95 / 100**0.5
+@pytest.mark.study
+def test_fluxes_without_drift_scatter_as_noise_does(draws, figure):
+    """Probabilities of n right experiments are even: Kolmogorov's limit of 1e-3 is 1.95/√n."""
+    found = np.sort([estimated(seed, 0.0)[0].probability for seed in draws(100)])
+    ranks = (np.arange(found.size) + 0.5) / found.size
+    distance, limit = np.abs(found - ranks).max(), 1.95 / found.size**0.5
+    figure(
+        "probabilities of no drift, distance from an even distribution", distance, f"< {limit:.3f}"
+    )
+    assert distance < limit
 
 
-def test_a_drift_of_thirty_standard_errors_is_found():
+@pytest.mark.study
+def test_a_drift_of_thirty_standard_errors_is_found(draws, figure):
     shown = estimated(0, 0.0)[0].flux_std
-    found = [estimated(seed, 30 * shown)[0] for seed in range(60)]
+    found = [estimated(seed, 30 * shown)[0] for seed in draws(60)]
     # With four degrees of freedom one in 6000 is missed.
     assert all(each.probability < WARNED for each in found)
-    # χ² of 240 degrees of freedom: the root mean square scatters by 4.6 %; three of these.
-    mean = np.mean([each.size**2 for each in found]) ** 0.5
-    assert mean == pytest.approx(30 * shown, rel=0.15)
+    # χ² of 60 × 4 degrees of freedom: the root mean square scatters by 4.6 %; three of these.
+    ratio = np.mean([each.size**2 for each in found]) ** 0.5 / (30 * shown)
+    limit = 0.15 * (60 / len(found)) ** 0.5
+    figure("drift found over the true one, rms", ratio, f"1 ± {limit:.2f}")
+    assert ratio == pytest.approx(1, abs=limit)
 
 
-def test_the_tilt_follows_students_t():
+@pytest.mark.study
+def test_the_tilt_follows_students_t(draws, figure):
     """Errors over their standard deviations: 50 and 90 % of t with four degrees of freedom."""
-    found = [estimated(seed, 1e-3) for seed in range(100)]
+    found = [estimated(seed, 1e-3) for seed in draws(100)]
     ratio = np.abs([error / drift.tilt_std for drift, error, _ in found])
     for quantile, share in ((0.741, 0.5), (2.132, 0.9)):
-        # 200 values: four standard errors of a share.
-        limit = 4 * (share * (1 - share) / 200) ** 0.5
-        assert np.mean(ratio < quantile) == pytest.approx(share, abs=limit)
+        # Two values for each experiment: four standard errors of a share.
+        limit = 4 * (share * (1 - share) / ratio.size) ** 0.5
+        below = np.mean(ratio < quantile)
+        figure(f"tilts below the quantile of {share} of t", below, f"{share} ± {limit:.2f}")
+        assert below == pytest.approx(share, abs=limit)
 
 
 def test_a_drift_that_is_not_linear_contradicts_a_linear_one():
