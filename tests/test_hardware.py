@@ -305,6 +305,37 @@ def test_damaged_files_are_refused_by_name(made, tmp_path, suffix):
         refused(whole.replace(text.encode(), other.encode(), 1), "checksum")
 
 
+@pytest.mark.parametrize(
+    ("written", "edited"),
+    [("GAIN_BITS (16)", "GAIN_BITS (15)"), ("return 0;", "return 1;"), ("ROWS (24)", "ROWS (12)")],
+)
+def test_an_edited_c_header_is_refused(made, tmp_path, written, edited):
+    path = tmp_path / "table.h"
+    hardware.Table.of(made[1], out_bits=13).save(path)
+    text = path.read_text()
+    assert written in text
+    path.write_text(text.replace(written, edited, 1))
+    with pytest.raises(errors.FileError, match=r"table\.h: was edited.*SHA-256.*write the table"):
+        hardware.read(path)
+    # Line ends of another system are no edit.
+    path.write_bytes(text.replace("\n", "\r\n").encode())
+    assert same(hardware.read(path), hardware.Table.of(made[1], out_bits=13))
+
+
+def test_a_far_offset_is_named(made):
+    planes = np.array(made[1].coefficients)
+    exact = hardware.Table.of(made[1]).metadata["largest_error_dn"]
+    planes[0, 4, 5] += 3e5
+    far = Polynomial(planes, made[1].flags)
+    with pytest.raises(errors.InputError, match=r"'offset_bits' is 12.*63\.\d DN.*: \(4, 5\); or"):
+        hardware.Table.of(far)
+    assert hardware.Table.of(far, offset_step=128.0).metadata["largest_error_dn"] > 60
+    flags = made[1].flags.copy()
+    flags[4, 5] |= Flag.DO_NOT_USE
+    without = hardware.Table.of(Polynomial(planes, flags))
+    assert without.metadata["largest_error_dn"] == exact
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_file_cut_anywhere_is_refused_by_name(tmp_path, suffix):
     flags = np.zeros((4, 5), np.uint32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from typing import TYPE_CHECKING
 
@@ -41,7 +42,9 @@ _A_LINE = 16
 
 _APPLY = """
 /* Output word z of pixel p for the word x of the ADC; (z + {upper}_ZERO) steps of the output are
-   the corrected value in DN. Right shifts of negative numbers must be arithmetic. */
+   the corrected value in DN. The DAC must have subtracted {lower}_coarse[p] steps
+   ahead of the ADC: a raw word of a camera without it is another number, and gives a wrong z.
+   Right shifts of negative numbers must be arithmetic. */
 static inline uint16_t {lower}_apply(uint16_t x, uint32_t p)
 {{
     if ({lower}_gain[p] == 0) return 0; /* a pixel that must not be used */
@@ -68,9 +71,9 @@ def encoded(content: Content, name: str) -> bytes:
         *_macros(content, upper),
         *_arrays(content, lower),
         _function(content.format, lower),
-        _last(upper),
     ]
-    return "\n".join([*lines, ""]).encode()
+    text = "\n".join([*lines, ""])
+    return f"{text}{_last(upper, text)}\n".encode()
 
 
 def _macros(content: Content, upper: str) -> list[str]:
@@ -105,22 +108,30 @@ def _function(f: Format, lower: str) -> str:
     )
 
 
-def _last(upper: str) -> str:
-    """Last line, by which a file is known to be whole."""
-    return f"#endif /* {upper}_H */"
+def _last(upper: str, above: str) -> str:
+    """Last line, by which a file is known to be whole and as it was written."""
+    digest = hashlib.sha256(above.encode()).hexdigest()
+    return f"#endif /* {upper}_H, SHA-256 of the lines above: {digest} */"
 
 
 def decoded(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
-    text = data.decode()
+    text = data.decode().replace("\r\n", "\n").rstrip()
     first = text.split("\n", 1)[0].rstrip()
     if not first.startswith(_FIRST):
         raise FileError(f"{path}: holds no table that equipix has written")
     fields = read_header(path, first.removeprefix(_FIRST).removesuffix(" */"))
     guard = re.search(r"^#ifndef (\w+)_H\s*$", text, re.MULTILINE)
-    if guard is None or not text.rstrip().endswith(_last(guard[1])):
+    above, newline, last = text.rpartition("\n")
+    if guard is None or not last.startswith(f"#endif /* {guard[1]}_H"):
         raise FileError(f"{path}: has no last line '#endif' with its guard: incomplete")
-    return made(path, fields, {name: _words(path, text, name) for name in DTYPES})
+    content = made(path, fields, {name: _words(path, text, name) for name in DTYPES})
+    if last != _last(guard[1], above + newline):
+        raise FileError(
+            f"{path}: was edited: the SHA-256 in its last line is not that of the lines above: "
+            "write the table again"
+        )
+    return content
 
 
 def _words(path: Path, text: str, name: str) -> Array:

@@ -22,6 +22,16 @@ _FINEST_GAIN = -40
 _NAMED = 3
 """Most pixels that a message names."""
 
+_FAR = 15.0
+"""Distance from the median above which an offset is far, over the median distance: of a normal
+distribution ten standard deviations."""
+
+_FEW = 0.01
+"""Largest share of offsets that are far from most: more are a part of the array."""
+
+_COSTLY = 2.0
+"""Largest error over that without far offsets, above which these are refused."""
+
 _ZERO_LIMIT = 2**31
 """The output 0 stands for fewer steps than this."""
 
@@ -145,6 +155,47 @@ def _refuse_unresponsive(gain: Floats) -> None:
         )
 
 
+def refuse_far_offsets(
+    found: Encoded,
+    line: tuple[Floats, Floats],
+    widths: dict[str, int],
+    steps: Steps,
+    lowest: float,
+) -> None:
+    """Refuse few offsets far from most that make the words of all the others coarse.
+
+    The first parameter is what `encode` made of the others.
+
+    Raises
+    ------
+    InputError
+        With their places, and what the largest error is without them.
+    """
+    used, step = usable(found.flags), 2.0**steps.out
+    away = np.abs(line[0] - np.median(line[0][used]))
+    far = used & (away > _FAR * max(step, float(np.median(away[used]))))
+    few = 0 < np.count_nonzero(far) <= _FEW * np.count_nonzero(used)
+    if steps.offset is not None or found.largest_error <= step or not few:
+        return
+    flags = np.array(found.flags)
+    set_bits(flags, "undetermined", far)
+    without = encode(line, flags, widths, steps, lowest).largest_error
+    if found.largest_error > _COSTLY * without:
+        raise InputError(
+            f"'offset_bits' is {widths['offset_bits']}: the step that holds all offsets makes the "
+            f"largest error {found.largest_error:.3g} DN, without the {np.count_nonzero(far)} "
+            f"offsets far from most {without:.3g} DN. Flag DO_NOT_USE their pixels: "
+            f"{_places(far)}; or give an offset_step"
+        )
+
+
+def _places(pixels: Bools) -> str:
+    """Name the first of some pixels."""
+    places = [tuple(each) for each in np.argwhere(pixels).tolist()]
+    more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
+    return ", ".join(map(str, places[:_NAMED])) + more
+
+
 def _refuse_extreme(words: Words, gain: Floats, used: Bools) -> None:
     """Refuse gains that no step holds together, and name the fewer ones that are far from most."""
     step = words.finest(gain, _FINEST_GAIN)
@@ -154,12 +205,12 @@ def _refuse_extreme(words: Words, gain: Floats, used: Bools) -> None:
     far = small
     if 2 * np.count_nonzero(small) > gain.size:
         far = gain >= min(words.limits[1] * float(np.median(gain)), gain.max())
-    places = [tuple(each) for each in np.argwhere(used)[far].tolist()]
-    more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
+    pixels = used.copy()
+    pixels[used] = far
     raise InputError(
         f"'gain_bits' is {words.bits}: no gain_step holds gains from {gain.min():.6g} to "
         f"{gain.max():.6g}, of which {float(np.median(gain)):.6g} is the median. Flag DO_NOT_USE "
-        f"the pixels far from it: {', '.join(map(str, places[:_NAMED]))}{more}{_wider(words, gain)}"
+        f"the pixels far from it: {_places(pixels)}{_wider(words, gain)}"
     )
 
 

@@ -10,7 +10,7 @@ from equipix._check import naming_memory, number
 from equipix.correction.protocol import check_correction
 from equipix.errors import InputError
 from equipix.hardware.content import Content
-from equipix.hardware.encode import Steps, encode, origin
+from equipix.hardware.encode import Steps, encode, origin, refuse_far_offsets
 from equipix.hardware.line import line_of
 from equipix.hardware.words import check_width, chosen_exponent, exponent_of
 
@@ -44,6 +44,7 @@ def content_of(
     with naming_memory("making a table"):
         offset, gain, sag = line_of(correction, linearise)
         found = encode((offset, gain), correction.flags, bits, exponents, float(lowest))
+        refuse_far_offsets(found, (offset, gain), bits, exponents, float(lowest))
     metadata = {
         **origin(correction),
         "lowest": float(lowest),
