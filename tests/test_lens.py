@@ -268,6 +268,24 @@ class TestCombine:
         levels = [equipix.average(each, dark=dark) for each in frames[1:]]
         equipix.combine(nuc.fit(levels, order=order), falloff)
 
+    def test_a_second_correction_of_raw_frames_is_refused(self, tmp_path):
+        array = simulate.StaringArray.of("InSb", SHAPE, rng=1)
+        frames = [list(array.frames(e, 2, rng=k)) for k, e in enumerate((4e6, 8e6, 12e6))]
+        raw = nuc.fit([equipix.average(each) for each in frames], order=1)
+        raw.save(tmp_path / "raw.npz")
+        falloff = lens.fit_falloff(flat()).correction()
+        same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
+        for then in (raw, equipix.load(tmp_path / "raw.npz"), equipix.combine(raw, same)):
+            with pytest.raises(errors.InputError, match="'then' holds the offsets of raw levels"):
+                equipix.combine(falloff, then)
+        learned = equipix.scene.ConstantStatistics(SHAPE, (0.0, 1.0))
+        for each in simulate.MovingScene(seed=1, shape=SHAPE).frames(5):
+            learned.update(each.values)
+        learned.result().save(tmp_path / "scene.npz")
+        for then in (learned.result(), equipix.load(tmp_path / "scene.npz")):
+            with pytest.raises(errors.InputError, match="'then' is the result of a scene method"):
+                equipix.combine(raw, then)
+
     @pytest.mark.parametrize(
         ("one", "other", "wanted"),
         [

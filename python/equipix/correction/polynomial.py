@@ -183,9 +183,10 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     ------
     InputError
         If the sensors differ in shape, or in the name or the bit depth where both metadata have
-        one, or `then` is of an order above 1 or subtracts a dark frame; or `then` is a gain alone,
-        and `first` a response to averages of raw levels: the mean offset stays in frames that it
-        has corrected, and the gain would multiply it.
+        one, or `then` is of an order above 1, subtracts a dark frame, or is of raw frames: a
+        response to averages of raw levels, or the result of a scene method; or `then` is a gain
+        alone, and `first` a response to averages of raw levels: the mean offset stays in frames
+        that it has corrected, and the gain would multiply it.
 
     Examples
     --------
@@ -215,6 +216,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
             "order, or correct frames twice"
         )
     gain = after[1] if len(after) == 2 else 0.0
+    _refuse_raw(then)
     leaves = _leaves_offset(first) and not np.nan_to_num(after[0]).any()
     if leaves and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
         raise InputError(_words_of_offset(first))
@@ -244,6 +246,20 @@ def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
     taken = ("name",) if depth_of(first).bits else ("name", "bit_depth")
     added = {key: other[key] for key in taken if other.get(key) and not one.get(key)}
     return {**one, **added}
+
+
+def _refuse_raw(then: Correction) -> None:
+    """Refuse a second correction that holds the offsets of raw frames."""
+    if _leaves_offset(then):
+        raise InputError(
+            "'then' holds the offsets of raw levels, which 'first' takes away already: fit it to "
+            "levels that 'first' has corrected"
+        )
+    if "scene" in then.metadata:
+        raise InputError(
+            "'then' is the result of a scene method, which does not state whether its frames were "
+            "raw or corrected by 'first': correct frames by 'first' and then by 'then'"
+        )
 
 
 def _leaves_offset(correction: Correction) -> bool:
