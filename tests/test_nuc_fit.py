@@ -272,6 +272,14 @@ class TestOrder:
         with pytest.raises(errors.InputError, match="2 of 2 differ: give three"):
             nuc.fit(levels, order="auto")
 
+    @pytest.mark.parametrize("places", [[0, 0, 0, -1, -1], [0, 0, 0, 0, -1]])
+    def test_auto_refuses_two_levels_repeated(self, places):
+        """Between them order 0 has no rival: it left 227 DN in frames of another level."""
+        rng = np.random.default_rng(4)
+        levels = noisy(curves(truth(1, rng), np.array(LEVELS)[places]), rng, NOISE.of_mean(100))
+        with pytest.raises(errors.InputError, match="2 of 5 differ: give three"):
+            nuc.fit(levels, order="auto", variance=NOISE.of_mean(100))
+
 
 class TestInverse:
     def test_the_cubic_is_as_close_as_it_says(self):

@@ -9,6 +9,7 @@ import numpy as np
 from equipix._check import as_array, naming_memory, number
 from equipix.errors import InputError
 from equipix.metrics.moments import stack_of, temporal_of
+from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -32,13 +33,20 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     ndarray, shape (rows, cols), float64
         ΔT·σ/ΔV in kelvin: σ is the temporal noise of one frame, rms of the two levels, with the
         drift of the frame mean removed, over pixels that have a value in all frames. NaN for a
-        pixel that has not, infinite for one that does not respond; usual figures are the median or
-        the mean over good pixels.
+        pixel that has not, infinite for one that does not respond. The usual figure is the median
+        over good pixels. Which level is the colder one does not matter.
 
     Raises
     ------
     InputError
         If the shapes do not fit, or `delta_t` is not above 0.
+
+    Notes
+    -----
+    A sample variance of f degrees of freedom follows χ²/f, whose median is below 1. σ² is divided
+    by that median, (1 − 2/(9f))³ after Wilson and Hilferty, so that the median over pixels is
+    that of the noise; by 1 % too small with two frames. Without it the median was smaller by 16, 9
+    and 6 % with 2, 3 and 4 frames of each level.
 
     Examples
     --------
@@ -57,8 +65,11 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     # A bad pixel, which corrected frames hold as NaN, has no part in the drift of the others.
     first, second = temporal_of(low), temporal_of(high)
     rise = np.abs(second.mean - first.mean)
+    # Of the mean of two equal variances (Welch-Satterthwaite).
+    freedom = round(4 / (1 / (len(low) - 1) + 1 / (len(high) - 1)))
+    variance = (first.variance + second.variance) / 2 / scatter_limit(freedom + 1, sigmas=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(delta_t * np.sqrt((first.variance + second.variance) / 2) / rise)
+        return np.asarray(delta_t * np.sqrt(variance) / rise)
 
 
 @naming_memory("roughness")

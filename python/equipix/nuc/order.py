@@ -92,7 +92,7 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     """
     between = np.argsort(levels.references)[1:-1]
     highest = min(3, levels.distinct() - 2)
-    if highest < 0 or not len(between):
+    if highest < 1:
         raise InputError(
             f"'order' is 'auto', which leaves out one of the levels between the lowest and the "
             f"highest, but {levels.distinct()} of {len(levels)} differ: give three, or an order"
