@@ -345,7 +345,7 @@ def _saved(paths: list[Path], level: float | None, rejection: Rejection | None) 
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
-            f"{level:g}: average the frames again with it (saturation=, --saturation {level:g})"
+            f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
         )
     return statistics
 

@@ -11,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from equipix._native import __version__
-from equipix.cli.terminal import say, show_warning
+from equipix.cli.terminal import CALLED, say, show_warning
 from equipix.errors import EquipixError, EquipixWarning
 
 COMMANDS = {
@@ -46,7 +46,10 @@ class _Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, found, rest = super().resolve_command(ctx, args)
-        return name, found if name is None else command(name), rest
+        if name is not None:
+            found = command(name)
+            CALLED.set(found)
+        return name, found, rest
 
 
 app = typer.Typer(

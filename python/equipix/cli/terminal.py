@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 from equipix.errors import FileError, InputError
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     Report = Callable[[int, int, str], None]
+
+CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
+"""The command, or the group of commands, that was called."""
 
 _WHOLE = 1e9
 """Whole numbers below this are printed with all digits, as saturation levels are."""
@@ -66,8 +70,13 @@ class _Announcer:
 
 
 def say(kind: str, message: object) -> None:
-    """Write one line to stderr: ``equipix: kind: message``."""
-    text = " ".join(str(message).split())
+    """Write one line to stderr: ``equipix: kind: message``, which names options."""
+    text, called = " ".join(str(message).split()), CALLED.get()
+    if called is not None:
+        # Imported where there is a message: `equipix --help` needs none.
+        from equipix.cli.wording import in_options
+
+        text = in_options(text, called)
     print(f"equipix: {kind}: {text}", file=sys.stderr)  # noqa: T201
 
 

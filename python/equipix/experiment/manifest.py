@@ -45,6 +45,9 @@ _WANTED = {
     "rotation": "0, 90, 180 or 270",
 }
 
+KEYS = frozenset(_WANTED)
+"""All keys and tables of the manifests."""
+
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Text = Annotated[str, Field(min_length=1)]
 Files = Text | Annotated[list[Text], Field(min_length=1)]
