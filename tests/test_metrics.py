@@ -89,6 +89,35 @@ class TestCorrectability:
         # 400 draws of 90 %: five standard errors.
         assert inside / 400 == pytest.approx(0.9, abs=5 * np.sqrt(0.09 / 400))
 
+    @pytest.mark.study
+    @pytest.mark.parametrize("lines", ["columns", "rows", "columns and pixels"])
+    def test_the_interval_covers_a_pattern_of_lines(self, lines, draws, figure):
+        seeds, inside = draws(300), 0
+        for seed in seeds:
+            rng = np.random.default_rng(seed)
+            pattern = {
+                "columns": np.ones((24, 1)) * rng.standard_normal(32),
+                "rows": np.ones(32) * rng.standard_normal((24, 1)),
+                "columns and pixels": (rng.standard_normal((24, 32)) + rng.standard_normal(32))
+                / np.sqrt(2),
+            }[lines]
+            stack = 0.5 * pattern + rng.standard_normal((8, 24, 32))
+            found = metrics.correctability(stack)
+            inside += found.low <= 0.5 <= found.high
+        covered = inside / len(seeds)
+        figure(f"share of 95 % intervals of C that cover it, {lines}", covered, "0.92 to 0.96")
+        error = 3 * np.sqrt(0.95 * 0.05 / len(seeds))
+        assert 0.92 - error <= covered <= 0.96 + error
+
+    def test_frames_along_the_last_axis_are_noticed(self):
+        rng = np.random.default_rng(5)
+        stack = frames_of(rng, spatial=0.3)
+        assert stack.shape[0] < min(SHAPE)
+        with pytest.warns(errors.EquipixWarning, match=r"moveaxis\(frames, -1, 0\)"):
+            metrics.correctability(np.moveaxis(stack, 0, -1))
+        # Many frames of narrow arrays are none such.
+        assert metrics.correctability(frames_of(rng, count=100, shape=(40, 12))).ratio < 1
+
     def test_drift_of_the_frame_mean_does_not_count(self):
         stack = frames_of(np.random.default_rng(3), spatial=0.5)
         plain = metrics.correctability(stack)
@@ -385,6 +414,28 @@ class TestEmvaTransfer:
         dark, bright, light = self.levels(np.random.default_rng(15))
         with pytest.raises(errors.InputError, match=message):
             metrics.emva_transfer(dark, bright, change(light))
+
+    @pytest.mark.parametrize(
+        "change",
+        [lambda light: light[::-1], lambda light: np.where(light > 9000, 20_000 - light, light)],
+    )
+    def test_light_that_falls_where_the_signal_rises_is_refused(self, change):
+        dark, bright, light = self.levels(np.random.default_rng(11))
+        with pytest.raises(
+            errors.InputError, match=r"'light' is .* at level .* one value for each"
+        ):
+            metrics.emva_transfer(dark, bright, change(light))
+
+    def test_exchanged_darks_are_refused(self):
+        dark, bright, light = self.levels(np.random.default_rng(11))
+        with pytest.raises(errors.InputError, match="no level is brighter .* not exchanged"):
+            metrics.emva_transfer(bright, dark, light)
+
+    def test_light_in_another_unit_gives_no_quantum_efficiency(self):
+        dark, bright, light = self.levels(np.random.default_rng(11))
+        found = metrics.emva_transfer(dark, bright, light / 1000)
+        assert np.isnan(found.quantum_efficiency)
+        assert found.responsivity == pytest.approx(125, rel=1e-3)
 
     def test_counts_that_do_not_fit_are_refused(self):
         dark, bright, light = self.levels(np.random.default_rng(13))

@@ -15,7 +15,7 @@ from equipix.metrics.moments import signed_root, stack_of, temporal_of, warn_of_
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from equipix._types import Bools
+    from equipix._types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,18 @@ def correctability(
 
     .. math:: \sigma_s^2 = s^2 - \sigma_t^2 / n, \qquad C^2 = \sigma_s^2 / \sigma_t^2 .
 
-    n s²/σ_t² is (1 + n C²) times a value of Fisher's distribution with N − 1 and (N − 1)(n − 1)
+    n s²/σ_t² is (1 + n C²) times a value of Fisher's distribution with f and (N − 1)(n − 1)
     degrees of freedom where the pattern is normally distributed, which gives the interval; its
-    quantiles are Paulson's [2]_. Few pixels far off, as bad ones are, make it too narrow. The
-    ratio is that of [1]_.
+    quantiles are Paulson's [2]_. Pixels of a column or a row may have a pattern in common, and few
+    columns determine its variance less well than many pixels. So the sum S of squares of the mean
+    image is divided into that between columns, between rows and the rest, and
+
+    .. math:: f = S^2 / \sum_i S_i^2 / f_i
+
+    with the degrees of freedom f_i of the parts (Satterthwaite [3]_): N − 1 where pixels are
+    independent, the number of columns less one where columns alone differ. A pattern of larger
+    areas, and few pixels far off, as bad ones are, make the interval too narrow. The ratio is that
+    of [1]_.
 
     References
     ----------
@@ -97,6 +105,8 @@ def correctability(
        staring infrared systems (in Russian).
     .. [2] E. Paulson, "An approximate normalization of the analysis of variance distribution",
        Annals of Mathematical Statistics 13 (1942) 233-235.
+    .. [3] F. E. Satterthwaite, "An approximate distribution of estimates of variance components",
+       Biometrics Bulletin 2 (1946) 110-114.
 
     Examples
     --------
@@ -122,7 +132,7 @@ def correctability(
         raise InputError("'frames' are all equal: they show no temporal noise")
     spatial = float(found.mean[found.used].var(ddof=1)) - temporal / n
     ratio = n * spatial / temporal + 1
-    degrees = pixels - 1, (pixels - 1) * (n - 1)
+    degrees = _freedom(found.mean, found.used), (pixels - 1) * (n - 1)
     tail = (1 - confidence) / 2
     low, high = (
         signed_root((ratio / _fisher_quantile(p, *degrees) - 1) / n) for p in (1 - tail, tail)
@@ -187,7 +197,23 @@ def _as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
     return given
 
 
-def _fisher_quantile(probability: float, first: int, second: int) -> float:
+def _freedom(image: Floats, used: Bools) -> float:
+    """Degrees of freedom f of the variance over pixels, as of `correctability`."""
+    away = np.where(used, image - image[used].mean(), 0.0)
+    total, left = float(np.sum(away**2)), np.count_nonzero(used) - 1
+    if total == 0:
+        return float(left)
+    parts = []
+    for axis in (0, 1):
+        counts, sums = used.sum(axis=axis), away.sum(axis=axis)
+        freedom = np.count_nonzero(counts) - 1
+        parts.append((float(np.sum(sums[counts > 0] ** 2 / counts[counts > 0])), freedom))
+    rest = max(0.0, total - sum(square for square, _ in parts))
+    parts.append((rest, left - sum(freedom for _, freedom in parts)))
+    return total**2 / sum(square**2 / freedom for square, freedom in parts if freedom > 0)
+
+
+def _fisher_quantile(probability: float, first: float, second: float) -> float:
     """Quantile of F by Paulson's normal approximation, whose equation in F^(1/3) is quadratic."""
     z = NormalDist().inv_cdf(probability)
     a, b = 2 / (9 * first), 2 / (9 * second)

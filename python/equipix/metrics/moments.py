@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from equipix._check import as_array
-from equipix.errors import DriftWarning, InputError, warn
+from equipix.errors import DriftWarning, EquipixWarning, InputError, warn
 from equipix.frames import FrameStatistics, refuse_subtracted
 
 if TYPE_CHECKING:
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
     from equipix._types import Array, Bools, Floats
 
+
+_SIGMAS = 6.0
+"""Standard errors above chance from which noise is common to a line."""
 
 _MOST_DRIFT = 5.0
 """Scatter of frame means over the noise of a pixel, up to which they are of one level. Where gains
@@ -51,13 +54,47 @@ def signed_root(square: float) -> float:
 
 
 def stack_of(name: str, frames: ArrayLike) -> Array:
-    """Return two or more frames of two pixels or more in their own dtype."""
+    """Return two or more frames of two pixels or more in their own dtype.
+
+    Warns
+    -----
+    EquipixWarning
+        If the last axis seems to be that of the frames.
+    """
     stack = as_array(name, frames, ndim=3)
     if len(stack) < 2 or stack[0].size < 2:
         raise InputError(
             f"'{name}' has shape {stack.shape}, expected two or more frames of two or more pixels"
         )
+    if stack.shape[2] < min(stack.shape[:2]):
+        _warn_of_axes(name, stack)
     return stack
+
+
+def _warn_of_axes(name: str, stack: Array) -> None:
+    """Warn if values along the last axis have in common what differs between frames.
+
+    Of frames (rows, cols, n) this is the pattern: a row is taken for a frame, and its n values of a
+    pixel for a line of pixels.
+    """
+    with np.errstate(invalid="ignore"):
+        mean = stack.mean(axis=0, dtype=np.float64)
+    lines, every = 0.0, 0.0
+    for frame in stack:
+        with np.errstate(invalid="ignore"):
+            free = np.nan_to_num(frame - mean, posinf=0, neginf=0)
+        lines += float(np.sum(free.mean(axis=1) ** 2))
+        every += float(np.sum(free**2))
+    length, count = stack.shape[2], stack.shape[0] * stack.shape[1]
+    within = (every - length * lines) / (count * (length - 1)) if length > 1 else 0.0
+    if length * lines / count > (1 + _SIGMAS * np.sqrt(2 / count)) * within:
+        warn(
+            f"'{name}' has shape {stack.shape}, {len(stack)} frames of "
+            f"{stack.shape[1]} x {length} pixels, and the noise of pixels is common along the last "
+            "axis, which is the shortest: if it is that of the frames, give "
+            "numpy.moveaxis(frames, -1, 0)",
+            EquipixWarning,
+        )
 
 
 def temporal_of(stack: Array, mask: Bools | None = None) -> Temporal:

@@ -16,8 +16,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Floats
+    from equipix._types import Bools, Floats
     from equipix.frames import FrameStatistics
+
+_LOWER = 0.05
+"""Fall of the signal where the light rises, above which light and levels do not belong together."""
+
+_MOST_EFFICIENT = 1.1
+"""Largest quantum efficiency that may be one, with its error: a photon frees one electron."""
 
 _SEQUENCES = (list, tuple, np.ndarray)
 """Types of a sequence of levels: a text, and one average, are none."""
@@ -43,7 +49,8 @@ class EmvaTransfer:
     responsivity : float
         R, slope of the signal over the light, in DN per unit of `light`.
     quantum_efficiency : float
-        R/K, where the light is in photons per pixel.
+        R/K, where the light is in photons per pixel; NaN where it is above 1.1, so that the light
+        is in another unit. Another unit may also make a number below that, which nothing shows.
     saturation_dn : float
         Signal, less the dark, at the level of the largest temporal noise.
     linearity_error : float
@@ -83,7 +90,8 @@ def emva_transfer(
     ------
     InputError
         If the numbers of levels do not fit, values are not finite, too few levels lie below
-        saturation, or their light does not differ.
+        saturation, `dark` is brighter than `bright`, or their light does not differ, or the signal
+        falls by more than 5 % where the light rises.
 
     Notes
     -----
@@ -110,6 +118,7 @@ def emva_transfer(
     off = np.array([_mean_and_variance("dark", each) for each in dark])
     on = np.array([_mean_and_variance("bright", each) for each in bright])
     signal, variance = (on - off).T
+    _refuse_dark(off[:, 0], on[:, 0])
     largest = int(np.argmax(on[:, 1]))
     saturation = float(signal[largest])
     below = signal <= _TRANSFER * saturation
@@ -126,16 +135,18 @@ def emva_transfer(
         )
     if not levels[below].any():
         raise InputError("'light' is 0 at all levels up to 70 % of saturation, expected light")
+    _refuse_falling(levels, signal, linear)
     gain = _slope(signal[below], variance[below])
     responsivity = _slope(levels[below], signal[below])
     if not gain > 0:
         raise InputError(f"'bright': the noise does not rise with the signal, the gain is {gain:g}")
     read = float(off[:, 1].mean()) - 1 / 12
+    efficiency = responsivity / gain
     return EmvaTransfer(
         gain,
         signed_root(read) / gain,
         responsivity,
-        responsivity / gain,
+        efficiency if efficiency <= _MOST_EFFICIENT else float("nan"),
         saturation,
         _linearity_error(levels[linear], signal[linear]),
     )
@@ -144,6 +155,30 @@ def emva_transfer(
 def _mean_and_variance(name: str, frames: ArrayLike | FrameStatistics) -> tuple[float, float]:
     found = moments(name, frames)
     return float(found.mean.mean()), found.variance
+
+
+def _refuse_dark(dark: Floats, bright: Floats) -> None:
+    """Refuse levels of which none is brighter than its dark: the two are exchanged."""
+    if not np.any(bright > dark):
+        raise InputError(
+            f"'bright' has means up to {bright.max():.6g} DN, 'dark' from {dark.min():.6g} DN: no "
+            "level is brighter than its dark, expected light: see that they are not exchanged"
+        )
+
+
+def _refuse_falling(light: Floats, signal: Floats, linear: Bools) -> None:
+    """Refuse light that is not that of its levels: a signal that falls where the light rises."""
+    order = np.flatnonzero(linear)[np.lexsort((signal[linear], light[linear]))]
+    highest = np.maximum.accumulate(signal[order])
+    falls = np.flatnonzero(signal[order] < (1 - _LOWER) * highest)
+    if falls.size:
+        after = order[falls[0]]
+        before = order[int(np.argmax(signal[order[: falls[0]]]))]
+        raise InputError(
+            f"'light' is {light[before]:g} at level {before} and {light[after]:g} at level {after},"
+            f" where the signal is {signal[before]:.6g} and {signal[after]:.6g} DN: expected light "
+            "that rises with the signal, one value for each level in the order of 'bright'"
+        )
 
 
 def _slope(x: Floats, y: Floats) -> float:
