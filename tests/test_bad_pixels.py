@@ -241,8 +241,13 @@ class TestLimits:
             nuc.find_defects(response, np.ones((3, 4, 5)))
         with pytest.raises(errors.InputError, match="holds one frame"):
             nuc.find_defects(response, equipix.average(np.ones((1, *SHAPE))))
-        with pytest.raises(errors.InputError, match="are all equal"):
-            nuc.find_defects(response, np.ones((3, *SHAPE)))
+        with pytest.raises(errors.InputError, match="hold no value"):
+            nuc.find_defects(response, np.full((3, *SHAPE), np.nan))
+
+    @pytest.mark.parametrize("value", [8000, 8000.5])
+    def test_equal_frames_show_no_noisy_pixel(self, response, value):
+        found = nuc.find_defects(response, np.full((3, *SHAPE), value))
+        assert found.counts["noisy"] == found.counts["flickering"] == 0
 
 
 class TestFlags:

@@ -48,7 +48,7 @@ LAYERS = (
     {"correction", "defects", "lens", "metrics", "uncertainty"},
     {"noise"},
     {"frames", "shifts"},
-    {"batches", "drift", "flags", "maps", "mending", "rejection"},
+    {"batches", "drift", "flags", "maps", "mending", "rejection", "rounding"},
     {"io"},
     {"_check", "_readonly"},
     {"_types"},

@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import errors, simulate
 from equipix.defects import dead_pixels, hot_pixels
+from equipix.exposures.averaged import Averaged
 from equipix.exposures.front import exposures_of
 from equipix.noise import NoiseModel
 
@@ -49,10 +50,19 @@ def test_the_model_has_a_floor_relative_to_its_largest_variance():
     assert model.variance(1000.0) == pytest.approx(300, rel=1e-5)
 
 
-def test_frames_that_are_all_equal_have_no_model(raw):
+def test_equal_frames_count_as_one(raw):
     same = [equipix.average(np.stack([each[0]] * 2)) for each in raw]
-    with pytest.raises(errors.InputError, match="all equal"):
-        equipix.calibrate(same, CROSS)
+    one = [equipix.average(each[:1]) for each in raw]
+    first, other = (equipix.calibrate(each, CROSS) for each in (same, one))
+    np.testing.assert_array_equal(first.sensitivity, other.sensitivity)
+
+
+def test_equal_frames_of_whole_numbers_have_the_noise_of_rounding(raw):
+    same = [equipix.average(np.rint(np.stack([each[0]] * 2)).astype(np.uint16)) for each in raw]
+    model = Averaged.of(same).noise
+    assert model.scatter(500.0) == pytest.approx(0, abs=1e-3)
+    # The floor of the noise is 1e-4 of a step.
+    assert model.of_mean(2).variance(500.0) == pytest.approx(1 / 12, rel=1e-3)
 
 
 class TestSaturatedExposures:

@@ -144,15 +144,15 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     -------
     ndarray of bool, shape (rows, cols)
         True where the level is more than 10 standard deviations above the median (estimated by
-        1.4826 times the median absolute deviation, and at least one DN), or the variance beyond
-        what noise explains.
+        1.4826 times the median absolute deviation, and at least one DN or one step between values),
+        or the variance beyond what noise and rounding explain.
     """
     excess = dark.mean - np.nanmedian(dark.mean)
-    spread = max(1.0, 1.4826 * float(np.nanmedian(np.abs(excess))))
+    spread = max(1.0, dark.step, 1.4826 * float(np.nanmedian(np.abs(excess))))
     hot: NDArray[Any] = excess > HOT_SIGMAS * spread
     frames = int(dark.count.max())
     if noise is not None and frames > 1:
-        hot |= dark.variance > scatter_limit(frames, sigmas=SIGMAS) * noise.variance(0.0)
+        hot |= dark.variance > scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
     return hot
 
 
@@ -188,7 +188,8 @@ def noisy_pixels(
     for mean, variance, count in zip(means, variances, frames, strict=True):
         if count < 2:
             continue
-        limit = max(scatter_limit(count, sigmas=SIGMAS), times**2) * noise.variance(mean)
+        of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(mean)
+        limit = np.maximum(of_chance, times**2 * noise.scatter(mean))
         known = np.isfinite(variance) & np.isfinite(mean)
         noisy &= ~known | (variance > limit)
         seen |= known

@@ -24,6 +24,7 @@ from equipix._readonly import ReadOnly
 from equipix.batches import batches, sum_dtype, unmasked
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.rejection import Rejection
+from equipix.rounding import step_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -44,6 +45,7 @@ _PAGES = {
     "saturated": np.uint32,
 }
 _COUNTS = ("count", "saturated")
+_SAMPLED = 4096  # pixels that show the step between values
 _DARK = "dark_"  # before the names of the dark's pages
 
 
@@ -73,6 +75,9 @@ class FrameStatistics(ReadOnly):
     reject : float or None
         The deviation, in standard deviations, beyond which samples were left out; None where all
         count.
+    step : float
+        Step between the values of the frames, in DN: 1 of whole numbers, 16 of 12 bits that were
+        shifted to 16; 0 of values that are not whole. See `equipix.rounding`.
     """
 
     mean: NDArray[Any]
@@ -84,6 +89,7 @@ class FrameStatistics(ReadOnly):
     saturation: float | None = None
     raw: bool = False
     reject: float | None = None
+    step: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
@@ -242,10 +248,10 @@ def save_statistics(
     """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content |= {name: getattr(statistics, name) for name in ("saturation", "raw", "reject")}
+    content |= {name: getattr(statistics, name) for name in ("saturation", "raw", "reject", "step")}
     if dark is not None:
         pages |= {_DARK + name: values for name, values in dark.maps.items()}
-        content |= {_DARK + "saturation": dark.saturation, _DARK + "reject": dark.reject}
+        content |= {_DARK + name: getattr(dark, name) for name in ("saturation", "reject", "step")}
     io.save_pages(path, pages, content, force=force)
 
 
@@ -274,7 +280,14 @@ def _of_pages(
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
     level, reject = (content.get(before + name) for name in ("saturation", "reject"))
     return FrameStatistics(
-        mean, variance, of_mean, count, saturated, saturation=level, reject=reject
+        mean,
+        variance,
+        of_mean,
+        count,
+        saturated,
+        saturation=level,
+        reject=reject,
+        step=content.get(before + "step", 0.0),
     )
 
 
@@ -362,7 +375,19 @@ def _statistics(
         saturated,
         saturation=_level_of(dtype, level),
         raw=dtype.kind in "iu",
+        step=_step(mean, variance, count),
     )
+
+
+def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> float:
+    """Step between the values of frames, of a sample of the pixels.
+
+    Sums over frames are multiples of it. Those of a pixel whose frames are equal are multiples of
+    their number as well, so there the mean counts.
+    """
+    sample = np.linspace(0, mean.size - 1, min(mean.size, _SAMPLED)).astype(np.intp)
+    means, variances, counts = (each.ravel()[sample] for each in (mean, variance, count))
+    return step_of(means * np.where(variances > 0, counts, 1))
 
 
 def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -9,6 +10,12 @@ import numpy as np
 
 from equipix._check import number
 from equipix.errors import InputError
+from equipix.rounding import (
+    UNIFORM,
+    largest_scatter,
+    scatter_slope,
+    unaveraged,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -19,14 +26,27 @@ MEDIAN_SQUARE = 0.4549
 """Median of the square of a standard normal variable."""
 
 _BINS = 64
+"""Most points of an exposure."""
+
+_FEWEST = 16
+"""Fewest pixels of a point, where an exposure has them."""
 
 _FLOOR = 1e-6
 """Least variance of a model, as a fraction of the largest that it was fitted to."""
 
+_ROUNDS = 100
+"""Most rounds of weights."""
+
+_STEADY = 1e-13
+"""Relative change of the model at which weights are final."""
+
+_LEAST_V = 1e-8
+"""Least variance of noise, in squared steps, at which a slope is taken: at 0 it is infinite."""
+
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of one frame as a function of its mean signal.
+    """Variance of a value as a function of its mean signal.
 
     Attributes
     ----------
@@ -34,14 +54,25 @@ class NoiseModel:
         Standard deviation of a frame without light, quantisation included, in DN.
     gain : float
         Slope of the photon noise, in DN per electron.
+    step : float
+        Step between the whole numbers that frames are rounded to, in DN; 0 if they are not, or if
+        their noise is far above it.
+    frames : int
+        Number of frames of which the value is the mean.
+    dark_variance : float
+        Variance of a dark that was subtracted from the mean, in DN².
 
     Notes
     -----
-    At mean signal μ (in DN, dark subtracted) the variance is ``read_noise² + gain · μ``: noise
-    without light and photon noise. Rounding to whole DN adds its 1/12 DN² to the former; since no
-    other number has a unit, frames in any unit give the same weights. Two parameters fitted over
-    all pixels weight a pixel better than its own sample variance, whose scatter would enter the
-    weights.
+    At mean signal μ (in DN, dark subtracted) the variance of one frame is ``read_noise² + gain ·
+    μ``: noise without light and photon noise. Rounding to whole DN adds its 1/12 DN² to the former;
+    since no other number has a unit, frames in any unit give the same weights. Two parameters
+    fitted over all pixels weight a pixel better than its own sample variance, whose scatter would
+    enter the weights.
+
+    A part B of the rounding is the same in all frames of a pixel: see `equipix.rounding`. So frames
+    scatter by s² = read_noise² + gain · μ − B, and the mean of n frames has the variance s²/n + B.
+    At a noise of half a step B is 3e-6 of a squared step, at none it is all of its 1/12.
 
     `signal` should be an expectation, not a noisy value: with a model evaluated on the values
     themselves those that are low by chance have larger weights, which at N electrons lowers a
@@ -58,26 +89,57 @@ class NoiseModel:
 
     read_noise: float
     gain: float
+    step: float = 0.0
+    frames: int = 1
+    dark_variance: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse parameters that give no variance."""
-        for name, value in (("read_noise", self.read_noise), ("gain", self.gain)):
+        for name in ("read_noise", "gain", "step", "dark_variance"):
+            value = getattr(self, name)
             if not 0 <= number(name, value) < np.inf:
                 raise InputError(f"'{name}' is {value!r}, expected a number not below 0")
+        if not number("frames", self.frames) >= 1:
+            raise InputError(f"'frames' is {self.frames!r}, expected 1 or more")
         if self.read_noise == self.gain == 0:
             raise InputError("'read_noise' and 'gain' are both 0, expected some noise")
 
     def variance(self, signal: ArrayLike) -> NDArray[Any]:
-        """Variance of one frame, in DN², at the mean `signal`, in DN."""
-        return self.read_noise**2 + self.gain * np.maximum(signal, 0)
+        """Variance of the value, in DN², at the mean `signal`, in DN."""
+        variance = self.scatter(signal) / self.frames + self.rounding(signal)
+        return np.asarray(variance + self.dark_variance)
+
+    def scatter(self, signal: ArrayLike) -> NDArray[Any]:
+        """Mean variance s² between frames, in DN²."""
+        return np.asarray(self._of_frame(signal) - self.rounding(signal))
+
+    def rounding(self, signal: ArrayLike) -> NDArray[Any]:
+        """Variance B of the rounding that frames do not average out, in DN²."""
+        if self.step == 0:
+            return np.zeros(())
+        return self.step**2 * unaveraged(self._in_steps(signal))
+
+    def largest_scatter(self, signal: ArrayLike) -> NDArray[Any]:
+        """Variance between frames of a pixel half-way between two steps, in DN²."""
+        if self.step == 0:
+            return self._of_frame(signal)
+        return self.step**2 * largest_scatter(self._in_steps(signal))
 
     def of_mean(self, frames: int, *, dark_variance: float = 0.0) -> Self:
         """Model of the mean of so many frames, minus a dark of that variance."""
-        variance = self.read_noise**2 / frames + dark_variance
-        return type(self)(read_noise=float(np.sqrt(variance)), gain=self.gain / frames)
+        added = self.dark_variance / frames + dark_variance
+        return dataclasses.replace(self, frames=frames * self.frames, dark_variance=added)
+
+    def _of_frame(self, signal: ArrayLike) -> NDArray[Any]:
+        """Variance of one frame."""
+        return self.read_noise**2 + self.gain * np.maximum(signal, 0)
+
+    def _in_steps(self, signal: ArrayLike) -> NDArray[Any]:
+        """Variance of one frame before it is rounded, in squared steps."""
+        return np.maximum(self._of_frame(signal) / self.step**2 - UNIFORM, 0)
 
     @classmethod
-    def fit(cls, points: NDArray[Any], *, gain: float | None = None) -> Self:
+    def fit(cls, points: NDArray[Any], *, gain: float | None = None, step: float = 0.0) -> Self:
         """Model that fits the photon-transfer curve best.
 
         Parameters
@@ -87,48 +149,96 @@ class NoiseModel:
             exposure, as `photon_transfer` gives them.
         gain : float, optional
             The gain where it is known, in DN per electron.
+        step : float
+            Step between the values of frames, in DN; 0 if they are not rounded.
 
         Returns
         -------
         NoiseModel
-            Weighted least squares; a variance s² of f degrees of freedom has variance 2s⁴/f.
-            The gain is not below 0, the variance without light not below a millionth of the
-            largest variance.
+            Least squares with the weights of the model itself: a variance s² of f degrees of
+            freedom has variance 2s⁴/f. The gain is not below 0. The variance without light is not
+            below that of the rounding, nor below a millionth of the largest variance.
 
         Raises
         ------
         InputError
-            If no variance is above 0.
+            If no variance is above 0, of values that are not rounded.
+
+        Notes
+        -----
+        Weights by the variances found, 1/s⁴, would let those win that are low by chance: of bins
+        with f degrees of freedom the mean is low by 2/f, and all of it where a bin scatters by 0.
+        Weights by the model start from equal ones and follow it until they are steady. They are
+        those of half the mean variance of the darkest tenth of the points, or less. Where rounding
+        is as large as the noise, s² depends on where in a step the means lie, which light of one
+        level does not average out: half the square of that deviation is part of the variance of a
+        point.
         """
         signal, variance, degrees = points.T
-        floor = _FLOOR * variance.max()
-        if not floor > 0:
-            raise InputError(
-                "repeated frames are all equal, which gives no noise model: give one of them"
+        least = max(_FLOOR * variance.max(), UNIFORM * step**2)
+        if not least > 0:
+            raise InputError("repeated frames are all equal, which gives no noise model")
+        darkest = np.argsort(signal, kind="stable")[: -(-len(signal) // 10)]
+        lowest = variance[darkest].mean() / 2
+        found = _bounded_line(signal, variance, degrees, least, gain)
+        for _ in range(_ROUNDS):
+            model = cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
+            former, found = (
+                found,
+                _bounded_line(
+                    signal, *model._linearised(signal, variance, degrees, lowest), least, gain
+                ),
             )
-        weight = degrees / np.maximum(variance, floor) ** 2
-        given = gain
-        if gain is None:
-            x = signal - np.average(signal, weights=weight)
-            spread = np.sum(weight * x**2)
-            gain = max(0.0, float(np.sum(weight * x * variance) / spread)) if spread > 0 else 0.0
-        read_variance = np.average(variance - gain * signal, weights=weight)
-        if read_variance < floor:
-            read_variance = floor
-            # At its bound the other parameter is fitted again: else every variance is too large.
-            energy = np.sum(weight * signal**2)
-            if given is None and energy > 0:
-                gain = max(0.0, float(np.sum(weight * signal * (variance - floor)) / energy))
-        return cls(read_noise=float(np.sqrt(read_variance)), gain=gain)
+            if np.allclose(found, former, rtol=_STEADY, atol=0):
+                break
+        return cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
+
+    def _linearised(
+        self, signal: NDArray[Any], variance: NDArray[Any], degrees: NDArray[Any], lowest: float
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Variances of one frame that the scatter found stands for, near the model, and weights."""
+        expected, slope = self.scatter(signal), np.ones(())
+        phase = self.largest_scatter(signal) - expected
+        if self.step > 0:
+            slope = scatter_slope(np.maximum(self._in_steps(signal), _LEAST_V))
+        error = 2 * np.maximum(expected, lowest) ** 2 / degrees + phase**2 / 2
+        return self._of_frame(signal) + (variance - expected) / slope, slope**2 / error
+
+
+def _bounded_line(
+    signal: NDArray[Any],
+    variance: NDArray[Any],
+    weight: NDArray[Any],
+    least: float,
+    gain: float | None,
+) -> tuple[float, float]:
+    """Intercept, at least `least`, and slope, at least 0 unless given, of a weighted fit."""
+    given = gain
+    if gain is None:
+        x = signal - np.average(signal, weights=weight)
+        spread = np.sum(weight * x**2)
+        gain = max(0.0, float(np.sum(weight * x * variance) / spread)) if spread > 0 else 0.0
+    intercept = float(np.average(variance - gain * signal, weights=weight))
+    if intercept < least:
+        intercept = least
+        # At its bound the other parameter is fitted again: else every variance is too large.
+        energy = np.sum(weight * signal**2)
+        if given is None and energy > 0:
+            gain = max(0.0, float(np.sum(weight * signal * (variance - least)) / energy))
+    return intercept, gain
 
 
 def photon_transfer(
-    signal: NDArray[Any], variance: NDArray[Any], usable: NDArray[Any], frames: int
+    signal: NDArray[Any],
+    variance: NDArray[Any],
+    usable: NDArray[Any],
+    frames: int,
+    step: float = 0.0,
 ) -> NDArray[Any]:
     """Give the points of the photon-transfer curve that one exposure contributes.
 
-    The usable pixels, in the order of their signal, are cut into bins of equal numbers. A pixel
-    whose variance is above `scatter_limit` is left out of its bin's mean.
+    The usable pixels, in the order of the mean signal of their neighbours, are cut into bins of
+    equal numbers. A pixel whose variance is above `scatter_limit` is left out of its bin's mean.
 
     Parameters
     ----------
@@ -138,25 +248,48 @@ def photon_transfer(
         Which pixels count.
     frames : int
         Number of frames averaged; fewer than two give no point.
+    step : float
+        Step between the values of frames, in DN; 0 if they are not rounded.
 
     Returns
     -------
     ndarray, shape (points, 3)
         Mean signal, mean variance and degrees of freedom of each bin.
+
+    Notes
+    -----
+    A pixel's own mean would not do for the order, since it correlates with its scatter: where two
+    rounded frames have a whole mean, they are equal.
     """
     if frames < 2:
         return np.empty((0, 3))
     pixels = np.flatnonzero(usable)
-    pixels = pixels[np.argsort(signal.ravel()[pixels])]
+    order = np.argsort(_of_neighbours(signal, usable).ravel()[pixels], kind="stable")
     limit = scatter_limit(frames)
     points = []
-    for chunk in np.array_split(pixels, min(_BINS, len(pixels)) or 1):
-        kept = inliers(variance.ravel()[chunk], limit)
+    bins = min(_BINS, max(1, len(pixels) // _FEWEST))
+    for chunk in np.array_split(pixels[order], bins):
+        # A pixel half-way between two steps scatters by a quarter of a squared step.
+        kept = inliers(variance.ravel()[chunk], limit, least=step**2 / 4)
         if kept.any():
             bin_ = chunk[kept]
             mean = (signal.ravel()[bin_].mean(), variance.ravel()[bin_].mean())
             points.append((*mean, len(bin_) * (frames - 1)))
     return np.array(points).reshape(-1, 3)
+
+
+def _of_neighbours(image: NDArray[Any], usable: NDArray[Any]) -> NDArray[Any]:
+    """Mean of the usable ones of the eight neighbours of each pixel; NaN where there is none."""
+    sums = _around(np.where(usable, image, 0.0))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(sums / _around(usable.astype(np.float64)))
+
+
+def _around(image: NDArray[Any]) -> NDArray[Any]:
+    """Sum over the eight neighbours of each pixel."""
+    padded = np.pad(image, 1)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] - image)
 
 
 def modelled_variances(
@@ -186,10 +319,13 @@ def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
     return float((1 - width + sigmas * np.sqrt(width)) ** 3)
 
 
-def inliers(values: NDArray[Any], limit: float) -> NDArray[Any]:
-    """Which values are at most `limit` times the mean of those that are; found in a few rounds."""
+def inliers(values: NDArray[Any], limit: float, *, least: float = 0.0) -> NDArray[Any]:
+    """Which values are at most `limit` times the mean of those that are; found in a few rounds.
+
+    They are compared with `least` where the mean is below it.
+    """
     keep: NDArray[Any] = np.isfinite(values)
     for _ in range(5):
         if keep.any():
-            keep &= values <= limit * values[keep].mean()
+            keep &= values <= limit * max(least, values[keep].mean())
     return keep

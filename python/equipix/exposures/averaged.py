@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -71,6 +72,8 @@ class Averaged:
         Whether no dark was subtracted from averages of whole numbers.
     dark : FrameStatistics or None
         The dark frames that were subtracted.
+    step : float
+        Largest step between the values of frames, in DN; 0 if they are not whole.
     pedestal : float
         Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
     """
@@ -96,6 +99,7 @@ class Averaged:
         self._points: list[Array] = []
         self._clipped: list[Clipping | None] = []
         self.raw = True
+        self.step = 0.0
 
     @classmethod
     def of(cls, frames: Sequence[FrameStatistics], *, words: Words = EXPOSURES) -> Self:
@@ -122,6 +126,7 @@ class Averaged:
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
             self.dark = frames.dark
+            self.step = 0.0 if frames.dark is None else frames.dark.step
         if shape != self.saturated.shape:
             raise InputError(
                 f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
@@ -148,7 +153,8 @@ class Averaged:
             self._of_dark.append(_added_by_dark(frames, count))
         # Clipped samples scatter less: their bins would have most of the weight in the noise model.
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
-        self._points.append(photon_transfer(frames.mean, frames.variance, free, count))
+        self.step = max(self.step, frames.step)
+        self._points.append(photon_transfer(frames.mean, frames.variance, free, count, frames.step))
 
     def counted_from_lowest(self) -> Self:
         """Return a copy whose noise models count the signal from the lowest of several exposures.
@@ -162,13 +168,23 @@ class Averaged:
 
     @cached_property
     def noise(self) -> NoiseModel | None:
-        """Noise model of one frame, fitted over all pixels of all frames; None without scatter."""
+        """Noise model of one frame, fitted over all pixels of all frames.
+
+        None without scatter: of single frames, and of equal ones that are not rounded.
+        """
         points = [each - (self.pedestal, 0, 0) for each in self._points]
         known = any(map(len, points))
         if self.dark is not None:
             points.append(_dark_points(self.dark))
             known |= self.gain is not None and len(points[-1]) > 0
-        return NoiseModel.fit(np.concatenate(points), gain=self.gain) if known else None
+        every = np.concatenate(points)
+        if not known or (self.step == 0 and not every[:, 1].any()):
+            return None
+        return NoiseModel.fit(every, gain=self.gain, step=self.step)
+
+    def rounded(self, noise: NoiseModel) -> NoiseModel:
+        """Noise model of one frame that counts the rounding of these frames."""
+        return noise if noise.step > 0 else dataclasses.replace(noise, step=self.step)
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -190,7 +206,8 @@ class Averaged:
         Of a dark that is not kept it is what the averages state; None without any.
         """
         if self.dark is not None:
-            return np.asarray(noise.variance(0.0) / np.maximum(self.dark.count, 1))
+            scatter = noise.scatter(0.0) / np.maximum(self.dark.count, 1)
+            return np.asarray(scatter + noise.rounding(0.0))
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
@@ -252,4 +269,4 @@ def _dark_points(dark: FrameStatistics) -> Array:
     """Points of the photon-transfer curve at signal 0."""
     usable: Bools = np.asarray(dark.saturated == 0)
     frames = int(dark.count.max())
-    return photon_transfer(np.zeros(dark.mean.shape), dark.variance, usable, frames)
+    return photon_transfer(np.zeros(dark.mean.shape), dark.variance, usable, frames, dark.step)

@@ -139,6 +139,8 @@ def _of_averaged(
             "samples are counted where equipix.average is given the level"
         )
     noise = averaged.noise if variance is None else variance
+    if isinstance(noise, NoiseModel):
+        noise = averaged.rounded(noise)
     models = as_models(noise, averaged.count)
     if isinstance(noise, NoiseModel):
         models = averaged.models(noise)

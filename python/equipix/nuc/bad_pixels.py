@@ -81,7 +81,7 @@ def find_defects(
     ------
     InputError
         If an argument is of another type, or the frames are of another shape, fewer than two, or
-        all equal.
+        without a value.
 
     Warns
     -----

@@ -12,6 +12,7 @@ from equipix.frames import FrameStatistics
 from equipix.metrics.moments import stack_of, temporal_of, warn_of_drift
 from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
 from equipix.nuc.curve import response_at
+from equipix.rounding import step_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.nuc.limits import DefectLimits
     from equipix.nuc.response import Response
+
+_SAMPLED = 4096
+"""Pixels that show the step between values."""
 
 
 def mean_slope(response: Response) -> Floats:
@@ -56,21 +60,23 @@ def of_frames(
     if isinstance(frames, FrameStatistics):
         _check_shape(frames.mean.shape, good.shape)
         mean, variance, count = frames.mean, frames.variance, int(frames.count.max())
+        step = frames.step
     else:
         stack = stack_of("frames", frames)
         _check_shape(stack.shape[1:], good.shape)
         over_time = temporal_of(stack, ~good)
         warn_of_drift(over_time)
         mean, variance, count = over_time.mean, over_time.variance, over_time.frames
+        step = step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
         slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
-    model = _common_noise(mean, variance, good, count)
-    of_level = mean[None], variance[None], [count], model
-    found = {"noisy": noisy_pixels(*of_level, times=limits.noise)}
-    if slow is not None:
-        found["flickering"] = noisy_pixels(*of_level) & slow
-    return found
+    model = _common_noise(mean, variance, good, count, step)
+    noisy = flickering = np.zeros(good.shape, bool)
+    if model is not None:
+        of_level = mean[None], variance[None], [count], model
+        noisy, flickering = noisy_pixels(*of_level, times=limits.noise), noisy_pixels(*of_level)
+    return {"noisy": noisy} if slow is None else {"noisy": noisy, "flickering": flickering & slow}
 
 
 def _dead(response: Response, slope: Floats, least: float) -> Bools:
@@ -92,15 +98,19 @@ def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
     return found
 
 
-def _common_noise(mean: Array, variance: Array, good: Bools, count: int) -> NoiseModel:
-    """Noise that pixels of a signal have in common."""
+def _common_noise(
+    mean: Array, variance: Array, good: Bools, count: int, step: float
+) -> NoiseModel | None:
+    """Noise that pixels of a signal have in common; None of equal frames that are not rounded."""
     known = good & np.isfinite(mean) & np.isfinite(variance)
     if not known.any():
         known = np.isfinite(mean) & np.isfinite(variance)
-    points = photon_transfer(mean, variance, known, count)
-    if not (len(points) and points[:, 1].max() > 0):
-        raise InputError("'frames' are all equal, or hold no value: they show no noise")
-    return NoiseModel.fit(points)
+    points = photon_transfer(mean, variance, known, count, step)
+    if not len(points):
+        raise InputError("'frames' hold no value: they show no noise")
+    if step == 0 and not points[:, 1].any():
+        return None
+    return NoiseModel.fit(points, step=step)
 
 
 def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:

@@ -244,14 +244,22 @@ def _averaged(levels: object) -> Averaged | None:
 
 
 def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | None:
-    """Noise of each mean frame, from noise models or one variance a level."""
+    """Noise of each mean frame, from noise models or one variance a level.
+
+    What rounding leaves in a mean is that at the median of the level.
+    """
     if measured.models:
-        return tuple(
-            LevelNoise(model.read_noise**2, model.gain, pedestal) for model in measured.models
-        )
+        pairs = zip(measured.models, measured.values, strict=True)
+        return tuple(_level_noise(model, values, pedestal) for model, values in pairs)
     if measured.variance is None:
         return None
     return tuple(LevelNoise(float(each), 0.0, 0.0) for each in measured.variance)
+
+
+def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNoise:
+    signal = max(0.0, float(np.nanmedian(values)) - pedestal)
+    slope = model.gain / model.frames
+    return LevelNoise(float(model.variance(signal)) - slope * signal, slope, pedestal)
 
 
 def _used(measured: Measured, mask: Bools | None) -> Array:

@@ -1,0 +1,141 @@
+"""Noise of rounded values: its formulas, the noise model of rounded frames, no false flags."""
+
+from math import erf
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import nuc
+from equipix.defects import hot_pixels
+from equipix.exposures.averaged import Averaged
+from equipix.noise import photon_transfer
+from equipix.rounding import (
+    largest_scatter,
+    scatter,
+    scatter_slope,
+    step_of,
+    unaveraged,
+)
+
+SIGMAS = (0.01, 0.05, 0.1, 0.141, 0.142, 0.2, 0.3, 0.5, 1.0, 3.0)
+PHASES = (np.arange(1000) + 0.5) / 1000
+
+
+def of_phase(sigma, phase):
+    """Bias and variance of a rounded normal value by the probabilities of whole numbers."""
+    whole = np.arange(-40, 41)
+    below = np.array([erf(x) for x in (whole - 0.5 - phase) / (sigma * np.sqrt(2))]) / 2
+    above = np.array([erf(x) for x in (whole + 0.5 - phase) / (sigma * np.sqrt(2))]) / 2
+    share = above - below
+    mean = share @ whole
+    return mean - phase, share @ (whole - mean) ** 2
+
+
+@pytest.mark.parametrize("sigma", SIGMAS)
+def test_formulas_are_those_of_probabilities(sigma):
+    bias, variance = np.transpose([of_phase(sigma, phase) for phase in PHASES])
+    v = sigma**2
+    # What Poisson's formula leaves out below v = 0.02 is 2e-8, and the largest series term 1e-11.
+    assert unaveraged(v) == pytest.approx(np.mean(bias**2), abs=3e-8)
+    assert scatter(v) == pytest.approx(variance.mean(), abs=3e-8)
+    assert largest_scatter(v) == pytest.approx(of_phase(sigma, 0.5)[1], abs=1e-9)
+    assert largest_scatter(v) > variance.max() - 1e-12
+    h = 1e-4 * v
+    slope = (scatter(v + h) - scatter(v - h)) / (2 * h)
+    assert scatter_slope(v) == pytest.approx(slope, rel=1e-4)
+
+
+def test_without_noise_all_of_the_rounding_stays():
+    assert unaveraged(0.0) == 1 / 12
+    assert scatter(0.0) == 0
+    assert largest_scatter(0.0) == 0.25
+    np.testing.assert_array_equal(unaveraged(np.array([2.0, 1e9])), 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "step"),
+    [
+        (np.arange(100), 1),
+        (16 * np.arange(100), 16),
+        (np.arange(100) + 0.5, 0),
+        (np.array([5.0, 7.0]), 1),
+        (np.full(50, 96.0), 1),
+        (np.full(3, np.nan), 0),
+        (np.append(64.0 * np.arange(20), np.nan), 64),
+    ],
+)
+def test_the_step_is_found(values, step):
+    assert step_of(np.asarray(values, np.float64)) == step
+
+
+@pytest.mark.parametrize("suffix", ["npz", "tif"])
+def test_averages_keep_the_step(tmp_path, suffix):
+    rng = np.random.default_rng(1)
+    frames = (16 * rng.integers(0, 255, (4, 20, 30))).astype(np.uint16)
+    average = equipix.average(frames, dark=equipix.average(frames[:2]))
+    assert (average.step, average.dark.step) == (16, 16)
+    average.save(tmp_path / f"a.{suffix}")
+    loaded = equipix.FrameStatistics.load(tmp_path / f"a.{suffix}")
+    assert (loaded.step, loaded.dark.step) == (16, 16)
+    assert equipix.average(0.3 * frames).step == 0
+
+
+def rounded(rng, signal, sigma, frames, step=1):
+    values = signal + sigma * rng.standard_normal((frames, *signal.shape))
+    return (step * np.rint(values / step)).astype(np.uint16)
+
+
+def even(rng, shape=(96, 96)):
+    """Light of one level on pixels whose offsets spread over many steps."""
+    return rng.normal(1000, 30, shape)
+
+
+@pytest.mark.parametrize("step", [1, 16])
+@pytest.mark.parametrize("frames", [2, 8, 64])
+@pytest.mark.parametrize("sigma", [0.05, 0.2])
+def test_a_good_array_has_no_noisy_pixel(sigma, frames, step):
+    rng = np.random.default_rng(frames)
+    signal = even(rng)
+    levels = [
+        equipix.average(rounded(rng, step * f * signal, step * sigma, frames, step))
+        for f in (1, 1.618, 2.236, 2.8)
+    ]
+    response = nuc.fit(levels, order=1)
+    found = nuc.find_defects(response, rounded(rng, step * signal, step * sigma, frames, step))
+    assert found.counts["noisy"] == found.counts["flickering"] == 0
+    assert nuc.find_defects(response, levels[0]).counts["noisy"] == 0
+    averaged = Averaged.of(levels)
+    assert not averaged.findings(averaged.noise).noisy.any()
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05, 0.15])
+@pytest.mark.parametrize("frames", [2, 32])
+def test_darks_with_less_noise_than_a_step_have_no_hot_pixel(sigma, frames):
+    rng = np.random.default_rng(7)
+    dark = equipix.average(rounded(rng, rng.normal(5, 0.7, (96, 96)), sigma, frames))
+    light = rounded(rng, even(rng), max(sigma, 0.05), frames)
+    averaged = Averaged.of([equipix.average(light, dark=dark)])
+    assert not hot_pixels(dark, averaged.noise).any()
+
+
+def test_bins_do_not_follow_the_scatter_of_a_pixel():
+    """Two frames with a whole mean are equal: by their own means bins would scatter by 0 or 1/2."""
+    rng = np.random.default_rng(2)
+    frames = equipix.average(rounded(rng, even(rng, (128, 128)), 0.2, 2))
+    points = photon_transfer(frames.mean, frames.variance, np.ones((128, 128), bool), 2, 1.0)
+    # 256 pixels a bin, of which 0.226 differ by 1 and have the variance 1/2.
+    error = np.sqrt(0.226 * 0.774 / 256) / 2
+    assert abs(points[:, 1] - scatter(0.04)).max() < 5 * error
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2, 1.0, 10.0])
+@pytest.mark.parametrize("frames", [2, 16])
+def test_the_mean_of_frames_is_off_by_the_variance_of_the_model(sigma, frames):
+    rng = np.random.default_rng(3)
+    signal = even(rng, (128, 128))
+    average = equipix.average(rounded(rng, signal, sigma, frames))
+    noise = Averaged.of([average]).noise.of_mean(frames)
+    error = float(np.mean((average.mean - signal) ** 2))
+    # The square of an error scatters by at most √2 of its mean, over 16 384 pixels; so does s².
+    assert float(noise.variance(1000.0)) == pytest.approx(error, rel=5 * 2 * np.sqrt(1 / 2**13))
