@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,40 @@ class TestKinds:
         found = nuc.find_defects(response, average)
         assert found.counts["noisy"] == 2
         assert "flickering" not in found.counts
+
+    def test_few_frames_do_not_determine_flicker(self, array, response):
+        few = nuc.find_defects(response, frames(array, 8e6, 97, 99))
+        assert few.not_determinable == {"flickering": "below 98 frames"}
+        assert "flickering" not in few.counts
+        # What was found nevertheless is flagged.
+        assert places(few.flags, Flag.TELEGRAPH) == {FLICKER}
+        enough = nuc.find_defects(response, frames(array, 8e6, 98, 99))
+        assert (enough.not_determinable, enough.counts["flickering"]) == ({}, 1)
+        loose = nuc.DefectLimits(correlation=2.5)
+        assert not nuc.find_defects(
+            response, frames(array, 8e6, 23, 99), limits=loose
+        ).not_determinable
+
+    def test_jumps_are_found_though_their_samples_are_left_out(self):
+        rng = np.random.default_rng(8)
+        jumps = rng.choice(64 * 80, 80, replace=False)
+        truth, levels = 1 + 0.02 * rng.standard_normal((64, 80)), []
+        for light in (500, 1500, 2500, 3500):
+            stack = 100 + light * truth + 4 * rng.standard_normal((64, 64, 80))
+            state = np.cumsum(rng.random((64, 80)) < 0.1, axis=0) % 2
+            stack.reshape(64, -1)[:, jumps] += 40 * state
+            rays = rng.random(stack.shape) < 1e-3
+            stack[rays] += rng.uniform(100, 300, rays.sum())
+            levels.append(equipix.average(stack, reject=5))
+        response = nuc.fit(levels, order=1)
+        # 76 of 80 in the prototype.
+        found = np.flatnonzero(response.flags & Flag.HOT)
+        assert set(found) <= set(jumps)
+        assert len(found) >= 76
+        unflagged = dataclasses.replace(response, flags=np.zeros_like(response.flags))
+        found = np.flatnonzero(nuc.find_defects(unflagged, levels[2]).flags & Flag.HOT)
+        assert set(found) <= set(jumps)
+        assert len(found) >= 60
 
     def test_without_frames_the_curves_alone_count(self, response):
         found = nuc.find_defects(response)

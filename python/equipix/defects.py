@@ -30,6 +30,12 @@ HOT_SIGMAS = 10.0
 DEAD_RESPONSE = 0.5
 """Response relative to the neighbours below which a pixel is dead."""
 
+_CHANCE = 1e-7
+"""Probability below which a number of samples left out is no chance."""
+
+_ROUNDS = 3
+"""Rounds in which the share of samples left out is found without the pixels found before."""
+
 _BLOCK = 16
 """Side of the blocks of pixels whose median is what is usual there."""
 
@@ -194,6 +200,46 @@ def noisy_pixels(
         noisy &= ~known | (variance > limit)
         seen |= known
     return noisy & seen
+
+
+def often_rejected(missing: Array, samples: int) -> Bools:
+    """Find pixels of which samples were left out more often than chance explains.
+
+    A pixel that jumps between levels loses the samples of the rarer one: those that are left show
+    little noise, and their mean is that of one level.
+
+    Parameters
+    ----------
+    missing : ndarray, shape (rows, cols), of whole numbers
+        Samples that were left out.
+    samples : int
+        All samples of a pixel.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where the binomial distribution of so many samples, each left out with the share of
+        the other pixels, gives a probability below 1e-7.
+    """
+    found = np.zeros(missing.shape, bool)
+    for _ in range(_ROUNDS if missing.any() else 0):
+        others = missing[~found]
+        # One more than there are: of none the share would be 0.
+        share = (float(others.sum()) + 1) / (samples * others.size + 1)
+        found = np.asarray(missing >= _binomial_limit(samples, share))
+    return found
+
+
+def _binomial_limit(samples: int, share: float) -> int:
+    """Return the smallest number that is reached with a probability below 1e-7."""
+    if share >= 1:
+        return samples + 1
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, samples + 1)))])
+    hits = np.arange(samples + 1)
+    terms = logs[-1] - logs - logs[::-1] + hits * np.log(share)
+    terms += (samples - hits) * np.log1p(-share)
+    above = np.cumsum(np.exp(terms)[::-1])[::-1]
+    return int(np.count_nonzero(above >= _CHANCE))
 
 
 def response_outliers(

@@ -131,6 +131,7 @@ def defects(
     if output is not None:
         flagged.save(output, force=force)
     result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
+    result |= {kind: f"not determinable {why}" for kind, why in found.not_determinable.items()}
     result |= {"percentiles_of_K": found.gain_percentiles, "flagged_pixels": flag_counts(flagged)}
     show_result(result, as_json=as_json)
 

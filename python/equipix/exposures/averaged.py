@@ -14,6 +14,7 @@ from equipix.defects import (
     dead_pixels,
     hot_pixels,
     noisy_pixels,
+    often_rejected,
     refuse_saturated,
 )
 from equipix.errors import InputError
@@ -125,8 +126,11 @@ class Averaged:
             self.values = np.empty((self.count, *shape), self._dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
+            self._missing, self._screened = np.zeros(shape, np.int64), 0
             self.dark = frames.dark
             self.step = 0.0 if frames.dark is None else frames.dark.step
+            if self.dark is not None:
+                self._screen(self.dark)
         if shape != self.saturated.shape:
             raise InputError(
                 f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
@@ -149,12 +153,20 @@ class Averaged:
         self.saturated |= saturates
         count = int(frames.count.max())
         self._frames.append(count)
+        self._screen(frames)
         if self.dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
         # Clipped samples scatter less: their bins would have most of the weight in the noise model.
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self.step = max(self.step, frames.step)
         self._points.append(photon_transfer(frames.mean, frames.variance, free, count, frames.step))
+
+    def _screen(self, frames: FrameStatistics) -> None:
+        """Count the samples that were left out as those of cosmic rays."""
+        if frames.reject is not None:
+            count, known = frames.count.astype(np.int64), frames.count > 0
+            self._missing += np.where(known, count.max() - count, 0)
+            self._screened += int(count.max())
 
     def counted_from_lowest(self) -> Self:
         """Return a copy whose noise models count the signal from the lowest of several exposures.
@@ -216,6 +228,7 @@ class Averaged:
         noisy = None
         if noise is not None:
             noisy = noisy_pixels(self._signals, self.variances, self._frames, noise)
+            noisy |= often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
         if self.dark is not None:
             hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.defects import noisy_pixels, response_outliers
+from equipix.defects import noisy_pixels, often_rejected, response_outliers
 from equipix.errors import InputError
 from equipix.frames import FrameStatistics
 from equipix.metrics.moments import stack_of, temporal_of, warn_of_drift
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 _SAMPLED = 4096
 """Pixels that show the step between values."""
+
+_CORRELATED = 0.5
+"""Correlation of successive frames from which flicker must be found."""
 
 
 def mean_slope(response: Response) -> Floats:
@@ -76,7 +79,17 @@ def of_frames(
     if model is not None:
         of_level = mean[None], variance[None], [count], model
         noisy, flickering = noisy_pixels(*of_level, times=limits.noise), noisy_pixels(*of_level)
+    if isinstance(frames, FrameStatistics) and frames.reject is not None:
+        missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
+        noisy = noisy | often_rejected(missing, count)
     return {"noisy": noisy} if slow is None else {"noisy": noisy, "flickering": flickering & slow}
+
+
+def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
+    """Say that frames are too few to find flicker, if they are."""
+    needed = int(np.ceil((limits.correlation / _CORRELATED) ** 2 - 2))
+    count = len(np.asarray(frames))
+    return {"flickering": f"below {needed} frames"} if count < needed else {}
 
 
 def _dead(response: Response, slope: Floats, least: float) -> Bools:
