@@ -282,7 +282,7 @@ class TestLimits:
 
     @pytest.mark.parametrize("value", [8000, 8000.5])
     def test_equal_frames_show_no_noisy_pixel(self, response, value):
-        found = nuc.find_defects(response, np.full((3, *SHAPE), value))
+        found = nuc.find_defects(response, np.full((98, *SHAPE), value))
         assert found.counts["noisy"] == found.counts["flickering"] == 0
 
 
