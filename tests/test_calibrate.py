@@ -236,6 +236,7 @@ class TestLaws:
 
 
 class TestErrorEstimate:
+    @pytest.mark.study
     @pytest.mark.parametrize("sweeps", [100, 1000, 5000])
     def test_it_sees_the_large_scales_of_the_hard_case(self, sweeps):
         frames, truth = hard_case((582, 782))

@@ -138,8 +138,11 @@ SCENES = {
 }
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("scene", SCENES)
-def test_standard_error(scene: str) -> None:
+def test_standard_error(
+    scene: str, draws: Callable[[int], range], figure: Callable[..., None]
+) -> None:
     """Errors of the shift are one standard error wide: 1.0 ± 0.1.
 
     The spread of 2 × 400 z-scores has a standard error of 1/√1600 = 0.025; the mean, of 0.035.
@@ -147,7 +150,7 @@ def test_standard_error(scene: str) -> None:
     spot, count = SCENES[scene]
     rng = np.random.default_rng(len(scene))
     z = []
-    for _ in range(400):
+    for _ in draws(400):
         place = np.array(SHAPE) / 2 + rng.uniform(-4, 4, 2)
         move = rng.uniform(-7, 7, 2)
         before, after = (
@@ -155,8 +158,12 @@ def test_standard_error(scene: str) -> None:
         )
         measured = equipix.measure_shift(before, after)
         z.append((measured.shift - move) / measured.std)
-    assert np.std(z) == pytest.approx(1, abs=0.1)
-    assert abs(np.mean(z)) < 4 * 0.035
+    error = 1 / np.sqrt(2 * len(z))
+    limit = max(0.1, 3 * error / np.sqrt(2))
+    figure("z of measured shifts, spread", np.std(z), f"1 ± {limit:.2f}")
+    figure("z of measured shifts, mean", np.mean(z), f"0 ± {4 * error:.2f}")
+    assert np.std(z) == pytest.approx(1, abs=limit)
+    assert abs(np.mean(z)) < 4 * error
 
 
 @pytest.mark.parametrize(
@@ -178,7 +185,10 @@ def test_fractions_of_a_pixel_bring_no_bias(
         np.testing.assert_allclose(measured.shift, move, rtol=0, atol=bound)
 
 
-def test_what_is_normal_on_a_sensor_is_no_obstacle() -> None:
+@pytest.mark.study
+def test_what_is_normal_on_a_sensor_is_no_obstacle(
+    draws: Callable[[int], range], figure: Callable[..., None]
+) -> None:
     """Spot of 0.3 % of the image, hot and dead pixels, vignetting, 5 % non-uniformity.
 
     White non-uniformity of rms s moves the centroid of a disc by s/(2√π) rms. Dead pixels right on
@@ -190,7 +200,7 @@ def test_what_is_normal_on_a_sensor_is_no_obstacle() -> None:
     pattern = spread / np.sqrt(3) / (2 * np.sqrt(np.pi)) * np.sqrt(2)
     rows, cols = np.indices(shape)
     z = []
-    for _ in range(60):
+    for _ in draws(60):
         sensor = 1 + rng.uniform(-spread, spread, shape)
         before = rng.uniform(60, 180, 2)
         centres = (before, before - rng.uniform(-20, 20, 2))
@@ -213,7 +223,9 @@ def test_what_is_normal_on_a_sensor_is_no_obstacle() -> None:
         z.append(error / np.hypot(measured.std, pattern))
     assert np.abs(z).max() < 4.5
     # 120 values: the spread's standard error is 0.065; what mends a pixel is not its own value.
-    assert np.std(z) == pytest.approx(1, abs=4 * 0.065)
+    limit = 4 / np.sqrt(4 * len(z))
+    figure("z of measured shifts among defects, spread", np.std(z), f"1 ± {limit:.2f}")
+    assert np.std(z) == pytest.approx(1, abs=limit)
 
 
 def test_a_low_spot_on_a_bright_vignetted_background() -> None:

@@ -133,6 +133,7 @@ CASES = {
 }
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("method", "tolerance"),
     # Coordinate descent to 1e-6 takes some ten thousand sweeps.

@@ -40,10 +40,11 @@ def parts(labels):
 # A sensor of a few pixels in parts may end in a minimum that is not the best.
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestSilentPixels:
+    @pytest.mark.study
     @pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2])
-    def test_components_are_those_of_the_reference(self, noise):
-        shown = 0
-        for seed in range(80):
+    def test_components_are_those_of_the_reference(self, noise, draws):
+        shown, seeds = 0, draws(80)
+        for seed in seeds:
             frames, _, silent, mask = bridged(seed, noise=noise)
             cal = equipix.calibrate(
                 frames,
@@ -75,7 +76,8 @@ class TestSilentPixels:
             assert (lost & UNDETERMINED == UNDETERMINED).all()
             dead = silent & ~held & (cal.component_labels == 0)
             assert (cal.flags[dead] & Flag.DEAD > 0).all()
-        assert shown >= 3  # or nothing was
+        # Of the whole study three, or nothing was.
+        assert shown >= 3 or len(seeds) < 80
 
     def test_the_only_bridge(self):
         """Two halves, told apart by a column of masked pixels but for one without response."""
