@@ -442,6 +442,36 @@ class TestOrderOfFewTemperatures:
             bolometer.fit(averages, [20.0] * 5, 2.0)
         bolometer.fit(self.averages(array, [20.0] * 5), [20.0] * 5, 2.0)  # warnings are errors
 
+    @pytest.mark.parametrize("pair", [(2, 3), (2, 4), (0, 1), (1, 6)])
+    @pytest.mark.parametrize("order", ["auto", 3])
+    def test_two_exchanged_temperatures_are_told(self, array, pair, order):
+        celsius = np.linspace(-20, 70, 7)
+        averages = self.averages(array, celsius)
+        exchanged = celsius.copy()
+        exchanged[[*pair]] = celsius[[*reversed(pair)]]
+        for given in (averages, [each.mean for each in averages]):
+            bolometer.fit(given, celsius, 2.0, order=order)  # warnings are errors
+            # Exchanged with the highest one, a temperature may leave the others no order above 0.
+            told = "turns back .* none are exchanged|'substrate_c' explains nothing"
+            with pytest.warns(errors.MisfitWarning, match=told):
+                bolometer.fit(given, exchanged, 2.0, order=order)
+
+
+def test_a_response_that_crosses_0_is_flagged_where_it_does():
+    """Its gain has no limit there: it was -591 to 329, unflagged."""
+    celsius = np.array([-20.0, 0, 20, 40, 60])
+    response = np.ones((5, 3, 4))
+    response[:, 1, 2] = (celsius - 30) / 50 + 1.0
+    level = 30_000 + celsius[:, None, None]
+    bodies = (level - 500 * response, level + 500 * response)
+    found = bolometer.fit(level + 0 * response, celsius, 2.0, black_bodies=bodies, order=1)
+    for state, flagged in ((-20.0, True), (0.0, True), (20.0, False), (60.0, False)):
+        here = found.at(state)
+        expected = Flag.DEAD | Flag.DO_NOT_USE if flagged else 0
+        assert here.flags[1, 2] == expected, state
+        assert not np.delete(here.flags.ravel(), 6).any()
+    assert not found.flags.any()
+
 
 class TestSaturatedReferences:
     SATURATED = Flag.SATURATED | Flag.DO_NOT_USE

@@ -12,7 +12,9 @@ from equipix._readonly import ReadOnly
 from equipix.bolometer.saved import KIND, read_fields, save_fields
 from equipix.bolometer.states import Axes
 from equipix.correction.polynomial import Polynomial
+from equipix.defects import DEAD_RESPONSE
 from equipix.errors import FileError, InputError
+from equipix.flags import set_bits
 from equipix.io import load_pages
 
 if TYPE_CHECKING:
@@ -115,7 +117,8 @@ class DynamicCorrection(ReadOnly):
         -------
         Polynomial
             Of order 1; `equipix.Corrector` takes it, it can be saved, and its `metadata` hold the
-            state.
+            state. A pixel whose response at this state is below half of that of the array is
+            flagged ``DEAD``: where a polynomial crosses 0 gains have no limit.
 
         Raises
         ------
@@ -145,7 +148,9 @@ class DynamicCorrection(ReadOnly):
         offset = level - (level + deviation) * gain
         # Corrected frames hold the level L.
         planes = np.stack([offset, gain])
-        return Polynomial(planes, self.flags, metadata, leaves_offset=True)
+        flags = self.flags.copy()
+        set_bits(flags, "non_responding", response < DEAD_RESPONSE)
+        return Polynomial(planes, flags, metadata, leaves_offset=True)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `DynamicCorrection.load` reads.

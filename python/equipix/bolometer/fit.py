@@ -49,7 +49,8 @@ def fit(
         Bias at each state in volts.
     black_bodies : tuple of two, optional
         Mean frames of a cold and a hot black body, each as `shutter` and at the same states. Their
-        difference gives the gain. Each may have the temperature that suits; it need not be known.
+        difference gives the gain. Each may have the temperature that suits; it need not be known,
+        and exchanged they give the same.
     order : int or "auto"
         Highest power of the temperature, of offset and gain: 0 is the static correction. "auto"
         takes for each that which best predicts a temperature that is held out.
@@ -76,7 +77,9 @@ def fit(
     -----
     MisfitWarning
         With "auto", if the references are averages and the best prediction is worse than five
-        times what their noise explains, or if temperature explains nothing.
+        times what their noise explains, or if temperature explains nothing. With any order, if the
+        pattern of the array before the shutter turns back between two temperatures, as it does
+        where some are exchanged. All temperatures in reversed order fit as well as the true ones.
     SaturationWarning
         If many values of a reference are exactly the highest one, and not known to saturate.
 
@@ -200,7 +203,10 @@ class Shown:
     def order(self, order: int | Literal["auto"]) -> tuple[int, list[float] | None]:
         """Order that is given, or that which best predicts, and the prediction error of each."""
         if not (isinstance(order, str) and order == "auto"):
-            return _checked_order(order), None
+            given = _checked_order(order)
+            if self.is_offset:
+                self._held_out().warn_of_exchanged()
+            return given, None
         held_out = self._held_out()
         if len(self.states.groups) == 1:
             held_out.warn_of_repeats()

@@ -12,7 +12,7 @@ from equipix.bolometer.solver import rank_of, solver_of
 from equipix.errors import InputError, MisfitWarning, warn
 
 if TYPE_CHECKING:
-    from equipix._types import Floats
+    from equipix._types import Bools, Floats
     from equipix.bolometer.states import Axes, Regressor, States
 
 HIGHEST = 8
@@ -26,6 +26,19 @@ _ROUNDING = 1e-12
 
 _MANY_SIGMAS = 5.0
 """Prediction error over that of noise from which the polynomials do not follow the array."""
+
+
+_FEWEST = 4
+"""Fewest references of one bias that show how the pattern follows the temperature."""
+
+_MOST = 0.8
+"""Least share of the variance that the pattern must hold: of noise alone it has a third at most."""
+
+_FAR = 3.0
+"""Largest deviation that counts, over the median one of its reference: two standard deviations."""
+
+_BACK = 0.1
+"""Share of its range by which the pattern may turn back between two temperatures."""
 
 
 class Form(NamedTuple):
@@ -123,18 +136,64 @@ class HeldOut:
 
     def _warn(self, order: int, error: float) -> None:
         """Warn of predictions that are worse than noise explains."""
-        if self.variance is None:
-            return
-        noise = self._error_of_noise(order, self.variance) + self._rounding
+        noise = np.inf
+        if self.variance is not None:
+            noise = self._error_of_noise(order, self.variance) + self._rounding
         if error <= _MANY_SIGMAS**2 * noise:
+            if order > 0:
+                self.warn_of_exchanged()
             return
         warn(
             f"order {order} predicts temperatures that are held out best, yet with "
-            f"{np.sqrt(error / noise):.3g} times the error that noise explains: take references at "
-            f"more temperatures than {len(self.states.groups)}, and see that each of 'substrate_c' "
-            "is that of its reference",
+            f"{np.sqrt(error / noise):.3g} times the error that noise explains: "
+            + (
+                self._turn()
+                or f"take references at more temperatures than {len(self.states.groups)}, and see "
+                "that each of 'substrate_c' is that of its reference"
+            ),
             MisfitWarning,
         )
+
+    def warn_of_exchanged(self) -> None:
+        """Warn of temperatures that are probably those of other references."""
+        if turn := self._turn():
+            warn(turn, MisfitWarning)
+
+    def _turn(self) -> str:
+        """Say where the pattern of the array turns back as the temperature rises, if it does.
+
+        Its course is the score of the first principal component of the references of one bias,
+        where this holds most of their variance: more than noise can.
+        """
+        for volts in self.states.biases:
+            of_bias = self.states.bias_v == volts
+            celsius, course = self._course(of_bias)
+            steps = np.diff(course) * np.sign(course[-1] - course[0])
+            back = np.flatnonzero(steps < -_BACK * np.ptp(course))
+            if back.size:
+                here, there = celsius[back[0]], celsius[back[0] + 1]
+                return (
+                    f"the pattern of the array turns back between {here:g} and {there:g} °C of "
+                    "'substrate_c': see that each is the temperature of its reference, and that "
+                    "none are exchanged"
+                )
+        return ""
+
+    def _course(self, of_bias: Bools) -> tuple[Floats, Floats]:
+        """Temperatures, lowest first, and the scores of the references; 0 where noise is most."""
+        celsius = self.states.substrate_c[of_bias]
+        order = np.argsort(celsius, kind="stable")
+        away = self.deviation[of_bias][order]
+        # Pixels far off, such as saturated ones, are not the pattern of the array.
+        away = away - np.median(away, axis=1, keepdims=True)
+        away -= away.mean(axis=0)
+        most = _FAR * np.median(np.abs(away), axis=1, keepdims=True)
+        away = np.clip(away, -most, most)
+        squares, vectors = np.linalg.eigh(away @ away.T)
+        course = vectors[:, -1]
+        if len(course) < _FEWEST or squares[-1] < _MOST * squares.sum() or squares[-1] <= 0:
+            course = np.zeros_like(course)
+        return celsius[order], course
 
     def _warn_of_one(self) -> None:
         """Warn where the states determine no order but 0."""
