@@ -291,7 +291,7 @@ def test_version(run):
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1"])
 def test_a_tolerance_that_is_none_is_refused(run, experiment, tmp_path, value):
     output = tmp_path / "cal.tif"
-    refused(run("calibrate", experiment, "-o", output, "--tolerance", value), "'tolerance' is")
+    refused(run("calibrate", experiment, "-o", output, "--tolerance", value), "--tolerance is")
 
 
 def test_usage_errors_have_status_2(run, experiment, tmp_path):
@@ -522,7 +522,7 @@ class TestPlan:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            (("--max-shift", 9, 9, "--noise", "nan"), "'noise' is nan"),
+            (("--max-shift", 9, 9, "--noise", "nan"), "--noise is nan"),
             ((), "give either '--shifts'"),
             (("--shifts", CROSS, "--max-shift", 9, 9), "give either '--shifts'"),
             (("--shifts", "0,0 5"), "'--shifts' is '0,0 5'"),

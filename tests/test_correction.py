@@ -246,7 +246,7 @@ class TestCommandLine:
             "correct", saved, tmp_path / "raw.tif", "-o", output, "--force", "--dark", "none"
         )
         assert status == 1
-        assert "'dark' is 'none'" in err
+        assert "--dark is 'none'" in err
 
     def test_inspect(self, run, saved):
         status, out, _ = run("inspect", saved, "--json")
