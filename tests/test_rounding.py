@@ -63,6 +63,7 @@ def test_without_noise_all_of_the_rounding_stays():
         (np.full(50, 96.0), 1),
         (np.full(3, np.nan), 0),
         (np.append(64.0 * np.arange(20), np.nan), 64),
+        (1e30 * np.arange(1, 10), 0),
     ],
 )
 def test_the_step_is_found(values, step):

@@ -112,7 +112,8 @@ def step_of(values: NDArray[Any]) -> float:
     known = values[np.isfinite(values)]
     whole = np.rint(known)
     rounding = 4 * np.finfo(np.float64).eps * np.abs(known) + 1e-9
-    if not known.size or np.any(np.abs(known - whole) > rounding):
+    # Beyond some 5e14 a float64 does not tell whether it is whole.
+    if not known.size or np.any((np.abs(known - whole) > rounding) | (rounding > 0.5)):
         return 0.0
     different = np.unique(whole)
     if len(different) < _FEWEST:
