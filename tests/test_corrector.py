@@ -307,7 +307,10 @@ class TestRefusals:
         response = twelve_bits()
         message = f"'frames' holds {value}, above 4095, the largest value of the 12 bits"
         raw = np.full(SHAPE, 4095, np.uint16)
-        corrector, both = Corrector(response), equipix.combine(response, response)
+        corrector, both = (
+            Corrector(response),
+            equipix.combine(response, equipix.Polynomial(*identity())),
+        )
         corrector.apply(raw)
         np.testing.assert_array_equal(
             both.correct(raw), equipix.Polynomial(both.coefficients, both.flags).correct(raw)
@@ -327,7 +330,10 @@ class TestRefusals:
     def test_a_level_below_full_scale_refuses_no_value_of_the_sensor(self, dtype):
         response = twelve_bits(saturation=3900)
         raw = np.full(SHAPE, 2000, dtype)
-        corrector, both = Corrector(response), equipix.combine(response, response)
+        corrector, both = (
+            Corrector(response),
+            equipix.combine(response, equipix.Polynomial(*identity())),
+        )
         for value, holds in ((4095, nullcontext()), (4096, pytest.raises(errors.InputError))):
             raw[3, 4] = value
             for correct in (response.correct, both.correct, corrector.apply):
@@ -364,7 +370,7 @@ class TestRefusals:
 
     def test_a_combination_keeps_the_level_in_its_file(self, tmp_path):
         response = twelve_bits()
-        equipix.combine(response, response).save(tmp_path / "both.tif")
+        equipix.combine(response, equipix.Polynomial(*identity())).save(tmp_path / "both.tif")
         assert equipix.load(tmp_path / "both.tif").saturation == 4095
 
     def test_memory_that_cannot_be_had(self):

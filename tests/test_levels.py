@@ -107,6 +107,11 @@ class TestLevelExperiment:
             ('"level1.tif"', '"none.tif"', "none.tif: does not exist"),
             ('"level2.tif"', '"level1.tif"', "'level1.tif' stands in 'frames' of level '10 °C'"),
             ("value = 10", 'value = "warm"', "'value' in level 0 holds 'warm', expected a number"),
+            (
+                'value = 10\nunit = " °C"',
+                'value = 283\nunit = "K"',
+                "'unit' is 'K' and '°C' in different levels: give all values in one unit",
+            ),
         ],
     )
     def test_refuses_a_wrong_file_by_its_place(self, folder, old, new, message):
@@ -123,6 +128,21 @@ class TestLevelExperiment:
         path.write_text('[level]\nframes = "level1.tif"\n')
         with pytest.raises(errors.FileError, match=r"write \[\[level\]\]"):
             LevelExperiment.load(path)
+
+    @pytest.mark.parametrize(
+        ("values", "words"),
+        [
+            ((40, 30, 20, 10), "level '10 °C' to .* in level '20 °C'"),
+            ((10, 30, 20, 40), "level '20 °C' to .* in level '30 °C'"),
+        ],
+    )
+    def test_values_that_run_against_the_means_are_told(self, folder, values, words):
+        text = (folder / "levels.toml").read_text(encoding="utf-8")
+        for number, value in enumerate(values, start=1):
+            text = text.replace(f"value = {10 * number}\n", f"value = {value}.0\n")
+        (folder / "exchanged.toml").write_text(text, encoding="utf-8")
+        with pytest.warns(errors.EquipixWarning, match=f"falls from .* in {words}, whose 'value'"):
+            LevelExperiment.load(folder / "exchanged.toml").run()
 
     def test_a_level_that_saturates_is_named(self, folder, array):
         frames = list(array.frames(3e7, 4, rng=9))
@@ -526,6 +546,27 @@ class TestCorrectedFiles:
         arguments = ("correct", tmp_path / "response.tif", folder / "level2.tif", "-o")
         status, _, err = run(*arguments, tmp_path / "no.tif", "--sensor", "array 8")
         assert (status, "'array 8', but the correction is of 'array 7'" in err) == (1, True)
+
+    @pytest.mark.parametrize("name", ["levels.toml", "raw.toml"])
+    def test_frames_scaled_to_1_are_refused(self, run, folder, tmp_path, name):
+        """They came out as -1503 DN, with status 0."""
+        response = LevelExperiment.load(folder / name).run(order=2)
+        response.save(tmp_path / "r.npz")
+        scaled = io.read_frames([folder / "level2.tif"]) / 16383
+        for dtype in (np.float32, np.float64):
+            corrects = [response.correct]
+            if dtype is np.float32:
+                corrects.append(equipix.Corrector(response).apply)
+            for correct in corrects:
+                with pytest.raises(errors.InputError, match="scaled to 0 to 1, multiply by 16383"):
+                    correct(scaled.astype(dtype))
+        io.write_frames(tmp_path / "scaled.tif", iter(scaled.astype(np.float32)), nbytes=1)
+        status, _, err = run(
+            "correct", tmp_path / "r.npz", tmp_path / "scaled.tif", "-o", tmp_path / "out.tif"
+        )
+        assert status == 1
+        assert "multiply by 16383" in err
+        assert not (tmp_path / "out.tif").exists()
 
     @pytest.mark.usefixtures("corrected")
     def test_frames_of_more_bits_are_refused(self, run, folder, tmp_path):

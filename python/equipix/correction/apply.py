@@ -65,7 +65,7 @@ def apply(
         result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
         bad = ~usable(flags)
         for source, target in zip(_each(raw), _each(result), strict=True):
-            depth.refuse_above(float(np.fmax.reduce(source, axis=None)), raw.dtype)
+            depth.refuse_highest(float(np.fmax.reduce(source, axis=None)), raw.dtype)
             formula(source, target)
             if flagged == "nan":
                 target[bad] = np.nan
@@ -181,7 +181,7 @@ def _fast(
         if raw.size:
             prepared = kept(sources, flagged, coefficients)
             counts = run(prepared, raw, result, largest_of(result.dtype), None)
-            depth.refuse_above(counts.highest, raw.dtype)
+            depth.refuse_highest(counts.highest, raw.dtype)
         return result
 
 

@@ -167,7 +167,7 @@ class Corrector:
             self._check(raw)
             result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
             counts = run(self._native, raw, result, self._largest, self._workers)
-        self._depth.refuse_above(counts.highest, raw.dtype)
+        self._depth.refuse_highest(counts.highest, raw.dtype)
         with self._counting:
             self.clipped += counts.limited
             self.frames += 1 if raw.ndim == 2 else len(raw)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from equipix._check import naming_memory
-from equipix.errors import FileError, InputError
+from equipix.defects import SIGMAS
+from equipix.errors import EquipixWarning, FileError, InputError, warn
 from equipix.experiment.described import Described
 from equipix.experiment.formats import check_formats
 from equipix.experiment.manifest import LevelManifest, read_level_manifest
@@ -28,6 +32,7 @@ if TYPE_CHECKING:
 
     from equipix._types import By, Order, Progress
     from equipix.frames import FrameStatistics
+    from equipix.nuc.levels import Levels
     from equipix.nuc.response import Response
 
 
@@ -97,6 +102,12 @@ class LevelExperiment(Described[LevelManifest]):
             If an option is out of range, or the levels do not determine the curves.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
+
+        Warns
+        -----
+        EquipixWarning
+            If the mean of a level is lower than that of a level with a lower value, beside the
+            warnings of `equipix.nuc.fit`.
         """
         check_order(order, by)
         shape = check_formats(self._images())
@@ -106,6 +117,7 @@ class LevelExperiment(Described[LevelManifest]):
         refuse_repeats(self.path, self.manifest, hashes)
         averaged = self._average(workers, progress)
         levels = levels_of(averaged, mask=excluded)
+        self._warn_of_order(levels)
         origin = self._provenance(averaged, levels.references.tolist(), hashes)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
@@ -128,6 +140,27 @@ class LevelExperiment(Described[LevelManifest]):
                 except InputError as error:
                     raise FileError(f"{self.path}: {error}") from error
         return averaged
+
+    def _warn_of_order(self, levels: Levels) -> None:
+        """Warn of values of levels that do not rise with the means by more than noise explains."""
+        entries = zip(self.manifest.level, self.manifest.names, strict=True)
+        known = [
+            (level.value, name, mean, sigma)
+            for (level, name), mean, sigma in zip(
+                entries, levels.references, np.sqrt(levels.variances), strict=True
+            )
+            if level.value is not None
+        ]
+        known.sort(key=lambda each: each[0])
+        for (_, below, least, one), (_, above, most, other) in pairwise(known):
+            if most < least - SIGMAS * np.hypot(one, other):
+                warn(
+                    f"{self.path}: the mean of the frames falls from {least:.6g} DN in level "
+                    f"'{below}' to {most:.6g} DN in level '{above}', whose 'value' is higher: see "
+                    "that each value is that of its frames",
+                    EquipixWarning,
+                )
+                return
 
     def _dark(self, workers: int | None, progress: Progress | None) -> FrameStatistics | None:
         if self.manifest.dark is None:

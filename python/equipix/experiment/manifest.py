@@ -178,6 +178,16 @@ class LevelManifest(_Table):
     dark: Dark | None = None
     level: Annotated[list[Level], Field(min_length=1)]
 
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        units = list(dict.fromkeys(each.unit.strip() for each in self.level if each.unit))
+        if len(units) > 1:
+            raise _problem(
+                f"'unit' is {' and '.join(map(repr, units[:2]))} in different levels: give all "
+                "values in one unit, and name it in each level"
+            )
+        return self
+
     @property
     def names(self) -> list[str]:
         """Name of each level: its own, its value, or its number."""
