@@ -246,7 +246,7 @@ class TestCommands:
         status, out, err = run(*given)
         assert status == 0
         assert "warning: curves of order 1" in err
-        assert "order=2 or order='auto'" in err
+        assert "--order 2 or --order auto" in err
         assert "curves of order" not in run(*given, "--order", "2")[2]
         two = text.split("[[level]]")
         (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
@@ -419,7 +419,7 @@ class TestCorrectedFiles:
         arguments = ("correct", tmp_path / "response.tif", tmp_path / "one.tif")
         status, _, err = run(*arguments, "-o", tmp_path / "out.png", "--dtype", "float32")
         assert status == 1
-        assert "expected 'dtype' uint8 or uint16" in err
+        assert "expected --dtype uint8 or uint16" in err
 
     def test_files_name_the_correction_by_its_hash(self, corrected, run, tmp_path):
         import hashlib
@@ -527,7 +527,7 @@ class TestCorrectedFiles:
         status, _, err = run(
             *arguments, tmp_path / "b.tif", "--dtype", "uint16", "--bit-depth", "8"
         )
-        assert "more bits in 'bit_depth'" in err
+        assert "more bits in --bit-depth" in err
         assert call("16.tif", "--dtype", "uint16")[1]["limited_values"] == 0
 
     def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
