@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration.pixel_flags import odd_pixels
+from equipix.calibration.residuals import FEWEST
 from equipix.exposures.front import union
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Floats
+    from equipix._types import Bools, Floats
     from equipix.calibration.options import Options
     from equipix.calibration.weights import Weighted
 
@@ -19,57 +20,93 @@ _CONTRADICTORY = 9.0
 """Mean squared residual of a pixel over the usual one from which its values contradict the fit. Of
 five values noise has it in less than one of a million pixels."""
 
+_WITHOUT_NOISE = 1e-3
+"""The same below which they show no noise: of three values noise has it in two of a thousand
+pixels, of five in three of a million."""
+
+_SEVERAL = 3
+"""Fewest values that show whether they have noise: M fits one, and nearly two."""
+
 
 def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
     """Mask dead and hot pixels that contradict the fit, and fit once more.
 
     A constant value, taken for a product of light and sensitivity, displaces the beam, and so the
-    pixels that see the same cells. A pixel of unusual but proportional response stays.
+    pixels that see the same cells: if it is a large one, theirs are the larger residuals. So those
+    in the cells of hot pixels count too, and all hot ones are left out to find what is usual. A
+    pixel of unusual but proportional response stays; values without noise, such as 0 always, are
+    no measurements.
     """
     dead, hot = odd_pixels(weighted, options.fit)
-    if not (dead | hot).any():
+    suspect = dead | hot
+    if not suspect.any():
         return weighted
-    squares = _mean_squares(weighted, options.fit.workers)
-    false = (dead | hot) & (squares > _CONTRADICTORY * _usual(weighted, options, squares))
-    if not false.any():
-        return weighted
+    squares = _squares(weighted, options.fit.workers)
+    own, (noise, error) = _of_pixels(squares), _usual(weighted, squares, options)
+    with np.errstate(invalid="ignore"):
+        false = own > _CONTRADICTORY * max(noise, error)
+        several = np.isfinite(squares).sum(axis=0) >= _SEVERAL
+        false |= several & (own < _WITHOUT_NOISE * noise) & (noise > error)
+    if hot.any() and weighted.fit.degrees_of_freedom >= FEWEST:
+        others = _without(weighted, dead & false, hot, options)
+        usual = max(_usual(others, _squares(others, options.fit.workers), options))
+        false |= hot & (_of_cells(weighted, squares) > _CONTRADICTORY * usual)
+        if false[hot].all():
+            return others
+    false &= suspect
+    return _without(weighted, dead & false, hot & false, options) if false.any() else weighted
+
+
+def _without(weighted: Weighted, dead: Bools, hot: Bools, options: Options) -> Weighted:
+    """Fit again without dead and hot pixels, which are findings then."""
     exposures = weighted.exposures
     findings = dataclasses.replace(
         exposures.findings,
-        dead=union(exposures.findings.dead, dead & false),
-        hot=union(exposures.findings.hot, hot & false),
+        dead=union(exposures.findings.dead, dead),
+        hot=union(exposures.findings.hot, hot),
     )
-    exposures = dataclasses.replace(exposures.without(false), findings=findings)
+    exposures = dataclasses.replace(exposures.without(dead | hot), findings=findings)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
-def _usual(weighted: Weighted, options: Options, squares: Floats) -> float:
-    """Mean squared residual of a pixel without influence on the beam: of noise, or of the solver.
+def _of_cells(weighted: Weighted, squares: Floats) -> Floats:
+    """Mean of squares (n, rows, cols) over the cells of the beam that each pixel sees."""
+    exposures, fit = weighted.exposures, weighted.fit
+    total, count = np.zeros((2, *fit.beam.values.shape))
+    for k, each in enumerate(squares):
+        known = np.isfinite(each)
+        exposures.cells(total, fit, k)[:] += np.where(known, each, 0)
+        exposures.cells(count, fit, k)[:] += known
+    mean = np.divide(total, count, where=count > 0, out=np.zeros(total.shape))
+    seen = sum(exposures.cells(mean, fit, k) for k in range(len(squares)))
+    return np.asarray(seen / len(squares))
+
+
+def _usual(weighted: Weighted, squares: Floats, options: Options) -> tuple[float, float]:
+    """Mean squared residual of a pixel without influence on the beam: of noise, and of the solver.
 
     Other pixels have less, since the beam follows them: their mean is the share of the degrees of
     freedom among the measurements.
     """
     exposures, fit = weighted.exposures, weighted.fit
     if fit.degrees_of_freedom < 1:
-        return np.inf
-    noise = np.nanmedian(squares) * exposures.usable().sum() / fit.degrees_of_freedom
+        return 0.0, np.inf
+    noise = np.nanmedian(_of_pixels(squares)) * exposures.usable().sum() / fit.degrees_of_freedom
     # Without noise, only what the solver leaves would be compared.
     error = max(options.fit.tolerance, float(fit.error_estimate[-1]))
     power = np.square(exposures.values, dtype=np.float64)
-    return float(max(noise, error**2 * np.nanmean(exposures.weighted_squares(power))))
+    return float(noise), float(error**2 * np.nanmean(exposures.weighted_squares(power)))
 
 
-def _mean_squares(weighted: Weighted, workers: int | None) -> Floats:
-    """Mean squared residual of each pixel times weights; NaN without any."""
-    exposures, fit = weighted.exposures, weighted.fit
-    usable = exposures.usable()
-    total, count = np.zeros(exposures.shape), np.zeros(exposures.shape)
-    for k in range(len(exposures)):
-        residual = exposures.residual(fit, k, workers)
-        known = usable[k] & np.isfinite(residual)
-        variance: Array | float = 1.0 if exposures.variance is None else exposures.variance[k]
-        total += np.divide(residual**2, variance, where=known, out=np.zeros(exposures.shape))
-        count += known
-    return np.asarray(
-        np.divide(total, count, where=count > 0, out=np.full(exposures.shape, np.nan))
-    )
+def _squares(weighted: Weighted, workers: int | None) -> Floats:
+    """Squared residuals times weights (n, rows, cols); NaN where there are none."""
+    exposures = weighted.exposures
+    return exposures.weighted_squares(np.square(exposures.residuals(weighted.fit, workers)))
+
+
+def _of_pixels(squares: Floats) -> Floats:
+    """Mean of squares (n, rows, cols) over the exposures of each pixel; NaN without any."""
+    count = np.isfinite(squares).sum(axis=0)
+    total = np.nansum(squares, axis=0)
+    mean = np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan))
+    return np.asarray(mean)
