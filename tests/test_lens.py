@@ -119,6 +119,17 @@ class TestFit:
             lens.fit_falloff(np.full(SHAPE, 7.0))
         with pytest.raises(errors.InputError, match="not darker at the edge"):
             lens.fit_falloff(1 / lens.cos4(squared(), FOCAL))
+        # A dark in its place gave f = 5614 pixels.
+        dark = 100 + np.random.default_rng(1).standard_normal(SHAPE)
+        with pytest.raises(errors.InputError, match="Give the flat, not the dark"):
+            lens.fit_falloff(dark)
+
+    @pytest.mark.parametrize("law", ["cos4", "radial"])
+    def test_a_dark_less_the_flat_is_refused(self, law):
+        with pytest.raises(
+            errors.InputError, match=r"'flat' has the median -\d+\.\d+, expected light"
+        ):
+            lens.fit_falloff(20 - flat(1), law=law)
 
 
 class TestCorrection:

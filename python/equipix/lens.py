@@ -41,6 +41,9 @@ _SETTLED = 1e-4
 _ROUNDING = 1e-9
 """Error of the model and its numerical derivatives, relative to the values."""
 
+_SHOWN = 3.0
+"""Standard errors by which the fall-off by cos⁴ must differ from none."""
+
 _CLIP = 5.0
 """Robust standard deviations beyond which a block is left out."""
 
@@ -176,8 +179,8 @@ def fit_falloff(
     Raises
     ------
     InputError
-        If an argument has a wrong shape or dtype, the flat shows no fall-off that determines the
-        law, or the fit does not converge.
+        If an argument has a wrong shape or dtype, the flat is below 0 or shows no fall-off that
+        determines the law, or the fit does not converge.
 
     Notes
     -----
@@ -202,6 +205,7 @@ def fit_falloff(
     """
     check_word("law", law, get_args(Law))
     image = _image(flat, sensitivity, mask)
+    _refuse_negative(image)
     shape = check_shape((image.shape[0], image.shape[1]))
     half = _half_diagonal(shape)
     rows, cols, values = _blocks(image)
@@ -222,8 +226,12 @@ def fit_falloff(
     reach = float(np.hypot(rows - centre[0], cols - centre[1]).max() + edge)
     errors = {"row": std[1] * half, "col": std[2] * half}
     if law == "cos4":
-        if not found[3] > 0:
-            raise InputError("'flat' is not darker at the edge: it shows no fall-off by cos⁴")
+        if not found[3] > _SHOWN * std[3]:
+            raise InputError(
+                f"'flat' shows a fall-off (half diagonal / focal length)² of {found[3]:.3g} with a "
+                f"standard error of {std[3]:.2g}, expected {_SHOWN:g} of them above 0: it is not "
+                "darker at the edge. Give the flat, not the dark, and less noise"
+            )
         focal = float(half / np.sqrt(found[3]))
         errors["focal_length"] = focal * std[3] / found[3] / 2
         return LensFalloff(law, centre, focal, np.empty(0), _plain(errors), shape, reach)
@@ -246,6 +254,16 @@ def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | Non
     if np.count_nonzero(np.isfinite(image)) < 100:
         raise InputError("'flat' has fewer than 100 finite values, expected those of a sensor")
     return image
+
+
+def _refuse_negative(image: Floats) -> None:
+    """Refuse a flat below 0, from which more than its dark was subtracted."""
+    median = float(np.nanmedian(image))
+    if not median > 0:
+        raise InputError(
+            f"'flat' has the median {median:.6g}, expected light above 0: see that the dark was "
+            "subtracted once, and from the flat"
+        )
 
 
 def _map(name: str, given: ArrayLike, shape: tuple[int, ...]) -> Array:
