@@ -297,6 +297,8 @@ class TestInverse:
         assert response.largest_inverse_error == response.inverse_error[good].max()
         assert np.nanmedian(largest / response.inverse_error) > 0.98
 
+    # The noise stated, or the difference of each two frames, is above what residuals show.
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_an_error_beyond_the_noise_is_said(self):
         levels = curves(truth(2, np.random.default_rng(8)))
         error = nuc.fit(levels, order=2).inverse_error
@@ -327,6 +329,8 @@ class TestInverse:
             total = total * frame + coefficient
         np.testing.assert_array_equal(response.correct(frame, flagged="keep"), total)
 
+    # The noise stated, or the difference of each two frames, is above what residuals show.
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_a_stored_dark_is_part_of_the_coefficients(self):
         rng = np.random.default_rng(9)
         dark = equipix.average(rng.integers(60, 62, (64, *SHAPE), dtype=np.uint16))
@@ -635,3 +639,20 @@ class TestRawAverages:
         assert response.raw
         with pytest.raises(errors.InputError, match="part of its curves"):
             response.correct(np.ones(SHAPE), dark=np.ones(SHAPE))
+
+
+class TestMisfit:
+    """The message names what the data leave as a cause."""
+
+    def test_auto_is_not_recommended_where_it_was_given(self):
+        rng = np.random.default_rng(21)
+        levels = noisy(curves(truth(2, rng)), rng)
+        with pytest.warns(errors.MisfitWarning, match="no other order predicts") as found:
+            nuc.fit(levels, order="auto", variance=NoiseModel(read_noise=0.2, gain=0.0025))
+        assert "order='auto'" not in str(found[0].message)
+
+    def test_residuals_far_below_the_noise_are_named(self):
+        rng = np.random.default_rng(22)
+        levels = noisy(curves(truth(1, rng)), rng)
+        with pytest.warns(errors.MisfitWarning, match=r"chi-square 0\.1.*limit 0.5"):
+            nuc.fit(levels, order=1, variance=NoiseModel(read_noise=6.0, gain=2.25))

@@ -9,6 +9,7 @@ import equipix
 from equipix import nuc
 from equipix.defects import hot_pixels
 from equipix.exposures.averaged import Averaged
+from equipix.exposures.clipping import clipping_of
 from equipix.noise import photon_transfer
 from equipix.rounding import (
     largest_scatter,
@@ -16,6 +17,7 @@ from equipix.rounding import (
     scatter_slope,
     step_of,
     unaveraged,
+    unaveraged_apart,
 )
 
 SIGMAS = (0.01, 0.05, 0.1, 0.141, 0.142, 0.2, 0.3, 0.5, 1.0, 3.0)
@@ -104,7 +106,7 @@ def test_a_good_array_has_no_noisy_pixel(sigma, frames, step):
     ]
     response = nuc.fit(levels, order=1)
     found = nuc.find_defects(response, rounded(rng, step * signal, step * sigma, frames, step))
-    assert found.counts["noisy"] == found.counts["flickering"] == 0
+    assert found.counts["noisy"] == found.counts.get("flickering", 0) == 0
     assert nuc.find_defects(response, levels[0]).counts["noisy"] == 0
     averaged = Averaged.of(levels)
     assert not averaged.findings(averaged.noise).noisy.any()
@@ -140,3 +142,27 @@ def test_the_mean_of_frames_is_off_by_the_variance_of_the_model(sigma, frames):
     error = float(np.mean((average.mean - signal) ** 2))
     # The square of an error scatters by at most √2 of its mean, over 16 384 pixels; so does s².
     assert float(noise.variance(1000.0)) == pytest.approx(error, rel=5 * 2 * np.sqrt(1 / 2**13))
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2])
+@pytest.mark.parametrize("spread", [0.05, 0.2, 0.6])
+def test_what_pixels_less_than_a_step_apart_have_in_common(sigma, spread):
+    phase = np.linspace(-4, 4, 4001)
+    bias = np.array([of_phase(sigma, each)[0] for each in phase % 1])
+    rng = np.random.default_rng(4)
+    own = []
+    for _ in range(400):
+        light = (rng.random() + spread * rng.standard_normal(400)) % 1
+        own.append(np.interp(light, phase, bias).var())
+    apart = float(unaveraged(sigma**2) - unaveraged(sigma**2 + spread**2))
+    assert np.mean(own) == pytest.approx(apart, abs=5 * np.std(own) / np.sqrt(400))
+    # The grid of spreads is a thousandth of a step wide.
+    found = unaveraged_apart(sigma**2, spread**2 + apart + 0.01, 0.01)
+    assert found == pytest.approx(max(apart, 0.1 * unaveraged(sigma**2)), rel=1e-3)
+
+
+def test_means_at_whole_numbers_are_no_saturation():
+    """Without noise many pixels share the highest whole number, as they do each other one."""
+    rng = np.random.default_rng(5)
+    frames = equipix.average(rounded(rng, rng.normal(27, 1, (64, 80)), 0.05, 100), saturation=255)
+    assert clipping_of(frames) is None

@@ -240,3 +240,14 @@ class TestBlackBody:
         gap = 1.239841984 / blackbody.hgcdte_cutoff(0.2, 77.0)
         wanted = -0.302 + 0.386 - 0.0324 + 0.006656 + 5.35e-4 * 77 * 0.6
         assert gap == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_another_depth_scales_what_the_read_out_adds(bits):
+    array = StaringArray.of("InSb", SHAPE, rng=1)
+    other = array.with_causes(bit_depth=bits)
+    share = 2.0**bits / 2**14
+    np.testing.assert_allclose(other.offset_dn, share * np.asarray(array.offset_dn))
+    np.testing.assert_allclose(other.drift_dn, share * np.asarray(array.drift_dn))
+    given = array.with_causes(bit_depth=bits, offset_dn=60.0)
+    assert given.offset_dn == 60.0

@@ -15,6 +15,7 @@ from equipix.rounding import (
     largest_scatter,
     scatter_slope,
     unaveraged,
+    unaveraged_apart,
 )
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ _FEWEST = 16
 
 _FLOOR = 1e-6
 """Least variance of a model, as a fraction of the largest that it was fitted to."""
+
+_FAR = 6.0
+"""Distance from the median, in its median or in steps, beyond which a mean is no usual one."""
 
 _ROUNDS = 100
 """Most rounds of weights."""
@@ -118,6 +122,23 @@ class NoiseModel:
         if self.step == 0:
             return np.zeros(())
         return self.step**2 * unaveraged(self._in_steps(signal))
+
+    def rounding_apart(self, signal: float, means: NDArray[Any]) -> float:
+        """Part of the rounding B that differs between pixels of one signal, with these means.
+
+        Where the means are less than a step apart pixels have a part of it in common.
+        """
+        every = float(self.rounding(signal))
+        if every == 0:
+            return 0.0
+        off = np.abs(means - np.nanmedian(means))
+        near = off[off <= _FAR * max(self.step, float(np.nanmedian(off)))]
+        between = float(np.mean(near**2)) / self.step**2
+        if between > 1:
+            return every
+        of_noise = float(self.scatter(signal)) / self.frames / self.step**2
+        v = float(self._in_steps(signal))
+        return self.step**2 * unaveraged_apart(v, between, of_noise)
 
     def largest_scatter(self, signal: ArrayLike) -> NDArray[Any]:
         """Variance between frames of a pixel half-way between two steps, in DN²."""

@@ -42,6 +42,12 @@ _FINE = 1.0
 _TERMS = 7
 """Terms of a series: at `_SMALL` the eighth is below 1e-11."""
 
+_GRID = 1001
+"""Spreads between 0 and one step that are compared."""
+
+_LEAST_APART = 0.1
+"""Least part of B that counts as different between pixels."""
+
 _FEWEST = 8
 """Different values that must all be multiples of a step before it is one."""
 
@@ -93,6 +99,35 @@ def largest_scatter(v: ArrayLike) -> NDArray[Any]:
         np.exp(-2 * np.pi**2 * k**2 * few) * (1 / (np.pi * k) ** 2 + 4 * few) for k in _terms()
     )
     return np.asarray(np.where(v < _SMALL, 0.25, few + UNIFORM + waves))
+
+
+def unaveraged_apart(v: float, between: float, of_noise: float) -> float:
+    """Part of B that differs between pixels whose means are less than a step apart, in q².
+
+    Parameters
+    ----------
+    v : float
+        Variance of the noise of one frame.
+    between : float
+        Variance of the means between pixels.
+    of_noise : float
+        Part of it that is noise of the means.
+
+    Returns
+    -------
+    float
+        At least a tenth of B: means that are all equal do not show how far apart the light was.
+
+    Notes
+    -----
+    Over pixels whose light is spread normally by w, β has the mean that it has at a noise of v + w.
+    That part, B(v + w) on average, is common to them, and B(v) − B(v + w) is left. The means are
+    spread by w + B(v) − B(v + w) and their noise, which gives w.
+    """
+    w = np.linspace(0, 1, _GRID) ** 2
+    whole = float(unaveraged(v))
+    left = whole - unaveraged(v + w)
+    return max(_LEAST_APART * whole, float(np.interp(between - of_noise, w + left, left)))
 
 
 def step_of(values: NDArray[Any]) -> float:

@@ -219,7 +219,8 @@ class Averaged:
         """
         if self.dark is not None:
             scatter = noise.scatter(0.0) / np.maximum(self.dark.count, 1)
-            return np.asarray(scatter + noise.rounding(0.0))
+            of_mean = noise.of_mean(int(self.dark.count.max()))
+            return np.asarray(scatter + of_mean.rounding_apart(0.0, self.dark.mean))
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 

@@ -41,10 +41,11 @@ class Clipping(NamedTuple):
     values: int
 
 
-def clipping(values: Array, crowded: float = _CROWDED) -> Clipping | None:
+def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Clipping | None:
     """Find the level that values of one exposure are clipped at; what is NaN does not count.
 
-    At the level must be more than `crowded` times as many values as just below.
+    At the level must be more than `crowded` times as many values as just below: within `step`, the
+    step between the values of frames, at least, since frames without noise have their means there.
 
     Notes
     -----
@@ -65,7 +66,7 @@ def clipping(values: Array, crowded: float = _CROWDED) -> Clipping | None:
     below = known[known < top - rounding]
     if not below.size:
         return None
-    width = max(_BELOW * top, top - float(below.max())) + rounding
+    width = max(_BELOW * top, top - float(below.max()), step) + rounding
     if count <= crowded * np.count_nonzero(below >= top - width):
         return None
     level = float(np.rint(top)) if abs(top - np.rint(top)) <= rounding else top
@@ -87,7 +88,7 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     others = np.isfinite(raw) & (raw < found.level * (1 - _ROUNDING))
     if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:
         return found
-    return clipping(raw)
+    return clipping(raw, step=frames.step)
 
 
 def unclipped(frames: FrameStatistics, clipped: Clipping) -> Bools:

@@ -246,7 +246,8 @@ def _averaged(levels: object) -> Averaged | None:
 def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | None:
     """Noise of each mean frame, from noise models or one variance a level.
 
-    What rounding leaves in a mean is that at the median of the level.
+    What rounding leaves in a mean is that at the median of the level, less what all pixels have in
+    common, which V̄ takes.
     """
     if measured.models:
         pairs = zip(measured.models, measured.values, strict=True)
@@ -259,7 +260,8 @@ def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | N
 def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNoise:
     signal = max(0.0, float(np.nanmedian(values)) - pedestal)
     slope = model.gain / model.frames
-    return LevelNoise(float(model.variance(signal)) - slope * signal, slope, pedestal)
+    common = float(model.rounding(signal)) - model.rounding_apart(signal, values)
+    return LevelNoise(float(model.variance(signal)) - common - slope * signal, slope, pedestal)
 
 
 def _used(measured: Measured, mask: Bools | None) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from equipix._check import as_array, as_shifts
 from equipix.errors import InputError
 from equipix.io import as_path
+from equipix.rounding import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
 from equipix.simulate.signal import Beam, window
@@ -135,11 +136,19 @@ class VirtualExperiment:
         return self.camera.frames(light, count, rng=rng)
 
     def variance_of_mean(self) -> Floats:
-        """Variance of the dark-subtracted mean of each exposure, (n, rows, cols), in DN²."""
+        """Variance of the dark-subtracted mean of each exposure, (n, rows, cols), in DN².
+
+        What frames do not average out of the rounding is included: see `equipix.rounding`.
+        """
         shape = self.camera.shape
-        dark = self.camera.variance(np.zeros(shape)) / self.dark_count
+        dark = self._of_mean(np.zeros(shape), self.dark_count)
         lights = (window(self.beam, shape, position) for position in self.positions)
-        return np.stack([self.camera.variance(light) / self.count + dark for light in lights])
+        return np.stack([self._of_mean(light, self.count) + dark for light in lights])
+
+    def _of_mean(self, light: Floats, count: int) -> Floats:
+        """Variance of the mean of so many frames."""
+        before = self.camera.variance(light) - UNIFORM
+        return np.asarray(scatter(before) / count + unaveraged(before))
 
     def noise_prediction(self, *, draws: int = 4, rng: Rng) -> tuple[float, float]:
         """Error of the sensitivity of the good pixels that the camera's noise alone leaves.

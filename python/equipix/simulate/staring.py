@@ -196,8 +196,20 @@ class StaringArray:
         return cls(shape=(rows, cols), band_start_um=start, seed=seed, **maps)
 
     def with_causes(self, **causes: Any) -> Self:
-        """Return a copy with other values of some attributes."""
-        return replace(self, **causes)
+        """Return a copy with other values of some attributes.
+
+        With another `bit_depth` the ADC divides the same range into other steps: `offset_dn` and
+        `drift_dn` are scaled with their number unless they are given too.
+        """
+        bits = causes.get("bit_depth", self.bit_depth)
+        check_bit_depth(bits)
+        finer = 2.0 ** (bits - self.bit_depth)
+        scaled = {
+            name: finer * np.asarray(getattr(self, name))
+            for name in ("offset_dn", "drift_dn")
+            if finer != 1
+        }
+        return replace(self, **scaled | causes)
 
     @cached_property
     def _maps(self) -> dict[str, Floats]:
