@@ -46,7 +46,7 @@ LAYERS = (
     {"bolometer", "detector"},
     {"exposures", "hardware", "plan", "simulate"},
     {"correction", "defects", "lens", "metrics", "uncertainty"},
-    {"noise"},
+    {"light", "noise"},
     {"frames", "shifts"},
     {"batches", "drift", "flags", "maps", "mending", "rejection", "rounding"},
     {"io"},

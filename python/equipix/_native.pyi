@@ -30,7 +30,7 @@ __all__ = [
 
 _Spot: TypeAlias = tuple[list[float], list[float]]
 _Progress: TypeAlias = Callable[[int, int, str], object]
-_Statistics: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+_Statistics: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], float]
 
 __version__: str
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,10 +11,11 @@ import numpy as np
 
 from equipix._readonly import ReadOnly
 from equipix.errors import InputError
+from equipix.light import light_of
 from equipix.noise import scatter_limit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -158,7 +160,8 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     hot: NDArray[Any] = excess > HOT_SIGMAS * spread
     frames = int(dark.count.max())
     if noise is not None and frames > 1:
-        hot |= dark.variance > scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
+        limit = scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
+        hot |= dark.variance > _with_light(limit, light_of(dark).variance(dark.mean))
     return hot
 
 
@@ -169,6 +172,7 @@ def noisy_pixels(
     noise: NoiseModel,
     *,
     times: float = 1.0,
+    light: Iterable[Array] | None = None,
 ) -> Bools:
     """Find pixels that scatter between frames by more than the noise explains.
 
@@ -183,6 +187,8 @@ def noisy_pixels(
     times : float
         Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
         is beyond chance.
+    light : iterable of ndarray, shape (rows, cols), optional
+        What the variances of each exposure have of light that varied between its frames, in DN².
 
     Returns
     -------
@@ -191,13 +197,14 @@ def noisy_pixels(
     """
     noisy = np.ones(means.shape[1:], dtype=bool)
     seen = np.zeros_like(noisy)
-    for mean, variance, count in zip(means, variances, frames, strict=True):
+    common = itertools.repeat(np.zeros(()), len(frames)) if light is None else light
+    for mean, variance, count, shared in zip(means, variances, frames, common, strict=True):
         if count < 2:
             continue
         of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(mean)
         limit = np.maximum(of_chance, times**2 * noise.scatter(mean))
         known = np.isfinite(variance) & np.isfinite(mean)
-        noisy &= ~known | (variance > limit)
+        noisy &= ~known | (variance > _with_light(limit, shared))
         seen |= known
     return noisy & seen
 
@@ -240,6 +247,11 @@ def _binomial_limit(samples: int, share: float) -> int:
     terms += (samples - hits) * np.log1p(-share)
     above = np.cumsum(np.exp(terms)[::-1])[::-1]
     return int(np.count_nonzero(above >= _CHANCE))
+
+
+def _with_light(limit: Array | float, light: Array) -> Array:
+    """Largest variance by noise of variance up to `limit` and light: their deviations add up."""
+    return np.asarray((np.sqrt(limit) + np.sqrt(light)) ** 2)
 
 
 def response_outliers(

@@ -45,6 +45,7 @@ _PAGES = {
     "saturated": np.uint32,
 }
 _COUNTS = ("count", "saturated")
+_NUMBERS = ("saturation", "reject", "step", "light_variance")
 _SAMPLED = 4096  # pixels that show the step between values
 _DARK = "dark_"  # before the names of the dark's pages
 
@@ -78,6 +79,9 @@ class FrameStatistics(ReadOnly):
     step : float
         Step between the values of the frames, in DN: 1 of whole numbers, 16 of 12 bits that were
         shifted to 16; 0 of values that are not whole. See `equipix.rounding`.
+    light_variance : float or None
+        Unbiased variance of the means of the frames over all pixels, in DN²: that of the light, and
+        of the noise over the number of pixels. None of one frame, or where it is not known.
     """
 
     mean: NDArray[Any]
@@ -90,6 +94,7 @@ class FrameStatistics(ReadOnly):
     raw: bool = False
     reject: float | None = None
     step: float = 0.0
+    light_variance: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
@@ -248,10 +253,10 @@ def save_statistics(
     """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
     pages, dark = dict(statistics.maps), statistics.dark
     content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content |= {name: getattr(statistics, name) for name in ("saturation", "raw", "reject", "step")}
+    content |= {name: getattr(statistics, name) for name in ("raw", *_NUMBERS)}
     if dark is not None:
         pages |= {_DARK + name: values for name, values in dark.maps.items()}
-        content |= {_DARK + name: getattr(dark, name) for name in ("saturation", "reject", "step")}
+        content |= {_DARK + name: getattr(dark, name) for name in _NUMBERS}
     io.save_pages(path, pages, content, force=force)
 
 
@@ -278,17 +283,8 @@ def _of_pages(
     pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
 ) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    level, reject = (content.get(before + name) for name in ("saturation", "reject"))
-    return FrameStatistics(
-        mean,
-        variance,
-        of_mean,
-        count,
-        saturated,
-        saturation=level,
-        reject=reject,
-        step=content.get(before + "step", 0.0),
-    )
+    numbers = {name: content[before + name] for name in _NUMBERS if before + name in content}
+    return FrameStatistics(mean, variance, of_mean, count, saturated, **numbers)
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:
@@ -364,9 +360,9 @@ def _saved(paths: list[Path], level: float | None, rejection: Rejection | None) 
 
 
 def _statistics(
-    maps: tuple[NDArray[Any], ...], dtype: np.dtype[Any], level: float | None
+    maps: tuple[Any, ...], dtype: np.dtype[Any], level: float | None
 ) -> FrameStatistics:
-    mean, variance, count, saturated = maps
+    mean, variance, count, saturated, light_variance = maps
     return FrameStatistics(
         mean,
         variance,
@@ -376,6 +372,7 @@ def _statistics(
         saturation=_level_of(dtype, level),
         raw=dtype.kind in "iu",
         step=_step(mean, variance, count),
+        light_variance=None if np.isnan(light_variance) else light_variance,
     )
 
 

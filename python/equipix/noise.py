@@ -200,7 +200,7 @@ class NoiseModel:
         if not least > 0:
             raise InputError("repeated frames are all equal, which gives no noise model")
         darkest = np.argsort(signal, kind="stable")[: -(-len(signal) // 10)]
-        lowest = variance[darkest].mean() / 2
+        lowest = max(least, variance[darkest].mean() / 2)
         found = _bounded_line(signal, variance, degrees, least, gain)
         for _ in range(_ROUNDS):
             model = cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
@@ -255,6 +255,7 @@ def photon_transfer(
     usable: NDArray[Any],
     frames: int,
     step: float = 0.0,
+    common: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
     """Give the points of the photon-transfer curve that one exposure contributes.
 
@@ -271,6 +272,8 @@ def photon_transfer(
         Number of frames averaged; fewer than two give no point.
     step : float
         Step between the values of frames, in DN; 0 if they are not rounded.
+    common : ndarray, shape (rows, cols), optional
+        Part of the variance that is no noise but that of the light, in DN².
 
     Returns
     -------
@@ -281,6 +284,9 @@ def photon_transfer(
     -----
     A pixel's own mean would not do for the order, since it correlates with its scatter: where two
     rounded frames have a whole mean, they are equal.
+
+    The part C of the light leaves σ² of a variance σ² + C, with the scatter of more than σ² alone:
+    degrees of freedom are fewer by the square of σ²/(σ² + C), the mean over the exposure.
     """
     if frames < 2:
         return np.empty((0, 3))
@@ -295,8 +301,16 @@ def photon_transfer(
         if kept.any():
             bin_ = chunk[kept]
             mean = (signal.ravel()[bin_].mean(), variance.ravel()[bin_].mean())
-            points.append((*mean, len(bin_) * (frames - 1)))
-    return np.array(points).reshape(-1, 3)
+            light = 0.0 if common is None else common.ravel()[bin_].mean()
+            points.append((*mean, light, len(bin_) * (frames - 1)))
+    return _without_light(np.array(points).reshape(-1, 4))
+
+
+def _without_light(points: NDArray[Any]) -> NDArray[Any]:
+    """Points of signal, variance and degrees of freedom, of those with the part of the light."""
+    signal, variance, light, degrees = points.T
+    left = max(_FLOOR, 1 - light.sum() / variance.sum()) if light.any() else 1.0
+    return np.stack([signal, variance - light, left**2 * degrees], axis=1)
 
 
 def _of_neighbours(image: NDArray[Any], usable: NDArray[Any]) -> NDArray[Any]:

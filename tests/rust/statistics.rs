@@ -41,6 +41,19 @@ fn naive<T: Sample>(frames: &[T], shape: Shape, pixel: usize) -> (f64, f64) {
     (mean, if n < 2.0 { f64::NAN } else { scatter / (n - 1.0) })
 }
 
+/// Unbiased variance of the means of the frames over their finite samples.
+fn of_light<T: Sample>(frames: &[T], shape: Shape) -> f64 {
+    let means: Vec<f64> = frames
+        .chunks(shape.len())
+        .map(|frame| frame.iter().map(|sample| sample.to_f64()).filter(|value| value.is_finite()))
+        .filter_map(|values| {
+            let (sum, count) = values.fold((0.0, 0), |(sum, count), v| (sum + v, count + 1));
+            (count > 0).then(|| sum / f64::from(count))
+        })
+        .collect();
+    naive(&means, Shape::new(1, 1), 0).1
+}
+
 /// Equal up to the rounding of n terms of size `top`, or both NaN.
 fn close(a: f64, b: f64, n: usize, top: f64) -> bool {
     (a.is_nan() && b.is_nan()) || (a - b).abs() <= 4.0 * (n + 8) as f64 * f64::EPSILON * top
@@ -70,6 +83,8 @@ proptest! {
         let parts = merged(&frames, shape, &cuts, 2).unwrap();
         prop_assert_eq!(format!("{whole:?}"), format!("{parts:?}"));
         let count = frames.len() / shape.len();
+        let light = of_light(&frames, shape);
+        prop_assert!(close(whole.light_variance, light, count, 65535.0_f64.powi(2)));
         for pixel in 0..shape.len() {
             let (mean, variance) = naive(&frames, shape, pixel);
             prop_assert!(close(whole.mean[pixel], mean, count, 65535.0));
@@ -83,6 +98,8 @@ proptest! {
     ) {
         let parts = merged(&frames, shape, &cuts, 2).unwrap();
         let count = frames.len() / shape.len();
+        let light = of_light(&frames, shape);
+        prop_assert!(close(parts.light_variance, light, count + shape.len(), 4e6));
         for pixel in 0..shape.len() {
             let (mean, variance) = naive(&frames, shape, pixel);
             prop_assert!(close(parts.mean[pixel], mean, count, 1e3));

@@ -18,6 +18,7 @@ def on_input(exposures: Exposures) -> list[Verdict]:
     found = [
         _on_clipping(exposures),
         _on_raw(exposures),
+        Verdict("light", exposures.unsteady) if exposures.unsteady else None,
         _on_units(exposures),
         _on_repeats(exposures),
     ]

@@ -20,6 +20,7 @@ from equipix.defects import (
 from equipix.errors import InputError
 from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
 from equipix.frames import same_statistics
+from equipix.light import NAMED, Light, light_of
 from equipix.noise import NoiseModel, photon_transfer
 
 if TYPE_CHECKING:
@@ -75,6 +76,8 @@ class Averaged:
         The dark frames that were subtracted.
     step : float
         Largest step between the values of frames, in DN; 0 if they are not whole.
+    light : list of Light
+        What the variances of each exposure have of light that varied between its frames.
     pedestal : float
         Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
     """
@@ -101,6 +104,7 @@ class Averaged:
         self._clipped: list[Clipping | None] = []
         self.raw = True
         self.step = 0.0
+        self.light: list[Light] = []
 
     @classmethod
     def of(cls, frames: Sequence[FrameStatistics], *, words: Words = EXPOSURES) -> Self:
@@ -159,7 +163,12 @@ class Averaged:
         # Clipped samples scatter less: their bins would have most of the weight in the noise model.
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self.step = max(self.step, frames.step)
-        self._points.append(photon_transfer(frames.mean, frames.variance, free, count, frames.step))
+        light = light_of(frames)
+        self.light.append(light)
+        common = light.variance(frames.mean)
+        self._points.append(
+            photon_transfer(frames.mean, frames.variance, free, count, frames.step, common)
+        )
 
     def _screen(self, frames: FrameStatistics) -> None:
         """Count the samples that were left out as those of cosmic rays."""
@@ -204,6 +213,17 @@ class Averaged:
         return tuple(self._frames)
 
     @property
+    def unsteady(self) -> str:
+        """The exposure whose light varied most between its frames, in words; or nothing."""
+        worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
+        if not self.light[worst].is_large:
+            return ""
+        return (
+            f"{self._words.place(worst)}: {self.light[worst].words} (limit {NAMED:g}). It was "
+            "taken out of the noise model. Let the source settle, or average more frames"
+        )
+
+    @property
     def clipped(self) -> Clipping | None:
         """A saturation level that was not given, if the values show one."""
         return highest(self._clipped)
@@ -228,7 +248,9 @@ class Averaged:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
-            noisy = noisy_pixels(self._signals, self.variances, self._frames, noise)
+            pairs = zip(self.light, self.values, strict=True)
+            light = (of_light.variance(values) for of_light, values in pairs)
+            noisy = noisy_pixels(self._signals, self.variances, self._frames, noise, light=light)
             noisy |= often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
         if self.dark is not None:
@@ -283,4 +305,6 @@ def _dark_points(dark: FrameStatistics) -> Array:
     """Points of the photon-transfer curve at signal 0."""
     usable: Bools = np.asarray(dark.saturated == 0)
     frames = int(dark.count.max())
-    return photon_transfer(np.zeros(dark.mean.shape), dark.variance, usable, frames, dark.step)
+    common = light_of(dark).variance(dark.mean)
+    signal = np.zeros(dark.mean.shape)
+    return photon_transfer(signal, dark.variance, usable, frames, dark.step, common)

@@ -63,6 +63,8 @@ class Exposures(ReadOnly):
         A saturation level that was not given, if the values show one.
     raw : bool
         Whether the values are averages of whole numbers from which no dark was subtracted.
+    unsteady : str
+        Which exposure has light that varied between its frames, and by how much; empty if none has.
     """
 
     values: Array
@@ -77,6 +79,7 @@ class Exposures(ReadOnly):
     dark_variance: Floats | None = None
     clipped: Clipping | None = None
     raw: bool = False
+    unsteady: str = ""
 
     def __len__(self) -> int:
         """Return the number of exposures."""

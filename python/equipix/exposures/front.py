@@ -64,6 +64,7 @@ def exposures_of(
             dark_variance=_of_dark(dark_variance, measured, offset=offset),
             clipped=measured.clipped,
             raw=measured.raw and not offset,
+            unsteady=measured.unsteady,
         )
         refuse_nothing(exposures, given)
         return exposures
@@ -104,6 +105,7 @@ class Measured(NamedTuple):
     dark_variance: Floats | None = None
     clipped: Clipping | None = None
     raw: bool = False
+    unsteady: str = ""
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -160,6 +162,7 @@ def _of_averaged(
         None if model is None else averaged.dark_variance(model),
         averaged.clipped,
         averaged.raw,
+        averaged.unsteady,
     )
 
 

@@ -153,7 +153,7 @@ def moments(name: str, frames: ArrayLike | FrameStatistics) -> Moments:
     -----
     The mean of each frame is subtracted before its noise is taken, so a drift of the light does
     not count: for two frames the variance is ½⟨(y₀ − y₁)²⟩ − ½(μ₀ − μ₁)², ⟨⟩ over all pixels.
-    Averages do not know the means of their frames, so there a drift counts as noise.
+    Averages keep the variance of the means of their frames, which is subtracted: the same number.
     """
     if isinstance(frames, FrameStatistics):
         return _of_average(name, frames)
@@ -179,4 +179,5 @@ def _of_average(name: str, frames: FrameStatistics) -> Moments:
             f"'{name}' has {count} to {frames.count.max()} samples a pixel, expected as many "
             "everywhere, two or more"
         )
-    return Moments(frames.mean, float(frames.variance.mean()), count)
+    noise = float(frames.variance.mean()) - (frames.light_variance or 0.0)
+    return Moments(frames.mean, noise, count)

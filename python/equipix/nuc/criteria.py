@@ -9,6 +9,7 @@ import numpy as np
 from equipix.defects import noisy_pixels, often_rejected, response_outliers
 from equipix.errors import InputError
 from equipix.frames import FrameStatistics
+from equipix.light import Light, light_of
 from equipix.metrics.moments import stack_of, temporal_of, warn_of_drift
 from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
 from equipix.nuc.curve import response_at
@@ -59,11 +60,11 @@ def of_frames(
     frames: ArrayLike | FrameStatistics, good: Bools, limits: DefectLimits
 ) -> dict[str, Bools]:
     """Bad pixels by their noise; `good` are those whose curves are usable."""
-    slow = None
+    slow, light = None, Light()
     if isinstance(frames, FrameStatistics):
         _check_shape(frames.mean.shape, good.shape)
         mean, variance, count = frames.mean, frames.variance, int(frames.count.max())
-        step = frames.step
+        step, light = frames.step, light_of(frames)
     else:
         stack = stack_of("frames", frames)
         _check_shape(stack.shape[1:], good.shape)
@@ -74,11 +75,13 @@ def of_frames(
         slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
-    model = _common_noise(mean, variance, good, count, step)
+    common = light.variance(mean)
+    model = _common_noise(mean, variance, good, count, step, common)
     noisy = flickering = np.zeros(good.shape, bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
-        noisy, flickering = noisy_pixels(*of_level, times=limits.noise), noisy_pixels(*of_level)
+        flickering = noisy_pixels(*of_level)
+        noisy = noisy_pixels(*of_level, times=limits.noise, light=[common])
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
         noisy = noisy | often_rejected(missing, count)
@@ -112,13 +115,13 @@ def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
 
 
 def _common_noise(
-    mean: Array, variance: Array, good: Bools, count: int, step: float
+    mean: Array, variance: Array, good: Bools, count: int, step: float, light: Array
 ) -> NoiseModel | None:
     """Noise that pixels of a signal have in common; None of equal frames that are not rounded."""
     known = good & np.isfinite(mean) & np.isfinite(variance)
     if not known.any():
         known = np.isfinite(mean) & np.isfinite(variance)
-    points = photon_transfer(mean, variance, known, count, step)
+    points = photon_transfer(mean, variance, known, count, step, light)
     if not len(points):
         raise InputError("'frames' hold no value: they show no noise")
     if step == 0 and not points[:, 1].any():

@@ -11,7 +11,7 @@ import numpy as np
 from equipix import _native
 from equipix._readonly import ReadOnly
 from equipix.defects import SIGMAS, Findings, response_outliers
-from equipix.errors import BrightDarkWarning, InputError, warn
+from equipix.errors import BrightDarkWarning, DriftWarning, InputError, warn
 from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
@@ -174,6 +174,8 @@ def levels_of(
     given = None if mask is None else as_mask(mask, measured.values.shape)
     check_saturation(measured, averaged, given)
     pedestal = 0.0 if averaged is None else averaged.pedestal
+    if measured.unsteady:
+        warn(measured.unsteady, DriftWarning)
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
     findings = _with_odd_responses(values, noise, measured.findings)

@@ -14,6 +14,9 @@
 //! n = nₐ + n_b    δ = x̄_b − x̄ₐ    x̄ = x̄ₐ + δ n_b/n    M = Mₐ + M_b + δ² nₐ n_b/n    s² = M / (n − 1)
 //! ```
 //!
+//! The light may vary between frames. What it does to all pixels together shows in the means of the
+//! frames over all pixels, whose variance is kept, one number, added frame by frame in their order.
+//!
 //! Samples that are not finite do not count. Saturated samples do: they are counted apart, and
 //! whoever uses the mean decides what to do with the pixel.
 //!
@@ -25,6 +28,9 @@ use crate::error::{Error, Result};
 use crate::frames::{Sample, Shape, Stack};
 use crate::memory;
 use crate::parallel::Workers;
+
+mod light;
+use light::{FloatLight, Light, WholeLight, total_of_finite, total_of_whole};
 
 /// Pixels of one block: their sums stay in the first-level cache while a batch passes.
 const BLOCK: usize = 1024;
@@ -45,6 +51,8 @@ pub struct Statistics {
     pub count: Vec<u32>,
     /// Number of samples at or above the saturation level.
     pub saturated: Vec<u32>,
+    /// Unbiased variance of the means of the frames over all pixels; NaN of fewer than two.
+    pub light_variance: f64,
 }
 
 impl Statistics {
@@ -56,8 +64,12 @@ impl Statistics {
 pub trait Summable: Sample {
     /// The partial sums that suit it.
     type Sums: PartialSums<Self>;
+    /// What is kept of the means of frames.
+    type Light: Light;
     /// The level that no sample exceeds, where the type has one.
     const FULL_SCALE: Option<f64>;
+    /// Sum and number of the samples that count.
+    fn total(samples: &[Self]) -> (f64, usize);
 }
 
 /// Partial sums of a block of pixels.
@@ -75,19 +87,25 @@ pub trait PartialSums<T>: Clone + std::fmt::Debug + Send + Sync {
 }
 
 macro_rules! summable {
-    ($($sample:ty: $sums:ty, $full_scale:expr;)*) => {$(
+    ($($sample:ty: $sums:ty, $light:ty, $full_scale:expr, $total:ident;)*) => {$(
         impl Summable for $sample {
             type Sums = $sums;
+            type Light = $light;
             const FULL_SCALE: Option<f64> = $full_scale;
+
+            #[inline(always)]
+            fn total(samples: &[Self]) -> (f64, usize) {
+                $total(samples)
+            }
         }
     )*};
 }
 
 summable! {
-    u8: ExactSums, Some(255.0);
-    u16: ExactSums, Some(65535.0);
-    f32: Moments, None;
-    f64: Moments, None;
+    u8: ExactSums, WholeLight, Some(255.0), total_of_whole;
+    u16: ExactSums, WholeLight, Some(65535.0), total_of_whole;
+    f32: Moments, FloatLight, None, total_of_finite;
+    f64: Moments, FloatLight, None, total_of_finite;
 }
 
 /// Σx and Σx² in whole numbers: 2³² samples of 16 bits fill 64.
@@ -230,6 +248,7 @@ pub struct Accumulator<T: Summable> {
     shape: Shape,
     saturation: f64,
     frames: u32,
+    light: T::Light,
     blocks: Vec<T::Sums>,
 }
 
@@ -249,7 +268,7 @@ impl<T: Summable> Accumulator<T> {
         memory::check(Self::bytes(shape), || format!("averaging frames of {shape}"))?;
         let blocks = (0..shape.len()).step_by(BLOCK);
         let blocks = blocks.map(|start| T::Sums::new(BLOCK.min(shape.len() - start))).collect();
-        Ok(Self { shape, saturation, frames: 0, blocks })
+        Ok(Self { shape, saturation, frames: 0, light: T::Light::default(), blocks })
     }
 
     /// Sizes of one frame.
@@ -273,12 +292,18 @@ impl<T: Summable> Accumulator<T> {
         self.frames = self.total(frames.count())?;
         let all: Vec<&[T]> = (0..frames.count()).map(|index| frames.frame(index)).collect();
         for batch in all.chunks(BATCH) {
-            workers.map_blocks(&mut self.blocks, 1, |index, block| {
-                if !control.is_cancelled() {
-                    add_block(&mut block[0], batch, index * BLOCK, self.saturation);
+            let totals = workers.map_blocks(&mut self.blocks, 1, |index, block| {
+                if control.is_cancelled() {
+                    return Vec::new();
                 }
+                add_block(&mut block[0], batch, index * BLOCK, self.saturation)
             });
             control.check()?;
+            for frame in 0..batch.len() {
+                let every = totals.iter().map(|block| block[frame]);
+                let (sum, count) = every.fold((0.0, 0), |(a, m), (b, n)| (a + b, m + n));
+                self.light.add(sum, count);
+            }
         }
         Ok(())
     }
@@ -294,6 +319,7 @@ impl<T: Summable> Accumulator<T> {
             return Err(Error::value("saturation", format!("is {there}, expected {here} as here")));
         }
         self.frames = self.total(other.frames as usize)?;
+        self.light.merge(&other.light);
         self.blocks.iter_mut().zip(&other.blocks).for_each(|(a, b)| a.merge(b));
         Ok(())
     }
@@ -308,6 +334,7 @@ impl<T: Summable> Accumulator<T> {
             variance: Vec::with_capacity(size),
             count: Vec::with_capacity(size),
             saturated: Vec::with_capacity(size),
+            light_variance: self.light.variance(),
         };
         self.blocks.iter().for_each(|block| block.finish(&mut statistics));
         statistics
@@ -330,12 +357,21 @@ impl<T: Summable> Accumulator<T> {
     }
 }
 
-/// Adds the pixels from `start` on of a batch of frames, by the widest vectors the processor has.
-fn add_block<T: Summable>(block: &mut T::Sums, batch: &[&[T]], start: usize, saturation: f64) {
+/// Adds the pixels from `start` on of a batch of frames, by the widest vectors the processor has;
+/// the sum and number of those that count in each frame.
+fn add_block<T: Summable>(
+    block: &mut T::Sums,
+    batch: &[&[T]],
+    start: usize,
+    saturation: f64,
+) -> Vec<(f64, usize)> {
     let pieces: Vec<&[T]> =
         batch.iter().map(|frame| &frame[start..frame.len().min(start + BLOCK)]).collect();
     pulp::Arch::new().dispatch(
         #[inline(always)]
-        || block.add(&pieces, saturation),
-    );
+        || {
+            block.add(&pieces, saturation);
+            pieces.iter().map(|samples| T::total(samples)).collect()
+        },
+    )
 }

@@ -18,6 +18,7 @@ type Maps<'py> = (
     Bound<'py, PyArray2<f64>>,
     Bound<'py, PyArray2<u32>>,
     Bound<'py, PyArray2<u32>>,
+    f64,
 );
 
 enum Sums {
@@ -138,11 +139,19 @@ fn stack<T: Element>(py: Python<'_>, frames: Frames<T>) -> PyResult<Bound<'_, Py
 }
 
 fn maps(py: Python<'_>, statistics: Statistics) -> PyResult<Maps<'_>> {
-    let Statistics { shape: Shape { rows, cols }, mean, variance, count, saturated } = statistics;
+    let Statistics {
+        shape: Shape { rows, cols },
+        mean,
+        variance,
+        count,
+        saturated,
+        light_variance,
+    } = statistics;
     Ok((
         mean.into_pyarray(py).reshape([rows, cols])?,
         variance.into_pyarray(py).reshape([rows, cols])?,
         count.into_pyarray(py).reshape([rows, cols])?,
         saturated.into_pyarray(py).reshape([rows, cols])?,
+        light_variance,
     ))
 }
