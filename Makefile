@@ -39,7 +39,7 @@ figures: $(BIN)/.built-release
 	$(BIN)/python docs/uncertainty.py
 
 docs:
-	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps -p equipix-core
+	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --workspace
 
 lint: $(BIN)/.built-ci docs
 	cargo fmt --all --check

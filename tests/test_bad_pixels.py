@@ -105,8 +105,9 @@ class TestKinds:
             response, frames(array, 8e6, 23, 99), limits=loose
         ).not_determinable
 
-    def test_jumps_are_found_though_their_samples_are_left_out(self):
-        rng = np.random.default_rng(8)
+    def levels_with_jumps(self, seed):
+        """Averages of frames with cosmic rays and 80 pixels that jump, and these pixels."""
+        rng = np.random.default_rng(seed)
         jumps = rng.choice(64 * 80, 80, replace=False)
         truth, levels = 1 + 0.02 * rng.standard_normal((64, 80)), []
         for light in (500, 1500, 2500, 3500):
@@ -116,6 +117,23 @@ class TestKinds:
             rays = rng.random(stack.shape) < 1e-3
             stack[rays] += rng.uniform(100, 300, rays.sum())
             levels.append(equipix.average(stack, reject=5))
+        return levels, jumps
+
+    @pytest.mark.study
+    def test_jumps_are_found_in_all_draws_and_no_good_pixel(self, draws, figure):
+        share, false = [], 0
+        for seed in draws(20):
+            levels, jumps = self.levels_with_jumps(seed)
+            found = np.flatnonzero(nuc.fit(levels, order=1).flags & Flag.DO_NOT_USE)
+            share.append(np.isin(jumps, found).mean())
+            false += np.count_nonzero(~np.isin(found, jumps))
+        figure("share of jumping pixels found, reject=5, 64 frames", np.mean(share), "76 of 80")
+        figure("good pixels flagged beside them", false, "0 of 100 800")
+        # Of 5040 pixels a draw, each by a chance of 1e-7.
+        assert (np.mean(share) >= 76 / 80, false) == (True, 0)
+
+    def test_jumps_are_found_though_their_samples_are_left_out(self):
+        levels, jumps = self.levels_with_jumps(8)
         response = nuc.fit(levels, order=1)
         # 76 of 80 in the prototype.
         found = np.flatnonzero(response.flags & Flag.HOT)
@@ -238,6 +256,26 @@ class TestRegions:
         response = nuc.fit(levels, order=1, variance=np.ones(5))
         for flags in (response.flags, nuc.find_defects(response).flags):
             np.testing.assert_array_equal((flags & Flag.DO_NOT_USE) != 0, dead)
+
+    @pytest.mark.study
+    def test_regions_of_any_size_and_place_are_found(self, draws, figure):
+        found, lost = [], 0
+        for seed in draws(100):
+            rng, shape = np.random.default_rng(seed), (72, 96)
+            dead = np.zeros(shape, bool)
+            # Up to 30 pixels are less than half of the 5×5 blocks around, at the corners as well.
+            rows, cols = rng.integers(1, 31, 2)
+            top, left = rng.integers(0, shape[0] - rows + 1), rng.integers(0, shape[1] - cols + 1)
+            dead[top : top + rows, left : left + cols] = True
+            truth = np.where(dead, 0.0, 1 + 0.02 * rng.standard_normal(shape))
+            lights = np.linspace(500.0, 3500.0, 3)[:, None, None]
+            levels = lights * truth + rng.standard_normal((3, *shape))
+            flagged = (nuc.fit(levels, order=1, variance=np.ones(3)).flags & Flag.DO_NOT_USE) != 0
+            found.append(flagged[dead].mean())
+            lost += np.count_nonzero(flagged & ~dead)
+        figure("pixels found of dead regions of up to 30×30", np.mean(found), "all")
+        figure("good pixels lost beside them", lost, "none")
+        assert (min(found), lost) == (1, 0)
 
     def test_a_calibration_finds_it(self):
         shifts, rng = equipix.cross_pattern(11, 19), np.random.default_rng(11)

@@ -568,6 +568,21 @@ class TestCorrectedFiles:
         assert "multiply by 16383" in err
         assert not (tmp_path / "out.tif").exists()
 
+    def test_a_dark_subtracted_before_is_told(self, run, folder, tmp_path):
+        LevelExperiment.load(folder / "levels.toml").run().save(tmp_path / "r.npz")
+        dark = io.read_frames([folder / "dark.tif"]).mean(axis=0)
+        once = (io.read_frames([folder / "dark.tif"])[:2] - dark).astype(np.float32)
+        io.write_frames(tmp_path / "once.tif", iter(once), nbytes=1)
+        for options, told in (((), True), (("--dark", "none"), False)):
+            arguments = (tmp_path / "r.npz", tmp_path / "once.tif", *options, "--force")
+            status, _, err = run("correct", *arguments, "-o", tmp_path / "out.tif")
+            assert status == 0
+            assert ("darker than the dark" in err) is told
+        status, _, err = run(
+            "correct", tmp_path / "r.npz", folder / "dark.tif", "-o", tmp_path / "raw.tif"
+        )
+        assert (status, "darker" in err) == (0, False)
+
     @pytest.mark.usefixtures("corrected")
     def test_frames_of_more_bits_are_refused(self, run, folder, tmp_path):
         frame = np.full((1, *SHAPE), 40000, np.uint16)

@@ -106,6 +106,29 @@ def with_small_variances(rng):
     return photograph(rng, smooth(), noise=1.3 * NOISE)
 
 
+def with_a_breathing_beam(rng):
+    sensor = simulate.cosine_sensitivity(SENSOR, rng=rng)
+    widths = 100 * np.exp(0.03 * rng.standard_normal(5))
+    beams = [simulate.gaussian_beam(SENSOR, width=width) for width in widths]
+    pairs = zip(CROSS, beams, strict=True)
+    frames = np.concatenate([simulate.exposures(sensor, beam, [shift]) for shift, beam in pairs])
+    return frames + NOISE * rng.standard_normal(frames.shape), CROSS
+
+
+def with_two_exchanged(rng):
+    frames, shifts = photograph(rng, wavy(rng))
+    first, second = rng.choice(5, 2, replace=False)
+    frames[[first, second]] = frames[[second, first]]
+    return frames, shifts
+
+
+def with_flicker(rng):
+    frames, shifts = photograph(rng, smooth())
+    phase = rng.uniform(0, 2 * np.pi, (5, 1, 1))
+    waves = 2 * np.pi * np.arange(SENSOR[0])[:, None] / rng.uniform(5, 15)
+    return frames * (1 + 5e-3 * np.sin(waves + phase)), shifts
+
+
 CAUSES = {
     "rows": with_row_noise,
     "columns": with_column_noise,
@@ -115,6 +138,8 @@ CAUSES = {
     "shifts": with_false_shifts,
     "flux": with_drift,
     "structure": with_fine_speckle,
+    "illumination": with_a_breathing_beam,
+    "order": with_two_exchanged,
     "noise": with_small_variances,
 }
 
@@ -144,6 +169,61 @@ def test_a_false_scale_is_named_with_its_size():
         scale = float(found.remedy.split("wrong by about ")[1].split("%")[0])
         # 1 % along rows, to a third: the sensitivity takes a part of what it leaves.
         assert scale == pytest.approx(1, abs=0.34)
+
+
+def test_flicker_while_rows_are_read_is_common_to_rows():
+    for seed in range(3):
+        assert found_in(*with_flicker(np.random.default_rng([12, seed]))).cause == "rows"
+
+
+def test_a_misfit_comes_before_the_drift_that_it_feigns():
+    frames, shifts = with_a_breathing_beam(np.random.default_rng(13))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EquipixWarning)
+        cal = equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2))
+    assert [verdict.kind for verdict in cal.verdicts] == ["misfit", "drift"]
+
+
+def test_shift_std_is_no_remedy_where_it_was_given():
+    frames, shifts = with_false_shifts(np.random.default_rng(14))
+    assert "or give 'shift_std'" in found_in(frames, shifts).remedy
+    frames, shifts = photograph(np.random.default_rng(14), wavy(1), 1.02 * CROSS, given=CROSS)
+    found = found_in(frames, shifts, shift_std=np.array([[1e-4, 1e-4]] * 5))
+    if found is not None:
+        assert "or give" not in found.remedy
+
+
+@pytest.mark.parametrize(("period", "widened"), [(3.0, None), (5.0, True), (10.0, False)])
+def test_error_bars_in_speckle_are_refused_widened_or_left(period, widened):
+    """With 5 periods a pixel residuals are a tenth larger than noise, with 3 six times as large."""
+    rng = np.random.default_rng([15, round(10 * period)])
+    waves = 60
+    k = 2 * np.pi / (period * rng.uniform(0.8, 1.2, waves))
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, waves))
+
+    def beam(rows, cols):
+        arguments = zip(k * np.sin(angle), k * np.cos(angle), phase, strict=True)
+        return 1 + 0.018 * sum(np.cos(a * rows + b * cols + c) for a, b, c in arguments)
+
+    shifts = CROSS + rng.uniform(-0.5, 0.5, CROSS.shape)
+    truth = simulate.cosine_sensitivity(SENSOR, rng=rng)
+    frames = simulate.exposures(truth, beam, shifts)
+    frames += NOISE * rng.standard_normal(frames.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EquipixWarning)
+        cal = equipix.calibrate(
+            frames, shifts, variance=np.full(5, NOISE**2), tolerance=1e-5, uncertainty=True
+        )
+    if widened is None:
+        assert cal.sensitivity_std is None
+        assert "finer than a spline" in cal.verdicts[-1].message
+        with pytest.raises(equipix.errors.InputError, match="move by whole pixels"):
+            cal.std_of(equipix.maps.tilt_weights(np.ones(SENSOR, bool)))
+        return
+    z = (cal.sensitivity - truth / truth.mean()) / cal.sensitivity_std
+    # An rms over 6144 pixels scatters by 1 %. Slight misfits are widened by all that they show.
+    assert (0.9 if widened else 0.95) < np.sqrt(np.mean(z**2)) < 1.3
+    assert (cal.weighted.excess > 1) == widened
 
 
 def test_variances_that_are_too_large_are_noticed():

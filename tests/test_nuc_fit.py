@@ -272,6 +272,13 @@ class TestOrder:
         with pytest.raises(errors.InputError, match="2 of 2 differ: give three"):
             nuc.fit(levels, order="auto")
 
+    @pytest.mark.parametrize("order", [0, 1, "auto"])
+    def test_levels_along_the_last_axis_are_refused(self, order):
+        levels = np.moveaxis(np.array(curves(truth(1, np.random.default_rng(1)))), 0, -1)
+        assert levels.shape[2] < min(SHAPE)
+        with pytest.raises(errors.InputError, match=r"along the last axis: .*moveaxis"):
+            nuc.fit(levels, order=order)
+
     @pytest.mark.parametrize("places", [[0, 0, 0, -1, -1], [0, 0, 0, 0, -1]])
     def test_auto_refuses_two_levels_repeated(self, places):
         """Between them order 0 has no rival: it left 227 DN in frames of another level."""

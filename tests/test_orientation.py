@@ -177,3 +177,77 @@ def test_it_is_kept_in_files(tmp_path):
     cal = equipix.calibrate(frames, CROSS, tolerance=1e-2)
     cal.save(tmp_path / "cal.npz")
     assert equipix.load(tmp_path / "cal.npz").orientation == cal.orientation
+
+
+class TestOrientationsThatLeaveNoResidual:
+    """In a Gaussian beam the shifts in another orientation fit as well, with other fluxes."""
+
+    BEAM = staticmethod(simulate.gaussian_beam(SENSOR, width=150, centre=(40, 70)))
+    TRUE = np.array([(0, 0), (3, 9), (11, 2), (-7, 8), (5, -9), (-3, -8), (9, 11)], float)
+    VARIANCE = np.full(7, 1e-6)
+
+    def calibrated(self, seed, given, **options):
+        rng = np.random.default_rng([8, seed])
+        truth = simulate.cosine_sensitivity(SENSOR, rng=rng)
+        flux = np.exp(options.pop("drift", 0.0) * rng.standard_normal(7))
+        frames = simulate.exposures(truth, self.BEAM, self.TRUE, flux=flux)
+        frames += 1e-3 * rng.standard_normal(frames.shape)
+        options = {"variance": self.VARIANCE, "tolerance": 1e-4} | options
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", EquipixWarning)
+            cal = equipix.calibrate(frames, given, **options)
+        return cal, truth
+
+    @pytest.mark.parametrize(
+        "known", [{"flux": "fit"}, {"flux": np.ones(7), "flux_std": 3e-2}], ids=["free", "prior"]
+    )
+    @pytest.mark.parametrize("way", [Orientation(cols=True), Orientation(rows=True, cols=True)])
+    def test_free_fluxes_say_by_how_much_another_sensitivity_fits(self, known, way):
+        cal, truth = self.calibrated(1, way.shifts(self.TRUE), **known)
+        (found,) = cal.verdicts
+        assert found.kind == ("tilt" if "flux_std" not in known else "orientation")
+        assert cal.orientation.sign == "undetermined"
+        assert "neither residuals nor fluxes determine the orientation" in found.message
+        assert f"differs by {cal.orientation.difference:.1%}" in found.message
+        # The error of M by this orientation is no larger than what is said of the worst.
+        error = np.std(np.log(cal.sensitivity / truth))
+        assert 1e-2 < error < 1.3 * cal.orientation.difference
+
+    def test_a_prior_that_excludes_the_others_says_nothing(self):
+        cal, _ = self.calibrated(2, self.TRUE, flux=np.ones(7), flux_std=2e-4)
+        assert cal.verdicts == ()
+        assert cal.orientation.hidden is None
+
+    @pytest.mark.parametrize("way", [Orientation(cols=True), Orientation(rows=True, cols=True)])
+    def test_a_wrong_sign_is_named_before_the_lamp(self, way):
+        """Its fluxes agree with those given in the true orientation alone."""
+        for seed in range(3):
+            cal, _ = self.calibrated(seed, way.shifts(self.TRUE))
+            assert [verdict.kind for verdict in cal.verdicts] == ["orientation", "drift"]
+            assert cal.orientation.hidden == way
+            assert way.words in cal.verdicts[0].message
+            assert "probably wrong" in cal.orientation.words
+            assert cal.shift_sign == "undetermined"
+
+    def test_a_drift_of_the_lamp_is_no_wrong_sign(self):
+        for seed in range(6):
+            cal, _ = self.calibrated(seed, self.TRUE, drift=10.0 ** -(1 + seed % 3))
+            assert [verdict.kind for verdict in cal.verdicts] == ["drift"]
+
+    def test_a_prior_that_only_another_orientation_keeps_names_it_first(self):
+        cal, _ = self.calibrated(3, -self.TRUE, flux=np.ones(7), flux_std=2e-4)
+        assert [verdict.kind for verdict in cal.verdicts] == ["orientation", "prior"]
+
+    def test_it_is_kept_in_files(self, tmp_path):
+        cal, _ = self.calibrated(4, -self.TRUE)
+        cal.save(tmp_path / "cal.npz")
+        assert equipix.load(tmp_path / "cal.npz").orientation == cal.orientation
+
+
+def test_after_a_wrong_sign_no_other_cause_is_named():
+    """Reversed shifts in a beam with structure also contradict fluxes and leave a misfit."""
+    frames = photograph(4, simulate.wavy_beam(SENSOR, rng=5))
+    with pytest.warns(ShiftSignWarning) as told:
+        cal = equipix.calibrate(frames, -CROSS, variance=np.full(5, 1e-6), tolerance=1e-3)
+    assert [verdict.kind for verdict in cal.verdicts] == ["sign"]
+    assert len(told) == 1

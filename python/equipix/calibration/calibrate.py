@@ -11,6 +11,7 @@ from equipix import _native
 from equipix.calibration import verdicts
 from equipix.calibration.coverage import with_coverage
 from equipix.calibration.error_bars import (
+    is_too_fine,
     standard_deviations,
     with_dark_misfit,
     with_hidden_tilt,
@@ -268,16 +269,19 @@ def calibrated(
     weighted, widths = widened(weighted, options)
     weighted = with_dark_misfit(weighted, options.fit)
     weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))
-    test = orientation_test(weighted.exposures, weighted.fit, options.fit)
+    test = orientation_test(weighted.exposures, weighted.fit, options.fit, exposures.flux)
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)
     drift = lamp_drift(weighted, residuals)
-    found = verdicts.on_fit(weighted, options, test, drift, misfit(weighted, residuals))
-    found += verdicts.on_noise(frames, widths)
+    misfits = misfit(weighted, residuals)
+    weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
+    found = verdicts.on_fit(weighted, options, test, drift, misfits, widths)
+    found = verdicts.unexplained(found, advice) + verdicts.on_noise(frames)
     found = with_coverage(found, weighted, flags)
     # Before the error bars, which may be refused or interrupted.
     verdicts.say(found)
-    wanted = options.uncertainty and not verdicts.is_too_far(weighted.fit)
+    has_none = verdicts.is_too_far(weighted.fit) or is_too_fine(weighted)
+    wanted = options.uncertainty and not has_none
     bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)

@@ -6,6 +6,7 @@ Each gives the part of their squares that one cause explains, less what white no
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,6 +28,10 @@ _BINS = 16
 _FAINT = 0.1
 """Spread of the signals, relative to their mean, below which nothing can grow with them."""
 
+_WORST, _EXCHANGED, _ALONE = 6, 1.25, 2.0
+"""Exposures that are compared as exchanged; how many times their squares those of such are at most
+when they are exchanged in the beam that was fitted to both; how many times as many others have."""
+
 
 class Part(NamedTuple):
     """What a cause explains of the sum of squares.
@@ -44,8 +49,37 @@ def by_flux(residuals: Floats, signal: Floats, noise: float) -> Part:
 
 
 def by_shifts(residuals: Floats, signal: Floats, slopes: Floats, noise: float) -> Part:
-    """Part proportional to the slopes of the signal (2, n, rows, cols), beside that of fluxes."""
-    return _explained(residuals, [signal, *slopes], noise, beside=1)
+    """Part proportional to the signal of each exposure and to its slopes (2, n, rows, cols)."""
+    return _explained(residuals, [signal, *slopes], noise)
+
+
+def by_illumination(residuals: Floats, signal: Floats, slopes: Floats, noise: float) -> Part:
+    """Part that a beam explains which changes its shape smoothly: also quadratic in the place."""
+    rows, cols = (np.linspace(-1, 1, size) for size in residuals.shape[1:])
+    places = (rows[:, None], cols, rows[:, None] ** 2, rows[:, None] * cols, cols**2)
+    return _explained(residuals, [signal, *slopes, *(signal * place for place in places)], noise)
+
+
+def exchanged(residuals: Floats, light: Floats, response: Floats) -> tuple[int, int] | None:
+    """Find two exposures each of which fits at the place of the other.
+
+    Squares of residuals of both, each at the place of the other, are compared with those at their
+    own. The beam was fitted to the wrong places, so they need not be fewer, but by far the fewest
+    of all pairs of the six exposures with the most residuals.
+    """
+    squares = np.nansum(residuals**2, axis=(1, 2))
+    worst = np.sort(np.argsort(squares)[::-1][:_WORST])
+
+    def at_the_other(k: int, other: int) -> float:
+        return float(np.nansum((residuals[k] + (light[k] - light[other]) * response[k]) ** 2))
+
+    shares = {
+        (int(i), int(j)): (at_the_other(i, j) + at_the_other(j, i)) / (squares[i] + squares[j])
+        for i, j in combinations(worst, 2)
+    }
+    pair, *others = sorted(shares, key=lambda each: shares[each])
+    is_alone = bool(others) and shares[others[0]] > _ALONE * shares[pair]
+    return pair if is_alone and shares[pair] < _EXCHANGED else None
 
 
 def moves(residuals: Floats, signal: Floats, slopes: Floats) -> Floats:
@@ -113,14 +147,12 @@ def by_signal(residuals: Floats, signal: Floats) -> float:
     return 1 - left / float(np.sum((squares - squares.mean()) ** 2))
 
 
-def _explained(residuals: Floats, patterns: list[Floats], noise: float, *, beside: int = 0) -> Part:
-    """Part along patterns of each exposure, less that along the first `beside` of them alone."""
+def _explained(residuals: Floats, patterns: list[Floats], noise: float) -> Part:
+    """Part along patterns of each exposure."""
     explained, remaining = 0.0, residuals.copy()
     for k, (columns, values) in enumerate(_each_exposure(residuals, patterns)):
         fitted = columns @ _coefficients(columns, values)
-        before = columns[:, :beside] @ _coefficients(columns[:, :beside], values)
-        explained += float(fitted @ fitted - before @ before)
-        explained -= noise * (len(patterns) - beside)
+        explained += float(fitted @ fitted) - noise * len(patterns)
         remaining[k][np.isfinite(residuals[k])] -= fitted
     return Part(explained, remaining)
 

@@ -10,6 +10,7 @@ import numpy as np
 from equipix._readonly import ReadOnly
 from equipix.calibration.residual_tests import ROBUST
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
+from equipix.calibration.shift_errors import flux_variance
 from equipix.calibration.significance import chi2_tail
 from equipix.drift import affine_columns, slope_covariance, unit_times
 
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
 WARNED = 1e-3
 """Probability of a scatter of fluxes without drift below which `calibrate` warns."""
-
-_ADDED = 0.01
-"""The same below which error bars contain the hidden tilt."""
 
 _VISIBLE = 1e-6
 """Share of the variance of a trend below which what it leaves is rounding."""
@@ -41,10 +39,12 @@ class Drift(ReadOnly):
         Standard deviation ε of ln c of an exposure about what was given, that of noise subtracted;
         0 where the fluxes scatter no more than noise lets them.
     flux_std : float
-        Standard error of the flux of an exposure.
+        Standard error of the flux of an exposure, by noise and by shifts that were not refined.
     degrees_of_freedom : int
         Number of combinations of fluxes that leave a residual, n − 3 (n − 4 for a linear trend).
-        Errors of the tilt over `tilt_std` follow Student's t with so many.
+        Errors of the tilt over its standard deviation are at most as far out as those of Student's
+        t with so many: as t where the drift is above five standard errors, and between that and
+        the normal law where it is smaller.
     probability : float
         That fluxes scatter so much without drift.
     slope_covariance : ndarray, shape (2, 2)
@@ -66,8 +66,8 @@ class Drift(ReadOnly):
 
     @property
     def is_added(self) -> bool:
-        """Whether error bars contain it."""
-        return self.size > 0 and self.probability < _ADDED
+        """Whether error bars contain it: without a threshold, below which they were too small."""
+        return self.size > 0
 
     @property
     def words(self) -> str:
@@ -138,8 +138,10 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     the beam does not take is (1 − 1/j)/(1 − 1/n), with j exposures that see its cell. Errors of
     ln c that are affine in the shifts leave no residual: with P the projector on the other f
     combinations, ε² = |P v|²/f less the variance of v. Without drift the sum of squares of P v over
-    their variances follows χ² of f degrees of freedom. Sums are over blocks of pixels; one whose
-    own flux is far from the median of its exposure is left out, so that dust looks like no drift.
+    their variances follows χ² of f degrees of freedom. The variance of v is that of noise and that
+    of shifts which have a prior and were not refined: the square of the mean slope of ln L times
+    the variance of the shift. Sums are over blocks of pixels; one whose own flux is far from the
+    median of its exposure is left out, so that dust looks like no drift.
     """
     exposures, fit = weighted.exposures, weighted.fit
     turns = set(exposures.positions.rotation.tolist())
@@ -157,6 +159,7 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
         return None
     variances *= max(residuals.scale, weighted.reduced_chi2)
     variances += _solver_error(fit.error_estimate[-1], shifts, exposures.shape) ** 2
+    variances += flux_variance(weighted, residuals)
     roots = np.sqrt(variances)
     scatter = _rest(columns / roots[:, None], fluxes / roots)
     flux_std = float(np.sqrt(variances.mean()))

@@ -10,6 +10,7 @@ import numpy as np
 from equipix.calibration import causes
 from equipix.calibration.residual_tests import lag_one
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
+from equipix.calibration.shift_errors import without_shift_errors
 
 if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
@@ -28,6 +29,9 @@ _CORRELATED = 0.01
 
 _MOST = 0.5
 """Share of an excess from which a cause is the likely one."""
+
+_ENOUGH = 0.9
+"""Share of what more unknowns explain from which fewer are the cause."""
 
 _ABOVE = 3.0
 """Steps of a beam from cell to cell, in noise of a measurement, from which they are its own."""
@@ -48,8 +52,8 @@ class Misfit:
     correlation : Correlation
         That of neighbouring residuals, along the axis where it is the larger.
     cause : str
-        Likely cause: "flux", "shifts", "rows", "columns", "exposure", "region", "signal",
-        "structure", "noise" or "unknown".
+        Likely cause: "flux", "shifts", "illumination", "order", "rows", "columns", "exposure",
+        "region", "signal", "structure", "noise" or "unknown".
     remedy : str
         The cause in words, and what to do.
     """
@@ -59,6 +63,15 @@ class Misfit:
     correlation: Correlation
     cause: str
     remedy: str
+
+    @property
+    def excess(self) -> float:
+        """Factor on variances of M where the beam is finer than its spline; else 1.
+
+        What the spline leaves is a noise of its own to M, whose pixels average over exposures at
+        different fractions of a pixel. Other misfits are no noise, and their size in M is unknown.
+        """
+        return max(1.0, self.chi2) if self.cause == "structure" and self.chi2 > 0 else 1.0
 
     @property
     def words(self) -> str:
@@ -90,6 +103,10 @@ def misfit(weighted: Weighted, residuals: Residuals) -> Misfit | None:
         return None
     known = weighted.exposures.variance is not None
     chi2 = weighted.reduced_chi2 if known else float("nan")
+    left = without_shift_errors(weighted, residuals)
+    if left is not residuals:
+        chi2 *= float(np.nansum(left.values**2) / np.nansum(residuals.values**2))
+        residuals = left
     std = (2 / weighted.fit.degrees_of_freedom) ** 0.5 if known else float("nan")
     limit = max(_LEAST, _SIGMAS * std)
     high = chi2 * (1 - inexactness**2) > 1 + limit
@@ -145,30 +162,70 @@ def _common(
     values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
     excess = abs(largest.product) * np.count_nonzero(np.isfinite(values))
     noise = max(float(np.nanmean(values**2)) - abs(largest.product), 0.0)
+    found = _of_exposures(weighted, residuals, largest)
+    if found is not None and found[0] == "flux":
+        return found
+    light, response = (_flat(each) for each in (residuals.light, residuals.response))
+    if (pair := causes.exchanged(values, light, response)) is not None:
+        return "order", (
+            f"exposures {pair[0]} and {pair[1]} (from 0) fit better each at the shift of the "
+            "other: check the order of the frames and of 'shifts'"
+        )
     if _is_fine(weighted, residuals):
         return "structure", (
-            "between pixels a spline does not hold structure of the beam with periods below some "
-            f"{_FINE:g} pixels: defocus the beam, or move the sensor by whole pixels"
+            "the beam is finer than a spline of one knot a pixel can follow (periods below some "
+            f"{_FINE:g} pixels): move by whole pixels, or defocus the beam"
         )
+    if found is not None:
+        return found
     slopes = np.stack([_flat(each) for each in residuals.slopes])
-    flux = causes.by_flux(values, signal, noise)
-    if flux.explained > _MOST * excess:
-        return "flux", (
-            "exposures differ by a factor that no tilt explains: use flux='fit' or 'flux_std'"
-        )
-    shifts = causes.by_shifts(values, signal, slopes, noise)
-    if shifts.explained > _MOST * excess:
-        return "shifts", (
-            "they are proportional to the slope of the beam: check the shifts"
-            f"{_scale_words(weighted, causes.moves(values, signal, slopes))}, or give 'shift_std'"
-        )
+    remaining = causes.by_shifts(values, signal, slopes, noise).remaining
     for axis, name in ((2, "rows"), (1, "columns")):
-        if causes.by_lines(shifts.remaining, axis, noise).explained > _MOST * excess:
+        parts = [causes.by_lines(each, axis, noise).explained for each in (values, remaining)]
+        if max(parts) > _MOST * excess:
             return name, (
                 f"they are common to the pixels of {name}, as noise of the read-out is: subtract "
                 "it with reference pixels. Error bars do not contain it"
             )
     return _local(values, residuals, noise, excess)
+
+
+def _of_exposures(
+    weighted: Weighted, residuals: Residuals, largest: Correlation
+) -> tuple[str, str] | None:
+    """A cause with few numbers for each exposure: its flux, its shift, the shape of its beam.
+
+    That with the fewest counts, if it explains nine tenths of what all explain. Measurements in
+    cells that all exposures see are compared: of others the beam takes more.
+    """
+    inside = np.where(_seen_by_all(weighted, residuals), residuals.values, np.nan)
+    common = max(lag_one(inside, residuals.share), key=lambda each: abs(each.product))
+    if not common.product:
+        inside, common = residuals.values, largest
+    values, signal = _flat(inside), _flat(residuals.signal)
+    slopes = np.stack([_flat(each) for each in residuals.slopes])
+    excess = abs(common.product) * np.count_nonzero(np.isfinite(values))
+    noise = max(float(np.nanmean(values**2)) - abs(common.product), 0.0)
+    illumination = causes.by_illumination(values, signal, slopes, noise).explained
+    lines = [causes.by_lines(values, axis, noise).explained for axis in (1, 2)]
+    limit = max(_MOST * excess, _ENOUGH * max(illumination, *lines))
+    if causes.by_flux(values, signal, noise).explained > limit:
+        return "flux", (
+            "exposures differ by a factor that no tilt explains: use flux='fit' or 'flux_std'"
+        )
+    if causes.by_shifts(values, signal, slopes, noise).explained > limit:
+        stated = weighted.exposures.positions.std is not None
+        return "shifts", (
+            "they are proportional to the slope of the beam: check the shifts"
+            f"{_scale_words(weighted, causes.moves(values, signal, slopes))}"
+            f"{', which are wrong by more than their' if stated else ', or give'} 'shift_std'"
+        )
+    if illumination > limit:
+        return "illumination", (
+            "the illumination changes its shape between exposures: keep lamp, optics and stray "
+            "light still, and take the exposures faster"
+        )
+    return None
 
 
 def _local(

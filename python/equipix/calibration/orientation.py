@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.calibration.hidden_orientation import hidden
 from equipix.calibration.window_fit import WindowFit
 from equipix.errors import InputError, InsufficientMemoryError
 from equipix.exposures.orientation import Orientation
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from equipix._native import Fit
     from equipix._types import Array, ShiftSign
     from equipix.exposures.exposures import Exposures
+    from equipix.exposures.flux import Flux
     from equipix.exposures.options import FitOptions
     from equipix.exposures.positions import Positions
 
@@ -62,6 +64,13 @@ class OrientationTest:
         F of the given orientation over that of the best; None where nothing was compared.
     reason : str
         Why nothing was concluded; empty where `sign` is not "undetermined".
+    hidden : Orientation or None
+        Where `sign` is "undetermined": another orientation, with another M, that neither residuals
+        nor fluxes exclude.
+    difference : float
+        Its rms relative difference of M over the sensor; 0 without one.
+    is_likely : bool
+        Whether the fluxes given agree with that orientation and not with the one as given.
     """
 
     rows: ShiftSign = "undetermined"
@@ -72,6 +81,9 @@ class OrientationTest:
     best: Orientation = AS_GIVEN
     ratio: float | None = None
     reason: str = ""
+    hidden: Orientation | None = None
+    difference: float = 0.0
+    is_likely: bool = False
 
     @property
     def words(self) -> str:
@@ -83,10 +95,14 @@ class OrientationTest:
         known = {name: getattr(self, name) for name in _QUESTIONS if name != "turned"}
         told = [f"{_QUESTIONS[name]} {it}" for name, it in known.items() if it != "undetermined"]
         parts = f" ({', '.join(told)})" if told else ""
+        if self.is_likely and self.hidden is not None:
+            return f"the orientation of the shifts is probably wrong: {self.hidden.words}"
         return f"the data do not determine the orientation of the shifts{parts}: {self.reason}"
 
 
-def orientation_test(exposures: Exposures, fit: Fit, options: FitOptions) -> OrientationTest:
+def orientation_test(
+    exposures: Exposures, fit: Fit, options: FitOptions, flux: Flux | None = None
+) -> OrientationTest:
     """Compare the fit with the shifts as given to those in all other orientations.
 
     Parameters
@@ -97,6 +113,8 @@ def orientation_test(exposures: Exposures, fit: Fit, options: FitOptions) -> Ori
         Their fit: the free fluxes start from its fluxes.
     options : FitOptions
         Number of threads and progress.
+    flux : Flux, optional
+        The fluxes as they were given; those of `exposures` unless given.
 
     Returns
     -------
@@ -121,6 +139,7 @@ def orientation_test(exposures: Exposures, fit: Fit, options: FitOptions) -> Ori
     """
     if exposures.offset:
         return OrientationTest(reason="it is not tested where the dark is fitted; " + _REMEDY)
+    known = exposures.flux if flux is None else flux
     exposures = dataclasses.replace(
         exposures,
         flux=exposures.flux.free(np.array(fit.flux)),
@@ -136,7 +155,14 @@ def orientation_test(exposures: Exposures, fit: Fit, options: FitOptions) -> Ori
     # The window first: the exposures chosen are copied.
     windows = {way: exposures.oriented(way).window(side).chosen(asked) for way in ways}
     try:
-        return _outcome(_fits(windows, options))
+        fits = _fits(windows, options)
+        left = _left(fits)
+        test = _outcome(fits, left)
+        if test.sign != "undetermined" or AS_GIVEN not in left:
+            return test
+        equal = {way: fits[way] for way in ways if way in left}
+        also = hidden(equal, windows, known.chosen(asked), exposures.shape)
+        return test if also is None else dataclasses.replace(test, **also._asdict())
     except (InputError, InsufficientMemoryError):
         # All arguments are valid for the whole sensor: the window has too little light or memory.
         return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
@@ -230,18 +256,26 @@ def _undecided(fits: Mapping[Orientation, WindowFit]) -> list[Orientation]:
     return [best, *others] if others else []
 
 
-def _outcome(fits: Mapping[Orientation, WindowFit]) -> OrientationTest:
+def _left(fits: Mapping[Orientation, WindowFit]) -> set[Orientation]:
+    """Orientations that final fits do not exclude."""
+    best = _best(fits)
+    return {way for way, fit in fits.items() if way == best or not fit.is_far_above(fits[best])}
+
+
+def _outcome(fits: Mapping[Orientation, WindowFit], left: set[Orientation]) -> OrientationTest:
     """The verdicts on the axes from final fits."""
     best = _best(fits)
-    left = {way for way, fit in fits.items() if way == best or not fit.is_far_above(fits[best])}
-    answers = {name: _answer(left, name) for name in _QUESTIONS}
+    rows, cols, exchanged, turned = (_answer(left, name) for name in _QUESTIONS)
     sign: ShiftSign = "undetermined"
     if AS_GIVEN not in left:
         sign = "contradicted"
     elif left == {AS_GIVEN}:
         sign = "confirmed"
     return OrientationTest(
-        **answers,
+        rows=rows,
+        cols=cols,
+        exchanged=exchanged,
+        turned=turned,
         sign=sign,
         best=best,
         ratio=fits[AS_GIVEN].left / fits[best].left if fits[best].left > 0 else None,

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix.calibration.residuals import sampled
+from equipix.calibration.shift_errors import flux_variance
 from equipix.calibration.significance import chi2_tail
 from equipix.drift import affine_columns
 from equipix.exposures.positions import WIDEST
@@ -85,7 +87,11 @@ def _of_fluxes(weighted: Weighted) -> Contradiction | None:
     if not turned:
         columns = affine_columns(positions.shifts, None)
     deviations = np.log(np.array(weighted.fit.flux) / flux.values)
-    return _contradiction("flux_std", deviations[:, None], flux.std[:, None], columns)
+    std = flux.std
+    if positions.std is not None:
+        # Shifts that were not refined leave a flux in a beam with a slope.
+        std = np.sqrt(std**2 + flux_variance(weighted, sampled(weighted)))
+    return _contradiction("flux_std", deviations[:, None], std[:, None], columns)
 
 
 def _of_shifts(weighted: Weighted) -> Contradiction | None:

@@ -39,7 +39,9 @@ def read_calibration(
 def _read_orientation(content: dict[str, Any] | None) -> OrientationTest | None:
     if content is None:
         return None
-    return OrientationTest(**{**content, "best": Orientation(**content["best"])})
+    ways = {name: content.get(name) for name in ("best", "hidden")}
+    made = {name: Orientation(**way) for name, way in ways.items() if way is not None}
+    return OrientationTest(**{**content, **made})
 
 
 def _read_drift(content: dict[str, Any] | None) -> Drift | None:

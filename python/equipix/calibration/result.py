@@ -134,9 +134,9 @@ class Calibration(ReadOnly):
     drift : Drift or None
         What the data say of fluxes that were given: the size of the lamp's drift about them, its
         standard error, the degrees of freedom, and the tilt that it hides, which is part of
-        `sensitivity_std`, `tilt_std` and `std_of` where the data show a drift. Errors of the tilt
-        over `tilt_std` then follow Student's t with so many degrees of freedom. None where fluxes
-        were fitted or have a prior, and where no combination of them leaves a residual.
+        `sensitivity_std`, `tilt_std` and `std_of`. Errors of the tilt over `tilt_std` are at most
+        as far out as Student's t with so many degrees of freedom. None where fluxes were fitted or
+        have a prior, and where no combination of them leaves a residual.
     """
 
     sensitivity: NDArray[Any]

@@ -142,7 +142,10 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
     chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
     history, orientation, drift = (fields[name] for name in ("history", "orientation", "drift"))
     if orientation is not None:
-        orientation = {**vars(orientation), "best": vars(orientation.best)}
+        changes = {"best": vars(orientation.best)}
+        if orientation.hidden is not None:
+            changes["hidden"] = vars(orientation.hidden)
+        orientation = vars(orientation) | changes
     return {
         "beam_origin": list(fields["beam_origin"]),
         "shifts": fields["shifts"].tolist(),

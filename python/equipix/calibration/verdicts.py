@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration import sample_variances
-from equipix.calibration.error_bars import incomplete_searches
+from equipix.calibration.error_bars import incomplete_searches, is_too_fine, too_fine
 from equipix.calibration.lamp_drift import WARNED
 from equipix.drift import distinct_trend
 from equipix.errors import (
@@ -25,7 +25,7 @@ from equipix.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from equipix._native import Fit
     from equipix.calibration.error_bars import DarkStd, ErrorBars
@@ -53,6 +53,12 @@ TOO_WEAK = (
     "those of the frames"
 )
 
+_EXPLAINED = frozenset({"orientation", "pattern", "drift", "misfit", "prior"})
+"""Kinds that name a cause, and are no news where the sign or the unit of the shifts is wrong."""
+
+_WHITE = frozenset({"noise", "signal"})
+"""Causes of a misfit that neighbouring residuals do not have in common."""
+
 _DEGENERATE = 0.1
 """Share of the variance of a drift below which the error of its size is over three times larger."""
 
@@ -66,6 +72,7 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "repeated": MisfitWarning,
     "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
+    "orientation": IdentifiabilityWarning,
     "components": IdentifiabilityWarning,
     "pattern": IdentifiabilityWarning,
     "tilt": IdentifiabilityWarning,
@@ -114,13 +121,16 @@ def on_plan(exposures: Exposures) -> list[Verdict]:
     return [verdict for verdict in found if verdict is not None]
 
 
-def on_noise(frames: float | None, contradictions: Iterable[Contradiction]) -> list[Verdict]:
-    """Verdicts on variances and priors that the data contradict.
+def on_noise(frames: float | None) -> list[Verdict]:
+    """Verdict on variances, where those given were sample variances of so many frames."""
+    return [] if frames is None else [Verdict("variance", sample_variances.words(frames))]
 
-    `frames` is the number of frames whose sample variances were given.
-    """
-    found = [] if frames is None else [Verdict("variance", sample_variances.words(frames))]
-    return [*found, *(Verdict("prior", each.words) for each in contradictions)]
+
+def unexplained(found: list[Verdict], advice: list[Verdict]) -> list[Verdict]:
+    """Verdicts that a wrong sign or unit of the shifts does not explain."""
+    if not {"sign", "unit"} & {each.kind for each in (*advice, *found)}:
+        return found
+    return [each for each in found if each.kind not in _EXPLAINED]
 
 
 def on_standard_deviations(
@@ -166,17 +176,21 @@ def on_fit(
     test: OrientationTest,
     drift: Drift | None,
     misfit: Misfit | None,
+    contradictions: Sequence[Contradiction] = (),
 ) -> list[Verdict]:
     """Verdicts on a fit, the most important first."""
+    disagree = bool(contradictions) or (drift is not None and drift.probability < WARNED)
     found = [
         _on_sign(test),
+        _on_orientation(test) if test.is_likely and disagree else None,
         _on_components(weighted.fit),
         _on_patterns(weighted.fit),
-        _on_tilt(weighted.fit),
+        _on_hidden(weighted.fit, test),
         _on_faint(weighted.exposures),
         *_on_residuals(drift, misfit),
+        *(Verdict("prior", each.words) for each in contradictions),
         _on_convergence(weighted.fit, options),
-        _on_uncertainty(weighted.fit, options),
+        _on_uncertainty(weighted, options),
     ]
     return [verdict for verdict in found if verdict is not None]
 
@@ -192,11 +206,13 @@ def fits_noise(fit: Fit) -> bool:
     return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
 
 
-def _on_uncertainty(fit: Fit, options: Options) -> Verdict | None:
-    """Verdict on a fit that is too far from its minimum for standard deviations."""
-    if not (options.uncertainty and is_too_far(fit)):
+def _on_uncertainty(weighted: Weighted, options: Options) -> Verdict | None:
+    """Verdict on a fit that is too far from its minimum or its beam for standard deviations."""
+    if options.uncertainty and is_too_fine(weighted):
+        return Verdict("uncertainty", too_fine(weighted))
+    if not (options.uncertainty and is_too_far(weighted.fit)):
         return None
-    error = float(fit.error_estimate[-1])
+    error = float(weighted.fit.error_estimate[-1])
     return Verdict(
         "uncertainty",
         "no standard deviations: the fit is too far from its minimum (estimated error "
@@ -212,6 +228,43 @@ def _on_sign(test: OrientationTest) -> Verdict | None:
         f"{test.words}; as given and with free fluxes the squared residuals are {test.ratio:.2g} "
         "times as large. A shift grows when the sensor moves towards larger rows and columns: "
         "give 'shifts' so, or exchange the aperture images before and after the moves",
+    )
+
+
+def _on_orientation(test: OrientationTest) -> Verdict | None:
+    """Verdict on another orientation, with which the fluxes agree as they do not as given."""
+    if test.hidden is None:
+        return None
+    return Verdict(
+        "orientation",
+        f"the orientation of the shifts is probably wrong: with {test.hidden.changes} the data "
+        "fit equally well, and the fluxes found agree with those given ten times as closely. "
+        f"The sensitivity is then wrong by {test.difference:.1%}, rms: {test.hidden.words}, "
+        "unless the figure of shifts in README confirms the axes of the stage",
+    )
+
+
+def _on_hidden(fit: Fit, test: OrientationTest) -> Verdict | None:
+    """Verdict on what neither residuals nor fluxes determine: a tilt, the orientation, or both."""
+    words = "" if test.hidden is None or test.is_likely else _undetermined(test)
+    if not fit.leaves_tilt:
+        return Verdict("orientation", words) if words else None
+    return Verdict(
+        "tilt",
+        "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: turn "
+        "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp"
+        f"{'. Besides, ' if words else ''}{words}",
+    )
+
+
+def _undetermined(test: OrientationTest) -> str:
+    changes = "" if test.hidden is None else test.hidden.changes
+    return (
+        "neither residuals nor fluxes determine the orientation of the shifts: with "
+        f"{changes} the data fit equally well, and the sensitivity differs by "
+        f"{test.difference:.1%}, rms, which no error bar contains. Compare the axes of the stage "
+        "once with the figure of shifts in README, put an object with structure into the beam, or "
+        "give fluxes that a monitor measured"
     )
 
 
@@ -235,16 +288,6 @@ def _on_patterns(fit: Fit) -> Verdict | None:
         "the shifts barely constrain a spatial pattern of the sensitivity (smallest Ritz value "
         f"{fit.smallest_ritz:.1e}, limit {_UNDETERMINED:g}): choose less regular shifts, see "
         "equipix.plan.error_budget",
-    )
-
-
-def _on_tilt(fit: Fit) -> Verdict | None:
-    if not fit.leaves_tilt:
-        return None
-    return Verdict(
-        "tilt",
-        "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: turn "
-        "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp",
     )
 
 
@@ -280,12 +323,17 @@ def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None
 
 
 def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
-    """Verdicts on fluxes and residuals; a misfit that wrong fluxes cause is said once."""
+    """Verdicts on fluxes and residuals, that which explains the other first.
+
+    A misfit that wrong fluxes cause is said once. Any other that neighbours have in common makes
+    the fluxes wrong too.
+    """
     drifts = drift is not None and drift.probability < WARNED
-    found = [Verdict("drift", drift.words)] if drift is not None and drifts else []
-    if misfit is not None and not (drifts and misfit.cause == "flux"):
-        found.append(Verdict("misfit", misfit.words))
-    return found
+    of_fluxes = [Verdict("drift", drift.words)] if drift is not None and drifts else []
+    if misfit is None or (drifts and misfit.cause == "flux"):
+        return of_fluxes
+    of_all = [Verdict("misfit", misfit.words)]
+    return of_fluxes + of_all if misfit.cause in _WHITE else of_all + of_fluxes
 
 
 def _on_convergence(fit: Fit, options: Options) -> Verdict | None:

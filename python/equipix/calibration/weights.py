@@ -33,7 +33,8 @@ class Weighted(NamedTuple):
     """Exposures with their final weights, their fit, and the measurements left out.
 
     `dark_misfit` is what the noise of the dark adds to F on average, `sampled` what the arrays held
-    that later questions read again.
+    that later questions read again. `excess` is the factor by which a beam that is finer than its
+    spline raises the variance of residuals above that given.
     """
 
     exposures: Exposures
@@ -41,6 +42,7 @@ class Weighted(NamedTuple):
     rejected: Bools | None
     dark_misfit: float = 0.0
     sampled: Mapping[str, Array] = MappingProxyType({})
+    excess: float = 1.0
 
     @property
     def reduced_chi2(self) -> float:
@@ -58,8 +60,8 @@ class Weighted(NamedTuple):
 
     @property
     def noise_variance(self) -> float:
-        """Variance of a value of weight 1: 1 where variances are known, else reduced χ²."""
-        return 1.0 if self.exposures.variance is not None else self.reduced_chi2
+        """Variance of a value of weight 1: `excess` where variances are known, else reduced χ²."""
+        return self.excess if self.exposures.variance is not None else self.reduced_chi2
 
 
 def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:

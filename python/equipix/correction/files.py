@@ -11,9 +11,16 @@ from equipix.correction.corrector import Corrector
 from equipix.correction.kernel import FAST, output_dtype, usual_treatment
 from equipix.correction.protocol import takes_dark
 from equipix.correction.tone import picture
-from equipix.errors import AlreadyCorrectedWarning, FileError, InputError, LimitedWarning, warn
+from equipix.errors import (
+    AlreadyCorrectedWarning,
+    BrightDarkWarning,
+    FileError,
+    InputError,
+    LimitedWarning,
+    warn,
+)
 from equipix.flags import usable
-from equipix.frames import average, refuse_subtracted
+from equipix.frames import FrameStatistics, average, refuse_subtracted
 from equipix.io import (
     description,
     find_files,
@@ -42,6 +49,10 @@ _MARKED = (".tif", ".tiff", ".png")
 _MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
 detected."""
+
+
+_DARKER = 0.25
+"""Share of the dark by which raw frames are not darker than it: a dark drifts by less."""
 
 
 class Corrected(NamedTuple):
@@ -140,6 +151,8 @@ def correct_files(
     -----
     AlreadyCorrectedWarning
         If files were written by this function.
+    BrightDarkWarning
+        If the first frame is darker than the dark by more than a quarter of the dark.
     LimitedWarning
         If most values had to be limited to the range of whole numbers.
     """
@@ -152,12 +165,13 @@ def correct_files(
     _refuse_pictures(output, total, wanted)
     warn_of_corrected(files, origin)
     flagged = usual_treatment(wanted) if flagged is None else flagged
+    of_dark = _dark(correction, dark)
     corrector = Corrector(
         correction,
         "float32" if display else wanted,
         bit_depth=bit_depth,
         flagged=flagged,
-        dark=_dark(correction, dark),
+        dark=of_dark,
         sensor=sensor,
         workers=workers,
     )
@@ -165,6 +179,8 @@ def correct_files(
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
         nonlocal done
         for _, frames in stream_frames(inputs):
+            if done == 0:
+                _warn_of_dark(frames[0], correction, of_dark)
             for frame in corrector.apply(_taken(frames)):
                 yield picture(frame, display) if display else frame
             done += len(frames)
@@ -271,6 +287,21 @@ def warn_of_corrected(files: list[Path], origin: str) -> None:
         "the raw frames",
         AlreadyCorrectedWarning,
     )
+
+
+def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> None:
+    """Warn of a frame from which the dark was probably subtracted before."""
+    given = getattr(correction, "dark", None) if isinstance(dark, str) else dark
+    if given is None:
+        return
+    offset = np.asarray(given.mean if isinstance(given, FrameStatistics) else given)
+    level, below = np.nanmedian(offset), np.nanmedian(offset - frame)
+    if level > 0 and below > _DARKER * level:
+        warn(
+            f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
+            "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them",
+            BrightDarkWarning,
+        )
 
 
 def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from equipix._types import Array
 
 
+_FURTHER = 5.0
+"""Range of the means along the last axis, over that along the first, from which they are levels."""
+
+
 def check_levels(levels: object) -> None:
     """Refuse stacks of raw frames, and levels of several shapes, before they become one array."""
     if isinstance(levels, FrameStatistics):
@@ -30,10 +34,30 @@ def check_levels(levels: object) -> None:
             f"'levels' holds raw frames, of shape {stacks[0]}: give one mean frame for each level, "
             "by equipix.average(frames)"
         )
+    if isinstance(levels, np.ndarray):
+        _refuse_last_axis(levels)
     shapes = list(dict.fromkeys(each.shape for each in known))
     if len(shapes) > 1:
         named = " and ".join(map(str, shapes[:2]))
         raise InputError(f"'levels' holds arrays of shapes {named}, expected one (rows, cols)")
+
+
+def _refuse_last_axis(levels: Array) -> None:
+    """Refuse levels along the last axis: it is the shortest, and its means differ most."""
+    if (
+        levels.ndim != 3
+        or levels.shape[2] >= min(levels.shape[:2])
+        or levels.dtype.kind not in "fiu"
+    ):
+        return
+    first, last = (np.ptp(np.mean(levels, axis=axes)) for axes in ((1, 2), (0, 1)))
+    if last > _FURTHER * first:
+        raise InputError(
+            f"'levels' has shape {levels.shape}, {len(levels)} levels of {levels.shape[1]} x "
+            f"{levels.shape[2]} pixels, whose means differ by {first:.4g} DN, and by {last:.4g} DN "
+            "along the last axis: expected levels along the first one, numpy.moveaxis(levels, -1, "
+            "0)"
+        )
 
 
 def check_variance(variance: Any, count: int) -> None:
