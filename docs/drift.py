@@ -20,7 +20,7 @@ import numpy as np
 import equipix
 from equipix import simulate
 from equipix.calibration.error_bars import functional_std
-from equipix.calibration.lamp_drift import WARNED, lamp_drift
+from equipix.calibration.lamp_drift import lamp_drift
 from equipix.calibration.options import Options
 from equipix.calibration.residuals import sampled
 from equipix.calibration.weights import weighted_fit
@@ -81,7 +81,7 @@ def main():
     for count in COUNTS:
         for drift in DRIFTS:
             found = [experiment(count, drift, seed) for seed in range(EXPERIMENTS)]
-            warned = np.mean([each[0].probability < WARNED for each in found])
+            warned = np.mean([each[0].is_certain for each in found])
             size = np.median([each[0].size for each in found])
             relative = drift / np.median([each[0].flux_std for each in found])
             errors = np.array([each[1] for each in found])

@@ -9,7 +9,7 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.lamp_drift import WARNED, lamp_drift
+from equipix.calibration.lamp_drift import lamp_drift
 from equipix.calibration.options import Options
 from equipix.calibration.residuals import sampled
 from equipix.calibration.significance import chi2_tail
@@ -59,7 +59,7 @@ def test_a_drift_of_thirty_standard_errors_is_found(draws, figure):
     shown = estimated(0, 0.0)[0].flux_std
     found = [estimated(seed, 30 * shown)[0] for seed in draws(60)]
     # With four degrees of freedom one in 6000 is missed.
-    assert all(each.probability < WARNED for each in found)
+    assert all(each.is_certain for each in found)
     # χ² of 60 × 4 degrees of freedom: the root mean square scatters by 4.6 %; three of these.
     ratio = np.mean([each.size**2 for each in found]) ** 0.5 / (30 * shown)
     limit = 0.15 * (60 / len(found)) ** 0.5
@@ -84,7 +84,7 @@ def test_a_drift_that_is_not_linear_contradicts_a_linear_one():
     times = np.arange(7.0)
     drift, _, _ = estimated(1, 1e-3, flux="linear", time=times)
     assert drift.degrees_of_freedom == 3
-    assert drift.probability < WARNED
+    assert drift.is_certain
 
 
 def test_it_is_not_asked_where_fluxes_are_found():

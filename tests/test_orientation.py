@@ -229,6 +229,13 @@ class TestOrientationsThatLeaveNoResidual:
             assert "probably wrong" in cal.orientation.words
             assert cal.shift_sign == "undetermined"
 
+    def test_a_right_sign_is_never_called_wrong(self):
+        for seed in range(6):
+            cal, _ = self.calibrated(seed, self.TRUE)
+            assert cal.verdicts == ()
+            assert cal.orientation.hidden is None
+            assert "do not determine" in cal.orientation.words
+
     def test_a_drift_of_the_lamp_is_no_wrong_sign(self):
         for seed in range(6):
             cal, _ = self.calibrated(seed, self.TRUE, drift=10.0 ** -(1 + seed % 3))

@@ -273,6 +273,8 @@ def calibrated(
     flags = pixel_flags(weighted, options.fit)
     residuals = sampled(weighted, workers=options.fit.workers)
     drift = lamp_drift(weighted, residuals)
+    contradicted = bool(widths) or (drift is not None and drift.is_certain)
+    test = test.among_fluxes(contradicted=contradicted)
     misfits = misfit(weighted, residuals)
     weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
     found = verdicts.on_fit(weighted, options, test, drift, misfits, widths)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from equipix.calibration.residuals import Residuals
     from equipix.calibration.weights import Weighted
 
-WARNED = 1e-3
+_WARNED = 1e-3
 """Probability of a scatter of fluxes without drift below which `calibrate` warns."""
 
 _VISIBLE = 1e-6
@@ -68,6 +68,11 @@ class Drift(ReadOnly):
     def is_added(self) -> bool:
         """Whether error bars contain it: without a threshold, below which they were too small."""
         return self.size > 0
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the data contradict the fluxes: `calibrate` warns."""
+        return self.probability < _WARNED
 
     @property
     def words(self) -> str:

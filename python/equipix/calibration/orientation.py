@@ -15,6 +15,7 @@ from equipix.exposures.orientation import Orientation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from typing import Self
 
     from equipix._native import Fit
     from equipix._types import Array, ShiftSign
@@ -84,6 +85,12 @@ class OrientationTest:
     hidden: Orientation | None = None
     difference: float = 0.0
     is_likely: bool = False
+
+    def among_fluxes(self, *, contradicted: bool) -> Self:
+        """Return the test without a likely orientation unless the fluxes given are contradicted."""
+        if contradicted or not self.is_likely:
+            return self
+        return dataclasses.replace(self, hidden=None, difference=0.0, is_likely=False)
 
     @property
     def words(self) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 
 from equipix.calibration import sample_variances
 from equipix.calibration.error_bars import incomplete_searches, is_too_fine, too_fine
-from equipix.calibration.lamp_drift import WARNED
 from equipix.drift import distinct_trend
 from equipix.errors import (
     ConvergenceWarning,
@@ -179,10 +178,9 @@ def on_fit(
     contradictions: Sequence[Contradiction] = (),
 ) -> list[Verdict]:
     """Verdicts on a fit, the most important first."""
-    disagree = bool(contradictions) or (drift is not None and drift.probability < WARNED)
     found = [
         _on_sign(test),
-        _on_orientation(test) if test.is_likely and disagree else None,
+        _on_orientation(test),
         _on_components(weighted.fit),
         _on_patterns(weighted.fit),
         _on_hidden(weighted.fit, test),
@@ -233,7 +231,7 @@ def _on_sign(test: OrientationTest) -> Verdict | None:
 
 def _on_orientation(test: OrientationTest) -> Verdict | None:
     """Verdict on another orientation, with which the fluxes agree as they do not as given."""
-    if test.hidden is None:
+    if test.hidden is None or not test.is_likely:
         return None
     return Verdict(
         "orientation",
@@ -328,9 +326,8 @@ def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
     A misfit that wrong fluxes cause is said once. Any other that neighbours have in common makes
     the fluxes wrong too.
     """
-    drifts = drift is not None and drift.probability < WARNED
-    of_fluxes = [Verdict("drift", drift.words)] if drift is not None and drifts else []
-    if misfit is None or (drifts and misfit.cause == "flux"):
+    of_fluxes = [Verdict("drift", drift.words)] if drift is not None and drift.is_certain else []
+    if misfit is None or (of_fluxes and misfit.cause == "flux"):
         return of_fluxes
     of_all = [Verdict("misfit", misfit.words)]
     return of_fluxes + of_all if misfit.cause in _WHITE else of_all + of_fluxes
