@@ -102,6 +102,7 @@ class Averaged:
         self._of_dark: list[float] = []
         self._points: list[Array] = []
         self._clipped: list[Clipping | None] = []
+        self._screened = 0  # samples of a pixel that were compared with the others
         self.raw = True
         self.step = 0.0
         self.light: list[Light] = []
@@ -130,7 +131,6 @@ class Averaged:
             self.values = np.empty((self.count, *shape), self._dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
-            self._missing, self._screened = np.zeros(shape, np.int64), 0
             self.dark = frames.dark
             self.step = 0.0 if frames.dark is None else frames.dark.step
             if self.dark is not None:
@@ -172,10 +172,12 @@ class Averaged:
 
     def _screen(self, frames: FrameStatistics) -> None:
         """Count the samples that were left out as those of cosmic rays."""
-        if frames.reject is not None:
-            count, known = frames.count.astype(np.int64), frames.count > 0
-            self._missing += np.where(known, count.max() - count, 0)
-            self._screened += int(count.max())
+        if frames.reject is None:
+            return
+        if not self._screened:
+            self._missing = np.zeros(frames.count.shape, np.uint32)
+        self._missing += np.where(frames.count > 0, frames.count.max() - frames.count, np.uint32(0))
+        self._screened += int(frames.count.max())
 
     def counted_from_lowest(self) -> Self:
         """Return a copy whose noise models count the signal from the lowest of several exposures.
@@ -251,7 +253,8 @@ class Averaged:
             pairs = zip(self.light, self.values, strict=True)
             light = (of_light.variance(values) for of_light, values in pairs)
             noisy = noisy_pixels(self._signals, self.variances, self._frames, noise, light=light)
-            noisy |= often_rejected(self._missing, self._screened)
+            if self._screened:
+                noisy |= often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
         if self.dark is not None:
             hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
