@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import _native, simulate
 from equipix.exposures.positions import Positions
+from equipix.shifts import whole_moves
 
 SHAPE = (40, 52)
 CROSS = equipix.cross_pattern(5, 7).astype(float)
@@ -116,3 +117,17 @@ def test_the_core_decides_what_is_common():
         assert positions.whole() is positions
     for apart in (CROSS + 0.25 * np.eye(5, 2), CROSS * (1 + 1e-6)):
         assert _native.common_fraction(apart) is None
+
+
+@pytest.mark.parametrize("first", [0.0, 1.0, 0.3, 0.6, 1.7, -0.5, -2.9])
+def test_moves_of_half_a_pixel_round_one_way_everywhere(first):
+    """The plan, the coverage and the solver see the same whole moves, wherever the first is."""
+    moves = np.array([0, 0.5, 1.5, 2.5, -0.5, -1.5, 1.1, -3.4])
+    whole = [0, 0, 1, 2, -1, -2, 1, -3]
+    shifts = np.column_stack([first + moves, 7.0 * np.arange(8)])
+    np.testing.assert_array_equal(np.diff(whole_moves(shifts)[:, 0]), np.diff(whole))
+    rounded = Positions.of(shifts).whole().shifts[:, 0]
+    np.testing.assert_allclose(rounded - first, whole, rtol=0, atol=1e-12)
+    with pytest.warns(equipix.errors.ShiftRoundingWarning):
+        found = equipix.plan.identify(SHAPE, shifts)
+    assert found.components == equipix.plan.identify(SHAPE, whole_moves(shifts)).components

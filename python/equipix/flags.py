@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Bools
+    from equipix._types import Array, Bools, Floats
 
 
 class Flag(IntFlag):
@@ -56,6 +56,13 @@ def set_bits(flags: Array, finding: str, pixels: Bools | None) -> None:
 def usable(flags: Array) -> Bools:
     """Pixels without ``DO_NOT_USE``."""
     return np.asarray((flags & Flag.DO_NOT_USE) == 0)
+
+
+def mean_of_usable(sensitivity: Floats, flags: Array) -> float:
+    """Mean sensitivity of pixels without ``DO_NOT_USE``; 1 if it is but for rounding, or none."""
+    counted = usable(flags) & np.isfinite(sensitivity)
+    mean = float(np.mean(sensitivity, where=counted)) if counted.any() else 1.0
+    return mean if abs(mean - 1) > counted.size * np.finfo(float).eps else 1.0
 
 
 def determined(sensitivity: Array, flags: Array) -> Bools:

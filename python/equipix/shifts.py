@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from equipix._types import Floats
 
+ROUNDING = 1e-6
+"""Largest fraction of a pixel that counts as rounding, as in the core."""
+
 _UNNOTICED = 0.02
 """Fraction of a pixel that a shift may be rounded by without a warning."""
 
@@ -200,24 +203,32 @@ class Rounding(NamedTuple):
         )
 
 
+def nearest_whole(distance: Floats) -> Floats:
+    """Nearest whole numbers; of two that are equally near, but for rounding, the lower one.
+
+    As in the compiled part: a move of half a pixel is then the same from wherever it starts, and a
+    fraction that all shifts have in common is one half, not minus one half.
+    """
+    # What rounds to 0 from below is no −0.
+    return np.asarray(np.ceil(distance - (0.5 + ROUNDING)) + 0.0)
+
+
 def round_shifts(
-    shifts: Floats, origin: Floats, std: ArrayLike | None = None
+    shifts: Floats, std: ArrayLike | None = None
 ) -> tuple[NDArray[np.int64], Rounding | None]:
-    """Shifts from an origin, rounded to whole pixels, and the largest rounding that is noticeable.
+    """Shifts from the first one in whole pixels, and the largest rounding that is noticeable.
 
     Parameters
     ----------
     shifts : ndarray, shape (n, 2)
         Shifts (row, col) in pixels.
-    origin : ndarray, shape (2,)
-        What they count from.
     std : array_like, shape (n, 2), optional
         Their standard errors, in pixels; 0 unless given.
 
     Returns
     -------
     whole : ndarray, shape (n, 2), int64
-        The nearest whole shifts.
+        The nearest whole moves from the first exposure; a tie goes to the lower one.
     rounding : Rounding or None
         Where a shift is more than 0.02 pixel and more than three standard errors from whole: it is
         named as given.
@@ -228,8 +239,8 @@ def round_shifts(
         If a shift is not a finite number.
     """
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
-    exact = np.clip(as_shifts(shifts - origin), -_BEYOND, _BEYOND)
-    whole = np.rint(exact)
+    exact = np.clip(as_shifts(shifts - shifts[0]), -_BEYOND, _BEYOND)
+    whole = nearest_whole(exact)
     known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
     change = np.abs(exact - whole)
     change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
@@ -243,7 +254,7 @@ def whole_moves(shifts: Floats) -> NDArray[np.int64]:
 
     A part of a pixel that all shifts have in common moves the grid of the beam along.
     """
-    return np.asarray(np.rint(shifts - shifts[0]) + np.rint(shifts[0])).astype(np.int64)
+    return round_shifts(shifts)[0] + nearest_whole(shifts[0]).astype(np.int64)
 
 
 def _frames(name: str, values: ArrayLike) -> NDArray[Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.exposures.positions import in_beam
+from equipix.shifts import nearest_whole
 
 if TYPE_CHECKING:
     from equipix._types import Array, Floats
@@ -139,7 +140,7 @@ def on_sensor(positions: Positions) -> Floats:
 def testable(rows: Array, shifts: Floats, shape: tuple[int, int]) -> Floats:
     """Share of each measurement (n, bands, rows, cols) that the beam does not take."""
     count = len(shifts)
-    moves = np.rint(shifts[:, None] - shifts)
+    moves = nearest_whole(shifts[:, None] - shifts)
     seen = []
     for axis, places in enumerate((rows.ravel(), np.arange(shape[1]))):
         at = places + moves[..., axis, None]

@@ -20,7 +20,7 @@ from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficien
 from equipix.correction.depth import depth_of
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
-from equipix.flags import determined
+from equipix.flags import determined, mean_of_usable
 from equipix.maps import slope_pixels, tilt
 
 if TYPE_CHECKING:
@@ -183,11 +183,13 @@ class Calibration(ReadOnly):
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
         exposures, fit, dtype = weighted.exposures, weighted.fit, weighted.exposures.values.dtype
+        mean, coefficients = mean_of_usable(fit.sensitivity, flags), fit.beam.coefficients
+        std = None if bars is None else bars.sensitivity
         return cls(
-            sensitivity=fit.sensitivity.astype(dtype, copy=False),
-            beam=fit.beam.values,
+            sensitivity=_scaled(fit.sensitivity, 1 / mean).astype(dtype, copy=False),
+            beam=_scaled(fit.beam.values, mean),
             beam_origin=_whole_if_possible(fit.beam.origin),
-            beam_coefficients=fit.beam.coefficients,
+            beam_coefficients=None if coefficients is None else _scaled(coefficients, mean),
             beam_tilt=np.array(fit.beam.tilt),
             flags=flags,
             shifts=np.array(fit.shifts, dtype=np.float64),
@@ -204,7 +206,7 @@ class Calibration(ReadOnly):
             dark=exposures.dark if fit.offset is None else fit.offset.astype(dtype, copy=False),
             dark_is_fitted=exposures.offset,
             metadata=metadata,
-            sensitivity_std=None if bars is None else bars.sensitivity,
+            sensitivity_std=None if std is None else _scaled(std, 1 / mean),
             tilt_std=None if bars is None else bars.tilt,
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
@@ -497,6 +499,11 @@ class Calibration(ReadOnly):
             If the suffix is unknown.
         """
         save_fields(path, vars(self), force=force)
+
+
+def _scaled(array: NDArray[Any], factor: float) -> NDArray[Any]:
+    """Return the array itself, which the fit shares, unless the gauge changes."""
+    return array if factor == 1 else np.asarray(array * factor)
 
 
 def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:

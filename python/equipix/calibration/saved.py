@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.exposures.positions import ROUNDING
 from equipix.io import check_format, check_pages, save_pages
+from equipix.shifts import ROUNDING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -12,7 +12,7 @@ from equipix import _native
 from equipix._check import as_array, as_shifts, check_count, per_exposure
 from equipix._readonly import ReadOnly
 from equipix.errors import InputError
-from equipix.shifts import round_shifts
+from equipix.shifts import ROUNDING, nearest_whole, round_shifts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,9 +34,6 @@ _TURNS = {
 
 WIDEST = 0.3
 """Largest prior standard deviation of a shift, in pixels: a fit moves it by less than a pixel."""
-
-ROUNDING = 1e-6
-"""Largest fraction of a pixel that counts as rounding, as in the core."""
 
 _BEYOND = 2**31
 """More pixels than any sensor has along a side."""
@@ -75,7 +72,7 @@ class Positions(ReadOnly):
         """Check what the caller gave, for `count` exposures if that is known."""
         # A shift beyond any sensor, which the solver refuses, must still fit an integer.
         exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
-        whole = np.rint(exact)
+        whole = nearest_whole(exact)
         places = np.where(np.abs(exact - whole) < ROUNDING, whole, exact)
         if count is not None:
             check_count("shifts", len(places), count)
@@ -103,9 +100,8 @@ class Positions(ReadOnly):
         """
         if _native.common_fraction(self.shifts) is not None:
             return self
-        first = self.shifts[0]
-        moves, rounding = round_shifts(self.shifts, first, std)
-        return dataclasses.replace(self, shifts=first + moves, rounding=rounding)
+        moves, rounding = round_shifts(self.shifts, std)
+        return dataclasses.replace(self, shifts=self.shifts[0] + moves, rounding=rounding)
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
         """Return the same exposures at other shifts, measured with standard deviations `std`."""

@@ -12,7 +12,7 @@ from equipix._check import as_shifts, check_shape, naming_memory
 from equipix.errors import InputError, ShiftRoundingWarning, warn
 from equipix.exposures.front import as_mask
 from equipix.exposures.positions import as_rotation
-from equipix.shifts import round_shifts
+from equipix.shifts import round_shifts, whole_moves
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -109,7 +109,7 @@ def identify(
     if len(exact) < 2:
         raise InputError(f"'shifts' holds {len(exact)} exposures, expected at least two")
     # A part of a pixel that all shifts have in common moves the grid of the beam along.
-    whole, rounding = round_shifts(exact, exact[0] - np.rint(exact[0]))
+    whole, rounding = whole_moves(exact), round_shifts(exact)[1]
     if rounding is not None:
         first = np.round(exact[0], 3).tolist()
         warn(
