@@ -238,6 +238,21 @@ class TestTheArrayAsReference:
         assert found.counts["noisy"] == 1
 
 
+@pytest.mark.parametrize("foreign", [1, 16])
+def test_frames_of_another_level_in_an_average_are_told(foreign):
+    """As a glob such as level1* takes those of level 10."""
+    rng = np.random.default_rng(3)
+    truth = 1 + 0.02 * rng.standard_normal(SHAPE)
+    stacks = [
+        100 + light * truth + 3 * rng.standard_normal((16, *SHAPE))
+        for light in range(500, 2501, 500)
+    ]
+    mixed = np.concatenate([stacks[0], stacks[-1][:foreign]])
+    levels = [equipix.average(each) for each in (mixed, *stacks[1:])]
+    with pytest.warns(errors.DriftWarning, match=r"level 0: .* all frames are of one level"):
+        nuc.fit(levels, order=1)
+
+
 class TestRegions:
     """A median of a block is that of bad pixels where they fill most of it."""
 

@@ -222,7 +222,8 @@ class Averaged:
             return ""
         return (
             f"{self._words.place(worst)}: {self.light[worst].words} (limit {NAMED:g}). It was "
-            "taken out of the noise model. Let the source settle, or average more frames"
+            f"taken out of the noise model. See that all frames are of one {self._words.one}, let "
+            "the source settle, or average more frames"
         )
 
     @property
