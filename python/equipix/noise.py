@@ -110,12 +110,15 @@ class NoiseModel:
 
     def variance(self, signal: ArrayLike) -> NDArray[Any]:
         """Variance of the value, in DN², at the mean `signal`, in DN."""
-        variance = self.scatter(signal) / self.frames + self.rounding(signal)
-        return np.asarray(variance + self.dark_variance)
+        variance = self.scatter(signal)
+        variance /= self.frames  # in place: images are large
+        variance += self.rounding(signal) + self.dark_variance
+        return variance
 
     def scatter(self, signal: ArrayLike) -> NDArray[Any]:
         """Mean variance s² between frames, in DN²."""
-        return np.asarray(self._of_frame(signal) - self.rounding(signal))
+        found = np.asarray(self._of_frame(signal))
+        return found if self.step == 0 else np.asarray(found - self.rounding(signal))
 
     def rounding(self, signal: ArrayLike) -> NDArray[Any]:
         """Variance B of the rounding that frames do not average out, in DN²."""
