@@ -170,6 +170,16 @@ def test_bad_arguments_are_named(experiments):
         equipix.compare([small, no_good])
 
 
+def test_the_command_line_refuses_one_calibration_given_twice(experiments, tmp_path, capsys):
+    _, calibrations, _ = experiments
+    path = str(tmp_path / "cal.tif")
+    calibrations[0].save(path)
+    with pytest.raises(SystemExit) as done:
+        cli.main(["compare", path, path])
+    assert done.value.code == 1
+    assert "hold one calibration" in capsys.readouterr().err
+
+
 def test_the_command_line_compares_files(experiments, tmp_path, capsys):
     _, calibrations, _ = experiments
     files = []

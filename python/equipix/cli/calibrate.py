@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,7 +25,7 @@ from equipix.cli.options import (
 from equipix.cli.summary import of_calibration, summary
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.comparison import compare as compare_calibrations
-from equipix.errors import EquipixError
+from equipix.errors import EquipixError, InputError
 from equipix.experiment.run import Experiment
 from equipix.io import SUFFIXES, read_mask, refuse_inputs
 from equipix.loading import load_any, load_calibration
@@ -129,7 +130,9 @@ def compare(
         check_picture(output)
         check_output(output, force=force)
         refuse_inputs([output], calibrations)
-    result = compare_calibrations([load_calibration(file) for file in calibrations])
+    loaded = [load_calibration(file) for file in calibrations]
+    _refuse_equal(calibrations, loaded)
+    result = compare_calibrations(loaded)
     if output is not None:
         names = [file.stem for file in calibrations]
         save_figure(draw_comparison(result, names), output, force=force)
@@ -158,6 +161,16 @@ def compare(
                 ", ".join(sorted(map(str, left_out)))
             )
         show_result(words, as_json=False)
+
+
+def _refuse_equal(files: list[Path], calibrations: list[Calibration]) -> None:
+    """Refuse one calibration given twice: independent experiments differ by their noise."""
+    for (one, first), (other, second) in combinations(zip(files, calibrations, strict=True), 2):
+        if np.array_equal(first.sensitivity, second.sensitivity, equal_nan=True):
+            raise InputError(
+                f"'{one}' and '{other}' hold one calibration, so that their agreement says "
+                "nothing: name calibrations of independent experiments"
+            )
 
 
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:
