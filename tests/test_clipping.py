@@ -156,7 +156,8 @@ def test_whole_numbers_saturate_at_the_largest_of_their_type():
     clipped = np.clip(np.rint(frames), 0, 65_535).astype(np.uint16)
     variance = np.full(5, 400.0)
     for given in (clipped, list(clipped)):
-        cal = equipix.calibrate(given, SHIFTS, variance=variance, uncertainty=True)
+        with pytest.warns(errors.MissingDarkWarning, match="frames of whole numbers"):
+            cal = equipix.calibrate(given, SHIFTS, variance=variance, uncertainty=True)
         reached = (clipped == 65_535).any(axis=0)
         np.testing.assert_array_equal((cal.flags & Flag.SATURATED) != 0, reached)
         mean = truth[np.isfinite(cal.sensitivity)].mean()
@@ -165,3 +166,18 @@ def test_whole_numbers_saturate_at_the_largest_of_their_type():
         assert np.sqrt(np.nanmean(z**2)) == pytest.approx(1, abs=4 * np.hypot(0.01, 0.02))
     _, said = calibrated(clipped.astype(float), variance=variance)
     assert "saturation = 65535" in said["SaturationWarning"]
+
+
+@pytest.mark.parametrize("level", [4095, 16_383])
+def test_a_level_spread_by_one_dn_is_named(level):
+    """5 % of the values clipped, and noise of ± 1 DN behind that."""
+    rng = np.random.default_rng(5)
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng)
+    frames = simulate.exposures(truth, simulate.gaussian_beam(SHAPE, width=150), SHIFTS)
+    frames = level / np.quantile(frames, 0.95) * frames + 5 * rng.standard_normal(frames.shape)
+    spread = np.minimum(frames, level - 1) + rng.integers(-1, 2, frames.shape)
+    _, said = calibrated(np.rint(spread), variance=np.full(5, 26.0))
+    words = f"values are between {level - 2} and {level}, .*saturation = {level - 2} "
+    assert re.search(words, said["SaturationWarning"])
+    _, said = calibrated(np.rint(0.9 * frames), variance=np.full(5, 26.0))
+    assert "SaturationWarning" not in said

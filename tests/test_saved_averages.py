@@ -9,6 +9,7 @@ import pytest
 
 import equipix
 from equipix import Experiment, cli, errors, simulate
+from equipix.io.tiff import write_frames
 
 SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
 
@@ -181,3 +182,20 @@ def test_the_limit_of_rejection_is_kept(tmp_path, capsys, suffix):
     assert equipix.FrameStatistics.load(path).reject is None
     assert run("inspect", path) == 0
     assert "rejected" not in capsys.readouterr().out
+
+
+def test_the_command_line_names_frames_darker_than_their_dark(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    for name, level in (("dark", 100), ("drifted", 120), ("light", 1000)):
+        frames = np.rint(level + rng.standard_normal((4, 20, 30))).astype(np.uint16)
+        write_frames(tmp_path / f"{name}.tif", frames, nbytes=0)
+
+    def said(frames, dark):
+        arguments = ["average", f"{tmp_path}/{frames}.tif", "--dark", f"{tmp_path}/{dark}.tif"]
+        with pytest.raises(SystemExit) as done:
+            cli.main([*arguments, "-o", f"{tmp_path}/mean.npz", "--force"])
+        assert not done.value.code
+        return capsys.readouterr().err
+
+    assert "darker than --dark by 900 of 1000 DN" in said("dark", "light")
+    assert said("light", "dark") == said("dark", "drifted") == ""

@@ -121,6 +121,19 @@ def test_averages_without_a_dark_are_named(manifest):
         equipix.calibrate(frames, CROSS, tolerance=1e-3)
 
 
+def test_arrays_as_cameras_write_them_are_no_signal():
+    rng = np.random.default_rng(1)
+    signal = simulate.exposures(np.ones(SHAPE), simulate.gaussian_beam(SHAPE, width=60), CROSS)
+    raw = np.rint(1000 * signal + 100 + rng.standard_normal(signal.shape))
+    for given in (raw.astype(np.uint16), [*raw.astype(np.uint16)]):
+        with pytest.warns(errors.MissingDarkWarning, match="no dark was subtracted from frames"):
+            cal = equipix.calibrate(given, CROSS, tolerance=1e-3)
+        assert "raw" in {each.kind for each in cal.verdicts}
+    for dtype in (np.int32, np.float32):
+        cal = equipix.calibrate(raw.astype(dtype), CROSS, tolerance=1e-3)
+        assert cal.verdicts == ()
+
+
 @pytest.mark.parametrize("dark", [None, True])
 def test_a_dark_that_is_no_choice(dark):
     with pytest.raises(errors.InputError, match=f"'dark' is {dark}, expected 'subtracted' or"):

@@ -22,7 +22,13 @@ from equipix._check import (
 )
 from equipix._readonly import ReadOnly
 from equipix.batches import batches, sum_dtype, unmasked
-from equipix.errors import FileError, InputError, UnsupportedFileError
+from equipix.errors import (
+    BrightDarkWarning,
+    FileError,
+    InputError,
+    UnsupportedFileError,
+    warn,
+)
 from equipix.rejection import Rejection
 from equipix.rounding import step_of
 
@@ -48,6 +54,9 @@ _COUNTS = ("count", "saturated")
 _NUMBERS = ("saturation", "reject", "step", "light_variance")
 _SAMPLED = 4096  # pixels that show the step between values
 _DARK = "dark_"  # before the names of the dark's pages
+
+_DARKER = 0.25
+"""Share of the dark by which frames are not darker than it: a dark drifts by less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,6 +478,20 @@ def _subtract(
         dark=dark if isinstance(dark, FrameStatistics) else None,
         raw=False,
     )
+
+
+def warn_of_bright_dark(statistics: FrameStatistics) -> None:
+    """Warn of a dark that is not that of the frames, or was subtracted from them before."""
+    if statistics.dark is None or not np.isfinite(statistics.mean).any():
+        return
+    level, below = np.nanmedian(statistics.dark.mean), -np.nanmedian(statistics.mean)
+    if level > 0 and below > _DARKER * level:
+        warn(
+            f"the frames are darker than 'dark' by {below:.4g} of {level:.4g} DN in the median "
+            f"(limit {_DARKER:.0%}): see that frames and dark are not exchanged, and give frames "
+            "from which no dark was subtracted",
+            BrightDarkWarning,
+        )
 
 
 def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:

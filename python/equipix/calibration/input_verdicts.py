@@ -33,13 +33,13 @@ def _on_clipping(exposures: Exposures) -> Verdict | None:
 
 
 def _on_raw(exposures: Exposures) -> Verdict | None:
-    """Verdict on averages without a dark."""
+    """Verdict on averages, or arrays as cameras write them, without a dark."""
     if not exposures.raw:
         return None
     return Verdict(
         "raw",
-        "no dark was subtracted from the averages, so that an offset of the camera counts as "
-        "light: give 'dark' to equipix.average (--dark), or subtract it before",
+        "no dark was subtracted from frames of whole numbers, so that an offset of the camera "
+        "counts as light: give 'dark' to equipix.average (--dark), or subtract it before",
     )
 
 

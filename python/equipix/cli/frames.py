@@ -16,7 +16,7 @@ from equipix.errors import InputError
 from equipix.experiment.provenance import origin_of
 from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
-from equipix.frames import refuse_subtracted, saved_shape
+from equipix.frames import refuse_subtracted, saved_shape, warn_of_bright_dark
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.loading import load
 
@@ -70,6 +70,7 @@ def average(
             workers=workers,
             progress=progress,
         )
+    warn_of_bright_dark(frames)
     frames.save(output, force=force)
     result = {"output": str(output), **of_statistics(frames)}
     show_result(result, as_json=as_json)

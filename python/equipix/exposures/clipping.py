@@ -21,6 +21,12 @@ _CROWDED = 2.0
 _BELOW = 0.0025
 """Width of "just below" over the highest value; at least one step between values."""
 
+_PLATEAU, _SPREAD = 4.0, 3.0
+"""How many times as many values are on a plateau as just below, and how wide it is, in DN."""
+
+_FINE = 1000.0
+"""Highest value from which a plateau of so many DN is narrow: an even patch of a scene is wider."""
+
 _RARE = 0.05
 """Largest share of pixels without scatter where its absence shows a level."""
 
@@ -35,10 +41,15 @@ _FEWEST_BITS = 8
 
 
 class Clipping(NamedTuple):
-    """A probable saturation level, in the units of the frames, and the values found at it."""
+    """A probable saturation level, in the units of the frames, and the values found at it.
+
+    `top` is the highest value where the level is one of several: noise of the electronics behind
+    the saturation spreads it.
+    """
 
     level: float
     values: int
+    top: float | None = None
 
 
 def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Clipping | None:
@@ -73,6 +84,23 @@ def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Cli
     return Clipping(level, count) if 2 * count < known.size or is_of_bits(level) else None
 
 
+def plateau(values: Array) -> Clipping | None:
+    """Find a level that noise of ± 1 DN spreads over three values; values of one exposure, in DN.
+
+    What an even scene does is none: most values are in a plateau then, or it is wider.
+    """
+    known = values[np.isfinite(values)]
+    top = float(known.max()) if known.size > _MANY else 0.0
+    if top < _FINE:
+        return None
+    level = float(np.rint(top)) - _SPREAD + 1
+    count = int(np.count_nonzero(known >= level))
+    low = level - max(_SPREAD, _BELOW * top)
+    below = int(np.count_nonzero(known >= low)) - count
+    is_level = count >= _MANY and count > _PLATEAU * below and 2 * count < known.size
+    return Clipping(level, count, top) if is_level else None
+
+
 def clipping_of(frames: FrameStatistics) -> Clipping | None:
     """Find the level that averaged frames are clipped at, before the dark was subtracted.
 
@@ -83,12 +111,12 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     raw = np.where(frames.saturated > 0, np.nan, _raw(frames))
     found = clipping(raw, crowded=0.0)
     if found is None:
-        return None
+        return plateau(raw)
     steady = frames.variance == 0
     others = np.isfinite(raw) & (raw < found.level * (1 - _ROUNDING))
     if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:
         return found
-    return clipping(raw, step=frames.step)
+    return clipping(raw, step=frames.step) or plateau(raw)
 
 
 def unclipped(frames: FrameStatistics, clipped: Clipping) -> Bools:
@@ -115,8 +143,11 @@ def clipping_advice(
 ) -> str:
     """Say what was found and what to write, in a file or to a function of arrays."""
     level = f"{clipped.level:.10g}"
+    where = f"exactly {level}, the highest one"
+    if clipped.top is not None:
+        where = f"between {level} and {clipped.top:.10g}, the highest one, with few just below"
     return (
-        f"{clipped.values} values are exactly {level}, the highest one: they probably saturate and "
+        f"{clipped.values} values are {where}: they probably saturate and "
         f"count as valid. Write saturation = {level} in [sensor] of {file}, or give it as "
         f"'saturation' to equipix.average or, of arrays, to {function}"
     )
@@ -128,7 +159,8 @@ def highest(found: Iterable[Clipping | None]) -> Clipping | None:
     if not levels:
         return None
     level = max(each.level for each in levels)
-    return Clipping(level, sum(each.values for each in levels if each.level == level))
+    same = [each for each in levels if each.level == level]
+    return Clipping(level, sum(each.values for each in same), same[0].top)
 
 
 def is_of_bits(level: float) -> bool:

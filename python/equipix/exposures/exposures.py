@@ -62,7 +62,7 @@ class Exposures(ReadOnly):
     clipped : Clipping or None
         A saturation level that was not given, if the values show one.
     raw : bool
-        Whether the values are averages of whole numbers from which no dark was subtracted.
+        Whether no dark was subtracted: from averages of whole numbers, or arrays of unsigned ones.
     unsteady : str
         Which exposure has light that varied between its frames, and by how much; empty if none has.
     """
@@ -140,7 +140,7 @@ class Exposures(ReadOnly):
             else variance,
             mask=None if mask is None else np.ascontiguousarray(mask[part]),
             findings=Findings(),
-            dark=None,
+            dark=None if self.dark is None else self.dark[part],
             dark_variance=None,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from equipix._check import as_array, as_floats, as_level, check_count, naming_me
 from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import EXPOSURES, Averaged, Words
-from equipix.exposures.clipping import Clipping, clipping, highest
+from equipix.exposures.clipping import Clipping, clipping, highest, plateau
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.nothing import refuse_nothing
@@ -63,7 +63,7 @@ def exposures_of(
             dark=measured.dark,
             dark_variance=_of_dark(dark_variance, measured, offset=offset),
             clipped=measured.clipped,
-            raw=measured.raw and not offset,
+            raw=(measured.raw or _is_unsigned(frames)) and not offset,
             unsteady=measured.unsteady,
         )
         refuse_nothing(exposures, given)
@@ -185,7 +185,7 @@ def _of_arrays(
         variances = as_variances(cast("ArrayLike", variance), values)
     level = _largest(frames) if saturation is None else as_level(saturation)
     if level is None:
-        clipped = highest(clipping(each) for each in values)
+        clipped = highest(clipping(each) or plateau(each) for each in values)
         return Measured(values, None, variances, models, Findings(), clipped=clipped)
     saturated = _saturated(values, level, words)
     clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
@@ -197,10 +197,21 @@ def _of_arrays(
 
 def _largest(frames: ArrayLike) -> float | None:
     """Largest value of arrays of whole numbers, which counts as saturated unless given."""
+    dtype = _dtype(frames)
+    return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
+
+
+def _is_unsigned(frames: object) -> bool:
+    """Whether frames are arrays as cameras write them: a subtracted dark leaves values below 0."""
+    dtype = _dtype(frames)
+    return dtype is not None and dtype.kind == "u"
+
+
+def _dtype(frames: object) -> np.dtype[Any] | None:
+    """Return the dtype that arrays have in common."""
     arrays = frames if isinstance(frames, list | tuple) else [frames]
     dtypes = {getattr(each, "dtype", None) for each in arrays}
-    dtype = dtypes.pop() if len(dtypes) == 1 else None
-    return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
+    return dtypes.pop() if len(dtypes) == 1 else None
 
 
 def _averaged(frames: object, words: Words) -> Averaged | None:
