@@ -28,6 +28,7 @@ from equipix.calibration.priors import widened
 from equipix.calibration.residuals import sampled
 from equipix.calibration.result import Calibration
 from equipix.calibration.sample_variances import steadied
+from equipix.calibration.small_errors import with_small_errors
 from equipix.calibration.unchanged import sampled_arrays
 from equipix.calibration.weights import weighted_fit
 from equipix.exposures.front import exposures_of
@@ -75,6 +76,7 @@ def calibrate(
     ----------
     frames : array_like, shape (n, rows, cols), or sequence of FrameStatistics
         Mean exposures with the dark subtracted, at least two. NaN or infinite counts as masked.
+        Of unsigned whole numbers no dark was subtracted, which is a finding.
         `FrameStatistics` contain their noise: the weights come from a noise model fitted over all
         pixels, not from each pixel's own sample variance; single frames show no noise, and without
         `variance` all their weights are 1. A mean with saturated samples is left
@@ -176,7 +178,8 @@ def calibrate(
         If the data contradict the fluxes given: the lamp has drifted, which hides a tilt.
     MisfitWarning
         If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
-        neighbouring pixels are correlated. The message names the likely cause.
+        neighbouring pixels are correlated, or if residuals show a curved response, an offset of all
+        values, crosstalk or the pattern of the dark. The message names the likely cause.
     SaturationWarning
         If many values are exactly at the highest one, and no saturation level is given or a higher
         one.
@@ -279,6 +282,7 @@ def calibrated(
     weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
     found = verdicts.on_fit(weighted, options, test, drift, misfits, widths)
     found = verdicts.unexplained(found, advice) + verdicts.on_noise(frames)
+    found = with_small_errors(found, weighted, residuals, options.fit)
     found = with_coverage(found, weighted, flags)
     # Before the error bars, which may be refused or interrupted.
     verdicts.say(found)

@@ -97,7 +97,9 @@ def plateau(values: Array) -> Clipping | None:
     count = int(np.count_nonzero(known >= level))
     low = level - max(_SPREAD, _BELOW * top)
     below = int(np.count_nonzero(known >= low)) - count
-    is_level = count >= _MANY and count > _PLATEAU * below and 2 * count < known.size
+    # A scene that is clipped reaches its level; stuck pixels are far above all others.
+    reached = bool(((known < low) & (known >= 2 * low - level)).any())
+    is_level = count >= _MANY and count > _PLATEAU * below and 2 * count < known.size and reached
     return Clipping(level, count, top) if is_level else None
 
 
