@@ -114,7 +114,11 @@ def refuse_saturated(
         )
 
 
-def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> NDArray[Any]:
+def dead_pixels(
+    signals: NDArray[Any],
+    models: Sequence[NoiseModel] | None,
+    usual: NDArray[Any] | float = 1.0,
+) -> NDArray[Any]:
     """Find pixels whose response to light is below half of that of their neighbours.
 
     Parameters
@@ -123,6 +127,8 @@ def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> N
         Dark-subtracted means of the exposures, in DN.
     models : sequence of NoiseModel, optional
         Those of `signals`, one an exposure: a pixel must be below by more than noise explains.
+    usual : ndarray of shape (rows, cols), optional
+        Response of good pixels, such as those of the colours of their filters.
 
     Returns
     -------
@@ -134,7 +140,7 @@ def dead_pixels(signals: NDArray[Any], models: Sequence[NoiseModel] | None) -> N
     for k, signal in enumerate(signals):
         margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
         # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
-        dead &= ~(signal + margin >= DEAD_RESPONSE * _block_medians(signal))
+        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * _block_medians(signal / usual))
     return dead
 
 

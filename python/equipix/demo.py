@@ -98,7 +98,7 @@ class Demo:
 
 
 def virtual_experiment(
-    shape: tuple[int, int], *, frames: int, bit_depth: int = 12, rng: int
+    shape: tuple[int, int], *, frames: int, bit_depth: int = 12, cfa: str | None = None, rng: int
 ) -> VirtualExperiment:
     """Prepare the demo's experiment: the hard case of plain coordinate descent.
 
@@ -114,6 +114,8 @@ def virtual_experiment(
         Frames of each exposure and of the dark.
     bit_depth : int
         Bits of the ADC.
+    cfa : str, optional
+        Colour filters of the camera.
     rng : int
         Seed of the simulation.
 
@@ -131,6 +133,7 @@ def virtual_experiment(
         frames=frames,
         exposure_e=EXPOSURE_E,
         bit_depth=bit_depth,
+        cfa=cfa,
         rng=generator,
     )
     camera = virtual.camera

@@ -8,6 +8,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import as_array
+from equipix.colour import Colours, planes_of
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +30,9 @@ def rms_at_both_scales(error: NDArray[Any]) -> tuple[float, float]:
     return rms(error), rms(block_means(error)) if min(error.shape) >= BLOCK else np.nan
 
 
-def relative_error(sensitivity: ArrayLike, truth: ArrayLike) -> Floats:
+def relative_error(
+    sensitivity: ArrayLike, truth: ArrayLike, *, cfa: ArrayLike | None = None
+) -> Floats:
     """Relative error of a measured sensitivity, both in the gauge mean 1.
 
     Parameters
@@ -38,6 +41,9 @@ def relative_error(sensitivity: ArrayLike, truth: ArrayLike) -> Floats:
         The measured sensitivity; NaN where undetermined.
     truth : array_like, shape (rows, cols)
         The true one; NaN in pixels that are not to count.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`: means are then those of the
+        pixel's colour.
 
     Returns
     -------
@@ -55,8 +61,12 @@ def relative_error(sensitivity: ArrayLike, truth: ArrayLike) -> Floats:
     true = as_array("truth", truth, ndim=2)
     ratio = measured / true
     valid = np.isfinite(ratio)
-    scale = np.mean(measured, where=valid) / np.mean(true, where=valid)
-    return np.where(valid, ratio / scale - 1, np.nan)
+    error = np.full(ratio.shape, np.nan)
+    for plane in planes_of(Colours.of(cfa), ratio.shape):
+        counted = valid & plane
+        scale = np.mean(measured, where=counted) / np.mean(true, where=counted)
+        error[counted] = ratio[counted] / scale - 1
+    return error
 
 
 def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:

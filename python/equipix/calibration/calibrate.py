@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix import _native
 from equipix.calibration import verdicts
+from equipix.calibration.colours import contradiction
 from equipix.calibration.coverage import with_coverage
 from equipix.calibration.error_bars import (
     is_too_fine,
@@ -62,6 +63,7 @@ def calibrate(
     shift_std: ArrayLike | None = None,
     dark: Literal["subtracted", "fit"] = "subtracted",
     dark_variance: ArrayLike | None = None,
+    cfa: ArrayLike | None = None,
     robust: bool = False,
     method: Method = "multiscale",
     tolerance: float = 1e-6,
@@ -122,6 +124,11 @@ def calibrate(
         exposures, so `variance` must be without it. It enters the error bars and `reduced_chi2`,
         not the weights. `FrameStatistics` with a dark contain it, unless `variance` is given as
         numbers.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, from pixel (0, 0) on: "RGGB", "GRBG", "GBRG" or "BGGR", rows
+        of one period divided by "/" ("RRGG/RRGG/GGBB/GGBB"), or an array of labels; the period is
+        at most 8×8. All colours see one beam. Neighbours and the gauge are then those of a colour:
+        M has the mean 1 within each, and `Calibration.colour_response` the responses.
     robust : bool
         Whether to leave out measurements that disagree with the others, such as a particle or a
         reflection in one exposure only. Left out is what is more than five standard deviations
@@ -246,6 +253,7 @@ def calibrate(
         shift_std=shift_std,
         offset=is_to_be_fitted(dark),
         dark_variance=dark_variance,
+        cfa=cfa,
     )
     if fit_options.whole_shifts:
         exposures = exposures.whole()
@@ -279,8 +287,9 @@ def calibrated(
     contradicted = bool(widths) or (drift is not None and drift.is_certain)
     test = test.among_fluxes(contradicted=contradicted)
     misfits = misfit(weighted, residuals)
+    differ = contradiction(weighted, residuals, flags)
     weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
-    found = verdicts.on_fit(weighted, options, test, drift, misfits, widths)
+    found = verdicts.on_fit(weighted, options, test, drift, misfits, widths, differ)
     found = verdicts.unexplained(found, advice) + verdicts.on_noise(frames)
     found = with_small_errors(found, weighted, residuals, options.fit)
     found = with_coverage(found, weighted, flags)
@@ -320,10 +329,12 @@ def _metadata(
         "max_sweeps": options.fit.max_sweeps,
         "dark": "fit" if exposures.offset else "subtracted",
         "flux": exposures.flux.kind,
-        "weights": "equal" if exposures.variance is None else "variances",
+        "weights": "variances" if exposures.knows_noise else "equal",
         "rotation": exposures.positions.rotation.tolist(),
         "robust": options.robust,
     }
+    if exposures.filters is not None and exposures.filters.given:
+        chosen["cfa"] = str(exposures.filters.colours)
     if exposures.positions.std is not None:
         chosen["shifts"] = fit.refinement
     metadata: dict[str, Any] = {

@@ -21,6 +21,7 @@ def on_input(exposures: Exposures) -> list[Verdict]:
         Verdict("light", exposures.unsteady) if exposures.unsteady else None,
         _on_units(exposures),
         _on_repeats(exposures),
+        _on_filters(exposures),
     ]
     return [verdict for verdict in found if verdict is not None]
 
@@ -55,6 +56,12 @@ def _on_units(exposures: Exposures) -> Verdict | None:
         f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
         "pitch, see 'From micrometres to pixels' in README",
     )
+
+
+def _on_filters(exposures: Exposures) -> Verdict | None:
+    """Verdict on a pattern of colour filters, or of the read-out, that nobody has named."""
+    filters = exposures.filters
+    return None if filters is None or filters.given else Verdict("cfa", filters.words)
 
 
 def _on_repeats(exposures: Exposures) -> Verdict | None:

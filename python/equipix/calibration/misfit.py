@@ -101,7 +101,7 @@ def misfit(weighted: Weighted, residuals: Residuals) -> Misfit | None:
     inexactness = residuals.inexactness
     if weighted.fit.degrees_of_freedom < FEWEST or not inexactness < 1:
         return None
-    known = weighted.exposures.variance is not None
+    known = weighted.exposures.knows_noise
     chi2 = weighted.reduced_chi2 if known else float("nan")
     left = without_shift_errors(weighted, residuals)
     if left is not residuals:
@@ -137,7 +137,7 @@ def _cause(
     noise = residuals.share * residuals.scale
     excess = float(np.nansum(values**2)) - noise * np.count_nonzero(np.isfinite(values))
     inside = np.where(_flat(_seen_by_all(weighted, residuals)), values, np.nan)
-    if weighted.exposures.variance is not None and causes.by_signal(inside, signal) > _MOST:
+    if weighted.exposures.knows_noise and causes.by_signal(inside, signal) > _MOST:
         return "signal", (
             "they grow with the signal: give 'variance' as a NoiseModel with photon noise, and see "
             "whether the response is linear"

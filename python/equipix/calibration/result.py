@@ -11,6 +11,7 @@ import numpy as np
 from equipix._check import check_count, check_progress
 from equipix._native import Beam
 from equipix._readonly import ReadOnly
+from equipix.calibration.colours import gauge_of, scaled
 from equipix.calibration.error_bars import checked_weights, functional_std
 from equipix.calibration.history import History
 from equipix.calibration.prediction import places_of, signal_at, subtract_signals
@@ -20,7 +21,7 @@ from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficien
 from equipix.correction.depth import depth_of
 from equipix.errors import InputError
 from equipix.exposures.front import measured_of
-from equipix.flags import determined, mean_of_usable
+from equipix.flags import determined
 from equipix.maps import slope_pixels, tilt
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from equipix.calibration.orientation import OrientationTest
     from equipix.calibration.verdicts import Verdict
     from equipix.calibration.weights import Weighted
+    from equipix.colour import Colours
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
 
@@ -47,8 +49,8 @@ class Calibration(ReadOnly):
     Attributes
     ----------
     sensitivity : ndarray, shape (rows, cols)
-        Relative sensitivity M of mean 1 over valid pixels; NaN where undetermined. float32 for
-        float32 frames, else float64.
+        Relative sensitivity M of mean 1 over valid pixels, with a `cfa` over those of each colour;
+        NaN where undetermined. float32 for float32 frames, else float64.
     beam : ndarray, shape of the padded grid, float64
         The beam L in the units of the frames; NaN where unobserved.
     beam_origin : tuple of int or float
@@ -137,6 +139,11 @@ class Calibration(ReadOnly):
         `sensitivity_std`, `tilt_std` and `std_of`. Errors of the tilt over `tilt_std` are at most
         as far out as Student's t with so many degrees of freedom. None where fluxes were fitted or
         have a prior, and where no combination of them leaves a residual.
+    cfa : Colours or None
+        Colour filters of the pixels, where they were given.
+    colour_response : dict of str to float, or None
+        Response of each colour to the light of the beam, of mean 1 over the pixels in use: M times
+        it is what pixels give for one light. NaN for a colour that is undetermined.
     """
 
     sensitivity: NDArray[Any]
@@ -168,6 +175,8 @@ class Calibration(ReadOnly):
     orientation: OrientationTest | None = None
     drift: Drift | None = None
     verdicts: tuple[Verdict, ...] = ()
+    cfa: Colours | None = None
+    colour_response: dict[str, float] | None = None
 
     @classmethod
     def of(
@@ -183,13 +192,13 @@ class Calibration(ReadOnly):
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
         exposures, fit, dtype = weighted.exposures, weighted.fit, weighted.exposures.values.dtype
-        mean, coefficients = mean_of_usable(fit.sensitivity, flags), fit.beam.coefficients
-        std = None if bars is None else bars.sensitivity
+        filters, gauge = exposures.filters, gauge_of(weighted, flags)
+        std, offset = None if bars is None else bars.sensitivity, fit.offset
         return cls(
-            sensitivity=_scaled(fit.sensitivity, 1 / mean).astype(dtype, copy=False),
-            beam=_scaled(fit.beam.values, mean),
+            sensitivity=scaled(fit.sensitivity, gauge.of_sensitivity, dtype),
+            beam=scaled(fit.beam.values, gauge.of_beam),
             beam_origin=_whole_if_possible(fit.beam.origin),
-            beam_coefficients=None if coefficients is None else _scaled(coefficients, mean),
+            beam_coefficients=scaled(fit.beam.coefficients, gauge.of_beam),
             beam_tilt=np.array(fit.beam.tilt),
             flags=flags,
             shifts=np.array(fit.shifts, dtype=np.float64),
@@ -203,10 +212,10 @@ class Calibration(ReadOnly):
             converged=fit.ended == "converged",
             error_estimate=float(fit.error_estimate[-1]),
             history=History(fit.sweeps, fit.objective, fit.error_estimate),
-            dark=exposures.dark if fit.offset is None else fit.offset.astype(dtype, copy=False),
+            dark=exposures.dark if offset is None else scaled(offset, exposures.response, dtype),
             dark_is_fitted=exposures.offset,
             metadata=metadata,
-            sensitivity_std=None if std is None else _scaled(std, 1 / mean),
+            sensitivity_std=scaled(std, gauge.of_sensitivity, dtype),
             tilt_std=None if bars is None else bars.tilt,
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
@@ -215,6 +224,8 @@ class Calibration(ReadOnly):
             orientation=orientation,
             drift=drift,
             verdicts=verdicts,
+            cfa=filters.colours if filters is not None and filters.given else None,
+            colour_response=gauge.response,
         )
 
     @property
@@ -418,7 +429,7 @@ class Calibration(ReadOnly):
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
         (place,) = places_of(np.reshape(shift, (1, 2)), [rotation], [flux])
-        return signal_at(place, self._beam, self.sensitivity)
+        return signal_at(place, self._beam, self._response)
 
     def residuals(
         self,
@@ -472,9 +483,17 @@ class Calibration(ReadOnly):
         )
         check_count("shifts", len(places), len(values))
         residuals = np.full(values.shape, np.nan, np.result_type(values, self.sensitivity))
-        signals = (signal_at(place, self._beam, self.sensitivity) for place in places)
+        signals = (signal_at(place, self._beam, self._response) for place in places)
         subtract_signals(measured, signals, self.dark if self.dark_is_fitted else None, residuals)
         return residuals
+
+    @property
+    def _response(self) -> NDArray[Any]:
+        """What the pixels give for one light: M, times the response of the colour."""
+        if self.cfa is None or self.colour_response is None:
+            return self.sensitivity
+        response = self.cfa.map_of(self.colour_response, self.shape)
+        return np.asarray(self.sensitivity * response, self.sensitivity.dtype)
 
     @property
     def _beam(self) -> Beam:
@@ -499,11 +518,6 @@ class Calibration(ReadOnly):
             If the suffix is unknown.
         """
         save_fields(path, vars(self), force=force)
-
-
-def _scaled(array: NDArray[Any], factor: float) -> NDArray[Any]:
-    """Return the array itself, which the fit shares, unless the gauge changes."""
-    return array if factor == 1 else np.asarray(array * factor)
 
 
 def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:

@@ -70,14 +70,18 @@ def steadied(
 
     Also returns the number of frames that they seem to be of; None where they are left as they are.
     """
-    frames = None if exposures.offset else sampled_frames(exposures.variance)
+    is_given = exposures.knows_noise and not exposures.offset
+    frames = sampled_frames(exposures.variance) if is_given else None
     variance = exposures.variance
     if frames is None or variance is None or _explains_residuals(weighted, options.fit.workers):
         return weighted, None
-    usable, number = exposures.usable(), max(2, round(frames))
+    usable, number, response = exposures.usable(), max(2, round(frames)), exposures.response
+    in_dn = (
+        (y * response, v * response**2) for y, v in zip(exposures.values, variance, strict=True)
+    )
     models = tuple(
-        NoiseModel.fit(photon_transfer(exposures.values[k], variance[k], usable[k], number))
-        for k in range(len(exposures))
+        NoiseModel.fit(photon_transfer(signal, each, usable[k], number))
+        for k, (signal, each) in enumerate(in_dn)
     )
     exposures = dataclasses.replace(exposures, variance=None, noise=models)
     return weighted_fit(exposures, options, weighted.fit), frames

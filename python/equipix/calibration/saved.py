@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.colour import Colours
 from equipix.io import check_format, check_pages, save_pages
 from equipix.shifts import ROUNDING
 
@@ -96,6 +97,8 @@ def read_fields(
         "shift_sign": numbers.get("shift_sign", "undetermined"),
         "orientation": numbers.get("orientation"),
         "drift": numbers.get("drift"),
+        "cfa": Colours.of(numbers.get("cfa")),
+        "colour_response": _responses(numbers.get("colour_response")),
         "history": _history(numbers["history"]),
         "rejected": None if rejected is None else rejected.astype(bool),
         "metadata": content["metadata"],
@@ -158,6 +161,7 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
         "shift_sign": fields["shift_sign"],
         "orientation": orientation,
         "drift": None if drift is None else _lists(vars(drift)),
+        **_colours(fields),
         "tilt_std": None
         if tilt_std is None
         else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],
@@ -168,6 +172,23 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
             "error_estimate": history.error_estimate.tolist(),
         },
     }
+
+
+def _colours(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect the pattern of the filters and the responses of the colours, where there are any."""
+    if fields["cfa"] is None:
+        return {}
+    found = fields["colour_response"].items()
+    return {
+        "cfa": [list(row) for row in fields["cfa"].pattern],
+        "colour_response": {label: value if value == value else None for label, value in found},
+    }
+
+
+def _responses(content: Mapping[str, float | None] | None) -> dict[str, float] | None:
+    if content is None:
+        return None
+    return {label: float("nan") if value is None else value for label, value in content.items()}
 
 
 def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -78,6 +78,8 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "faint": IdentifiabilityWarning,
     "dark": IdentifiabilityWarning,
     "misfit": MisfitWarning,
+    "cfa": MisfitWarning,
+    "colour": MisfitWarning,
     "drift": DriftWarning,
     "prior": MisfitWarning,
     "variance": MisfitWarning,
@@ -176,8 +178,9 @@ def on_fit(
     drift: Drift | None,
     misfit: Misfit | None,
     contradictions: Sequence[Contradiction] = (),
+    colours: str | None = None,
 ) -> list[Verdict]:
-    """Verdicts on a fit, the most important first."""
+    """Verdicts on a fit, the most important first; `colours` are words on their contradiction."""
     found = [
         _on_sign(test),
         _on_orientation(test),
@@ -185,7 +188,8 @@ def on_fit(
         _on_patterns(weighted.fit),
         _on_hidden(weighted.fit, test),
         _on_faint(weighted.exposures),
-        *_on_residuals(drift, misfit),
+        None if colours is None else Verdict("colour", colours),
+        *_on_residuals(drift, None if colours else misfit),
         *(Verdict("prior", each.words) for each in contradictions),
         _on_convergence(weighted.fit, options),
         _on_uncertainty(weighted, options),

@@ -53,7 +53,7 @@ class Weighted(NamedTuple):
         freedom = self.fit.degrees_of_freedom
         if freedom <= 0:
             return float("nan")
-        if self.exposures.variance is not None:
+        if self.exposures.knows_noise:
             return self.fit.misfit / (freedom + self.dark_misfit)
         left = self.fit.misfit - self.dark_misfit
         return left / freedom if left > 0 or self.dark_misfit == 0 else float("nan")
@@ -61,7 +61,7 @@ class Weighted(NamedTuple):
     @property
     def noise_variance(self) -> float:
         """Variance of a value of weight 1: `excess` where variances are known, else reduced χ²."""
-        return self.excess if self.exposures.variance is not None else self.reduced_chi2
+        return self.excess if self.exposures.knows_noise else self.reduced_chi2
 
 
 def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:
@@ -117,7 +117,12 @@ def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:
     """Exposures with the variances that their noise models have at these signals."""
-    return exposures.weighted(modelled_variances(exposures.noise, signals, exposures.values))
+    models, like = exposures.noise, exposures.values
+    if exposures.filters is None:
+        return exposures.weighted(modelled_variances(models, signals, like))
+    response = exposures.response  # the models are of values in DN
+    variances = modelled_variances(models, (signal * response for signal in signals), like)
+    return exposures.weighted(np.asarray(variances / np.square(response), like.dtype))
 
 
 def expected(

@@ -28,8 +28,13 @@ Mask = Annotated[
     Path | None,
     typer.Option(help="An image or .npy: pixels that are not 0 in it are not used."),
 ]
-
-
+Cfa = Annotated[
+    str | None,
+    typer.Option(
+        help="Colour filters of the pixels: RGGB, GRBG, GBRG or BGGR, or the rows of one period, "
+        "such as RRGG/RRGG/GGBB/GGBB."
+    ),
+]
 Sensor = Annotated[
     str | None,
     typer.Option(

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from equipix.cli.options import Force, Json, Picture, Seed
+from equipix.cli.options import Cfa, Force, Json, Picture, Seed
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.errors import InputError, UnusedInputWarning, warn
 from equipix.pictures.canvas import check_picture, save_figure
@@ -43,6 +43,7 @@ def plan(
     beam_width: Annotated[
         float | None, typer.Option(help="Width of a Gaussian beam in pixels; even unless given.")
     ] = None,
+    cfa: Cfa = None,
     rng: Seed = 0,
     output: Picture = None,
     force: Force = False,
@@ -72,12 +73,19 @@ def plan(
     elif max_shift is not None:
         with progress_bars() as progress:
             found = suggest(
-                shape, exposures, max_shift, drift=drift, rng=rng, progress=progress, **causes
+                shape,
+                exposures,
+                max_shift,
+                drift=drift,
+                cfa=cfa,
+                rng=rng,
+                progress=progress,
+                **causes,
             )
         budgets = [suggestion.budget for suggestion in found]
     if output is not None:
         save_figure(draw_plans(budgets), output, force=force)
-    plans = [_plan_summary(budget) for budget in budgets]
+    plans = [_plan_summary(budget, cfa) for budget in budgets]
     if as_json:
         result = {"shape": list(shape), "patterns": plans}
         show_result(result | ({"picture": str(output)} if output else {}), as_json=True)
@@ -96,14 +104,15 @@ def _pairs(text: str) -> list[list[float]]:
     return pairs
 
 
-def _plan_summary(budget: ErrorBudget) -> dict[str, Any]:
+def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
     """Collect the figures of a pattern."""
     # Rounded: equations and unknowns are the same between pixels, and the budget has the parts.
-    found = identify(budget.shape, whole_moves(budget.shifts))
+    found = identify(budget.shape, whole_moves(budget.shifts), cfa=cfa)
     order = advise_order(budget.shifts)
     return {
         "shifts": budget.shifts.tolist(),
         "components": budget.components,
+        **({} if found.by_colour is None else {"components_by_colour": found.by_colour}),
         "largest": found.largest if budget.components == found.components else found.labels.size,
         "equations": found.equations,
         "unknowns": found.unknowns,
@@ -126,12 +135,15 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
         "tilt from lamp drift": lambda p: f"{p['rms_by_cause']['drift']:.2e}",
         "shift errors": lambda p: f"{p['rms_by_cause']['shift_error']:.2e}",
         "parts that nothing compares": lambda p: str(p["components"]),
+        "  of each colour alone": lambda p: _by_colour(p["components_by_colour"]),
         "equations / unknowns": lambda p: f"{p['equations']} / {p['unknowns']}",
         "worst wave, cycles per pixel": lambda p: "({:.3f}, {:.3f})".format(*p["worst_wave"]),
         "λ of it": lambda p: f"{p['smallest_eigenvalue']:.3f}",
         "linear trend distinct from tilt": lambda p: f"{p['distinct_trend']:.1%}",
         "  in the order advised": lambda p: f"{p['distinct_trend_in_order']:.1%}",
     }
+    if "components_by_colour" not in plans[0]:
+        del rows["  of each colour alone"]
     patterns = [f"pattern {k + 1}" for k in range(len(plans))]
     show_table(
         ("rms error of the sensitivity", *patterns),
@@ -140,6 +152,11 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
     for pattern, found in zip(patterns, plans, strict=True):
         shifts = " ".join(f"{row:g},{col:g}" for row, col in _ordered(found))
         print(f"{pattern}, in the order advised: {shifts}")  # noqa: T201
+
+
+def _by_colour(found: dict[str, int]) -> str:
+    """Write the components of each colour, and their sum."""
+    return f"{sum(found.values())} ({', '.join(f'{k} {n}' for k, n in found.items())})"
 
 
 def _ordered(found: dict[str, Any]) -> list[list[float]]:

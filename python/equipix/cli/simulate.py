@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from equipix.cli.options import Force, Json, Seed, Shape, Workers
+from equipix.cli.options import Cfa, Force, Json, Seed, Shape, Workers
 from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError
@@ -25,13 +25,14 @@ def simulate(
     shape: Shape = (240, 320),
     frames: Annotated[int, typer.Option(min=1, help="Frames of an exposure.")] = 20,
     bit_depth: Annotated[int, typer.Option(min=8, max=16, help="Bits of the ADC.")] = 12,
+    cfa: Cfa = None,
     rng: Seed = 0,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write the images of an experiment with a virtual camera, and its truth."""
     check_output(output, force=force, folder=True)
-    virtual = virtual_experiment(shape, frames=frames, bit_depth=bit_depth, rng=rng)
+    virtual = virtual_experiment(shape, frames=frames, bit_depth=bit_depth, cfa=cfa, rng=rng)
     with progress_bars() as progress:
         manifest = virtual.write(output, force=force, progress=progress)
     show_result({"experiment": str(manifest), "shape": list(shape)}, as_json=as_json)

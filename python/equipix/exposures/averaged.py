@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from equipix._types import Array, Bools, Floats
     from equipix.frames import FrameStatistics
+    from equipix.mosaic import Filters
 
 
 class Words(NamedTuple):
@@ -247,7 +248,7 @@ class Averaged:
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
-    def findings(self, noise: NoiseModel | None) -> Findings:
+    def findings(self, noise: NoiseModel | None, filters: Filters | None = None) -> Findings:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
@@ -261,18 +262,19 @@ class Averaged:
             hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
         dead = None
         if noise is not None or self.dark is not None:
-            dead = self._dead(noise) & ~hot
+            dead = self._dead(noise, filters) & ~hot
         return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
     def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
         saturates = frames.saturated > 0
         refuse_saturated(which, frames.mean, saturates, self.saturation, self._saturation_key)
 
-    def _dead(self, noise: NoiseModel | None) -> Bools:
+    def _dead(self, noise: NoiseModel | None, filters: Filters | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""
         models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
-        dead: Bools = dead_pixels(self._signals, models) & measured
+        usual = 1.0 if filters is None else filters.map_of(self.saturated.shape)
+        dead: Bools = dead_pixels(self._signals, models, usual) & measured
         return dead
 
     @property

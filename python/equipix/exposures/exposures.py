@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from equipix.exposures.options import FitOptions
     from equipix.exposures.orientation import Orientation
     from equipix.exposures.positions import Positions
+    from equipix.mosaic import Filters
     from equipix.noise import NoiseModel
 
 _BLOCK = 64
@@ -65,6 +66,11 @@ class Exposures(ReadOnly):
         Whether no dark was subtracted: from averages of whole numbers, or arrays of unsigned ones.
     unsteady : str
         Which exposure has light that varied between its frames, and by how much; empty if none has.
+    filters : Filters or None
+        Colour filters of the pixels: values and deviations are over the response of the pixel's
+        colour, so that all pixels are alike; `noise` and `dark` are in DN.
+    relative : bool
+        Whether the variances are relative, in an unknown unit.
     """
 
     values: Array
@@ -80,6 +86,8 @@ class Exposures(ReadOnly):
     clipped: Clipping | None = None
     raw: bool = False
     unsteady: str = ""
+    filters: Filters | None = None
+    relative: bool = False
 
     def __len__(self) -> int:
         """Return the number of exposures."""
@@ -97,6 +105,37 @@ class Exposures(ReadOnly):
         if self.mask is not None:
             usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
         return usable
+
+    @property
+    def knows_noise(self) -> bool:
+        """Whether variances of the values are known, and not their ratios alone."""
+        return self.variance is not None and not self.relative
+
+    @property
+    def response(self) -> Floats | float:
+        """What the values are over: the response of each pixel's colour (rows, cols), or 1."""
+        return 1.0 if self.filters is None else self.filters.map_of(self.shape)
+
+    def behind(self, filters: Filters | None) -> Self:
+        """Return the exposures with values over the responses of the pixels' colours.
+
+        Where no variance is known that of the values was equal: what follows is relative.
+        """
+        if filters is None:
+            return self
+        response = filters.map_of(self.shape)
+        known = self.variance is not None
+        given = np.ones(len(self)) if self.variance is None else self.variance
+        given = given[:, None, None] if given.ndim == 1 else given
+        dark, dtype = self.dark_variance, self.values.dtype
+        return dataclasses.replace(
+            self,
+            values=self.values / response.astype(dtype),
+            variance=(given / response**2).astype(dtype) if known or not self.noise else None,
+            dark_variance=None if dark is None else dark / response**2,
+            filters=filters,
+            relative=not known and not self.noise,
+        )
 
     def weighted(self, variance: Array | None) -> Self:
         """Return the exposures with other variances."""
@@ -142,6 +181,7 @@ class Exposures(ReadOnly):
             findings=Findings(),
             dark=None if self.dark is None else self.dark[part],
             dark_variance=None,
+            filters=None,
         )
 
     def oriented(self, orientation: Orientation) -> Self:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from equipix._check import as_array, as_floats, as_level, check_count, naming_memory
+from equipix.colour import Colours
 from equipix.defects import Findings, refuse_saturated
 from equipix.errors import InputError
 from equipix.exposures.averaged import EXPOSURES, Averaged, Words
@@ -18,10 +19,11 @@ from equipix.exposures.nothing import refuse_nothing
 from equipix.exposures.positions import Positions
 from equipix.exposures.reach import check_reach
 from equipix.frames import FrameStatistics
+from equipix.mosaic import Filters, mean_signal
 from equipix.noise import NoiseModel
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -42,10 +44,17 @@ def exposures_of(
     shift_std: ArrayLike | None = None,
     offset: bool = False,
     dark_variance: ArrayLike | None = None,
+    cfa: ArrayLike | Colours | None = None,
 ) -> Exposures:
     """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
-        measured = measured_of(frames, variance, saturation)
+        colours = Colours.of(cfa)
+        measured = measured_of(
+            frames,
+            variance,
+            saturation,
+            seen=lambda values: Filters.of(colours, mean_signal(values)),
+        )
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
         positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
@@ -67,7 +76,7 @@ def exposures_of(
             unsteady=measured.unsteady,
         )
         refuse_nothing(exposures, given)
-        return exposures
+        return exposures.behind(measured.filters)
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
@@ -106,6 +115,7 @@ class Measured(NamedTuple):
     clipped: Clipping | None = None
     raw: bool = False
     unsteady: str = ""
+    filters: Filters | None = None
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -120,12 +130,17 @@ def measured_of(
     saturation: float | None = None,
     *,
     words: Words = EXPOSURES,
+    seen: Callable[[Array], Filters | None] = lambda _: None,
 ) -> Measured:
-    """Check frames and what is known of their noise; `words` are what messages call them."""
+    """Check frames and what is known of their noise.
+
+    `words` are what messages call them; `seen` finds the colour filters that the values show.
+    """
     averaged = frames if isinstance(frames, Averaged) else _averaged(frames, words)
     if averaged is None:
-        return _of_arrays(cast("ArrayLike", frames), variance, saturation, words)
-    return _of_averaged(averaged, variance, saturation, words)
+        measured = _of_arrays(cast("ArrayLike", frames), variance, saturation, words)
+        return measured._replace(filters=seen(measured.values))
+    return _of_averaged(averaged, variance, saturation, words, seen(averaged.values))
 
 
 def _of_averaged(
@@ -133,6 +148,7 @@ def _of_averaged(
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
     saturation: float | None,
     words: Words,
+    filters: Filters | None,
 ) -> Measured:
     """Averaged frames: their noise model, or the variances that the caller gives."""
     if saturation is not None:
@@ -150,7 +166,7 @@ def _of_averaged(
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), averaged.values)
     model = noise if isinstance(noise, NoiseModel) else None
-    findings = averaged.findings(model)
+    findings = averaged.findings(model, filters)
     dark = averaged.dark
     return Measured(
         averaged.values,
@@ -163,6 +179,7 @@ def _of_averaged(
         averaged.clipped,
         averaged.raw,
         averaged.unsteady,
+        filters,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import as_shifts, check_shape, naming_memory
+from equipix.colour import Colours
 from equipix.errors import InputError, ShiftRoundingWarning, warn
 from equipix.exposures.front import as_mask
 from equipix.exposures.positions import as_rotation
@@ -35,6 +36,9 @@ class Identifiability:
         Number of measurements used.
     unknowns : int
         Number of pixels and beam cells that are measured. One in each component is the gauge.
+    by_colour : dict of str to int, or None
+        Of a sensor with a `cfa` the number of components of each colour where it stands alone, with
+        a beam of its own. None without a `cfa`.
     """
 
     components: int
@@ -42,10 +46,13 @@ class Identifiability:
     largest: int
     equations: int
     unknowns: int
+    by_colour: dict[str, int] | None = None
 
     def __repr__(self) -> str:
         """Short form: how many pixels are compared."""
         parts = "1 component" if self.components == 1 else f"{self.components} components"
+        if self.by_colour is not None:
+            parts += f" (each colour alone: {sum(self.by_colour.values())})"
         return (
             f"<Identifiability: {parts}, the largest of {self.largest} of {self.labels.size} "
             f"pixels; {self.equations} equations for {self.unknowns} unknowns>"
@@ -58,6 +65,7 @@ def identify(
     mask: ArrayLike | None = None,
     *,
     rotation: ArrayLike | None = None,
+    cfa: ArrayLike | None = None,
 ) -> Identifiability:
     """Find which pixels an experiment can compare, before it is made.
 
@@ -71,6 +79,9 @@ def identify(
         True = will not be used, in all exposures or in one.
     rotation : array_like of int, shape (n,), optional
         How far each exposure is turned, in degrees: 0, 90, 180 or 270; 0 unless given.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`. The components are those of one
+        beam for all colours; those of each colour alone are counted beside them.
 
     Returns
     -------
@@ -103,6 +114,8 @@ def identify(
     (1, 15360, 6928)
     >>> plan.identify((48, 64), cross_pattern(4, 6)).components
     4
+    >>> plan.identify((48, 64), cross_pattern(5, 7), cfa="RGGB").by_colour
+    {'R': 1, 'G': 1, 'B': 1}
     """
     sizes = check_shape(shape)
     exact = as_shifts(shifts)
@@ -118,17 +131,36 @@ def identify(
         )
     masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
     turns = as_rotation(rotation, len(whole))
+    colours = Colours.of(cfa)
     with naming_memory("identifying"):
         labels, counts, seen = _native.planned_components(
             sizes, whole, rotation=turns.tolist(), mask=masked
         )
+        alone = None if colours is None else _alone(colours, whole, turns, masked, sizes)
     return Identifiability(
         components=len(counts),
         labels=labels,
         largest=max(counts, default=0),
         equations=_equations(sizes, len(whole), masked),
         unknowns=sum(counts) + seen,
+        by_colour=alone,
     )
+
+
+def _alone(
+    colours: Colours,
+    positions: NDArray[np.int64],
+    turns: NDArray[np.int64],
+    masked: NDArray[np.bool_] | None,
+    shape: tuple[int, int],
+) -> dict[str, int]:
+    """Count the components of each colour where it alone is measured."""
+    found = {}
+    for label, plane in colours.planes(shape):
+        mask = ~plane if masked is None else masked | ~plane
+        parts = _native.planned_components(shape, positions, rotation=turns.tolist(), mask=mask)
+        found[label] = len(parts[1])
+    return found
 
 
 def _equations(shape: tuple[int, int], count: int, mask: NDArray[np.bool_] | None) -> int:
@@ -139,15 +171,25 @@ def _equations(shape: tuple[int, int], count: int, mask: NDArray[np.bool_] | Non
     return used if mask.ndim == 3 else count * used
 
 
-def is_connected(shape: tuple[int, int], positions: NDArray[np.int64]) -> bool:
+def is_connected(
+    shape: tuple[int, int], positions: NDArray[np.int64], colours: Colours | None = None
+) -> bool:
     """Whether whole shifts compare all pixels of a sensor, by a part of it three spans wide.
 
     A part that is connected by itself proves it: such parts cover the sensor, overlap, and stay
     connected. One that is not rejects patterns that only detours through a large sensor connect.
+    Of colours each must be connected by itself, too; parts that begin a period apart are alike.
     """
     spans = np.ptp(positions, axis=0).tolist()
-    rows, cols = (min(size, 3 * span + 8) for size, span in zip(shape, spans, strict=True))
+    periods = (1, 1) if colours is None else colours.period
+    sizes = zip(shape, spans, periods, strict=True)
+    rows, cols = (min(size, 3 * span + 8 * period) for size, span, period in sizes)
     corners = positions - positions.min(axis=0)
     turns = [0] * len(corners)
-    counts = _native.planned_components((rows, cols), corners, rotation=turns, mask=None)[1]
-    return counts == [rows * cols]
+    alone = [] if colours is None else [plane for _, plane in colours.planes((rows, cols))]
+    for plane in (np.ones((rows, cols), bool), *alone):
+        mask = None if plane.all() else ~plane
+        counts = _native.planned_components((rows, cols), corners, rotation=turns, mask=mask)[1]
+        if counts != [np.count_nonzero(plane)]:
+            return False
+    return True

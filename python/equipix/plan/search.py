@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix._check import as_array, check_progress, check_shape, positive_count
 from equipix._types import Floats, Progress
+from equipix.colour import Colours
 from equipix.drift import tilt_rms, tilt_std
 from equipix.errors import DriftWarning, InputError
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     Points = NDArray[np.int64]
+    Random = np.random.Generator
 
 _STARTS, _FINALISTS = 10, 6
 """Searches from different patterns, and how many of their ends get a full error budget."""
@@ -44,6 +46,11 @@ _PERIODS = 8
 
 _PERIODIC = 0.02
 """λ of such a wave at which the predicted variance by noise counts twice."""
+
+
+_PHASES, _MOVED, _ONE_STEP = 100, 0.5, 0.3
+"""Of a sensor with colours: patterns tried for a start, share of the positions moved within the
+period, and share of these that are moved by one pixel."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,12 +84,14 @@ def suggest(
     shift_error: float = 0,
     beam_width: float | None = None,
     patterns: int = 3,
+    cfa: ArrayLike | None = None,
     rng: int | np.random.Generator = 0,
     progress: Progress | None = None,
 ) -> list[Suggestion]:
     """Find patterns of shifts within the stage's travel, best first.
 
-    Every one compares all pixels, by the exact test of `identify`.
+    Every one compares all pixels, by the exact test of `identify`; with a `cfa` all pixels of each
+    colour where it stands alone.
 
     Parameters
     ----------
@@ -98,6 +107,9 @@ def suggest(
         tenth of the noise; for the order of the patterns only such ratios matter.
     patterns : int
         How many patterns to return, at most.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`: the patterns suffice for each
+        colour by itself, with a beam of its own.
     rng : numpy.random.Generator or int
         Source of the random numbers of the search, or its seed: the same one finds the same.
     progress : callable, optional
@@ -141,6 +153,8 @@ def suggest(
     check_progress(progress)
     report: Progress = progress or (lambda *_: None)
     random = np.random.default_rng(rng)
+    colours = Colours.of(cfa)
+    period = 1 if colours is None else np.array(colours.period)
     check_causes(sizes, noise, drift or 0, shift_error, beam_width)
     lamp = noise / 10 if drift is None else drift
     score = _Score(sizes, travel, noise, lamp)
@@ -153,12 +167,14 @@ def suggest(
         counts = range(exposures, exposures + 1)
     found: list[Points] = []
     for count in counts:
-        starts = _starts(count, travel, random)
+        starts = _starts(count, travel // period, random)
+        if colours is not None:
+            starts = [_coloured(start, sizes, travel, colours, random) for start in starts]
         stage = f"searching {count} positions"
         ends = []
         for done, start in enumerate(starts):
             report(done, len(starts), stage)
-            ends.append(_improved(start, sizes, travel, score, random))
+            ends.append(_improved(start, sizes, travel, score, random, colours))
         report(len(starts), len(starts), stage)
         found = _distinct([end for end in ends if end is not None], score)
         if found:
@@ -166,7 +182,8 @@ def suggest(
     if not found:
         raise InputError(
             f"'max_shift' is {travel.tolist()}: no pattern of {exposures or 'two to five'} "
-            "exposures within it was found that compares every pixel; allow more of either"
+            "exposures within it was found that compares every pixel"
+            f"{'' if colours is None else ' of each colour alone'}; allow more of either"
         )
     suggestions = []
     with warnings.catch_warnings():
@@ -284,19 +301,45 @@ def _starts(count: int, travel: Points, rng: np.random.Generator) -> list[Points
     return starts
 
 
+def _coloured(
+    start: Points, shape: tuple[int, int], travel: Points, colours: Colours, rng: Random
+) -> Points:
+    """Stretch a pattern to whole periods, and move positions until pixels of all colours meet.
+
+    Positions whole periods apart compare equal places of the period alone. What lies between two
+    places of one colour is therefore added to some of them.
+    """
+    once = colours.numbers(colours.period)
+    cells = [np.argwhere(once == label) for label in range(len(colours.labels))]
+    apart = np.concatenate([(each[:, None] - each).reshape(-1, 2) for each in cells])
+    whole = start * colours.period
+    points = np.minimum(whole, travel)
+    for _ in range(_PHASES):
+        if is_connected(shape, points, colours):
+            break
+        steps = apart[rng.integers(len(apart), size=len(whole))]
+        steps[rng.random(len(whole)) < _ONE_STEP] = rng.integers(0, 2, 2)
+        points = np.clip(whole + steps * (rng.random((len(whole), 1)) < _MOVED), 0, travel)
+    return np.asarray(points)
+
+
 def _improved(
     points: Points,
     shape: tuple[int, int],
     travel: Points,
     score: _Score,
     rng: np.random.Generator,
+    colours: Colours | None = None,
 ) -> Points | None:
     """Move positions one by one while the error decreases; None if no pattern is connected."""
-    best = _whole_score(points, score) if is_connected(shape, points) else np.inf
+    best = _whole_score(points, score) if is_connected(shape, points, colours) else np.inf
+    period = 1 if colours is None else np.array(colours.period)
     unmoved, k = 0, 0
     while unmoved < 2 * len(points):
         others = np.delete(points, k, axis=0)
         places = _places(points[k], travel, rng)
+        # A move by whole periods keeps what each colour has in common with the other positions.
+        places = points[k] + (places - points[k]) // period * period
         scores = score(others, places)
         unmoved += 1
         for place in np.argsort(scores, kind="stable")[:_TRIED]:
@@ -304,7 +347,7 @@ def _improved(
                 break
             moved = points.copy()
             moved[k] = places[place]
-            if is_connected(shape, moved):
+            if is_connected(shape, moved, colours):
                 points, best, unmoved = moved, scores[place], 0
                 break
         k = (k + 1) % len(points)

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, as_shifts
+from equipix.colour import Colours
 from equipix.errors import InputError
 from equipix.io import as_path
 from equipix.rounding import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.camera import Camera
-from equipix.simulate.signal import Beam, window
+from equipix.simulate.signal import Beam, filtered, window
 from equipix.simulate.store import Recording, Stream, write_experiment
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Truth:
     Attributes
     ----------
     sensitivity : ndarray, shape (rows, cols), float64
-        Relative sensitivity, that of the dead pixels included.
+        Relative sensitivity, that of the dead pixels and the responses of colours included.
     shifts : ndarray, shape (n, 2), float64
         Where the stage really was: (row, col) in pixels.
     dead, hot : ndarray of int64
@@ -87,6 +88,8 @@ class VirtualExperiment:
         Numbers of frames: of an exposure, of the dark, of an image of the hole.
     entropy : int
         Seed of all frames.
+    cfa : Colours or None
+        Colour filters of the camera.
     """
 
     camera: Camera
@@ -97,6 +100,7 @@ class VirtualExperiment:
     dark_count: int
     aperture_count: int
     entropy: int
+    cfa: Colours | None = None
 
     @property
     def truth(self) -> Truth:
@@ -224,6 +228,7 @@ class VirtualExperiment:
                 for k in each[1:]
             ],
             truth=vars(self.truth),
+            cfa=None if self.cfa is None else str(self.cfa),
         )
 
 
@@ -242,6 +247,7 @@ def experiment(
     dead: int = 4,
     hot: int = 4,
     stage_error: float = 0.002,
+    cfa: ArrayLike | None = None,
     rng: Rng,
 ) -> VirtualExperiment:
     """Prepare a shift-calibration experiment with a virtual camera on a stage.
@@ -270,6 +276,9 @@ def experiment(
     stage_error : float
         Standard deviation of the error of each move, along each axis, in pixels; the errors add
         up along the way.
+    cfa : str or array_like of labels, optional
+        Colour filters of the camera, of letters R, G and B: `filtered` is applied to
+        `sensitivity`, and the manifest names the pattern.
     rng : numpy.random.Generator or int
         Source of the random numbers, or its seed.
 
@@ -300,10 +309,10 @@ def experiment(
             raise InputError(f"'{name}' is {number}, expected 1 or more")
     if dead < 0 or hot < 0 or dead + hot > size:
         raise InputError(f"{dead} dead and {hot} hot pixels do not fit {size} pixels")
-    full_scale = 2**bit_depth - 1
+    full_scale, colours = 2**bit_depth - 1, Colours.of(cfa)
     bad = rng.choice(size, dead + hot, replace=False)
     camera = Camera(
-        sensitivity=sensitivity,
+        sensitivity=sensitivity if colours is None else filtered(sensitivity, colours.pattern),
         dark=full_scale * rng.normal(DARK_LEVEL, DARK_SPREAD, np.shape(sensitivity)),
         gain_dn_per_e=full_scale / FULL_SCALE_E if gain_dn_per_e is None else gain_dn_per_e,
         read_noise_e=read_noise_e,
@@ -325,6 +334,7 @@ def experiment(
         dark_count=dark_frames,
         aperture_count=aperture_frames,
         entropy=int(rng.integers(2**63)),
+        cfa=colours,
     )
 
 

@@ -13,12 +13,18 @@ import numpy as np
 
 from equipix._check import as_array, as_shifts
 from equipix._types import Floats, Rng
+from equipix.colour import Colours
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
 Beam: TypeAlias = "Callable[[Floats, Floats], Floats]"
+
+COLOUR_RESPONSE = {"R": 0.35, "G": 1.0, "B": 0.45}
+"""Responses of the colours of a camera to a halogen lamp, over that of green."""
 
 
 def paper_sensitivity(shape: tuple[int, int], *, spread: float = 0.05, rng: Rng) -> Floats:
@@ -76,6 +82,47 @@ def cosine_sensitivity(
     u, v = (np.linspace(-0.5, 0.5, size) for size in shape)
     large_scale = 1 + amplitude * np.cos(2 * u)[:, None] * np.cos(3 * v + 1)
     return paper_sensitivity(shape, spread=spread, rng=rng) * large_scale
+
+
+def filtered(
+    sensitivity: ArrayLike, cfa: ArrayLike, *, response: Mapping[str, float] | None = None
+) -> Floats:
+    """Sensitivity of a sensor behind colour filters.
+
+    Parameters
+    ----------
+    sensitivity : array_like, shape (rows, cols)
+        Relative sensitivity of the pixels without their filters.
+    cfa : str or array_like of labels
+        Colour filters of the pixels, as for `equipix.calibrate`.
+    response : mapping of str to float, optional
+        Response of each colour to the light; R 0.35, G 1 and B 0.45 unless given.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols), float64
+        The sensitivity times the response of the pixel's colour.
+
+    Raises
+    ------
+    InputError
+        If `cfa` is no pattern, or a colour of it has no response.
+
+    Examples
+    --------
+    >>> from equipix import simulate
+    >>> simulate.filtered([[1, 1, 1], [1, 1, 1]], "RGGB")
+    array([[0.35, 1.  , 0.35],
+           [1.  , 0.45, 1.  ]])
+    """
+    plain = as_array("sensitivity", sensitivity, ndim=2)
+    colours, known = Colours.of(cfa), COLOUR_RESPONSE if response is None else response
+    if colours is None:
+        raise InputError("'cfa' is None, expected a pattern such as 'RGGB'")
+    missing = [label for label in colours.labels if label not in known]
+    if missing:
+        raise InputError(f"'response' has no value for the colours {missing} of 'cfa'")
+    return np.asarray(plain * colours.map_of(known, plain.shape), np.float64)
 
 
 def gaussian_beam(

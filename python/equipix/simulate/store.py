@@ -52,6 +52,8 @@ class Recording:
         Images of the hole before and after each move, from the first exposure on.
     truth : dict
         What a calibration should find, by name.
+    cfa : str or None
+        Colour filters of the camera.
     """
 
     bit_depth: int
@@ -60,6 +62,7 @@ class Recording:
     exposures: list[Stream]
     moves: list[tuple[Stream, Stream]]
     truth: dict[str, Any]
+    cfa: str | None = None
 
 
 def write_experiment(
@@ -100,6 +103,7 @@ def _manifest(recording: Recording) -> str:
         "[sensor]",
         'name = "virtual"',
         f"bit_depth = {recording.bit_depth}",
+        *([] if recording.cfa is None else [f'cfa = "{recording.cfa}"']),
         "",
         "[dark]",
         'frames = "dark/dark.tif"',

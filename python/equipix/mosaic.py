@@ -1,0 +1,218 @@
+"""Colour filters as values show them: the responses of colours, and patterns nobody has named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from string import ascii_uppercase
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import numpy as np
+
+from equipix.colour import LARGEST_PERIOD, Colours
+from equipix.maps import BLOCK, block_means
+from equipix.noise import MEDIAN_SQUARE
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from equipix._types import Array, Floats
+
+_SAMPLED = 128
+"""Rows and columns in the middle of the sensor in which a pattern is looked for."""
+
+_FEWEST = 16
+"""Least number of pixels in each place of the period."""
+
+_LEFT = 2.0
+"""Variance that a pattern of a shorter period may leave, over that which the best one leaves."""
+
+_ROUNDING = 1e-6
+"""Relative scatter of an image without noise."""
+
+_SIGMAS = 6.0
+"""Standard errors that noise does not reach."""
+
+_APART = 0.05
+"""Share of the range of responses that divides two colours."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Colours of the pixels and how they respond to the light of a measurement.
+
+    Attributes
+    ----------
+    colours : Colours
+        The pattern.
+    response : dict of str to float
+        Response of each colour; the mean over the pixels is 1.
+    given : bool
+        Whether the caller named the pattern, or the values alone show it.
+    """
+
+    colours: Colours
+    response: dict[str, float]
+    given: bool = True
+
+    @classmethod
+    def of(cls, colours: Colours | None, image: Array) -> Filters | None:
+        """Filters of a sensor by an image (rows, cols) of light without structure of few pixels.
+
+        Where no colours are given those that stand out of the image; None where none do.
+        """
+        found = pattern_of(image) if colours is None else colours
+        return None if found is None else cls(found, responses(found, image), colours is not None)
+
+    @property
+    def words(self) -> str:
+        """Name a pattern that the values alone show, and what to write."""
+        rows, cols = self.colours.period
+        if min(rows, cols) == 1:
+            axis, period = ("columns", cols) if rows == 1 else ("rows", rows)
+            return (
+                f"the response repeats every {period} {axis} by {self.spread:.0%}, as channels of "
+                "the read-out have it, not colours. No pixel is flagged for it; see whether the "
+                "gains of the channels are adjusted"
+            )
+        named = _bayer(self.colours)
+        write = " or ".join(f"cfa={each!r}" for each in named or [str(self.colours)])
+        known = ", whichever the data sheet names" if named else ""
+        return (
+            f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
+            f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
+            f"the colours, and a corrected frame loses its white balance: write {write}{known}"
+        )
+
+    @property
+    def spread(self) -> float:
+        """Largest over smallest response, less 1."""
+        return max(self.response.values()) / min(self.response.values()) - 1
+
+    def map_of(self, shape: tuple[int, ...]) -> Floats:
+        """Return a map (rows, cols) of the response of each pixel's colour."""
+        return self.colours.map_of(self.response, shape)
+
+
+def mean_signal(values: Array) -> Floats:
+    """Mean (rows, cols) over the frames (n, rows, cols) that have a finite value; else NaN."""
+    total, count = np.zeros(values.shape[1:]), np.zeros(values.shape[1:])
+    for each in values:
+        known = np.isfinite(each)
+        np.add(total, each, out=total, where=known)
+        count += known
+    return np.asarray(np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan)))
+
+
+def responses(colours: Colours, image: Array) -> dict[str, float]:
+    """Response of each colour, of mean 1 over the pixels: ratios within blocks, their median.
+
+    A colour without a pixel to measure, or without light, counts as 1.
+    """
+    size = min(BLOCK, *image.shape)
+    planes = dict(colours.planes(image.shape))
+    means = np.array([block_means(np.where(each, image, np.nan), size) for each in planes.values()])
+    share = np.array([each.mean() for each in planes.values()])[:, None, None]
+    known = np.isfinite(means)
+    weights = np.where(known, share, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = means * weights.sum(axis=0) / np.sum(weights * np.where(known, means, 0), axis=0)
+    found = {}
+    for label, ratio in zip(planes, ratios, strict=True):
+        finite = ratio[np.isfinite(ratio)]
+        median = float(np.median(finite)) if finite.size else 1.0
+        found[label] = median if median > 0 else 1.0
+    mean = sum(
+        found[label] * float(part) for label, part in zip(planes, share.ravel(), strict=True)
+    )
+    return {label: value / mean for label, value in found.items()}
+
+
+def pattern_of(image: Array) -> Colours | None:
+    """Find a pattern of period 2 to 8 that stands out of an image; None where none does.
+
+    The variance between the places of the period must exceed that of the pixels within a place: a
+    smaller pattern flags nothing. Of periods that explain as much the shortest is taken.
+    """
+    part, corner = _levelled(image)
+    steps = range(1, LARGEST_PERIOD + 1)
+    periods = [*product(steps, steps)][1:]
+    places = {period: found for period in periods if (found := _Places.of(part, period))}
+    left = {period: 1 / (1 + found.ratio) for period, found in places.items()}
+    least = min(left.values(), default=1.0)
+    if not least < 0.5:
+        return None
+    close = [period for period, rest in left.items() if rest <= _LEFT * least]
+    period = min(close, key=lambda each: each[0] * each[1])
+    turned = [at % step for at, step in zip(corner, period, strict=True)]
+    return places[period].labelled(turned)
+
+
+def _levelled(image: Array) -> tuple[Floats, tuple[int, int]]:
+    """The middle of an image over its means of blocks, and where it begins."""
+    size = min(BLOCK, *image.shape)
+    sizes = [min(_SAMPLED, each) // size * size for each in image.shape]
+    row, col = ((each - part) // 2 for each, part in zip(image.shape, sizes, strict=True))
+    part = np.asarray(image[row : row + sizes[0], col : col + sizes[1]], np.float64)
+    usual = block_means(part, size).repeat(size, axis=0).repeat(size, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(usual > 0, part / usual, np.nan), (row, col)
+
+
+class _Places(NamedTuple):
+    """Medians (rows, cols) of the places of a period, and the scatter about them."""
+
+    medians: Floats
+    scatter: float
+    error: float
+
+    @classmethod
+    def of(cls, image: Floats, period: tuple[int, int]) -> Self | None:
+        """Take them from an image; None where pixels are few."""
+        down, right = period
+        rows, cols = image.shape[0] // down, image.shape[1] // right
+        if rows * cols < _FEWEST:
+            return None
+        cut = image[: rows * down, : cols * right].reshape(rows, down, cols, right)
+        stack = cut.transpose(1, 3, 0, 2).reshape(down, right, -1)
+        known = np.isfinite(stack)
+        if known.sum(axis=2).min() < _FEWEST:
+            return None
+        medians = np.nanmedian(stack, axis=2)
+        away = np.nanmedian(np.abs(stack - medians[..., None]), axis=2)
+        scatter = float(np.sqrt(np.mean(away**2) / MEDIAN_SQUARE))
+        # The variance of a median of N normal values is π/2 of that of their mean.
+        return cls(medians, scatter, scatter * float(np.pi / 2 / known.sum(axis=2).min()) ** 0.5)
+
+    @property
+    def ratio(self) -> float:
+        """Variance between the places over that within them."""
+        between = max(float(self.medians.var()) - self.error**2, 0.0)
+        return between / max(self.scatter**2, _ROUNDING**2)
+
+    def labelled(self, turned: Sequence[int]) -> Colours:
+        """Give places of about one response one letter, counted from pixel (0, 0)."""
+        once = np.roll(self.medians, turned, (0, 1))
+        values = np.sort(once.ravel())
+        steps = np.diff(values) > max(_APART * (values[-1] - values[0]), _SIGMAS * self.error)
+        numbers = np.searchsorted(values[1:][steps], once, side="right")
+        rows, cols = (_shortest(numbers, axis) for axis in (0, 1))
+        once = numbers[:rows, :cols].tolist()
+        return Colours(tuple(tuple(ascii_uppercase[k] for k in row) for row in once))
+
+
+def _shortest(numbers: Array, axis: int) -> int:
+    """Shortest period of a pattern along an axis, which divides that one given."""
+    size = numbers.shape[axis]
+    steps = (step for step in range(1, size) if size % step == 0)
+    return next((s for s in steps if np.array_equal(np.roll(numbers, s, axis), numbers)), size)
+
+
+def _bayer(colours: Colours) -> list[str]:
+    """The two orders of Bayer's pattern that have such a diagonal; none of another pattern."""
+    if colours.period != (2, 2):
+        return []
+    (a, b), (c, d) = colours.pattern
+    if b == c and b not in (a, d):
+        return ["RGGB", "BGGR"]
+    return ["GRBG", "GBRG"] if a == d and a not in (b, c) else []
