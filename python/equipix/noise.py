@@ -259,6 +259,7 @@ def photon_transfer(
     frames: int,
     step: float = 0.0,
     common: NDArray[Any] | None = None,
+    period: tuple[int, int] = (1, 1),
 ) -> NDArray[Any]:
     """Give the points of the photon-transfer curve that one exposure contributes.
 
@@ -277,6 +278,9 @@ def photon_transfer(
         Step between the values of frames, in DN; 0 if they are not rounded.
     common : ndarray, shape (rows, cols), optional
         Part of the variance that is no noise but that of the light, in DN².
+    period : tuple of int
+        Rows and columns after which a pattern of colour filters repeats: neighbours are those of
+        one place in it.
 
     Returns
     -------
@@ -294,7 +298,7 @@ def photon_transfer(
     if frames < 2:
         return np.empty((0, 3))
     pixels = np.flatnonzero(usable)
-    order = np.argsort(_of_neighbours(signal, usable).ravel()[pixels], kind="stable")
+    order = np.argsort(_of_neighbours(signal, usable, period).ravel()[pixels], kind="stable")
     limit = scatter_limit(frames)
     points = []
     bins = min(_BINS, max(1, len(pixels) // _FEWEST))
@@ -316,18 +320,21 @@ def _without_light(points: NDArray[Any]) -> NDArray[Any]:
     return np.stack([signal, variance - light, left**2 * degrees], axis=1)
 
 
-def _of_neighbours(image: NDArray[Any], usable: NDArray[Any]) -> NDArray[Any]:
+def _of_neighbours(
+    image: NDArray[Any], usable: NDArray[Any], period: tuple[int, int]
+) -> NDArray[Any]:
     """Mean of the usable ones of the eight neighbours of each pixel; NaN where there is none."""
-    sums = _around(np.where(usable, image, 0.0))
+    sums = _around(np.where(usable, image, 0.0), period)
     with np.errstate(invalid="ignore"):
-        return np.asarray(sums / _around(usable.astype(np.float64)))
+        return np.asarray(sums / _around(usable.astype(np.float64), period))
 
 
-def _around(image: NDArray[Any]) -> NDArray[Any]:
-    """Sum over the eight neighbours of each pixel."""
-    padded = np.pad(image, 1)
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] - image)
+def _around(image: NDArray[Any], period: tuple[int, int]) -> NDArray[Any]:
+    """Sum over the eight neighbours of each pixel, a period away."""
+    down, right = period
+    padded = np.pad(image, ((down, down), (right, right)))
+    rows = padded[: -2 * down] + padded[down:-down] + padded[2 * down :]
+    return np.asarray(rows[:, : -2 * right] + rows[:, right:-right] + rows[:, 2 * right :] - image)
 
 
 def modelled_variances(

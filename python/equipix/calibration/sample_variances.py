@@ -76,11 +76,12 @@ def steadied(
     if frames is None or variance is None or _explains_residuals(weighted, options.fit.workers):
         return weighted, None
     usable, number, response = exposures.usable(), max(2, round(frames)), exposures.response
+    period = (1, 1) if exposures.filters is None else exposures.filters.colours.period
     in_dn = (
         (y * response, v * response**2) for y, v in zip(exposures.values, variance, strict=True)
     )
     models = tuple(
-        NoiseModel.fit(photon_transfer(signal, each, usable[k], number))
+        NoiseModel.fit(photon_transfer(signal, each, usable[k], number, period=period))
         for k, (signal, each) in enumerate(in_dn)
     )
     exposures = dataclasses.replace(exposures, variance=None, noise=models)

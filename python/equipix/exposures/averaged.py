@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix.colour import planes_of
 from equipix.defects import (
     Findings,
     dead_pixels,
@@ -21,6 +22,7 @@ from equipix.errors import InputError
 from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
 from equipix.frames import same_statistics
 from equipix.light import NAMED, Light, light_of
+from equipix.mosaic import Filters, mean_signal, pattern_of
 from equipix.noise import NoiseModel, photon_transfer
 
 if TYPE_CHECKING:
@@ -30,8 +32,8 @@ if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
     from equipix._types import Array, Bools, Floats
+    from equipix.colour import Colours
     from equipix.frames import FrameStatistics
-    from equipix.mosaic import Filters
 
 
 class Words(NamedTuple):
@@ -65,6 +67,8 @@ class Averaged:
         What messages call that level.
     words : Words
         What messages call the frames.
+    colours : Colours, optional
+        Colour filters of the pixels; unless given those that stand out of the first frames.
 
     Attributes
     ----------
@@ -92,12 +96,14 @@ class Averaged:
         saturation: float | None = None,
         saturation_key: str = "saturation",
         words: Words = EXPOSURES,
+        colours: Colours | None = None,
     ) -> None:
-        self._words = words
+        self._words, self.colours = words, colours
+        self._period = (1, 1)
         self.count, self.gain, self.saturation = count, gain, saturation
         self._saturation_key = saturation_key
         self.dark: FrameStatistics | None = None
-        self.pedestal = 0.0
+        self.pedestal, self._is_counted = 0.0, False
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
         self._of_dark: list[float] = []
@@ -109,9 +115,15 @@ class Averaged:
         self.light: list[Light] = []
 
     @classmethod
-    def of(cls, frames: Sequence[FrameStatistics], *, words: Words = EXPOSURES) -> Self:
+    def of(
+        cls,
+        frames: Sequence[FrameStatistics],
+        *,
+        words: Words = EXPOSURES,
+        colours: Colours | None = None,
+    ) -> Self:
         """Reduce the statistics of all exposures."""
-        averaged = cls(len(frames), words=words)
+        averaged = cls(len(frames), words=words, colours=colours)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -133,6 +145,8 @@ class Averaged:
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
             self.dark = frames.dark
+            shown = pattern_of(frames.mean) if self.colours is None else self.colours
+            self._period = (1, 1) if shown is None else shown.period
             self.step = 0.0 if frames.dark is None else frames.dark.step
             if self.dark is not None:
                 self._screen(self.dark)
@@ -168,7 +182,9 @@ class Averaged:
         self.light.append(light)
         common = light.variance(frames.mean)
         self._points.append(
-            photon_transfer(frames.mean, frames.variance, free, count, frames.step, common)
+            photon_transfer(
+                frames.mean, frames.variance, free, count, frames.step, common, self._period
+            )
         )
 
     def _screen(self, frames: FrameStatistics) -> None:
@@ -186,9 +202,30 @@ class Averaged:
         Raw values contain the level without light, which adds no photon noise.
         """
         counted = copy.copy(self)
-        vars(counted).pop("noise", None)
-        counted.pedestal = min(float(np.nanmedian(values)) for values in self.values)
+        for known in ("noise", "filters"):
+            vars(counted).pop(known, None)
+        counted._is_counted = True
+        lowest = counted._lowest
+        counted.pedestal = float(np.nanmin(lowest))
         return counted
+
+    @cached_property
+    def filters(self) -> Filters | None:
+        """Colour filters of the pixels, where they are given or stand out of the values."""
+        shown = mean_signal(self.values)
+        if self._is_counted:
+            medians = [float(np.nanmedian(each)) for each in self.values]
+            shown = self.values[int(np.argmax(medians))] - self.values[int(np.argmin(medians))]
+        return Filters.of(self.colours, shown)
+
+    @property
+    def _lowest(self) -> Floats:
+        """Median of the lowest level in the colour of each pixel."""
+        shape = self.saturated.shape
+        lowest = np.empty(shape)
+        for plane in planes_of(None if self.filters is None else self.filters.colours, shape):
+            lowest[plane] = min(float(np.nanmedian(each[plane])) for each in self.values)
+        return lowest
 
     @cached_property
     def noise(self) -> NoiseModel | None:
@@ -248,7 +285,7 @@ class Averaged:
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
-    def findings(self, noise: NoiseModel | None, filters: Filters | None = None) -> Findings:
+    def findings(self, noise: NoiseModel | None) -> Findings:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
@@ -262,25 +299,25 @@ class Averaged:
             hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
         dead = None
         if noise is not None or self.dark is not None:
-            dead = self._dead(noise, filters) & ~hot
+            dead = self._dead(noise) & ~hot
         return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
     def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
         saturates = frames.saturated > 0
         refuse_saturated(which, frames.mean, saturates, self.saturation, self._saturation_key)
 
-    def _dead(self, noise: NoiseModel | None, filters: Filters | None) -> Bools:
+    def _dead(self, noise: NoiseModel | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""
         models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
-        usual = 1.0 if filters is None else filters.map_of(self.saturated.shape)
+        usual = 1.0 if self.filters is None else self.filters.map_of(self.saturated.shape)
         dead: Bools = dead_pixels(self._signals, models, usual) & measured
         return dead
 
     @property
     def _signals(self) -> Array:
-        """Values above the pedestal."""
-        return self.values - self.pedestal if self.pedestal else self.values
+        """Values above the level without light, as far as it is known."""
+        return self.values - self._lowest if self._is_counted else self.values
 
     def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
         """Noise model of each mean frame less the dark, for one exposure by itself."""

@@ -23,7 +23,7 @@ from equipix.mosaic import Filters, mean_signal
 from equipix.noise import NoiseModel
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import ArrayLike
 
@@ -48,13 +48,7 @@ def exposures_of(
 ) -> Exposures:
     """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
     with naming_memory("calibrating"):
-        colours = Colours.of(cfa)
-        measured = measured_of(
-            frames,
-            variance,
-            saturation,
-            seen=lambda values: Filters.of(colours, mean_signal(values)),
-        )
+        measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
         count = len(measured.values)
         given = None if mask is None else as_mask(mask, measured.values.shape)
         positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
@@ -130,17 +124,17 @@ def measured_of(
     saturation: float | None = None,
     *,
     words: Words = EXPOSURES,
-    seen: Callable[[Array], Filters | None] = lambda _: None,
+    colours: Colours | None = None,
 ) -> Measured:
     """Check frames and what is known of their noise.
 
-    `words` are what messages call them; `seen` finds the colour filters that the values show.
+    `words` are what messages call them, `colours` the filters of arrays or `FrameStatistics`.
     """
-    averaged = frames if isinstance(frames, Averaged) else _averaged(frames, words)
+    averaged = frames if isinstance(frames, Averaged) else _averaged(frames, words, colours)
     if averaged is None:
         measured = _of_arrays(cast("ArrayLike", frames), variance, saturation, words)
-        return measured._replace(filters=seen(measured.values))
-    return _of_averaged(averaged, variance, saturation, words, seen(averaged.values))
+        return measured._replace(filters=Filters.of(colours, mean_signal(measured.values)))
+    return _of_averaged(averaged, variance, saturation, words)
 
 
 def _of_averaged(
@@ -148,7 +142,6 @@ def _of_averaged(
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
     saturation: float | None,
     words: Words,
-    filters: Filters | None,
 ) -> Measured:
     """Averaged frames: their noise model, or the variances that the caller gives."""
     if saturation is not None:
@@ -166,7 +159,7 @@ def _of_averaged(
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), averaged.values)
     model = noise if isinstance(noise, NoiseModel) else None
-    findings = averaged.findings(model, filters)
+    findings = averaged.findings(model)
     dark = averaged.dark
     return Measured(
         averaged.values,
@@ -179,7 +172,7 @@ def _of_averaged(
         averaged.clipped,
         averaged.raw,
         averaged.unsteady,
-        filters,
+        averaged.filters,
     )
 
 
@@ -231,14 +224,14 @@ def _dtype(frames: object) -> np.dtype[Any] | None:
     return dtypes.pop() if len(dtypes) == 1 else None
 
 
-def _averaged(frames: object, words: Words) -> Averaged | None:
+def _averaged(frames: object, words: Words, colours: Colours | None) -> Averaged | None:
     """Statistics of all exposures, reduced; None for arrays."""
     if not isinstance(frames, list | tuple):
         return None
     statistics = [each for each in frames if isinstance(each, FrameStatistics)]
     if statistics and len(statistics) != len(frames):
         raise InputError(f"{words.argument} mixes FrameStatistics and arrays, expected either")
-    return Averaged.of(statistics, words=words) if statistics else None
+    return Averaged.of(statistics, words=words, colours=colours) if statistics else None
 
 
 def as_models(variance: object, count: int) -> list[NoiseModel]:

@@ -136,7 +136,7 @@ def find_defects(
         misfit = common_misfit(response)
         found = of_response(response, limits, misfit)
         if frames is not None:
-            found |= of_frames(frames, usable(response.flags), limits)
+            found |= of_frames(frames, usable(response.flags), limits, response.cfa)
     flags = response.flags.copy()
     for kind, pixels in found.items():
         set_bits(flags, kind, pixels)

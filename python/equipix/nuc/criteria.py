@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.colour import planes_of
 from equipix.defects import noisy_pixels, often_rejected, response_outliers
 from equipix.errors import InputError
 from equipix.frames import FrameStatistics
 from equipix.light import Light, light_of
 from equipix.metrics.moments import stack_of, temporal_of, warn_of_drift
+from equipix.mosaic import Filters
 from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
 from equipix.nuc.curve import response_at
 from equipix.rounding import step_of
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from equipix._types import Array, Bools, Floats
+    from equipix.colour import Colours
     from equipix.nuc.limits import DefectLimits
     from equipix.nuc.response import Response
 
@@ -45,7 +48,7 @@ def of_response(response: Response, limits: DefectLimits, misfit: float) -> dict
     slope = mean_slope(response)
     known = np.isfinite(slope)
     low, high = response.limits
-    whole = float(response.levels.max() - response.levels.min())
+    whole = _range(response)
     found = {
         "dead": _dead(response, slope, limits.response),
         "non_responding": slope * limits.gain < 1,
@@ -56,8 +59,22 @@ def of_response(response: Response, limits: DefectLimits, misfit: float) -> dict
     return found
 
 
+def _range(response: Response) -> Floats:
+    """Range of the levels, in which those of a colour are its own."""
+    low, high = response.limits
+    whole = np.zeros(response.shape)
+    for plane in planes_of(response.cfa, response.shape):
+        known = plane & np.isfinite(high - low)
+        if known.any():
+            whole[plane] = high[known].max() - low[known].min()
+    return whole
+
+
 def of_frames(
-    frames: ArrayLike | FrameStatistics, good: Bools, limits: DefectLimits
+    frames: ArrayLike | FrameStatistics,
+    good: Bools,
+    limits: DefectLimits,
+    cfa: Colours | None = None,
 ) -> dict[str, Bools]:
     """Bad pixels by their noise; `good` are those whose curves are usable."""
     slow, light = None, Light()
@@ -76,7 +93,8 @@ def of_frames(
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
     common = light.variance(mean)
-    model = _common_noise(mean, variance, good, count, step, common)
+    period = (1, 1) if cfa is None else cfa.period
+    model = _common_noise(mean, variance, good, count, step, common, period)
     noisy = flickering = np.zeros(good.shape, bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
@@ -101,6 +119,11 @@ def _dead(response: Response, slope: Floats, least: float) -> Bools:
         return np.zeros(slope.shape, bool)
     # Of a line; that of a higher order at 0, which is larger than that of the mean slope.
     std = np.sqrt(np.nan_to_num(response.variances[1]))
+    # With a `cfa` slopes are those over the mean of a colour; else a pattern may stand out of them.
+    filters = None if response.cfa is not None else Filters.of(None, slope)
+    if filters is not None:
+        usual = filters.map_of(slope.shape)
+        slope, std = slope / usual, std / usual
     return response_outliers(slope, lambda: std, least=least)[0]
 
 
@@ -115,13 +138,19 @@ def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
 
 
 def _common_noise(
-    mean: Array, variance: Array, good: Bools, count: int, step: float, light: Array
+    mean: Array,
+    variance: Array,
+    good: Bools,
+    count: int,
+    step: float,
+    light: Array,
+    period: tuple[int, int],
 ) -> NoiseModel | None:
     """Noise that pixels of a signal have in common; None of equal frames that are not rounded."""
     known = good & np.isfinite(mean) & np.isfinite(variance)
     if not known.any():
         known = np.isfinite(mean) & np.isfinite(variance)
-    points = photon_transfer(mean, variance, known, count, step, light)
+    points = photon_transfer(mean, variance, known, count, step, light, period)
     if not len(points):
         raise InputError("'frames' hold no value: they show no noise")
     if step == 0 and not points[:, 1].any():

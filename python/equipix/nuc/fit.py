@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array, By, Floats, Order
+    from equipix._types import Array, Bools, By, Floats, Order
     from equipix.exposures.averaged import Averaged
     from equipix.frames import FrameStatistics
     from equipix.noise import NoiseModel
@@ -44,6 +44,7 @@ def fit(
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
     mask: ArrayLike | None = None,
     saturation: float | None = None,
+    cfa: ArrayLike | None = None,
     workers: int | None = None,
 ) -> Response:
     r"""Fit the response curve of every pixel to levels of a uniform source.
@@ -68,6 +69,9 @@ def fit(
         True = do not use.
     saturation : float, optional
         Level of saturation of arrays, in DN; by default the largest value of a whole-number dtype.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`. Neighbours, and the mean V̄ of the
+        array, are then those of a colour, so that a corrected frame keeps its white balance.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result.
 
@@ -134,7 +138,7 @@ def fit(
     """
     check_order(order, by)
     with naming_memory("fitting response curves"):
-        given = levels_of(levels, variance=variance, mask=mask, saturation=saturation)
+        given = levels_of(levels, variance=variance, mask=mask, saturation=saturation, cfa=cfa)
     return fitted(given, order=order, by=by, workers=workers)
 
 
@@ -155,30 +159,55 @@ def fitted(
     workers = positive_workers(workers)
     with naming_memory("fitting response curves"):
         options: dict[str, Any] = {"order": order, "by": by}
+        parts = _parts(given)
         if order == "auto":
-            chosen, options["prediction_errors"] = chosen_order(given, by, workers=workers)
+            found = [chosen_order(part, by, workers=workers) for _, part in parts]
+            chosen, options["prediction_errors"] = max(found, key=lambda each: each[0])
         else:
             chosen = int(order)
-        check_count(given, chosen)
-        if chosen == 0 and by == "gain":
-            check_gain(given)
+        for _, part in parts:
+            check_count(part, chosen)
+            if chosen == 0 and by == "gain":
+                check_gain(part)
         options["weights"] = "equal" if given.noise is None else "variances"
         metadata = {
             "versions": {"equipix": _native.__version__, "numpy": np.__version__},
             "options": options,
             "started": started.isoformat(timespec="seconds"),
         }
-        response = _fitted(given, chosen, by, workers, metadata | (provenance or {}))
+        curves = [(pixels, _curves(part, chosen, by, workers)) for pixels, part in parts]
+        response = _response(given, _joined(curves), metadata | (provenance or {}))
         # One point is right at one level, whatever the others are; "auto" judged them all.
         if chosen > 0 or order == "auto":
             warn_of_misfit(response, common_misfit(response))
         return response
 
 
-def _fitted(
-    levels: Levels, order: int, by: By, workers: int | None, metadata: dict[str, Any]
-) -> Response:
-    """Fit one order and invert it."""
+def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:
+    """The levels of each colour, with a map of its pixels; all of them without colours."""
+    everywhere = np.ones(levels.usable.shape, bool)
+    if levels.cfa is None:
+        return [(everywhere, levels)]
+    planes = [plane for _, plane in levels.cfa.planes(everywhere.shape)]
+    return [(plane, levels.of_pixels(plane)) for plane in planes if levels.usable[plane].any()]
+
+
+def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
+    """Put the maps of each colour together; NaN, 0 or False where there is none."""
+    if len(parts) == 1 and parts[0][0].all():
+        return parts[0][1]
+    joined: dict[str, Array] = {}
+    shape = parts[0][0].shape
+    for name, first in parts[0][1].items():
+        nothing = np.nan if first.dtype.kind == "f" else 0
+        joined[name] = np.full((*first.shape[:-2], *shape), nothing, first.dtype)
+        for pixels, maps in parts:
+            joined[name][..., pixels] = maps[name][..., 0, :]
+    return joined
+
+
+def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str, Array]:
+    """Fit one order and invert it: maps by the names of `Response`, and where curves rise."""
     found = levels.fit(form_of(order, by), workers=workers)
     spare = len(levels) - (order + 1)
     cleaned = _of_alike_pixels(levels, found[2], spare) if order > 0 and spare > 0 else None
@@ -193,23 +222,34 @@ def _fitted(
     limits = levels.limits()
     rising = least_slope(deviation, limits) > 0
     inverse, difference = horner_inverse(np.where(rising, deviation, np.nan), limits)
+    return {
+        "deviation": deviation,
+        "variances": variances,
+        "inverse": inverse,
+        "inverse_error": difference,
+        "limits": limits,
+        "reduced_chi2": chi2,
+        "used": used,
+        "rising": rising,
+    }
+
+
+def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) -> Response:
+    """Make the result of the maps of `_curves`."""
     finished = datetime.now(UTC).isoformat(timespec="seconds")
-    flags = _flags(deviation, levels, rising)
-    metadata["inverse"] = inverse_verdict(difference[usable(flags)], levels.frame_noise)
+    flags = _flags(maps["deviation"], levels, maps.pop("rising"))
+    error = maps["inverse_error"][usable(flags)]
+    metadata["inverse"] = inverse_verdict(error, levels.frame_noise)
     return Response(
-        deviation=deviation,
-        variances=variances,
-        inverse=inverse,
-        inverse_error=difference,
-        limits=limits,
-        reduced_chi2=chi2,
-        used=used,
+        **maps,
         flags=flags,
         levels=levels.references,
         dark=levels.dark,
         raw=levels.raw,
         saturation=levels.saturation,
         metadata=metadata | {"finished": finished},
+        cfa=levels.cfa,
+        colour_response=levels.filters.response if levels.cfa and levels.filters else None,
     )
 
 

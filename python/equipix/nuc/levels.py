@@ -10,11 +10,13 @@ import numpy as np
 
 from equipix import _native
 from equipix._readonly import ReadOnly
+from equipix.colour import Colours
 from equipix.defects import SIGMAS, Findings, response_outliers
-from equipix.errors import BrightDarkWarning, DriftWarning, InputError, warn
+from equipix.errors import BrightDarkWarning, DriftWarning, InputError, MisfitWarning, warn
 from equipix.exposures.averaged import Averaged, Words
 from equipix.exposures.front import as_mask, measured_of, union
 from equipix.frames import FrameStatistics
+from equipix.mosaic import Filters
 from equipix.noise import MEDIAN_SQUARE, NoiseModel
 from equipix.nuc.arguments import check_levels, check_variance
 from equipix.nuc.saturation import check_saturation
@@ -77,6 +79,8 @@ class Levels(ReadOnly):
     frame_noise : float or None
         Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
         given; None if it is unknown.
+    filters : Filters or None
+        Colour filters of the pixels, where they are given or stand out of the levels.
     """
 
     values: Array
@@ -89,6 +93,31 @@ class Levels(ReadOnly):
     raw: bool = False
     saturation: float | None = None
     frame_noise: float | None = None
+    filters: Filters | None = None
+
+    @property
+    def cfa(self) -> Colours | None:
+        """The colour filters that were given."""
+        return self.filters.colours if self.filters is not None and self.filters.given else None
+
+    def of_pixels(self, pixels: Bools) -> Self:
+        """Return the levels of some pixels as one row of them, with references of their own."""
+
+        def chosen(image: Array | None) -> Array | None:
+            return None if image is None else image[pixels][None]
+
+        values = np.ascontiguousarray(self.values[:, pixels][:, None])
+        usable = self.usable[pixels][None]
+        return dataclasses.replace(
+            self,
+            values=values,
+            usable=usable,
+            references=_references(values, usable),
+            findings=Findings(dead=chosen(self.findings.dead)),
+            dark=chosen(self.dark),
+            dark_variance=chosen(self.dark_variance),
+            filters=None,
+        )
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -161,10 +190,12 @@ def levels_of(
     variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
     mask: ArrayLike | None = None,
     saturation: float | None = None,
+    cfa: ArrayLike | Colours | None = None,
 ) -> Levels:
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
     check_levels(levels)
-    averaged = _averaged(levels)
+    colours = Colours.of(cfa)
+    averaged = _averaged(levels, colours)
     if averaged is not None and averaged.raw and averaged.count > 1:
         averaged = averaged.counted_from_lowest()
     source = levels if averaged is None else averaged
@@ -178,7 +209,8 @@ def levels_of(
         warn(measured.unsteady, DriftWarning)
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
-    findings = _with_odd_responses(values, noise, measured.findings)
+    filters = _filters(values, colours if averaged is None else averaged.colours)
+    findings = _with_odd_responses(values, noise, measured.findings, filters)
     usable = _usable(values, findings, given)
     if measured.dark is not None:
         _warn_of_bright_dark(values, usable, noise, measured.dark_variance)
@@ -194,7 +226,21 @@ def levels_of(
         raw=measured.raw,
         saturation=_saturation_of(levels, saturation),
         frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
+        filters=filters,
     )
+
+
+def _filters(values: Array, colours: Colours | None) -> Filters | None:
+    """Colour filters as the rise from the lowest to the highest level shows them."""
+    known = np.isfinite(values).any(axis=(1, 2))
+    if not known.all():
+        return None if colours is None else Filters.of(colours, values[0])
+    medians = [float(np.nanmedian(each)) for each in values]
+    low, high = int(np.argmin(medians)), int(np.argmax(medians))
+    found = Filters.of(colours, values[high] - values[low] if high != low else values[0])
+    if found is not None and not found.given:
+        warn(found.words, MisfitWarning)
+    return found
 
 
 def _references(values: Array, usable: Bools) -> Floats:
@@ -231,7 +277,7 @@ def _saturation_of(levels: object, given: float | None) -> float | None:
     return known.pop() if len(known) == 1 else None
 
 
-def _averaged(levels: object) -> Averaged | None:
+def _averaged(levels: object, colours: Colours | None) -> Averaged | None:
     """Statistics of all levels, reduced; None for arrays."""
     if isinstance(levels, Averaged):
         return levels
@@ -239,7 +285,9 @@ def _averaged(levels: object) -> Averaged | None:
         return None
     if not all(isinstance(each, FrameStatistics) for each in levels):
         return None
-    averaged = Averaged(len(levels), saturation=_saturation_of(levels, None), words=_LEVELS)
+    averaged = Averaged(
+        len(levels), saturation=_saturation_of(levels, None), words=_LEVELS, colours=colours
+    )
     for each in levels:
         averaged.add(each)
     return averaged
@@ -274,7 +322,10 @@ def _used(measured: Measured, mask: Bools | None) -> Array:
 
 
 def _with_odd_responses(
-    values: Array, noise: tuple[LevelNoise, ...] | None, findings: Findings
+    values: Array,
+    noise: tuple[LevelNoise, ...] | None,
+    findings: Findings,
+    filters: Filters | None,
 ) -> Findings:
     """Add pixels that rise by less than half, or more than twice, as much as their neighbours."""
     if len(values) < 2 or not np.isfinite(values).any(axis=(1, 2)).all():
@@ -286,8 +337,10 @@ def _with_odd_responses(
     # A rise within the noise is refused later, with the number of levels that differ.
     if rise <= SIGMAS * np.sqrt(variance) or (not noise and rise <= _scatter(values, low, high)):
         return findings
-    response = (values[high] - values[low]) / rise
-    std = np.full(response.shape, np.sqrt(variance) / rise)
+    # Of a colour of less response the noise is that of the array, which is the larger one.
+    usual = rise if filters is None else rise * filters.map_of(values.shape[1:])
+    response = (values[high] - values[low]) / usual
+    std = np.broadcast_to(np.sqrt(variance) / usual, response.shape)
     dead, hot = response_outliers(response, lambda: std)
     return dataclasses.replace(
         findings, dead=union(findings.dead, dead), hot=union(findings.hot, hot)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from equipix._types import Array, Bools, Flagged, Floats
+    from equipix.colour import Colours
     from equipix.frames import FrameStatistics
 
 
@@ -49,7 +50,8 @@ class Response(ReadOnly):
     inverse_error : ndarray, shape (rows, cols), float64
         Largest difference of that cubic to the exact inverse over the valid range, in DN.
     limits : ndarray, shape (2, rows, cols), float64
-        Array's mean V̄ at the lowest and the highest level with a value of the pixel, in DN.
+        Array's mean V̄ at the lowest and the highest level with a value of the pixel, in DN; with a
+        `cfa` that of the pixel's colour, as in `deviation` and `inverse`.
     reduced_chi2 : ndarray, shape (rows, cols), float64
         Goodness of fit: mean square residual per degree of freedom, in units of the variance of a
         value; 1 on average where the noise is right. Where no noise was known, in DN². NaN with as
@@ -71,10 +73,15 @@ class Response(ReadOnly):
     metadata : dict
         Versions, options and times, as JSON values. With ``order="auto"`` the mean square error of
         prediction of each order.
+    cfa : Colours or None
+        Colour filters of the pixels, where they were given.
+    colour_response : dict of str to float, or None
+        Response of each colour to the source, of mean 1 over the pixels.
 
     Notes
     -----
-    The corrected value is the mean V̄ that the array has at the light that the pixel sees. K is
+    The corrected value is the mean V̄ that the array, or the pixel's colour, has at the light that
+    the pixel sees. K is
     small for a good pixel. A pixel with K = −1 does not respond, and 1/(1 + K) is without bound.
     """
 
@@ -91,6 +98,8 @@ class Response(ReadOnly):
     raw: bool = False
     saturation: float | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+    cfa: Colours | None = None
+    colour_response: dict[str, float] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

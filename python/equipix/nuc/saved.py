@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from equipix.colour import Colours
 from equipix.io import check_format, check_pages, save_pages
 
 if TYPE_CHECKING:
@@ -44,6 +45,9 @@ def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: 
         "saturation": fields["saturation"],
         "metadata": fields["metadata"],
     }
+    if fields["cfa"] is not None:
+        content["cfa"] = [list(row) for row in fields["cfa"].pattern]
+        content["colour_response"] = fields["colour_response"]
     save_pages(path, pages, content, force=force)
 
 
@@ -76,4 +80,6 @@ def read_fields(
         "raw": bool(content["raw"]),
         "saturation": None if level is None else float(level),
         "metadata": content["metadata"],
+        "cfa": Colours.of(content.get("cfa")),
+        "colour_response": content.get("colour_response"),
     }
