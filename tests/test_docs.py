@@ -37,6 +37,7 @@ PAGES = (
     "ARCHITECTURE.md",
     "CONTRIBUTING.md",
     "CHANGELOG.md",
+    "docs/colour.md",
     "docs/glossary.md",
     "docs/hardware.md",
     "docs/infrared.md",

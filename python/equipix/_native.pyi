@@ -84,6 +84,8 @@ class Corrector:
         unusable: NDArray[Any],
         flagged: str,
         levels: NDArray[Any] | None,
+        colours: NDArray[Any] | None,
+        reach: int,
     ) -> Corrector: ...
     def apply(
         self,

@@ -74,6 +74,11 @@ class Colours:
         return len(self.pattern), len(self.pattern[0])
 
     @property
+    def rows(self) -> list[list[str]]:
+        """The pattern as a JSON value, which `of` reads."""
+        return [list(row) for row in self.pattern]
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Each label once, in the order of reading."""
         return tuple(dict.fromkeys(label for row in self.pattern for label in row))

@@ -9,10 +9,12 @@ import numpy as np
 
 from equipix._check import as_array, check_shape, check_word, number
 from equipix._readonly import ReadOnly
+from equipix.colour import Colours
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.flags import set_bits
 from equipix.maps import block_means
+from equipix.mosaic import responses
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -154,6 +156,7 @@ def fit_falloff(
     law: Law = "cos4",
     sensitivity: ArrayLike | None = None,
     mask: ArrayLike | None = None,
+    cfa: ArrayLike | None = None,
 ) -> LensFalloff:
     """Fit the fall-off of a lens to a frame of a uniform scene.
 
@@ -170,6 +173,10 @@ def fit_falloff(
         Without it, the gain counts as noise about the law, and its large-scale part as fall-off.
     mask : array_like of bool, shape (rows, cols), optional
         True = do not use.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`: the flat is divided by the
+        response of each colour, so that all show one law. Not beside a `sensitivity` that contains
+        the responses.
 
     Returns
     -------
@@ -207,6 +214,9 @@ def fit_falloff(
     image = _image(flat, sensitivity, mask)
     _refuse_negative(image)
     shape = check_shape((image.shape[0], image.shape[1]))
+    colours = Colours.of(cfa)
+    if colours is not None:
+        image /= colours.map_of(responses(colours, image), shape)
     half = _half_diagonal(shape)
     rows, cols, values = _blocks(image)
     start = [0.5] if law == "cos4" else [-0.3, 0.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from itertools import product
 from string import ascii_uppercase
@@ -10,16 +11,19 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 
 from equipix.colour import LARGEST_PERIOD, Colours
-from equipix.maps import BLOCK, block_means
+from equipix.maps import BLOCK
 from equipix.noise import MEDIAN_SQUARE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from equipix._types import Array, Floats
+    from equipix._types import Array, Bools, Floats
 
 _SAMPLED = 128
 """Rows and columns in the middle of the sensor in which a pattern is looked for."""
+
+_MEASURED = 512
+"""Rows and columns in the middle of the sensor in which responses are measured."""
 
 _FEWEST = 16
 """Least number of pixels in each place of the period."""
@@ -94,11 +98,13 @@ class Filters:
         return self.colours.map_of(self.response, shape)
 
 
-def mean_signal(values: Array) -> Floats:
-    """Mean (rows, cols) over the frames (n, rows, cols) that have a finite value; else NaN."""
+def mean_signal(values: Array, mask: Bools | None = None) -> Floats:
+    """Mean (rows, cols) over the frames (n, rows, cols) that have a usable value; else NaN."""
     total, count = np.zeros(values.shape[1:]), np.zeros(values.shape[1:])
-    for each in values:
+    for k, each in enumerate(values):
         known = np.isfinite(each)
+        if mask is not None:
+            known &= ~(mask[k] if mask.ndim == 3 else mask)
         np.add(total, each, out=total, where=known)
         count += known
     return np.asarray(np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan)))
@@ -109,9 +115,12 @@ def responses(colours: Colours, image: Array) -> dict[str, float]:
 
     A colour without a pixel to measure, or without light, counts as 1.
     """
-    size = min(BLOCK, *image.shape)
-    planes = dict(colours.planes(image.shape))
-    means = np.array([block_means(np.where(each, image, np.nan), size) for each in planes.values()])
+    part, corner = _middle(image, _MEASURED)
+    planes = {
+        label: plane[tuple(slice(at, at + n) for at, n in zip(corner, part.shape, strict=True))]
+        for label, plane in colours.planes(image.shape)
+    }
+    means = np.array([_medians(np.where(each, part, np.nan)) for each in planes.values()])
     share = np.array([each.mean() for each in planes.values()])[:, None, None]
     known = np.isfinite(means)
     weights = np.where(known, share, 0)
@@ -149,14 +158,35 @@ def pattern_of(image: Array) -> Colours | None:
 
 
 def _levelled(image: Array) -> tuple[Floats, tuple[int, int]]:
-    """The middle of an image over its means of blocks, and where it begins."""
-    size = min(BLOCK, *image.shape)
-    sizes = [min(_SAMPLED, each) // size * size for each in image.shape]
+    """The middle of an image over medians of blocks, and where it begins."""
+    part, corner = _middle(image, _SAMPLED)
+    size = _size(part)
+    usual = _medians(part).repeat(size, axis=0).repeat(size, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(usual > 0, part / usual, np.nan), corner
+
+
+def _size(part: Array) -> int:
+    """Side of the blocks of an image."""
+    return int(min(BLOCK, *part.shape))
+
+
+def _middle(image: Array, most: int) -> tuple[Floats, tuple[int, int]]:
+    """The middle of an image, of whole blocks and at most so many pixels a side; its corner."""
+    size = _size(image)
+    sizes = [min(most, each) // size * size for each in image.shape]
     row, col = ((each - part) // 2 for each, part in zip(image.shape, sizes, strict=True))
     part = np.asarray(image[row : row + sizes[0], col : col + sizes[1]], np.float64)
-    usual = block_means(part, size).repeat(size, axis=0).repeat(size, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(usual > 0, part / usual, np.nan), (row, col)
+    return np.where(np.isfinite(part), part, np.nan), (row, col)
+
+
+def _medians(part: Floats) -> Floats:
+    """Medians of blocks, which single bad pixels do not move; NaN where there is no value."""
+    size = _size(part)
+    blocks = part.reshape(part.shape[0] // size, size, -1, size)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
+        return np.asarray(np.nanmedian(blocks, axis=(1, 3)))
 
 
 class _Places(NamedTuple):

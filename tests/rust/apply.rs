@@ -1,6 +1,6 @@
 //! Frames corrected by the kernel against the formula written out.
 
-use equipix_core::apply::{Corrected, Corrector, Counts, Raw, Unusable};
+use equipix_core::apply::{Alike, Corrected, Corrector, Counts, Raw, Unusable};
 use equipix_core::{Control, Shape, Stack, Workers};
 
 const SHAPE: Shape = Shape::new(37, 53);
@@ -23,8 +23,13 @@ fn corrector(planes: usize, bad: &[usize], then: Unusable) -> Corrector {
     let mut unusable = vec![false; SHAPE.len()];
     bad.iter().for_each(|&pixel| unusable[pixel] = true);
     let values = coefficients(planes);
-    Corrector::new(Stack::new("coefficients", &values, planes, SHAPE).unwrap(), &unusable, then)
-        .unwrap()
+    Corrector::new(
+        Stack::new("coefficients", &values, planes, SHAPE).unwrap(),
+        &unusable,
+        then,
+        Alike::ALL,
+    )
+    .unwrap()
 }
 
 fn applied<I: Raw, O: Corrected>(
@@ -93,6 +98,7 @@ fn halves_round_to_even_and_the_limits_hold_to_the_last_digit() {
         Stack::new("coefficients", &offsets, 1, shape).unwrap(),
         &[false; 8],
         Unusable::Kept,
+        Alike::ALL,
     )
     .unwrap();
     let (mut out, workers) = ([9_u8; 8], Workers::new(None).unwrap());
@@ -180,7 +186,7 @@ fn any_number_of_workers_gives_the_same_bytes() {
     let mut unusable = vec![false; shape.len()];
     unusable[70_000..70_009].fill(true);
     let stack = Stack::new("coefficients", &planes, 2, shape).unwrap();
-    let corrector = Corrector::new(stack, &unusable, Unusable::Replaced).unwrap();
+    let corrector = Corrector::new(stack, &unusable, Unusable::Replaced, Alike::ALL).unwrap();
     let raw: Vec<u16> = (0..shape.len()).map(|pixel| (pixel * 7919 % 65536) as u16).collect();
     let by = |workers| {
         let (mut out, control) = (vec![0_u16; shape.len()], Control::new());
@@ -235,6 +241,7 @@ fn values_outside_of_the_levels_of_their_pixel_are_counted() {
         Stack::new("coefficients", &identity, 2, shape).unwrap(),
         &unusable,
         Unusable::Replaced,
+        Alike::ALL,
     )
     .unwrap()
     .with_levels(Stack::new("levels", &levels, 2, shape).unwrap())
@@ -263,4 +270,29 @@ fn the_largest_raw_value_is_found_in_every_type() {
         assert_eq!(counted(&corrector, &single, 0_f32, 0.0, 1).1.highest, 200.0);
     }
     assert_eq!(counted(&corrector, &vec![-1_f32; SHAPE.len()], 0_f32, 0.0, 1).1.highest, 0.0);
+}
+
+#[test]
+fn a_pixel_behind_filters_is_replaced_by_the_nearest_of_its_colour() {
+    // RGGB, four rows of six; red at even rows and columns, blue at odd ones.
+    let shape = Shape::new(4, 6);
+    let colours: Vec<u8> = (0..24).map(|p| (p / 6 % 2 + p % 6 % 2) as u8).collect();
+    let frame: Vec<f32> =
+        (0..24).map(|p| [100.0, 300.0, 130.0][usize::from(colours[p])] + p as f32).collect();
+    let planes = [[0.0_f32; 24], [1.0; 24]].concat();
+    let mut unusable = [false; 24];
+    let (red, green) = (2 * 6 + 2, 6 + 2);
+    (unusable[red], unusable[green]) = (true, true);
+    let corrector = Corrector::new(
+        Stack::new("coefficients", &planes, 2, shape).unwrap(),
+        &unusable,
+        Unusable::Replaced,
+        Alike { colours: Some(&colours), reach: 2 },
+    )
+    .unwrap();
+    let (mut out, workers) = ([0.0_f32; 24], Workers::new(None).unwrap());
+    corrector.apply(&frame, &mut out, 0.0, &workers, &Control::new()).unwrap();
+    // Five red ones two pixels away, and the four green ones on the diagonals.
+    assert_eq!(out[red], (100 * 5 + 12 + 16 + 2 + 4) as f32 / 5.0 + 0.0);
+    assert_eq!(out[green], (300 * 4 + 1 + 3 + 13 + 15) as f32 / 4.0);
 }

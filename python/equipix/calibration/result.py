@@ -381,6 +381,7 @@ class Calibration(ReadOnly):
             flagged=flagged,
             out=out,
             depth=depth_of(self),
+            cfa=self.cfa,
         )
 
     @property

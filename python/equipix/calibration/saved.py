@@ -180,7 +180,7 @@ def _colours(fields: Mapping[str, Any]) -> dict[str, Any]:
         return {}
     found = fields["colour_response"].items()
     return {
-        "cfa": [list(row) for row in fields["cfa"].pattern],
+        "cfa": fields["cfa"].rows,
         "colour_response": {label: value if value == value else None for label, value in found},
     }
 

@@ -62,6 +62,7 @@ def of_response(response: Response) -> dict[str, Any]:
         "order": 0 if options.get("by") == "gain" else response.order,
         "levels": [float(f"{level:.6g}") for level in response.levels],
         **_level_values(response),
+        **_colours(response),
         **spread,
         _misfit_name(options): _misfit(response, options),
         "largest_inverse_error": response.largest_inverse_error,
@@ -74,6 +75,14 @@ def _sensor(correction: Correction) -> dict[str, str]:
     """Name of the sensor, where it is known."""
     name = sensor_of(correction)
     return {"sensor": name} if name else {}
+
+
+def _colours(correction: Calibration | Response) -> dict[str, str]:
+    """Colour filters and the responses of the colours, of mean 1, where there are any."""
+    if correction.cfa is None or correction.colour_response is None:
+        return {}
+    found = [f"{label} {value:.4g}" for label, value in correction.colour_response.items()]
+    return {"cfa": str(correction.cfa), "colour_response": ", ".join(found)}
 
 
 def _level_values(response: Response) -> dict[str, list[str]]:
@@ -142,6 +151,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
     return {
         **_sensor(calibration),
         "shape": list(calibration.shape),
+        **_colours(calibration),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
         "spread": float(np.nanstd(sensitivity, dtype=np.float64)),
         **_uncertainty(calibration),

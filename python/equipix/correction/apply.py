@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import as_array, naming_memory
+from equipix.colour import Colours
 from equipix.correction.depth import UNKNOWN, Depth
-from equipix.correction.kernel import FAST, check_flagged, kept, largest_of, run
+from equipix.correction.kernel import FAST, check_flagged, kept, largest_of, reach_of, run
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.frames import FrameStatistics, refuse_subtracted
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
     from equipix._types import Flagged
 
+_ONE = Colours((("",),))
+"""The pattern of a sensor without filters."""
+
 
 def apply(
     frames: ArrayLike,
@@ -29,6 +33,7 @@ def apply(
     flagged: Flagged,
     out: NDArray[Any] | None,
     depth: Depth = UNKNOWN,
+    cfa: Colours | None = None,
 ) -> NDArray[Any]:
     """Correct frames by a formula, and treat flagged pixels as `flagged` requires.
 
@@ -47,6 +52,8 @@ def apply(
         Array for the result, of the frames' shape, float32 or float64.
     depth : Depth
         Bits of the sensor.
+    cfa : Colours or None
+        Colour filters of the pixels: a pixel is replaced by those of its colour.
 
     Returns
     -------
@@ -70,7 +77,7 @@ def apply(
             if flagged == "nan":
                 target[bad] = np.nan
             elif flagged == "replace":
-                replace_bad(target, bad)
+                replace_bad(target, bad, cfa)
         return result
 
 
@@ -83,6 +90,7 @@ def apply_polynomial(
     flagged: Flagged,
     out: NDArray[Any] | None,
     depth: Depth,
+    cfa: Colours | None = None,
 ) -> NDArray[Any]:
     """Σ c_j y^j of each value y by Horner's scheme, and the values of flagged pixels.
 
@@ -93,7 +101,7 @@ def apply_polynomial(
     """
     # A copy is no array of the result.
     known = (flags.copy(),) if sources is None else sources
-    fast = _fast(frames, known, coefficients, flagged=flagged, out=out, depth=depth)
+    fast = _fast(frames, known, coefficients, flagged=flagged, out=out, depth=depth, cfa=cfa)
     if fast is not None:
         return fast
     planes = coefficients()
@@ -106,7 +114,7 @@ def apply_polynomial(
                 total += coefficient
         corrected[...] = total
 
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth, cfa=cfa)
 
 
 def apply_gain(
@@ -119,6 +127,7 @@ def apply_gain(
     flagged: Flagged,
     out: NDArray[Any] | None,
     depth: Depth,
+    cfa: Colours | None = None,
 ) -> NDArray[Any]:
     """(frame − dark) / gain of each value, and the values of flagged pixels.
 
@@ -136,7 +145,7 @@ def apply_gain(
     def coefficients() -> NDArray[Any]:
         return gain_coefficients(gain, offset)
 
-    fast = _fast(frames, sources, coefficients, flagged=flagged, out=out, depth=depth)
+    fast = _fast(frames, sources, coefficients, flagged=flagged, out=out, depth=depth, cfa=cfa)
     if fast is not None:
         return fast
     dark_level = np.zeros((), np.float32) if offset is None else offset
@@ -146,7 +155,7 @@ def apply_gain(
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(corrected, gain, out=corrected, casting="same_kind")
 
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth)
+    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth, cfa=cfa)
 
 
 def gain_coefficients(gain: NDArray[Any], dark: NDArray[Any] | None) -> NDArray[Any]:
@@ -166,6 +175,7 @@ def _fast(
     flagged: Flagged,
     out: NDArray[Any] | None,
     depth: Depth,
+    cfa: Colours | None,
 ) -> NDArray[Any] | None:
     """Correct frames by the compiled part; None where it does not take their types.
 
@@ -179,7 +189,7 @@ def _fast(
         result = np.empty(raw.shape, np.float32) if out is None else out
         check_flagged(flagged, result.dtype)
         if raw.size:
-            prepared = kept(sources, flagged, coefficients)
+            prepared = kept(sources, flagged, coefficients, cfa)
             counts = run(prepared, raw, result, largest_of(result.dtype), None)
             depth.refuse_highest(counts.highest, raw.dtype)
         return result
@@ -232,33 +242,44 @@ def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDA
     return offset
 
 
-def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> None:
+def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_], cfa: Colours | None = None) -> None:
     """Put the mean of the nearest good pixels in place of each bad one.
 
     The good ones of the eight neighbours count; where there are none, those that were filled in
-    the round before. A value that is NaN counts in no mean. An image without any good pixel
-    becomes NaN.
+    the round before. With a `cfa` those of its colour count, on the nearest square around the pixel
+    that has any. A value that is NaN counts in no mean. An image without any good pixel becomes
+    NaN.
     """
-    rows, cols = image.shape
-    good = np.zeros((rows + 2, cols + 2), bool)
-    good[1:-1, 1:-1] = ~bad & ~np.isnan(image)
-    values = np.zeros(good.shape)
-    values[1:-1, 1:-1] = np.where(good[1:-1, 1:-1], image, 0)
-    todo = np.argwhere(bad) + 1
-    around = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+    reach = reach_of(cfa)
+    inner = (slice(reach, -reach), slice(reach, -reach))
+    good = np.pad(~bad & ~np.isnan(image), reach)
+    values = np.pad(np.where(good[inner], image, 0).astype(np.float64), reach)
+    colours = np.pad((cfa or _ONE).numbers(image.shape), reach)
+    todo = np.argwhere(bad) + reach
     while len(todo):
-        places = [tuple((todo + step).T) for step in around]
-        count = np.sum([good[place] for place in places], axis=0)
+        count, total = np.zeros(len(todo)), np.zeros(len(todo))
+        for steps in map(_square, range(1, reach + 1)):
+            # Places (steps, pixels to do) in rows and columns.
+            places = tuple((todo + steps[:, None]).transpose(2, 0, 1))
+            used = good[places] & (colours[places] == colours[tuple(todo.T)]) & (count == 0)
+            count += used.sum(axis=0)
+            total += np.where(used, values[places], 0).sum(axis=0)
         ready = count > 0
         if not ready.any():
-            image[tuple((todo - 1).T)] = np.nan
+            image[tuple((todo - reach).T)] = np.nan
             return
-        total = np.sum([values[place] for place in places], axis=0)
         filled = tuple(todo[ready].T)
         values[filled] = total[ready] / count[ready]
         good[filled] = True
-        image[tuple((todo[ready] - 1).T)] = values[filled]
+        image[tuple((todo[ready] - reach).T)] = values[filled]
         todo = todo[~ready]
+
+
+def _square(reach: int) -> NDArray[np.int64]:
+    """Steps (n, 2) to the pixels on the square around a pixel, so far from it."""
+    side = np.arange(-reach, reach + 1)
+    steps = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(steps[np.abs(steps).max(axis=1) == reach])
 
 
 def _each(stack: NDArray[Any]) -> NDArray[Any]:

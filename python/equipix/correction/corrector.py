@@ -20,7 +20,7 @@ from equipix.correction.kernel import (
     run,
     usual_treatment,
 )
-from equipix.correction.protocol import check_correction, check_sensor, takes_dark
+from equipix.correction.protocol import cfa_of, check_correction, check_sensor, takes_dark
 from equipix.errors import InputError
 from equipix.flags import usable
 
@@ -89,7 +89,8 @@ class Corrector:
     16 bits with four coefficients is off by less than 0.05 DN through float32.
 
     A pixel is replaced by the mean of the good ones of its eight neighbours; where there are none,
-    by that of neighbours replaced before. NaN counts in no mean, so it does not spread.
+    by that of neighbours replaced before. Behind colour filters those of its colour count, on the
+    nearest square around it that has any. NaN counts in no mean, so it does not spread.
 
     Examples
     --------
@@ -127,7 +128,9 @@ class Corrector:
         levels = levels_of(correction)
         with naming_memory("preparing a correction"):
             coefficients = coefficients_of(correction, dark)
-            self._native = native(coefficients, correction.flags, flagged, levels)
+            self._native = native(
+                coefficients, correction.flags, flagged, levels, cfa_of(correction)
+            )
         good = int(np.count_nonzero(usable(correction.flags)))
         self.replaced = correction.flags.size - good if flagged == "replace" and good else 0
         self.clipped = self.frames = 0

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
     from equipix._types import Array
+    from equipix.colour import Colours
 
 FAST = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 """Types of frames, and of corrected frames, that the compiled part takes."""
@@ -29,33 +30,49 @@ class _Kept(NamedTuple):
 
     references: tuple[weakref.ref[Array], ...]
     flagged: str
+    cfa: Colours | None
     prepared: _native.Corrector
 
-    def fits(self, sources: tuple[Array, ...], flagged: str) -> bool:
+    def fits(self, sources: tuple[Array, ...], flagged: str, cfa: Colours | None) -> bool:
         """Whether they are for these; another array may have the identity of one that is gone."""
         pairs = zip(self.references, sources, strict=True)
-        return self.flagged == flagged and all(own() is other for own, other in pairs)
+        same = (self.flagged, self.cfa) == (flagged, cfa)
+        return same and all(own() is other for own, other in pairs)
 
 
 _KEPT: dict[tuple[int, ...], _Kept] = {}
 """Prepared coefficients of results, by the identities of their arrays: of each the last ones."""
 
 
+def reach_of(cfa: Colours | None) -> int:
+    """Most rows and columns from a pixel to the next one of its colour."""
+    return 1 if cfa is None else max(cfa.period)
+
+
 def native(
-    coefficients: Array, flags: Array, flagged: Flagged, levels: Array | None = None
+    coefficients: Array,
+    flags: Array,
+    flagged: Flagged,
+    levels: Array | None = None,
+    cfa: Colours | None = None,
 ) -> _native.Corrector:
     """Prepare coefficients of shape (n, rows, cols) for the compiled part.
 
     It counts values corrected to outside of `levels`, of shape (2, rows, cols), where they are
-    given.
+    given, and replaces pixels by those of their colour where there is a `cfa`.
     """
     planes = np.ascontiguousarray(coefficients, dtype=np.float32)
     ends = None if levels is None else np.ascontiguousarray(levels, dtype=np.float32)
-    return _native.Corrector(planes, np.ascontiguousarray(~usable(flags)), flagged, ends)
+    bad = np.ascontiguousarray(~usable(flags))
+    colours = None if cfa is None else cfa.numbers(bad.shape)
+    return _native.Corrector(planes, bad, flagged, ends, colours, reach_of(cfa))
 
 
 def kept(
-    sources: tuple[Array, ...], flagged: Flagged, coefficients: Callable[[], Array]
+    sources: tuple[Array, ...],
+    flagged: Flagged,
+    coefficients: Callable[[], Array],
+    cfa: Colours | None,
 ) -> _native.Corrector:
     """Prepare coefficients once for a result, as long as its arrays live and `flagged` is the same.
 
@@ -68,6 +85,8 @@ def kept(
         What becomes of flagged pixels.
     coefficients : callable
         Makes the coefficients.
+    cfa : Colours or None
+        Colour filters of the pixels.
 
     Returns
     -------
@@ -76,17 +95,18 @@ def kept(
     """
     flags = sources[-1]
     if any(array.flags.writeable for array in sources):
-        return native(coefficients(), flags, flagged)
+        return native(coefficients(), flags, flagged, cfa=cfa)
     key = tuple(map(id, sources))
     found = _KEPT.get(key)
-    if found is not None and found.fits(sources, flagged):
+    if found is not None and found.fits(sources, flagged, cfa):
         return found.prepared
 
     def forget(_: object) -> None:
         _KEPT.pop(key, None)
 
     references = tuple(weakref.ref(array, forget) for array in sources)
-    found = _KEPT[key] = _Kept(references, flagged, native(coefficients(), flags, flagged))
+    prepared = native(coefficients(), flags, flagged, cfa=cfa)
+    found = _KEPT[key] = _Kept(references, flagged, cfa, prepared)
     return found.prepared
 
 

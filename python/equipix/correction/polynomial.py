@@ -11,7 +11,7 @@ from equipix._check import check_type
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.depth import depth_of
-from equipix.correction.protocol import check_correction
+from equipix.correction.protocol import cfa_of, check_correction
 from equipix.errors import InputError
 from equipix.io import check_format, check_pages, save_pages
 
@@ -116,6 +116,7 @@ class Polynomial(ReadOnly):
             flagged=flagged,
             out=out,
             depth=depth_of(self),
+            cfa=cfa_of(self),
         )
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
@@ -245,7 +246,8 @@ def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
     # Without any the bits follow from the level of saturation of `first`.
     taken = ("name",) if depth_of(first).bits else ("name", "bit_depth")
     added = {key: other[key] for key in taken if other.get(key) and not one.get(key)}
-    return {**one, **added}
+    colours = cfa_of(first) or cfa_of(then)
+    return {**one, **added, **({} if colours is None else {"cfa": colours.rows})}
 
 
 def _refuse_raw(then: Correction) -> None:

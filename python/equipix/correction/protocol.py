@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from equipix._check import described
+from equipix.colour import Colours
 from equipix.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,6 +93,14 @@ def sensor_of(correction: Correction) -> str:
     """Return the name of the sensor in the metadata; empty where there is none."""
     sensor = correction.metadata.get("sensor")
     return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""
+
+
+def cfa_of(correction: Correction) -> Colours | None:
+    """Return the colour filters of the pixels, of the correction or of the sensor in metadata."""
+    own = getattr(correction, "cfa", None)
+    sensor = correction.metadata.get("sensor")
+    named = sensor.get("cfa") if isinstance(sensor, dict) else None
+    return Colours.of(named if own is None else own)
 
 
 def check_sensor(correction: Correction, sensor: str | None) -> None:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.calibration.weights import Weighted
     from equipix.experiment.manifest import Exposure, Manifest
+    from equipix.frames import FrameStatistics
+    from equipix.mosaic import Filters
     from equipix.shifts import ShiftMeasurement, Spot
 
 _AROUND = 8
@@ -65,8 +67,17 @@ class Equalisation:
         known = fit.information(workers=workers) * np.square(fit.sensitivity)
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = weighted.noise_variance * count / max(count - 2, 1) / known
-        gain = np.where(good, fit.sensitivity, 1).astype(exposures.values.dtype)
+        gain = np.where(good, fit.sensitivity, 1) * exposures.response
+        gain = gain.astype(exposures.values.dtype)
         return cls(gain, exposures.dark, np.where(good, variance, np.nan))
+
+    @classmethod
+    def of_colours(cls, filters: Filters | None, dark: FrameStatistics) -> Self | None:
+        """Responses of the colours alone, before any fit; None of a sensor without filters."""
+        if filters is None:
+            return None
+        gain = filters.map_of(dark.mean.shape)
+        return cls(gain, dark.mean, np.full(gain.shape, np.nan))
 
     def apply(self, frames: Array) -> Array:
         """Images of the aperture as equal pixels would have given them."""

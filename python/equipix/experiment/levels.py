@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equipix._check import naming_memory
+from equipix.colour import Colours
 from equipix.defects import SIGMAS
 from equipix.errors import EquipixWarning, FileError, InputError, warn
 from equipix.experiment.described import Described
@@ -130,6 +131,7 @@ class LevelExperiment(Described[LevelManifest]):
             saturation=sensor.saturation_level,
             saturation_key=sensor.saturation_key,
             words=Words("[[level]]", "level"),
+            colours=Colours.of(sensor.cfa),
         )
         with naming_memory("averaging"):
             dark = self._dark(workers, progress)

@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 from pydantic_core import PydanticCustomError
 
 from equipix import io
-from equipix.errors import EquipixError, FileError
+from equipix.colour import Colours
+from equipix.errors import EquipixError, FileError, InputError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -21,6 +22,7 @@ _WANTED = {
     "bit_depth": "a whole number from 1 to 16",
     "saturation": "a positive number (DN)",
     "gain_dn_per_e": "a positive number (DN per electron)",
+    "cfa": "colour filters: 'RGGB', rows of one period or lists of labels",
     "mask": "an image file",
     "region": "tables [[sensor.region]]",
     "rows": "[first, end], two whole numbers from 0 on, the first below the end",
@@ -91,8 +93,17 @@ class Sensor(_Table):
     bit_depth: Annotated[int, Field(ge=1, le=16)] | None = None
     saturation: Positive | None = None
     gain_dn_per_e: Positive | None = None
+    cfa: Text | list[Text] | list[list[Text]] | None = None
     mask: Text | None = None
     region: Annotated[list[Region], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _cfa_is_a_pattern(self) -> Self:
+        try:
+            Colours.of(self.cfa)
+        except InputError as error:
+            raise _problem(f"[sensor]: {error}") from error
+        return self
 
     @model_validator(mode="after")
     def _level_within_depth(self) -> Self:

@@ -12,6 +12,7 @@ from equipix.calibration.calibrate import calibrated
 from equipix.calibration.options import Options
 from equipix.calibration.pixel_flags import pixel_flags
 from equipix.calibration.weights import weighted_fit
+from equipix.colour import Colours
 from equipix.defects import hot_pixels
 from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from equipix.calibration.result import Calibration
     from equipix.exposures.exposures import Exposures
     from equipix.frames import FrameStatistics
-    from equipix.noise import NoiseModel
 
 _ROUGH = 1e-4
 """Tolerance of the fit that the aperture's images are corrected by: 3e-5 pixel."""
@@ -124,7 +124,11 @@ class Experiment(Described[Manifest]):
                     "give the result of Experiment.run"
                 )
             equalisation = Equalisation.of(calibration.weighted, calibration.flags)
-        hot = self._hot(FitOptions()) if self._is_moved() else None
+        options = FitOptions()
+        hot = self._hot(options) if self._is_moved() else None
+        if calibration is None and self.manifest.sensor.cfa is not None and self._is_moved():
+            dark = self._dark(options)
+            equalisation = Equalisation.of_colours(self._average(dark, options).filters, dark)
         return measured_shifts(self.path, self.manifest, equalisation, hot=hot)
 
     def _is_moved(self) -> bool:
@@ -220,8 +224,10 @@ class Experiment(Described[Manifest]):
         refuse_repeats(self.path, self.manifest, hashes)
         dark = self._dark(fit_options)
         hot = hot_pixels(dark, None)
-        shifts, std = measured_shifts(self.path, self.manifest, hot=hot)
-        exposures, noise = self._exposures(dark, shifts, std, flux, excluded, fit_options)
+        averaged = self._average(dark, fit_options)
+        colours = Equalisation.of_colours(averaged.filters, dark)
+        shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
+        exposures = self._exposures(averaged, shifts, std, flux, excluded, fit_options)
         start = None
         if self._is_moved() and not fit_options.whole_shifts:
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
@@ -230,7 +236,7 @@ class Experiment(Described[Manifest]):
             shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
-        origin = provenance(self.path, self.manifest, hashes, shifts, std, noise)
+        origin = provenance(self.path, self.manifest, hashes, shifts, std, averaged.noise)
         return calibrated(exposures, options, start=start, provenance=origin)
 
     def _warn_of_unused(self, flux: FluxModel | None) -> None:
@@ -257,16 +263,15 @@ class Experiment(Described[Manifest]):
 
     def _exposures(
         self,
-        dark: FrameStatistics,
+        averaged: Averaged,
         shifts: Floats,
         std: Floats,
         flux: FluxModel | None,
         mask: Bools | None,
         options: FitOptions,
-    ) -> tuple[Exposures, NoiseModel | None]:
-        """The exposures from averaged frames and the file, and the noise model of one frame."""
+    ) -> Exposures:
+        """The exposures from averaged frames and the file."""
         refined = std.any() and not options.whole_shifts
-        averaged = self._average(dark, options)
         exposures = exposures_of(
             averaged,
             shifts,
@@ -277,7 +282,7 @@ class Experiment(Described[Manifest]):
             time=self._column("time") if flux == "linear" else None,
             rotation=[exposure.rotation for exposure in self.manifest.exposure],
         )
-        return exposures.whole(std) if options.whole_shifts else exposures, averaged.noise
+        return exposures.whole(std) if options.whole_shifts else exposures
 
     def _average(self, dark: FrameStatistics, options: FitOptions) -> Averaged:
         """Mean signal of every exposure; the frames' other statistics are reduced at once."""
@@ -290,6 +295,7 @@ class Experiment(Described[Manifest]):
                 gain=sensor.gain_dn_per_e,
                 saturation=sensor.saturation_level,
                 saturation_key=sensor.saturation_key,
+                colours=Colours.of(sensor.cfa),
             )
             for each in exposures:
                 statistics = self._statistics(

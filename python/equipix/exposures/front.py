@@ -70,7 +70,8 @@ def exposures_of(
             unsteady=measured.unsteady,
         )
         refuse_nothing(exposures, given)
-        return exposures.behind(measured.filters)
+        shown = mean_signal(exposures.values, exposures.mask)
+        return exposures.behind(Filters.of(measured.colours, shown))
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
@@ -109,7 +110,7 @@ class Measured(NamedTuple):
     clipped: Clipping | None = None
     raw: bool = False
     unsteady: str = ""
-    filters: Filters | None = None
+    colours: Colours | None = None
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -133,7 +134,7 @@ def measured_of(
     averaged = frames if isinstance(frames, Averaged) else _averaged(frames, words, colours)
     if averaged is None:
         measured = _of_arrays(cast("ArrayLike", frames), variance, saturation, words)
-        return measured._replace(filters=Filters.of(colours, mean_signal(measured.values)))
+        return measured._replace(colours=colours)
     return _of_averaged(averaged, variance, saturation, words)
 
 
@@ -172,7 +173,7 @@ def _of_averaged(
         averaged.clipped,
         averaged.raw,
         averaged.unsteady,
-        averaged.filters,
+        averaged.colours,
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix._check import naming_memory, number
-from equipix.correction.protocol import check_correction
+from equipix.correction.protocol import cfa_of, check_correction
 from equipix.errors import InputError
 from equipix.hardware.content import Content
 from equipix.hardware.encode import Steps, encode, origin, refuse_far_offsets
@@ -17,7 +17,7 @@ from equipix.hardware.words import check_width, chosen_exponent, exponent_of
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from equipix.correction.protocol import Correction
+    from equipix.correction.protocol import Correction, cfa_of
 
 
 def content_of(
@@ -45,8 +45,10 @@ def content_of(
         offset, gain, sag = line_of(correction, linearise)
         found = encode((offset, gain), correction.flags, bits, exponents, float(lowest))
         refuse_far_offsets(found, (offset, gain), bits, exponents, float(lowest))
+    colours = cfa_of(correction)
     metadata = {
         **origin(correction),
+        **({} if colours is None else {"cfa": colours.rows}),
         "lowest": float(lowest),
         "largest_error_dn": found.largest_error,
     }

@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix._check import as_array, positive_workers
 from equipix._readonly import ReadOnly
+from equipix.colour import Colours
 from equipix.correction.apply import apply
 from equipix.errors import InputError
 from equipix.flags import usable
@@ -267,7 +268,8 @@ class Table(ReadOnly):
             words = self.apply(self.digitise(frame))
             corrected[...] = np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
 
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
+        cfa = Colours.of(self.metadata.get("cfa"))
+        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, cfa=cfa)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.hardware.read` reads bit by bit.

@@ -3,6 +3,7 @@
 from equipix.metrics.correctability import Correctability, correctability, validity_interval
 from equipix.metrics.emva import EmvaSpatial, Split, emva_spatial
 from equipix.metrics.frames import netd, roughness
+from equipix.metrics.planes import planes
 from equipix.metrics.three_d import ThreeDNoise, three_d_noise
 from equipix.metrics.transfer import EmvaTransfer, emva_transfer
 
@@ -16,6 +17,7 @@ __all__ = [
     "emva_spatial",
     "emva_transfer",
     "netd",
+    "planes",
     "roughness",
     "three_d_noise",
     "validity_interval",

@@ -201,13 +201,22 @@ class Response(ReadOnly):
                 flagged=flagged,
                 out=out,
                 depth=depth,
+                cfa=self.cfa,
             )
         zero = np.zeros(self.shape) if offset is None else offset
 
         def formula(frame: Array, corrected: Array) -> None:
             corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
 
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, depth=depth)
+        return apply(
+            frames,
+            formula,
+            flags=self.flags,
+            flagged=flagged,
+            out=out,
+            depth=depth,
+            cfa=self.cfa,
+        )
 
     @naming_memory("finding extrapolated values")
     def extrapolated(

@@ -46,7 +46,7 @@ def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: 
         "metadata": fields["metadata"],
     }
     if fields["cfa"] is not None:
-        content["cfa"] = [list(row) for row in fields["cfa"].pattern]
+        content["cfa"] = fields["cfa"].rows
         content["colour_response"] = fields["colour_response"]
     save_pages(path, pages, content, force=force)
 

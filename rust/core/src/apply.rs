@@ -96,6 +96,25 @@ pub enum Unusable {
     Replaced,
 }
 
+/// Which pixels stand for one another.
+#[derive(Clone, Copy, Debug)]
+pub struct Alike<'a> {
+    /// Number of the colour of each pixel; none where all are of one.
+    pub colours: Option<&'a [u8]>,
+    /// Most rows and columns from a pixel to one of its colour.
+    pub reach: usize,
+}
+
+impl Alike<'_> {
+    /// All pixels are of one colour.
+    pub const ALL: Self = Self { colours: None, reach: 1 };
+
+    /// Whether two pixels are of one colour.
+    fn are(&self, one: usize, other: usize) -> bool {
+        self.colours.is_none_or(|colours| colours[one] == colours[other])
+    }
+}
+
 /// What was found in frames while they were corrected.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Counts {
@@ -194,19 +213,28 @@ impl Corrector {
     /// Prepares coefficients, one plane a power of y, lowest first.
     ///
     /// # Errors
-    /// [`Error::Shape`] if there are more than four planes or `unusable` is of another size.
-    pub fn new(coefficients: Stack<'_, f32>, unusable: &[bool], then: Unusable) -> Result<Self> {
+    /// [`Error::Shape`] if there are more than four planes, or `unusable` or the colours are of another
+    /// size.
+    pub fn new(
+        coefficients: Stack<'_, f32>,
+        unusable: &[bool],
+        then: Unusable,
+        alike: Alike<'_>,
+    ) -> Result<Self> {
         let (shape, planes) = (coefficients.shape(), coefficients.count());
-        if planes == 0 || planes > PLANES || unusable.len() != shape.len() {
+        let fits = alike.colours.is_none_or(|colours| colours.len() == shape.len());
+        if planes == 0 || planes > PLANES || unusable.len() != shape.len() || !fits {
             return Err(Error::Shape {
                 argument: "coefficients",
                 got: format!("({planes}, {}, {})", shape.rows, shape.cols),
-                wanted: format!("(1 to {PLANES}, rows, columns) and a mask of as many pixels"),
+                wanted: format!(
+                    "(1 to {PLANES}, rows, columns), mask and colours of as many pixels"
+                ),
             });
         }
         let mut coefficients = coefficients.data().to_vec();
         let repairs = match then {
-            Unusable::Replaced => Repairs::of(shape, unusable),
+            Unusable::Replaced => Repairs::of(shape, unusable, alike),
             Unusable::Kept | Unusable::Blank => Repairs::default(),
         };
         if then != Unusable::Kept {
@@ -442,8 +470,9 @@ impl Repairs {
     }
 
     /// Round by round: a pixel takes the mean of those of its eight neighbours that are usable, or
-    /// were replaced in a round before.
-    fn of(shape: Shape, unusable: &[bool]) -> Self {
+    /// were replaced in a round before; of colours, of the nearest square around it with such pixels of
+    /// its own.
+    fn of(shape: Shape, unusable: &[bool], alike: Alike<'_>) -> Self {
         const WAITS: u32 = u32::MAX;
         const USABLE: u32 = u32::MAX - 1;
         let mut state: Vec<u32> =
@@ -453,14 +482,16 @@ impl Repairs {
         loop {
             let before = found.pixels.len();
             waiting.retain(|&pixel| {
-                let known = neighbours(shape, pixel).filter(|&q| state[q] != WAITS);
-                let sources = known.map(|q| match state[q] {
-                    USABLE => Source::Pixel(q as u32),
-                    index => Source::Repaired(index),
-                });
                 let start = found.all.len();
-                found.all.extend(sources);
-                let ready = found.all.len() > start;
+                let ready = (1..=alike.reach).any(|reach| {
+                    let around = around(shape, pixel, reach).filter(|&q| alike.are(pixel, q));
+                    let known = around.filter(|&q| state[q] != WAITS);
+                    found.all.extend(known.map(|q| match state[q] {
+                        USABLE => Source::Pixel(q as u32),
+                        index => Source::Repaired(index),
+                    }));
+                    found.all.len() > start
+                });
                 if ready {
                     found.pixels.push(pixel as u32);
                     found.starts.push(found.all.len());
@@ -477,13 +508,13 @@ impl Repairs {
     }
 }
 
-/// The up to eight neighbours of a pixel.
-fn neighbours(shape: Shape, pixel: usize) -> impl Iterator<Item = usize> {
+/// The pixels on the square around a pixel, `reach` from it: at 1 its up to eight neighbours.
+fn around(shape: Shape, pixel: usize, reach: usize) -> impl Iterator<Item = usize> {
     let (row, col) = (pixel / shape.cols, pixel % shape.cols);
-    let rows = row.saturating_sub(1)..=(row + 1).min(shape.rows - 1);
+    let rows = row.saturating_sub(reach)..=(row + reach).min(shape.rows - 1);
     rows.flat_map(move |r| {
-        let cols = col.saturating_sub(1)..=(col + 1).min(shape.cols - 1);
-        cols.map(move |c| r * shape.cols + c)
+        let cols = col.saturating_sub(reach)..=(col + reach).min(shape.cols - 1);
+        let far = move |c: &usize| r.abs_diff(row).max(c.abs_diff(col)) == reach;
+        cols.filter(far).map(move |c| r * shape.cols + c)
     })
-    .filter(move |&q| q != pixel)
 }

@@ -4,12 +4,13 @@
 //! |---|---|---|---|
 //! | coefficients | float32, 3 | `Stack<f32>` | copy, kept |
 //! | unusable | bool, 2 | `&[bool]` | view |
+//! | colours | uint8, 2 | `&[u8]` | view |
 //! | levels | float32, 3 | `Stack<f32>` | those of pixels with fewer levels than others are kept |
 //! | frames, out | uint8, uint16 or float32, 3 | `&[T]`, `&mut [T]` | view |
 
 use std::num::NonZeroUsize;
 
-use equipix_core::apply::{Corrected, Corrector, Counts, Raw, Unusable};
+use equipix_core::apply::{Alike, Corrected, Corrector, Counts, Raw, Unusable};
 use equipix_core::{Error, Shape, Stack, Workers};
 use numpy::{
     Element, PyReadonlyArray2, PyReadonlyArray3, PyReadwriteArray3, PyUntypedArrayMethods,
@@ -50,10 +51,14 @@ impl PyCorrector {
         unusable: PyReadonlyArray2<'_, bool>,
         flagged: &str,
         levels: Option<PyReadonlyArray3<'_, f32>>,
+        colours: Option<PyReadonlyArray2<'_, u8>>,
+        reach: usize,
     ) -> PyResult<Self> {
         let unusable = unusable.as_slice()?;
+        let colours = colours.as_ref().map(PyReadonlyArray2::as_slice).transpose()?;
+        let alike = Alike { colours, reach };
         let made = stack("coefficients", &coefficients)?
-            .and_then(|planes| Corrector::new(planes, unusable, then(flagged)?));
+            .and_then(|planes| Corrector::new(planes, unusable, then(flagged)?, alike));
         let made = match &levels {
             Some(levels) => {
                 let levels = stack("levels", levels)?;

@@ -1,0 +1,302 @@
+"""Sensors behind colour filters: calibrated, fitted to levels, corrected, by each colour."""
+
+import doctest
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import cross_pattern, errors, metrics, nuc, plan, simulate
+from equipix.colour import Colours
+
+SHAPE, CROSS, NOISE = (48, 56), cross_pattern(11, 19), 3.0
+X_TRANS = "GBGGRG/RGRBGB/GBGGRG/GRGGBG/BGBRGR/GRGGBG"
+PATTERNS = ["RGGB", "GRBG", "GBRG", "BGGR", "RRGG/RRGG/GGBB/GGBB", X_TRANS]
+NAMED = "ignore:the response repeats"
+
+
+def sensor(cfa, seed=1, dead=5):
+    """Sensitivity of a sensor, and its good pixels; the dead ones have a tenth of their colour."""
+    rng = np.random.default_rng(seed)
+    plain = 1 + 0.01 * rng.standard_normal(SHAPE)
+    truth = plain if cfa is None else simulate.filtered(plain, cfa)
+    good = np.ones(SHAPE, bool)
+    good.flat[rng.choice(good.size, dead, replace=False)] = False
+    return np.where(good, truth, 0.1 * truth), good
+
+
+def exposures(truth, seed=2, noise=NOISE, shifts=CROSS):
+    beam = simulate.gaussian_beam(SHAPE, width=200, amplitude=8000)
+    frames = simulate.exposures(truth, beam, shifts)
+    return frames + noise * np.random.default_rng(seed).standard_normal(frames.shape)
+
+
+def planes(cfa):
+    return dict(Colours.of(cfa).planes(SHAPE))
+
+
+class TestCalibrate:
+    @pytest.mark.parametrize("cfa", PATTERNS)
+    def test_a_good_sensor_has_no_flags_and_each_colour_the_mean_1(self, cfa):
+        truth, good = sensor(cfa)
+        cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2), cfa=cfa)
+        np.testing.assert_array_equal(cal.flags == 0, good)
+        for plane in planes(cfa).values():
+            assert cal.sensitivity[plane & good].mean() == pytest.approx(1, abs=1e-12)
+        light = np.mean(
+            [truth[plane & good].mean() * plane[good].mean() for plane in planes(cfa).values()]
+        )
+        means = {label: truth[plane & good].mean() for label, plane in planes(cfa).items()}
+        ratios = [cal.colour_response[label] / mean for label, mean in means.items()]
+        # Of some 600 pixels and five exposures the ratio of two colours is known to 1e-3/√600.
+        assert np.ptp(ratios) / np.mean(ratios) < 6 * 1e-3 / np.sqrt(100)
+        assert light > 0
+        assert np.mean((cal.sensitivity * cal.cfa.map_of(cal.colour_response, SHAPE))[good]) == (
+            pytest.approx(1, abs=1e-12)
+        )
+
+    @pytest.mark.filterwarnings(NAMED)
+    def test_without_a_cfa_the_pattern_is_named_and_nothing_flagged(self):
+        truth, good = sensor("GBRG")
+        cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2))
+        np.testing.assert_array_equal(cal.flags == 0, good)
+        (verdict,) = cal.verdicts
+        assert verdict.kind == "cfa"
+        assert "every 2 rows and 2 columns" in verdict.message
+        assert "cfa='GRBG' or cfa='GBRG'" in verdict.message
+        assert cal.cfa is None
+        assert cal.colour_response is None
+        assert np.abs(simulate.relative_error(cal.sensitivity, truth))[good].max() < 0.02
+
+    @pytest.mark.filterwarnings(NAMED)
+    @pytest.mark.parametrize(("pattern", "words"), [("AB/AB", "2 columns"), ("A/A/B", "3 rows")])
+    def test_a_period_along_one_axis_is_named_as_read_out(self, pattern, words):
+        truth, good = sensor(None)
+        truth = simulate.filtered(truth, pattern, response={"A": 0.4, "B": 1.0})
+        cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2))
+        np.testing.assert_array_equal(cal.flags == 0, good)
+        (verdict,) = cal.verdicts
+        assert words in verdict.message
+        assert "read-out" in verdict.message
+        assert "cfa=" not in verdict.message
+
+    def test_a_monochrome_sensor_is_calibrated_as_ever(self):
+        truth, good = sensor(None)
+        frames = exposures(truth)
+        alone = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2))
+        given = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
+        assert alone.verdicts == ()
+        assert alone.colour_response is None
+        error = simulate.relative_error(given.sensitivity, alone.sensitivity, cfa="RGGB")
+        # Two fits of the same data, each to the tolerance of 1e-6.
+        assert np.abs(error[good]).max() < 2e-5
+
+    @pytest.mark.parametrize("cfa", ["RGGB", None])
+    @pytest.mark.filterwarnings(NAMED)
+    def test_residuals_and_predictions_are_those_of_the_frames(self, cfa, tmp_path):
+        truth, _ = sensor("RGGB", dead=0)
+        frames = exposures(truth)
+        variance = np.full(5, NOISE**2)
+        cal = equipix.calibrate(frames, CROSS, variance=variance, cfa=cfa)
+        squares = np.nansum(cal.residuals(frames, variance=variance) ** 2)
+        assert squares == pytest.approx(cal.objective, rel=1e-9)
+        cal.save(tmp_path / "cal.npz")
+        again = equipix.load(tmp_path / "cal.npz")
+        assert (again.cfa, again.colour_response) == (cal.cfa, cal.colour_response)
+        np.testing.assert_array_equal(again.predict((3, 4)), cal.predict((3, 4)))
+        (held_out,) = exposures(truth, noise=0, shifts=[(3, 4)])
+        error = (cal.predict((3, 4)) - held_out) / held_out
+        assert np.nanstd(error) < 3 * NOISE / 8000 / truth.min()
+
+    def test_equal_weights_are_those_of_the_values(self):
+        truth, good = sensor("RGGB")
+        frames = exposures(truth)
+        known = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
+        unknown = equipix.calibrate(frames, CROSS, cfa="RGGB")
+        assert unknown.metadata["options"]["weights"] == "equal"
+        assert unknown.reduced_chi2 == pytest.approx(NOISE**2 * known.reduced_chi2, rel=1e-6)
+        np.testing.assert_allclose(
+            unknown.sensitivity[good], known.sensitivity[good], rtol=0, atol=2e-5
+        )
+
+    def test_averages_are_weighted_by_the_noise_of_their_values(self):
+        plain, good = sensor(None)
+        light = simulate.gaussian_beam(SHAPE, width=200)
+        virtual = simulate.experiment(
+            plain, light, CROSS, frames=30, rng=3, cfa="RGGB", dead=0, hot=0, stage_error=0
+        )
+        dark = equipix.average(list(virtual.dark()))
+        frames = [equipix.average(list(virtual.frames(k)), dark=dark) for k in range(5)]
+        cal = equipix.calibrate(frames, CROSS, cfa="RGGB")
+        np.testing.assert_array_equal(cal.flags == 0, good)
+        freedom = 5 * plain.size - 2 * plain.size
+        assert abs(cal.reduced_chi2 - 1) < 6 * np.sqrt(2 / freedom) + 0.02
+
+    def test_a_corrected_frame_keeps_its_white_balance(self):
+        truth, good = sensor("RGGB")
+        cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
+        scene = 1000 * truth
+        for flagged in ("nan", "replace"):
+            corrected = cal.correct(scene, dark=None, flagged=flagged)
+            for plane in planes("RGGB").values():
+                usual = scene[plane & good].mean()
+                inside = corrected[plane & (good if flagged == "nan" else True)]
+                assert np.abs(inside / usual - 1).max() < 0.01
+
+    def test_a_colour_that_varies_over_the_beam_is_a_finding(self):
+        truth, _ = sensor("RGGB", dead=0)
+        frames = exposures(truth)
+        slope = np.linspace(-0.5, 0.5, SHAPE[1] + 19)
+        for (_row, col), frame in zip(CROSS - CROSS.min(axis=0), frames, strict=True):
+            red = planes("RGGB")["R"]
+            frame[red] *= np.broadcast_to(1 + 0.03 * slope[col : col + SHAPE[1]], SHAPE)[red]
+        with pytest.warns(errors.MisfitWarning, match="colours contradict one beam"):
+            cal = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
+        (words,) = [each.message for each in cal.verdicts if each.kind == "colour"]
+        assert "'mask'" in words
+        assert "plan.suggest" in words
+
+    def test_each_colour_by_itself_has_a_beam_of_its_own(self):
+        truth, _ = sensor("RGGB", dead=0)
+        shifts = plan.suggest(SHAPE, 5, 12, cfa="RGGB", drift=1e-5)[0].shifts
+        tint = {"R": (0.05, 0.0), "G": (0.0, 0.0), "B": (-0.03, 0.04)}
+        frames = np.zeros((5, *SHAPE))
+        for label, plane in planes("RGGB").items():
+            down, right = tint[label]
+            beam = simulate.tilted_beam(SHAPE, width=200, slope=(down, right))
+            frames[:, plane] = 8000 * simulate.exposures(truth, beam, shifts)[:, plane]
+        for plane in planes("RGGB").values():
+            cal = equipix.calibrate(frames, shifts, mask=~plane)
+            assert cal.components == 1
+            error = simulate.relative_error(cal.sensitivity, np.where(plane, truth, np.nan))
+            assert np.nanmax(np.abs(error)) < 1e-5
+
+
+class TestUniformSource:
+    LIGHT = (1000.0, 5000.0, 10_000.0, 16_000.0)
+
+    def levels(self, truth, *, raw, rng=5):
+        rng = np.random.default_rng(rng)
+        dark = 200 + 5 * rng.standard_normal(SHAPE)
+        camera = simulate.Camera(sensitivity=truth, dark=dark)
+        off = equipix.average(list(camera.frames(np.zeros(SHAPE), 16, rng=rng)))
+        return [
+            equipix.average(
+                list(camera.frames(np.full(SHAPE, each), 16, rng=rng)), dark=None if raw else off
+            )
+            for each in self.LIGHT
+        ]
+
+    @pytest.mark.parametrize("raw", [False, True])
+    @pytest.mark.parametrize("cfa", ["GRBG", X_TRANS])
+    def test_curves_are_those_of_a_colour(self, cfa, raw, tmp_path):
+        truth, good = sensor(cfa)
+        levels = self.levels(truth, raw=raw)
+        response = nuc.fit(levels, cfa=cfa)
+        np.testing.assert_array_equal(response.flags == 0, good)
+        gain = np.where(good, truth, np.nan)
+        wanted = 1 + simulate.relative_error(gain, np.ones(SHAPE), cfa=cfa)
+        z = ((1 + response.deviation[1] - wanted) / np.sqrt(response.variances[1]))[good]
+        assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=5 / np.sqrt(2 * z.size))
+        corrected = response.correct(levels[2].mean, dark=None, flagged="replace")
+        for plane in planes(cfa).values():
+            usual = levels[2].mean[plane & good].mean()
+            assert corrected[plane & good].mean() == pytest.approx(usual, rel=1e-3)
+            assert corrected[plane].std() < 5
+        response.save(tmp_path / "response.npz")
+        again = equipix.load(tmp_path / "response.npz")
+        assert (again.cfa, again.colour_response) == (response.cfa, response.colour_response)
+        assert nuc.find_defects(response).counts["unusable"] == (~good).sum()
+
+    @pytest.mark.parametrize("raw", [False, True])
+    def test_without_a_cfa_the_pattern_is_named_and_nothing_flagged(self, raw):
+        truth, good = sensor("RGGB")
+        with pytest.warns(errors.MisfitWarning, match="cfa='RGGB' or cfa='BGGR'"):
+            response = nuc.fit(self.levels(truth, raw=raw))
+        np.testing.assert_array_equal(response.flags == 0, good)
+        assert nuc.find_defects(response).counts["unusable"] == (~good).sum()
+
+
+class TestReplacement:
+    @pytest.mark.parametrize("cfa", PATTERNS)
+    def test_the_compiled_part_replaces_as_numpy_does(self, cfa):
+        rng = np.random.default_rng(7)
+        flags = np.where(rng.random(SHAPE) < 0.2, equipix.Flag.DO_NOT_USE, 0).astype(np.uint32)
+        flags[8:14, 20:27] = equipix.Flag.DO_NOT_USE
+        metadata = {"sensor": {"cfa": Colours.of(cfa).rows}}
+        ones = np.stack([np.zeros(SHAPE), np.ones(SHAPE)])
+        correction = equipix.Polynomial(ones, flags, metadata)
+        scene = simulate.filtered(rng.uniform(900, 1100, SHAPE), cfa)
+        fast = correction.correct(scene.astype(np.float32), flagged="replace")
+        slow = correction.correct(scene, flagged="replace")
+        # Float32, and sums of up to some tens of values in it.
+        np.testing.assert_allclose(fast, slow, rtol=1e-5)
+        for label, plane in planes(cfa).items():
+            response = simulate.signal.COLOUR_RESPONSE[label]
+            assert 900 * response <= slow[plane].min()
+            assert slow[plane].max() <= 1100 * response
+
+
+class TestOthers:
+    def test_planes_have_one_colour_each(self):
+        truth, _ = sensor("RGGB", dead=0)
+        found = metrics.planes(np.stack([truth, truth]), "RGGB")
+        assert {name: each.shape for name, each in found.items()} == dict.fromkeys(
+            ("R", "G1", "G2", "B"), (2, 24, 28)
+        )
+        assert all(each.std() / each.mean() < 0.02 for each in found.values())
+        with pytest.raises(errors.InputError, match="smaller than a period of 2×2"):
+            metrics.planes(np.ones((1, 4)), "RGGB")
+
+    def test_figures_of_a_camera_are_taken_plane_by_plane(self):
+        truth, _ = sensor("RGGB", dead=0)
+        rng = np.random.default_rng(3)
+        dark = 50 + rng.standard_normal((16, *SHAPE))
+        bright = dark[::-1] + 1000 * truth
+        whole = metrics.emva_spatial(dark, bright, highpass=False)
+        off, on = (metrics.planes(each, "RGGB") for each in (dark, bright))
+        found = [metrics.emva_spatial(off[name], on[name], highpass=False) for name in off]
+        assert whole.prnu.total > 0.3
+        assert all(abs(each.prnu.total - 0.01) < 0.002 for each in found)
+
+    def test_a_lens_is_fitted_to_all_colours(self):
+        rows, cols = np.mgrid[:120, :160]
+        flat = 1000 * equipix.lens.cos4((rows - 62.0) ** 2 + (cols - 75.0) ** 2, 300.0)
+        found = equipix.lens.fit_falloff(simulate.filtered(flat, X_TRANS), cfa=X_TRANS)
+        assert found.focal_length == pytest.approx(300, rel=2e-3)
+
+    def test_an_experiment_on_disk_names_its_filters(self, tmp_path, run):
+        folder, output = tmp_path / "x", tmp_path / "cal.npz"
+        args = ("--shape", 48, 64, "--frames", 8, "--cfa", "GRBG", "--bit-depth", 8)
+        assert run("simulate", "-o", folder, *args)[0] == 0
+        assert 'cfa = "GRBG"' in (folder / "experiment.toml").read_text()
+        status, out, _ = run("calibrate", folder / "experiment.toml", "-o", output)
+        assert status == 0
+        assert "GRBG" in out
+        cal, truth = equipix.load(output), np.load(folder / "truth.npz")
+        bad = np.zeros(cal.shape, bool)
+        bad.flat[[*truth["dead"], *truth["hot"]]] = True
+        assert not (cal.flags[~bad] != 0).any()
+        assert cal.colour_response["R"] / cal.colour_response["G"] == pytest.approx(0.35, rel=0.02)
+
+    @pytest.mark.parametrize(("cfa", "words"), [('"RGB"', "'RGB', expected four"), ("7", "cfa")])
+    def test_a_wrong_pattern_in_a_manifest_is_named(self, tmp_path, cfa, words):
+        path = tmp_path / "experiment.toml"
+        path.write_text(f'[sensor]\ncfa = {cfa}\n[dark]\nframes = "d.tif"\n')
+        with pytest.raises(errors.FileError, match=words):
+            equipix.Experiment.load(path)
+
+    def test_a_plan_states_both_counts(self, run):
+        status, out, _ = run(
+            "plan", "--shape", 48, 52, "--shifts", "0,0 0,11 0,19 11,0 19,0", "--cfa", "RGGB"
+        )
+        assert status == 0
+        assert "36 (R 16, G 4, B 16)" in out
+
+
+def test_the_examples_of_the_page_run():
+    page = Path(__file__).parents[1] / "docs/colour.md"
+    found = doctest.testfile(str(page), module_relative=False)
+    assert found.attempted > 10
+    assert found.failed == 0
