@@ -1,0 +1,54 @@
+"""Many sensors behind colour filters: error bars, false flags, defects found, false verdicts."""
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import cross_pattern, simulate
+
+BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
+SHAPE, SHIFTS, NOISE, DEAD = (48, 52), cross_pattern(5, 7), 3.0, 6
+
+
+def drawn(seed):
+    """Calibration of a sensor with dead pixels, its errors, its good pixels."""
+    rng, cfa = np.random.default_rng([33, seed]), BAYER[seed % 4]
+    truth = simulate.filtered(1 + 0.01 * rng.standard_normal(SHAPE), cfa)
+    good = np.ones(SHAPE, bool)
+    good.flat[rng.choice(good.size, DEAD, replace=False)] = False
+    truth[~good] *= rng.uniform(0, 0.4, DEAD)
+    beam = simulate.gaussian_beam(SHAPE, width=120, amplitude=8000)
+    frames = simulate.exposures(truth, beam, SHIFTS)
+    frames += NOISE * rng.standard_normal(frames.shape)
+    cal = equipix.calibrate(
+        frames, SHIFTS, variance=np.full(5, NOISE**2), cfa=cfa, uncertainty=True
+    )
+    error = simulate.relative_error(cal.sensitivity, np.where(good, truth, np.nan), cfa=cfa)
+    return cal, error, good
+
+
+@pytest.mark.study
+def test_error_bars_flags_and_verdicts_are_those_of_a_monochrome_sensor(draws, figure):
+    squares, false, missed, verdicts = [], 0, 0, 0
+    seeds = draws(200)
+    for seed in seeds:
+        cal, error, good = drawn(seed)
+        z = error * cal.sensitivity / cal.sensitivity_std
+        squares.append(np.mean(z[good] ** 2))
+        false += np.count_nonzero((cal.flags != 0) & good)
+        missed += np.count_nonzero((cal.flags == 0) & ~good)
+        verdicts += len(cal.verdicts)
+    pixels = len(seeds) * (np.prod(SHAPE) - DEAD)
+    z = float(np.sqrt(np.mean(squares)))
+    # Errors of large scales are common to pixels, so the scatter of the draws tells the error of z.
+    error_of_z = float(np.std(squares) / np.sqrt(len(seeds)) / 2)
+    figure("z of calibrate behind RGGB and the like", round(z, 3), "0.97 to 1.03")
+    figure("false flags behind RGGB and the like", f"{false} of {pixels}", "below 1e-4")
+    figure("dead pixels missed behind RGGB and the like", missed, "0")
+    figure("verdicts on right models behind RGGB and the like", verdicts, "at most 1 %")
+    assert 0.97 - 3 * error_of_z < z < 1.03 + 3 * error_of_z
+    allowed = 1e-4 * pixels
+    assert false <= allowed + 3 * np.sqrt(allowed)
+    assert missed == 0
+    allowed = 0.01 * len(seeds)
+    assert verdicts <= allowed + 3 * np.sqrt(allowed) + 1
