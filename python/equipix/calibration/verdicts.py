@@ -180,7 +180,10 @@ def on_fit(
     contradictions: Sequence[Contradiction] = (),
     colours: str | None = None,
 ) -> list[Verdict]:
-    """Verdicts on a fit, the most important first; `colours` are words on their contradiction."""
+    """Verdicts on a fit, the most important first.
+
+    `colours` are words on their contradiction, which explains drifts and a misfit.
+    """
     found = [
         _on_sign(test),
         _on_orientation(test),
@@ -189,7 +192,7 @@ def on_fit(
         _on_hidden(weighted.fit, test),
         _on_faint(weighted.exposures),
         None if colours is None else Verdict("colour", colours),
-        *_on_residuals(drift, None if colours else misfit),
+        *([] if colours else _on_residuals(drift, misfit)),
         *(Verdict("prior", each.words) for each in contradictions),
         _on_convergence(weighted.fit, options),
         _on_uncertainty(weighted, options),

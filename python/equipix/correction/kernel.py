@@ -95,7 +95,7 @@ def kept(
     """
     flags = sources[-1]
     if any(array.flags.writeable for array in sources):
-        return native(coefficients(), flags, flagged, cfa=cfa)
+        return native(coefficients(), flags, flagged, None, cfa)
     key = tuple(map(id, sources))
     found = _KEPT.get(key)
     if found is not None and found.fits(sources, flagged, cfa):
@@ -105,7 +105,7 @@ def kept(
         _KEPT.pop(key, None)
 
     references = tuple(weakref.ref(array, forget) for array in sources)
-    prepared = native(coefficients(), flags, flagged, cfa=cfa)
+    prepared = native(coefficients(), flags, flagged, None, cfa)
     found = _KEPT[key] = _Kept(references, flagged, cfa, prepared)
     return found.prepared
 
