@@ -193,10 +193,16 @@ def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:
 
 
 def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
-    """Put the maps of each colour together; NaN, 0 or False where there is none."""
+    """Put the maps of each colour together; NaN, 0 or False where there is none.
+
+    The mean of the array at each level is that over the pixels of all colours.
+    """
     if len(parts) == 1 and parts[0][0].all():
         return parts[0][1]
-    joined: dict[str, Array] = {}
+    counts, means = zip(
+        *((pixels.sum(), maps.pop("levels")) for pixels, maps in parts), strict=True
+    )
+    joined: dict[str, Array] = {"levels": np.average(means, axis=0, weights=counts)}
     shape = parts[0][0].shape
     for name, first in parts[0][1].items():
         nothing = np.nan if first.dtype.kind == "f" else 0
@@ -207,7 +213,7 @@ def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
 
 
 def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str, Array]:
-    """Fit one order and invert it: maps by the names of `Response`, and where curves rise."""
+    """Fit one order and invert it: maps and levels of a `Response`, and where curves rise."""
     found = levels.fit(form_of(order, by), workers=workers)
     spare = len(levels) - (order + 1)
     cleaned = _of_alike_pixels(levels, found[2], spare) if order > 0 and spare > 0 else None
@@ -231,6 +237,7 @@ def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str
         "reduced_chi2": chi2,
         "used": used,
         "rising": rising,
+        "levels": levels.references,
     }
 
 
@@ -243,7 +250,6 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
     return Response(
         **maps,
         flags=flags,
-        levels=levels.references,
         dark=levels.dark,
         raw=levels.raw,
         saturation=levels.saturation,
