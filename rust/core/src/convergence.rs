@@ -27,6 +27,9 @@ use crate::frames::Real;
 /// Iterations before the smallest Ritz value is worth its name.
 pub(crate) const FEWEST_ITERATIONS: u64 = 10;
 
+/// A relative error that is rounding alone.
+pub(crate) const ROUNDING: f64 = 4.0 * f64::EPSILON;
+
 /// How often a step that raises F is halved; the last time, what is left of it is taken back.
 pub(crate) const MOST_HALVINGS: i32 = 10;
 /// Looks that may fail to lower the estimate before it counts as stalled.
@@ -41,6 +44,14 @@ pub struct Look {
     pub objective: f64,
     /// The estimated largest relative error of M.
     pub error: f64,
+}
+
+impl Look {
+    /// An error below rounding is rounding, and one that is no number, or below 0, is unknown.
+    pub(crate) const fn new(sweep: u64, objective: f64, error: f64) -> Self {
+        let error = if error >= 0.0 { error.max(ROUNDING) } else { f64::INFINITY };
+        Self { sweep, objective, error }
+    }
 }
 
 /// Why a solver ended.

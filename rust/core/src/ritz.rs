@@ -70,8 +70,9 @@ impl Lowest {
         Self { values: vec![known] }
     }
 
+    /// A value that is none counts as 0.
     pub(crate) fn push(&mut self, value: f64) {
-        self.values.push(self.found().min(value));
+        self.values.push(if value > 0.0 { self.found().min(value) } else { 0.0 });
     }
 
     /// The smallest so far.
@@ -82,8 +83,15 @@ impl Lowest {
     /// Where it is going: as far below as it has fallen over the last half of the iterations. A value
     /// that falls no longer is found; one among many eigenvalues near 0 falls like 1/iterations² until
     /// then.
-    pub(crate) fn expected(&self) -> f64 {
+    fn expected(&self) -> f64 {
         self.found().powi(2) / self.values[self.values.len() / 2]
+    }
+
+    /// What S⁻¹ makes of a size of P⁻¹ r: that over the smallest eigenvalue. Infinite where rounding has
+    /// left no positive one: nothing is known then of what lies along the pattern that belongs to it.
+    pub(crate) fn over(&self, size: f64) -> f64 {
+        let over = size / self.expected();
+        if self.found() > 0.0 && over >= 0.0 { over } else { f64::INFINITY }
     }
 }
 
@@ -102,6 +110,17 @@ mod tests {
             lowest.push(0.4);
         }
         assert!((lowest.found() - 0.1).abs() < 1e-12 && (lowest.expected() - 0.1).abs() < 1e-12);
+    }
+
+    #[test]
+    fn without_a_positive_value_nothing_is_known() {
+        for value in [0.0, -1e-3, f64::NEG_INFINITY, f64::NAN] {
+            let mut lowest = Lowest::new(0.25);
+            assert!((lowest.over(1e-9) - 4e-9).abs() < 1e-20);
+            lowest.push(value);
+            assert!(lowest.over(1e-9) == f64::INFINITY && lowest.over(0.0) == f64::INFINITY);
+        }
+        assert!(Lowest::new(0.25).over(f64::NAN) == f64::INFINITY);
     }
 
     #[test]

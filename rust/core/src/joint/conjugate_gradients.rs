@@ -79,7 +79,8 @@ impl ConjugateGradients {
     ) -> Result<bool> {
         let workers = system.pass.workers;
         let step = self.square / workers.dot(&self.direction, &self.product);
-        if !(step > 0.0 && step.is_finite()) {
+        // r · P⁻¹ r and the curvature are both above 0, or one of them is rounding.
+        if !(self.square > 0.0 && step > 0.0 && step.is_finite()) {
             return Ok(false);
         }
         self.energy += step * self.square;

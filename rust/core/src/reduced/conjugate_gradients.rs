@@ -9,6 +9,7 @@ use super::operator::Reduced;
 use super::two_level::TwoLevel;
 use crate::coarse;
 use crate::control::Control;
+use crate::convergence::ROUNDING;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
@@ -25,8 +26,6 @@ const LONGEST_STEP: f64 = 1e6;
 /// The share of r · P⁻¹ r at the start that single precision does not resolve: Ritz values from there on are
 /// those of rounding.
 const UNRESOLVED: f64 = 4e-12;
-/// A relative error that is rounding alone.
-const ROUNDING: f64 = 4.0 * f64::EPSILON;
 
 /// What a search holds, in bytes, where a *place* is a pixel of an image padded to the width of the beam:
 ///
@@ -185,7 +184,9 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
     pub(crate) fn iterate(&mut self, control: &Control) -> Result<bool> {
         let curvature = self.reduced.multiply(&self.direction, &mut self.product, control)?;
         let step = self.square / curvature;
-        if !(step > 0.0 && step < LONGEST_STEP) || self.is_settled() {
+        // r · P⁻¹ r and the curvature are both above 0, or one of them is rounding.
+        let is_positive = self.square > 0.0 && step > 0.0;
+        if !(is_positive && step < LONGEST_STEP) || self.is_settled() {
             return Ok(false);
         }
         let square = self.descend(step);

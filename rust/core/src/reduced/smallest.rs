@@ -57,12 +57,12 @@ impl Smallest {
     /// The share of b · S⁻¹ b that x · b lacks, at most: what is left is e · S e with e = S⁻¹ r, no more
     /// than r · P⁻¹ r over the smallest eigenvalue of P⁻¹S.
     pub(crate) fn lack<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
-        let left = search.square() / self.lowest.expected();
-        left / (search.energy + left)
+        let left = self.lowest.over(search.square());
+        if left.is_finite() { left / (search.energy + left) } else { 1.0 }
     }
 
     /// What is left of the error once the step that `search` has found is made.
     pub(crate) fn left<T: Real>(&self, search: &ConjugateGradients<'_, '_, T>) -> f64 {
-        search.largest() / self.lowest.expected()
+        self.lowest.over(search.largest())
     }
 }

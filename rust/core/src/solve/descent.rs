@@ -56,7 +56,7 @@ pub(super) fn minimise<'m, 'a, T: Real>(
         if estimate.prior.is_some() {
             objective = found;
         }
-        looks.push(Look { sweep, objective, error });
+        looks.push(Look::new(sweep, objective, error));
         let ended = if error <= options.tolerance {
             Ended::Converged
         } else if stalled(&looks) {

@@ -9,7 +9,7 @@ use crate::beam::Beam;
 use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::convergence::{
-    Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, rounding, stalled_since,
+    Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, ROUNDING, rounding, stalled_since,
 };
 use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
@@ -33,6 +33,9 @@ const CURVED: [f64; 2] = [1e-8, 0.03];
 const BY_SHIFTS: f64 = 0.1;
 /// Passes without progress after which a fit has stalled where shifts are sought: the steps are short.
 const PATIENCE_BY_SHIFTS: u64 = 150;
+/// Products of a search without one that halves P⁻¹ r, after which it ends: what is left is rounding, or lies along
+/// patterns that rounding does not resolve.
+const PATIENCE_OF_A_SEARCH: u64 = 200;
 /// The most that one step reduces the error by where products are made in single precision.
 const PRECISION: f64 = 1e-5;
 /// Steps after which the weight of the penalty, which M has a part in, and the variance of a
@@ -162,8 +165,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let kept = self.system.seeks_shifts().then(|| slope.clone());
         self.search.begin(&self.system, &preconditioner, slope, control)?;
         let first = self.search.product(&mut self.system, control)?;
-        let error = first / self.search.lowest.expected();
-        self.looks.push(Look { sweep: self.products(), objective, error });
+        let error = self.search.lowest.over(first);
+        self.looks.push(Look::new(self.products(), objective, error));
         if self.begins_to_refine(error) {
             return Ok(None);
         }
@@ -241,7 +244,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let least = if self.system.is_single() { PRECISION } else { CURVED[0] };
         let share = if slope.is_some() { BY_SHIFTS } else { first.clamp(least, CURVED[1]) };
         let reachable = first * share;
-        while self.products() + A_LOOK < self.limit {
+        let (mut least, mut waited) = (first, 0);
+        while self.products() + A_LOOK < self.limit && waited < PATIENCE_OF_A_SEARCH {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
             if !self.search.step(&self.system, preconditioner, control)? {
@@ -249,8 +253,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             }
             control.check()?;
             let size = self.search.product(&mut self.system, control)?;
+            (least, waited) = if size < 0.5 * least { (size, 0) } else { (least, waited + 1) };
             let aim = AIM * self.options.tolerance;
-            let near = size <= reachable || size / self.search.lowest.expected() <= aim;
+            let near = size <= reachable || self.search.lowest.over(size) <= aim;
             if near && self.search.iterations >= FEWEST_ITERATIONS {
                 break;
             }
@@ -264,6 +269,11 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.course = slope.map(turn);
         self.system.advance(&step, 1.0);
         self.taken = Some(step);
+        if waited == PATIENCE_OF_A_SEARCH && self.system.is_single() {
+            // Its smallest Ritz value is that of rounding too.
+            self.system.allows_single = false;
+            self.search = ConjugateGradients::default();
+        }
         Ok(())
     }
 
@@ -287,7 +297,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     /// Why it has ended, if it has.
     fn ended(&self) -> Option<Ended> {
         let last = self.looks.last()?;
-        let settled = last.error == 0.0;
+        let settled = last.error <= ROUNDING;
         let certain = self.search.iterations >= FEWEST_ITERATIONS || settled;
         let patience = if self.system.seeks_shifts() { PATIENCE_BY_SHIFTS } else { 0 };
         let stalled = stalled_since(&self.looks).is_some_and(|earlier| {

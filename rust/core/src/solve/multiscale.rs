@@ -196,7 +196,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         self.search.begin(control)?;
         let error = self.smallest.error(&self.search);
-        self.looks.push(Look { sweep: self.products, objective, error });
+        self.looks.push(Look::new(self.products, objective, error));
         Ok(())
     }
 
