@@ -159,7 +159,7 @@ class TestRefusals:
         folder, _ = recorded
         arguments = ("scene", folder / "frame00*.tif", "-o", tmp_path / "nuc.tif")
         self.refused(run(*arguments, "--width", "11"), "registered", "--width")
-        self.refused(run(*arguments, "--step", "0.3"), "'step' is 0.3", "0.2500")
+        self.refused(run(*arguments, "--step", "0.3"), "--step is 0.3", "0.2500")
         self.refused(run(*arguments, "--corrected", tmp_path / "c.png"), ".tif")
         floats = tmp_path / "floats.tif"
         write_frames(floats, recorded[1][:3].astype(np.float32), nbytes=1)

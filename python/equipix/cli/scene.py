@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from equipix.cli.options import Force, Json, Workers
+from equipix.cli.options import Force, Json, Mask, Workers, naming_mask
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.errors import InputError
-from equipix.io import SUFFIXES, find_files, refuse_inputs
+from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.scene import draw_sequence
 from equipix.scene import METHODS, SceneCorrection, load
@@ -49,12 +49,28 @@ def scene(
         float | None,
         typer.Option(help="Raw value from which a pixel is saturated; that of whole numbers."),
     ] = None,
+    bit_depth: Annotated[
+        int | None,
+        typer.Option(min=1, max=16, help="Bits of the raw values: --data-range of 0 up."),
+    ] = None,
+    mask: Mask = None,
     step: Annotated[
         float | None, typer.Option(help="Step of local-mean, gated and registered.")
     ] = None,
     width: Annotated[
         int | None, typer.Option(help="Neighbourhood of gated, constant-statistics and kalman.")
     ] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="Change of the local mean from which gated learns.")
+    ] = None,
+    motion: Annotated[
+        float | None,
+        typer.Option(help="Change from which constant-statistics and kalman take a frame."),
+    ] = None,
+    least_motion: Annotated[
+        float | None, typer.Option(help="Shift in pixels from which registered takes a pair.")
+    ] = None,
+    block: Annotated[int | None, typer.Option(help="Moving frames of a block of kalman.")] = None,
     corrected: Annotated[
         Path | None,
         typer.Option(help="A .tif of all frames, each corrected by what was learned before it."),
@@ -80,13 +96,27 @@ def scene(
     if picture is not None:
         check_picture(picture)
     written = [output, *(path for path, _ in others if path is not None)]
-    refuse_inputs(written, [*find_files(source), *([resume] if resume else [])])
+    refuse_inputs(written, [*find_files(source), *(path for path in (resume, mask) if path)])
     options = {
         name: value
-        for name, value in (("step", step), ("width", width), ("saturation", saturation))
+        for name, value in {
+            "step": step,
+            "width": width,
+            "threshold": threshold,
+            "motion": motion,
+            "least_motion": least_motion,
+            "block": block,
+            "saturation": saturation,
+            "mask": None if mask is None else read_mask(mask),
+        }.items()
         if value is not None
     }
-    learning = _method(method, source, data_range, options, resume, workers)
+    if bit_depth is not None:
+        if data_range is not None:
+            raise InputError("--bit-depth and --data-range exclude each other: leave out one")
+        data_range = (0, 2**bit_depth - 1)
+    with naming_mask(mask):
+        learning = _method(method, source, data_range, options, resume, workers)
     with progress_bars() as progress:
         done = run_sequence(learning, source, output=corrected, force=force, progress=progress)
     result = learning.result()
@@ -112,7 +142,8 @@ def _method(
         if options or data_range:
             raise InputError(
                 "'resume' (--resume) brings its options with it: leave out --data-range, "
-                "--saturation, --step and --width"
+                "--bit-depth, --mask, --saturation, --step, --width, --threshold, --motion, "
+                "--least-motion and --block"
             )
         found = load(resume, shape=shape, workers=workers)
         if found.method != name:
@@ -122,10 +153,10 @@ def _method(
     if data_range is None and dtype.kind != "u":
         raise InputError(
             f"the frames are {dtype}, whose range is unknown: give 'data_range' (--data-range "
-            "LOW HIGH)"
+            "LOW HIGH), or --bit-depth"
         )
     known = signature(METHODS[name]).parameters
-    if unknown := [f"--{option}" for option in options if option not in known]:
+    if unknown := [f"--{option.replace('_', '-')}" for option in options if option not in known]:
         raise InputError(f"--method {name} does not take {' and '.join(unknown)}: leave it out")
     return METHODS[name](shape, data_range or np.dtype(dtype), workers=workers, **options)
 
@@ -140,6 +171,8 @@ def _summary(output: Path, method: SceneCorrection, done: Sequence) -> dict[str,
         "frames": done.frames,
         "usable_frames": method.frames_taken,
         "frames_that_counted": method.frames,
+        "frames_foreign": method.frames_foreign,
+        "floor_dn": method.floor,
         "gain_rms": float(np.std(method.gain)),
         "offset_rms": float(np.std(method.offset)),
         "roughness": [

@@ -23,11 +23,11 @@ def held(gain: Floats, offset: Floats) -> tuple[Floats, Floats]:
 
 
 def neighbours(image: Floats, kernel: ArrayLike) -> Floats:
-    """Weighted mean of the neighbours, by shifts of the image with its edges reflected."""
+    """Weighted mean of the neighbours, by shifts of the image, reflected about its edge pixels."""
     kernel = np.asarray(kernel, np.float64)
     rows, cols = image.shape
     reach = [size // 2 for size in kernel.shape]
-    padded = np.pad(image, [(n, n) for n in reach], mode="symmetric")
+    padded = np.pad(image, [(n, n) for n in reach], mode="reflect")
     total = np.zeros(image.shape)
     for (i, j), weight in np.ndenumerate(kernel / kernel.sum()):
         total += weight * padded[i : i + rows, j : j + cols]
@@ -35,9 +35,9 @@ def neighbours(image: Floats, kernel: ArrayLike) -> Floats:
 
 
 def box(image: Floats, width: int) -> Floats:
-    """Mean over a square of odd width, with the edges reflected, from cumulative sums."""
+    """Mean over a square of odd width, reflected about the edge pixels, from cumulative sums."""
     reach = width // 2
-    padded = np.pad(image, reach, mode="symmetric")
+    padded = np.pad(image, reach, mode="reflect")
     sums = np.pad(padded, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
     low, high = sums[:-width], sums[width:]
     means: Floats = (
@@ -46,40 +46,87 @@ def box(image: Floats, width: int) -> Floats:
     return means
 
 
-def steps(step: float, y: Floats) -> Floats:
-    """Step of each pixel: shorter where the raw value is outside of [0, 1]."""
-    return step / np.maximum(1, (1 + y**2) / 2)
+def steps(step: float, depth: Floats) -> Floats:
+    """Step of each pixel: shorter where the raw value is more than 1 from the centre."""
+    return step / np.maximum(1, (1 + depth**2) / 2)
 
 
-class LocalMean:
+class Descent:
+    """Gain and offset that follow errors, with a step that follows their noise.
+
+    The gain belongs to the raw value less the mean of those so far. `half` is the noise that halves
+    the step: half of the mean square by which errors differ from those two updates before.
+    """
+
+    CENTRE, REMEMBERED = 1000, 32
+
+    def __init__(self, shape: tuple[int, int], step: float, half: float) -> None:
+        self.gain, self.offset = np.ones(shape), np.zeros(shape)
+        self.step, self.half = step, half
+        self.centre, self.frames = 0.0, 0
+        self.noise, self.updates = 0.0, 0
+        self.before: list[Floats] = []
+
+    def follow(self, y: Floats) -> None:
+        """Take the raw values of a frame for the centre."""
+        self.frames += 1
+        self.centre += (y.mean() - self.centre) / min(self.frames, self.CENTRE)
+
+    def pull(self, errors: Floats, *pulls: tuple[Floats, Floats, Floats]) -> None:
+        """Change the coefficients by raw values, their errors, and the part of each pixel.
+
+        Noise takes a share of the gain of each pixel that takes part; it is given back by parts.
+        """
+        if len(self.before) == 2:
+            square = np.mean((errors - self.before.pop(0)) ** 2) / 2
+            self.updates += 1
+            self.noise += (square - self.noise) / min(self.updates, self.REMEMBERED)
+        self.before.append(errors)
+        step = self.step / (1 + self.noise / self.half**2)
+        taken = np.zeros(self.gain.shape)
+        for y, error, part in pulls:
+            depth = y - self.centre
+            change = steps(step, depth) * error
+            self.gain = self.gain + change * depth
+            self.offset = self.offset + change - self.centre * change * depth
+            taken += steps(step, depth) * part
+        if taken.any():
+            lost = (1 - self.gain).sum() / (taken * self.gain).sum()
+            self.gain = self.gain * (1 + lost * taken)
+            self.offset = self.offset - taken * self.offset.sum() / taken.sum()
+        self.gain, self.offset = held(self.gain, self.offset)
+
+
+class LocalMean(Descent):
     """Towards the mean of the neighbours, in every frame."""
 
     KERNEL = ((0, 1, 0), (1, 0, 1), (0, 1, 0))
 
     def __init__(self, shape: tuple[int, int], step: float, kernel: ArrayLike = KERNEL) -> None:
-        self.gain, self.offset = np.ones(shape), np.zeros(shape)
-        self.step, self.kernel = step, kernel
+        super().__init__(shape, step, half=0.1)
+        self.kernel = kernel
 
     def update(self, y: Floats) -> None:
         """Take a frame."""
         corrected = self.gain * y + self.offset
         error = neighbours(corrected, self.kernel) - corrected
-        change = steps(self.step, y) * error
-        self.gain, self.offset = held(self.gain + change * y, self.offset + change)
+        self.follow(y)
+        self.pull(error, (y, error, np.ones(y.shape)))
 
 
-class Gated:
+class Gated(Descent):
     """Towards a local mean, where that mean changed, with shorter steps where the scene varies."""
 
     def __init__(
         self, shape: tuple[int, int], step: float, width: int, threshold: float, texture: float
     ) -> None:
-        self.gain, self.offset = np.ones(shape), np.zeros(shape)
-        self.step, self.width, self.threshold, self.texture = step, width, threshold, texture
+        super().__init__(shape, step, half=0.05)
+        self.width, self.threshold, self.texture = width, threshold, texture
         self.seen: Floats | None = None
 
     def update(self, y: Floats) -> None:
         """Take a frame."""
+        self.follow(y)
         corrected = self.gain * y + self.offset
         mean = box(corrected, self.width)
         variance = np.maximum(box(corrected**2, self.width) - mean**2, 0)
@@ -89,12 +136,13 @@ class Gated:
             return
         changed = np.abs(scene - self.seen) > self.threshold
         self.seen = np.where(changed, scene, self.seen)
-        change = steps(self.step, y) / (1 + self.texture * variance) * (mean - corrected)
-        change[~changed] = 0
-        self.gain, self.offset = held(self.gain + change * y, self.offset + change)
+        part = changed / (1 + self.texture * variance)
+        if changed.any():
+            error = part * (mean - corrected)
+            self.pull(error, (y, error, part))
 
 
-class Registered:
+class Registered(Descent):
     """Towards the other frame of a pair, moved by the shift between them."""
 
     def __init__(
@@ -106,38 +154,40 @@ class Registered:
         cutoff: float = 0.1,
         agreement: float = 0.3,
     ) -> None:
-        self.gain, self.offset = np.ones(shape), np.zeros(shape)
-        self.step, self.least, self.most = step, least_motion, most_motion
+        super().__init__(shape, step, half=2 * 0.02)
+        self.least, self.most = least_motion, most_motion
         self.cutoff, self.agreement = cutoff, agreement
         self.usual, self.pairs = 0.0, 0
-        self.before: tuple[Floats, Floats] | None = None
+        self.earlier: tuple[Floats, Floats] | None = None
         self.spline = [np.linalg.inv(_sampling(size)) for size in shape]
         self.moves: list[tuple[float, float]] = []
 
     def update(self, y: Floats) -> None:
         """Take a frame."""
+        self.follow(y)
         corrected = self.gain * y + self.offset
         spectrum = self.spectrum(corrected)
-        if self.before is None:
-            self.before = (y, spectrum)
+        if self.earlier is None:
+            self.earlier = (y, spectrum)
             return
-        move, agreement = self.motion(self.before[1], spectrum)
+        move, agreement = self.motion(self.earlier[1], spectrum)
         self.moves.append(tuple(move))
         if np.hypot(*move) < self.least and agreement >= self.least_agreement():
             return
         if agreement >= self.least_agreement() and np.max(np.abs(move)) <= self.most:
-            self.learn(self.before[0], y, move)
-        self.before = (y, spectrum)
+            self.learn(self.earlier[0], y, move)
+        self.earlier = (y, spectrum)
 
     def learn(self, first: Floats, second: Floats, move: Floats) -> None:
         """Change the coefficients by both frames of a pair."""
         error = self.error(first, second, move)
         if not self.takes(np.sum(error**2) / np.count_nonzero(error)):
             return
-        other = steps(self.step, second) * error
-        one = steps(self.step, first) * self.transposed(error, move)
-        gain, offset = other * second - one * first, other - one
-        self.gain, self.offset = held(self.gain + gain, self.offset + offset)
+        back = -self.transposed(error, move)
+        rows, cols = self.matrices(move)
+        inside = np.outer(rows.any(1), cols.any(1)).astype(float)
+        diagonal = np.outer((rows**2).sum(0), (cols**2).sum(0))
+        self.pull(error + back, (second, error, inside), (first, back, diagonal))
 
     def takes(self, square: float) -> bool:
         """Whether a pair's mean square difference is at most four times that of earlier pairs."""
@@ -250,17 +300,28 @@ class Moved:
 
     def __init__(self, threshold: float) -> None:
         self.threshold = threshold
-        self.blocks: Floats | None = None
+        self.last: Floats | None = None
+        self.noise, self.frames = 0.0, 0
 
     def __call__(self, y: Floats) -> bool:
-        """Compare a frame by the means of its blocks, less their own mean."""
-        rows, cols = (size // self.BLOCK for size in y.shape)
-        part = y[: rows * self.BLOCK, : cols * self.BLOCK]
-        blocks = part.reshape(rows, self.BLOCK, cols, self.BLOCK).mean(axis=(1, 3))
-        if self.blocks is not None and np.std(blocks - self.blocks) <= self.threshold:
+        """Compare a frame by means of blocks, less their own mean, with the noise in them."""
+        if self.last is not None and not self.differs(y - self.last):
             return False
-        self.blocks = blocks
+        self.last = y
+        self.frames += 1
         return True
+
+    def differs(self, change: Floats) -> bool:
+        """Whether the means of blocks change by more than the noise within the blocks explains."""
+        rows, cols = (size // self.BLOCK for size in change.shape)
+        part = change[: rows * self.BLOCK, : cols * self.BLOCK]
+        blocks = part.reshape(rows, self.BLOCK, cols, self.BLOCK)
+        means = blocks.mean(axis=(1, 3))
+        noise = np.mean(blocks.var(axis=(1, 3)) / (self.BLOCK**2 - 1))
+        variance = self.BLOCK**2 / 2 * noise
+        self.noise += (variance - self.noise) / min(self.frames, 32)
+        sure = 1 + 4 * np.sqrt(2 / means.size)
+        return bool(means.var() > self.threshold**2 + noise * sure)
 
 
 class ConstantStatistics:
@@ -295,7 +356,9 @@ class ConstantStatistics:
     def equalise(self) -> None:
         """Find the coefficients that give each pixel the statistics of its neighbourhood."""
         known = min(self.count, self.window)
-        trust = known / (known + self.prior)
+        share = min(self.moved.noise / self.variance.mean(), 0.9)
+        noisy = share * (2 - share) / (2 * ((1 - share) * 0.05) ** 2)
+        trust = known / (known + self.prior + noisy)
         deviation = np.sqrt(self.variance)
         wanted = np.maximum(box(deviation, self.width), 1e-9)
         ratio = wanted / np.maximum(deviation, 0.1 * wanted)

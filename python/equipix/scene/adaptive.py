@@ -12,7 +12,7 @@ from equipix.correction.polynomial import Polynomial
 from equipix.errors import FileError, InputError, UnusedInputWarning, warn
 from equipix.flags import set_bits
 from equipix.scene.dead import unresponsive
-from equipix.scene.saved import read_state, write_state
+from equipix.scene.saved import check_digest, read_state, write_state
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,6 +28,18 @@ DataRange = tuple[float, float]
 
 _FEW = 0.1
 """Share of the frames that counted below which `result` warns."""
+
+_STILL = 0.25
+"""Share of the field above which `result` warns that it never moved."""
+
+_USED = 0.3
+"""Share of the range below which `result` warns that the frames do not use it."""
+
+_SPREAD = 0.3
+"""Standard deviation of the gains above which `result` warns."""
+
+_FIRST_MASK = 64
+"""Frames after which pixels that do not respond are masked for the first time."""
 
 _TAKEN = (np.uint8, np.uint16, np.float32, np.float64)
 """Types that the compiled part takes as they are."""
@@ -46,6 +58,11 @@ class SceneCorrection:
 
     Values from `saturation` on, by default the largest whole number of the frames' dtype, do not
     change their pixels, nor the pixels with more than an eighth of such values around them.
+
+    Pixels of `mask` do not learn, and others do not learn from them; from 64 frames on those that
+    vary by less than half of what the pixels around them do are masked too. A frame that differs
+    from the one before and from the last usable one by more than three times the usual change, as
+    one of a shutter, is corrected and changes nothing (`Registered` compares pairs instead).
     """
 
     method: ClassVar[str] = ""
@@ -61,6 +78,7 @@ class SceneCorrection:
         saturation: float | None,
         workers: int | None,
         options: dict[str, Any],
+        mask: ArrayLike | None,
     ) -> None:
         """Check what all methods take; `options` holds the keywords of the method."""
         self._shape = check_shape(shape)
@@ -69,6 +87,9 @@ class SceneCorrection:
         self._workers = positive_workers(workers)
         self._options = options
         self._native = self._made()
+        self._mask, self._peak, self._masked_at = _mask_of(mask, self._shape), -np.inf, 0
+        if self._mask.any():
+            self._native.mask(self._mask)
 
     def _made(self) -> Native:
         """Make the compiled correction of the options."""
@@ -103,6 +124,22 @@ class SceneCorrection:
     def frames_taken(self) -> int:
         """Number of usable frames that were given, whether they counted or not."""
         return self._native.taken()
+
+    @property
+    def frames_foreign(self) -> int:
+        """Number of frames that were refused since they differ from the ones before and after."""
+        return self._native.foreign()
+
+    @property
+    def floor(self) -> float | None:
+        """Standard deviation in DN of the pattern that the method leaves, measured by itself.
+
+        It is how much its coefficients still change, at the mean of the frames: None before 32
+        frames that counted. It does not include patterns wider than the neighbourhood, nor what
+        stands still in all frames. While a pattern is still being learned, it is larger.
+        """
+        found = self._native.floor(self._workers)
+        return None if found is None else found * (self._range[1] - self._range[0])
 
     @property
     def saturation(self) -> float | None:
@@ -153,7 +190,20 @@ class SceneCorrection:
         if level is None and raw.dtype.kind in "iu":
             level = float(np.iinfo(raw.dtype).max)
         self._native.update(taken, corrected, saturation=level, workers=self._workers)
+        if np.isfinite(top := float(raw.max())):
+            self._peak = max(self._peak, top)
+        self._mask_unresponsive()
         return corrected
+
+    def _mask_unresponsive(self) -> None:
+        """Mask pixels that do not respond, after 64 frames and each time that they doubled."""
+        taken = self.frames_taken
+        if taken < _FIRST_MASK or taken & (taken - 1) or taken == self._masked_at:
+            return
+        self._masked_at = taken
+        weak = unresponsive(np.ones(self._shape), self._native.deviation(), taken)
+        if not (self._mask | weak).all():
+            self._native.mask(self._mask | weak)
 
     def _learned(self) -> bool:
         """Whether the coefficients have changed."""
@@ -195,9 +245,12 @@ class SceneCorrection:
         """
         self.check_learned()
         self._warn_of_few()
+        self._warn_of_still()
+        self._warn_of_range()
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
         low, high = self._range
         flags = np.zeros(self._shape, np.uint32)
+        set_bits(flags, "out_of_range", self._mask)
         set_bits(flags, "dead", unresponsive(gain, self._native.deviation(), self.frames_taken))
         metadata = {
             "scene": {
@@ -207,8 +260,11 @@ class SceneCorrection:
                 "saturation": self._saturation,
                 "frames": self.frames,
                 "frames_taken": self.frames_taken,
+                "frames_foreign": self.frames_foreign,
+                "floor_dn": self.floor,
             }
         }
+        _warn_of_spread(gain[flags == 0])
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
         return Polynomial(coefficients, flags, metadata)
 
@@ -218,6 +274,29 @@ class SceneCorrection:
             warn(
                 f"{self.frames} of {self.frames_taken} frames counted: the scene moved hardly, or "
                 "its contrast is too low for its motion to be seen beside the pattern",
+                UnusedInputWarning,
+            )
+
+    def _warn_of_still(self) -> None:
+        """Warn where much of the field never moved: its scene became part of the pattern."""
+        still = self._native.still()
+        if still is not None and still > _STILL:
+            warn(
+                f"in {still:.0%} of the field (limit {_STILL:.0%}) nothing moves from frame to "
+                "frame: a scene that stands still there, or frames that do not follow one another, "
+                "became part of the pattern; take a scene that moves over the whole field",
+                UnusedInputWarning,
+            )
+
+    def _warn_of_range(self) -> None:
+        """Warn where the range is far wider than the frames: thresholds are shares of it."""
+        low, high = self._range
+        if -np.inf < self._peak < low + _USED * (high - low):
+            bits = max(int(np.ceil(np.log2(max(self._peak, 1) + 1))), 1)
+            warn(
+                f"the largest value is {self._peak:g} DN, less than {_USED:.0%} of the range "
+                f"({low:g}, {high:g}): thresholds are shares of it. Give data_range=(0, "
+                f"{2**bits - 1}), on the command line --bit-depth {bits}",
                 UnusedInputWarning,
             )
 
@@ -237,7 +316,7 @@ class SceneCorrection:
             If the file exists and `force` is not set, or it cannot be written.
         """
         maps, counts = self._native.state()
-        content = {
+        content: dict[str, Any] = {
             "method": self.method,
             "shape": list(self._shape),
             "data_range": list(self._range),
@@ -245,7 +324,8 @@ class SceneCorrection:
             "options": self._options,
             "counts": dict(counts),
         }
-        write_state(path, dict(maps), content, force=force)
+        mask = {"mask": self._mask.astype(np.float32)}
+        write_state(path, dict(maps) | mask, content, force=force)
 
     @classmethod
     def load(
@@ -297,15 +377,39 @@ class SceneCorrection:
                 (float(low), float(high)),
                 saturation=content["saturation"],
                 workers=workers,
+                mask=maps.get("mask"),
                 **content["options"],
             )
             counts = [
                 (str(name), whole_number(name, count)) for name, count in content["counts"].items()
             ]
             made._native.restore(list(maps.items()), counts)
+            made._masked_at = made.frames_taken
+            check_digest(maps, content)
         except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
             raise FileError(f"{path}: is damaged: {error}") from error
         return made
+
+
+def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
+    """Pixels that are not used, where the mask is not 0."""
+    if mask is None:
+        return np.zeros(shape, bool)
+    masked: Array = as_array("mask", mask, ndim=2) != 0
+    if masked.shape != shape:
+        raise InputError(f"'mask' has shape {masked.shape}, expected {shape}")
+    return masked
+
+
+def _warn_of_spread(gain: Array) -> None:
+    """Warn where gains spread further than those of cameras."""
+    if gain.size and not np.std(gain) <= _SPREAD:
+        warn(
+            f"the gains spread by {np.std(gain):.2g} (limit {_SPREAD:g}), from {gain.min():.2g} to "
+            f"{gain.max():.2g}: the scene does not determine them; take a scene of more contrast, "
+            "or less noise",
+            UnusedInputWarning,
+        )
 
 
 def whole_number(name: str, value: int) -> int:

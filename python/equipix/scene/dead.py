@@ -11,8 +11,9 @@ from equipix.nuc.limits import DefectLimits
 if TYPE_CHECKING:
     from equipix._types import Array
 
-_WIDTH = 5
-"""Rows and columns of the square with whose median a pixel is compared."""
+_WIDTH, _EVERY = 11, 2
+"""Rows and columns of the square with whose median a pixel is compared, and every how many of them
+count: clusters of 5×5 pixels are less than half of it."""
 
 _LEAST_FRAMES = 51
 """Frames from which deviations are compared: of n frames that do not depend on each other a
@@ -44,8 +45,8 @@ def unresponsive(gain: Array, deviation: Array, frames: int) -> Array:
 
 
 def _median(values: Array) -> Array:
-    """Median over the square around each pixel, with the edges reflected."""
-    padded = np.pad(values, _WIDTH // 2, mode="symmetric")
+    """Median over the square around each pixel, reflected about the edge pixels."""
+    padded = np.pad(values, _WIDTH // 2, mode="reflect")
     squares = np.lib.stride_tricks.sliding_window_view(padded, (_WIDTH, _WIDTH))
-    median: Array = np.median(squares, axis=(2, 3))
+    median: Array = np.median(squares[:, :, ::_EVERY, ::_EVERY], axis=(2, 3))
     return median

@@ -37,6 +37,8 @@ class LocalMean(SceneCorrection):
         whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -77,15 +79,16 @@ class LocalMean(SceneCorrection):
         shape: tuple[int, int],
         data_range: DTypeLike | DataRange,
         *,
-        step: float = 0.02,
+        step: float = 0.025,
         kernel: ArrayLike = FOUR,
         saturation: float | None = None,
         workers: int | None = None,
+        mask: ArrayLike | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
         weights = as_array("kernel", kernel, ndim=2).astype(np.float64)
         options = {"step": number("step", step), "kernel": weights.tolist()}
-        super().__init__(shape, data_range, saturation, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options, mask)
 
     def _made(self) -> Native:
         kernel = np.array(self._options["kernel"], np.float64)
@@ -116,6 +119,8 @@ class Gated(SceneCorrection):
         whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -144,12 +149,13 @@ class Gated(SceneCorrection):
         shape: tuple[int, int],
         data_range: DTypeLike | DataRange,
         *,
-        step: float = 0.05,
+        step: float = 0.06,
         width: int = 11,
         threshold: float = 0.02,
         texture: float = 100.0,
         saturation: float | None = None,
         workers: int | None = None,
+        mask: ArrayLike | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
         options = {
@@ -158,7 +164,7 @@ class Gated(SceneCorrection):
             "threshold": number("threshold", threshold),
             "texture": number("texture", texture),
         }
-        super().__init__(shape, data_range, saturation, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options, mask)
 
     def _made(self) -> Native:
         return Native.gated(self._shape, self._range, **self._options)

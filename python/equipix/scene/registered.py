@@ -9,7 +9,7 @@ from equipix._native import SceneCorrection as Native
 from equipix.scene.adaptive import SceneCorrection, whole_number
 
 if TYPE_CHECKING:
-    from numpy.typing import DTypeLike
+    from numpy.typing import ArrayLike, DTypeLike
 
     from equipix.scene.adaptive import DataRange
 
@@ -41,6 +41,8 @@ class Registered(SceneCorrection):
         whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -78,6 +80,7 @@ class Registered(SceneCorrection):
         agreement: float = 0.3,
         saturation: float | None = None,
         workers: int | None = None,
+        mask: ArrayLike | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
         options = {
@@ -87,7 +90,7 @@ class Registered(SceneCorrection):
             "cutoff": number("cutoff", cutoff),
             "agreement": number("agreement", agreement),
         }
-        super().__init__(shape, data_range, saturation, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options, mask)
 
     def _made(self) -> Native:
         return Native.registered(self._shape, self._range, **self._options)

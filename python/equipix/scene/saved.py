@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.errors import FileError
+from equipix.errors import FileError, InputError
 from equipix.io import check_format, load_pages, save_pages
 
 if TYPE_CHECKING:
@@ -18,15 +20,40 @@ if TYPE_CHECKING:
 KIND = "state of a correction from the scene"
 """The kind in the metadata of the file."""
 
-FORMAT = 1
-"""Number of the file format; a file with a higher one is refused."""
+FORMAT = 2
+"""Number of the file format; a file with another one is refused."""
+
+_CONTENT = frozenset({"method", "shape", "data_range", "saturation", "options", "counts"})
+"""What is remembered beside the maps."""
 
 
 def write_state(
     path: str | PathLike[str], maps: Mapping[str, Array], content: Mapping[str, Any], *, force: bool
 ) -> None:
     """Write a state; see `SceneCorrection.save`."""
-    save_pages(path, maps, {"format": FORMAT, "kind": KIND, **content}, force=force)
+    digest = {"digest": _digest(maps, content)}
+    save_pages(path, maps, {"format": FORMAT, "kind": KIND, **content, **digest}, force=force)
+
+
+def check_digest(maps: Mapping[str, Array], content: Mapping[str, Any]) -> None:
+    """Refuse a state of which any byte is not the one that was saved.
+
+    Raises
+    ------
+    InputError
+        If the digest is that of another state.
+    """
+    held = {key: content[key] for key in sorted(_CONTENT)}
+    if content.get("digest") != _digest(maps, held):
+        raise InputError("'digest' is that of another state: maps or numbers were changed")
+
+
+def _digest(maps: Mapping[str, Array], content: Mapping[str, Any]) -> str:
+    """SHA-256 of all maps and of the content."""
+    found = hashlib.sha256(json.dumps(dict(content), sort_keys=True).encode())
+    for name, values in sorted(maps.items()):
+        found.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    return found.hexdigest()
 
 
 def read_state(
@@ -57,8 +84,12 @@ def read_state(
     """
     maps, content = load_pages(path)
     check_format(path, content, KIND, FORMAT)
-    missing = {"method", "shape", "data_range", "saturation", "options", "counts"} - content.keys()
-    if missing:
+    if content["format"] < FORMAT:
+        raise FileError(
+            f"{path}: has format {content['format']}, of an earlier version whose states lack the "
+            f"noise (format {FORMAT}): learn again"
+        )
+    if missing := _CONTENT - content.keys():
         raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")
     if method is not None and content["method"] != method:
         raise FileError(f"{path}: holds a state of '{content['method']}', expected '{method}'")

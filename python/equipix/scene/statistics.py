@@ -12,7 +12,7 @@ from equipix.errors import EquipixError
 from equipix.scene.adaptive import SceneCorrection, whole_number
 
 if TYPE_CHECKING:
-    from numpy.typing import DTypeLike
+    from numpy.typing import ArrayLike, DTypeLike
 
     from equipix._types import Array
     from equipix.scene.adaptive import DataRange
@@ -42,6 +42,8 @@ class ConstantStatistics(SceneCorrection):
         whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class ConstantStatistics(SceneCorrection):
         prior: int = 100,
         saturation: float | None = None,
         workers: int | None = None,
+        mask: ArrayLike | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
         options = {
@@ -84,7 +87,7 @@ class ConstantStatistics(SceneCorrection):
             "motion": number("motion", motion),
             "prior": whole_number("prior", prior),
         }
-        super().__init__(shape, data_range, saturation, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options, mask)
 
     def _made(self) -> Native:
         return Native.constant_statistics(self._shape, self._range, **self._options)
@@ -116,6 +119,8 @@ class Kalman(SceneCorrection):
         whole number of the frames' dtype, and none for floats.
     workers : int, optional
         Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -155,6 +160,7 @@ class Kalman(SceneCorrection):
         memory: float = 1e6,
         saturation: float | None = None,
         workers: int | None = None,
+        mask: ArrayLike | None = None,
     ) -> None:
         """Begin with gain 1 and offset 0."""
         options = {
@@ -165,7 +171,7 @@ class Kalman(SceneCorrection):
             "offset_spread": number("offset_spread", offset_spread),
             "memory": number("memory", memory),
         }
-        super().__init__(shape, data_range, saturation, workers, options)
+        super().__init__(shape, data_range, saturation, workers, options, mask)
 
     def _made(self) -> Native:
         return Native.kalman(self._shape, self._range, **self._options)

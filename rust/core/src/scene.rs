@@ -21,6 +21,10 @@
 mod bands;
 mod coefficients;
 mod constant_statistics;
+mod descent;
+mod field;
+mod fill;
+mod floor;
 mod gated;
 mod history;
 mod kalman;
@@ -44,6 +48,9 @@ pub use state::Snapshot;
 use bands::{BAND, bands, fold};
 use coefficients::{Coefficients, sum};
 use constant_statistics::ConstantStatistics;
+use field::Field;
+use fill::Fill;
+use floor::Floor;
 use gated::Gated;
 use history::History;
 use kalman::Kalman;
@@ -57,9 +64,12 @@ use crate::frames::{Sample, Shape};
 use crate::memory;
 use crate::parallel::Workers;
 
-/// Most bytes for each pixel: those of `Kalman`, ten values of the estimate and ten others, or of
+/// Most bytes for each pixel: those of `Kalman`, ten values of the estimate and sixteen others, or of
 /// `Registered`.
-const BYTES: u64 = 104;
+const BYTES: u64 = 128;
+
+/// Largest error of the gauge: it holds to half a unit in the last place of each value.
+const GAUGE: f64 = 1e-6;
 
 /// A correction that learns from the scene.
 #[derive(Debug)]
@@ -72,6 +82,11 @@ pub struct SceneCorrection {
     frames: u64,
     taken: u64,
     history: History,
+    field: Field,
+    floor: Floor,
+    /// 1 for masked pixels, and what they hold.
+    masked: Vec<f32>,
+    fill: Fill,
     raw: Vec<f32>,
     corrected: Vec<f32>,
 }
@@ -94,14 +109,19 @@ impl SceneCorrection {
         memory::check(shape.len() as u64 * BYTES, || {
             format!("a correction from the scene of {shape}")
         })?;
+        let coefficients = Coefficients::new(shape);
         Ok(Self {
             low,
             span: high - low,
             method: method(shape, options)?,
-            coefficients: Coefficients::new(shape),
+            floor: Floor::new(&coefficients),
+            coefficients,
             frames: 0,
             taken: 0,
             history: History::new(shape),
+            field: Field::new(shape),
+            masked: vec![0.0; shape.len()],
+            fill: Fill::default(),
             raw: vec![0.0; shape.len()],
             corrected: vec![0.0; shape.len()],
         })
@@ -149,6 +169,54 @@ impl SceneCorrection {
         self.history.deviation()
     }
 
+    /// Frames that were refused since they are far from the ones around them.
+    #[must_use]
+    pub const fn foreign(&self) -> u64 {
+        self.field.foreign
+    }
+
+    /// Share of the field that does not move, from 51 frames on.
+    #[must_use]
+    pub fn still(&self) -> Option<f64> {
+        self.field.still()
+    }
+
+    /// Standard deviation of the pattern that is left, on the scale [0, 1]: from the change of the coefficients since
+    /// a quarter to a half of the frames, at the mean level.
+    #[must_use]
+    pub fn floor(&self, workers: &Workers) -> Option<f64> {
+        let level = sum(&self.history.mean) / self.raw.len() as f64;
+        let (change, early) = self.floor.change(&self.coefficients, level, workers)?;
+        Some(change * self.method.forgets(early, self.frames).sqrt())
+    }
+
+    /// Masks pixels: they do not learn, and their neighbours do not learn from them.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if the mask is of another size; [`Error::Value`] if it leaves no pixel.
+    pub fn mask(&mut self, masked: &[bool]) -> Result<()> {
+        let shape = self.shape();
+        if masked.len() != shape.len() {
+            return Err(Error::Shape {
+                argument: "mask",
+                got: format!("{} values", masked.len()),
+                wanted: format!("those of a sensor {shape}"),
+            });
+        }
+        if masked.iter().all(|masked| *masked) {
+            return Err(Error::value("mask", "masks all pixels, expected some that are good"));
+        }
+        self.fill = Fill::new(shape, masked);
+        self.masked = masked.iter().map(|masked| f32::from(u8::from(*masked))).collect();
+        Ok(())
+    }
+
+    /// Masked pixels.
+    #[must_use]
+    pub fn masked(&self) -> Vec<bool> {
+        self.masked.iter().map(|masked| *masked > 0.0).collect()
+    }
+
     /// Corrects a frame by the coefficients before it, then learns from it; whether it counted.
     ///
     /// A frame that holds a value which is not finite, or of which half of the rows or more hold one value
@@ -173,27 +241,41 @@ impl SceneCorrection {
                 wanted: format!("those of a sensor {shape}"),
             });
         }
-        let Some(mean) = self.correct(frame, corrected, workers)? else { return Ok(false) };
+        let Some([mean, level]) = self.correct(frame, corrected, workers)? else {
+            return Ok(false);
+        };
+        let refuse = !self.method.compares_frames();
+        if !self.field.takes(shape, &self.raw, refuse, workers) {
+            return Ok(false);
+        }
+        self.taken += 1;
+        self.history.add(&self.raw, self.taken, workers);
+        self.fill.write(&mut self.raw);
+        self.fill.write(&mut self.corrected);
         let saturation =
             saturation.map_or(f32::INFINITY, |level| ((level - self.low) / self.span) as f32);
         let rule = (self.method.width(), self.method.leaves_out_saturated());
-        let left_out = saturation::left_out(shape, &self.raw, saturation, rule, workers);
+        let mut left_out = saturation::left_out(shape, &self.raw, saturation, rule, workers);
+        if rule.1 {
+            left_out = self.fill.mark(left_out, shape.len());
+        }
         let frame = Frame {
             shape,
             raw: &self.raw,
             corrected: &self.corrected,
             mean,
+            level,
             saturation,
             left_out: left_out.as_deref(),
+            fill: &self.fill,
         };
         let used = self.method.update(&frame, &mut self.coefficients, workers);
-        self.taken += 1;
-        self.history.add(&self.raw, self.taken, workers);
         self.frames += u64::from(used);
+        self.floor.follow(self.frames, &self.coefficients);
         Ok(used)
     }
 
-    /// Writes y, X and the corrected frame in raw units; the mean of X, unless the frame is unusable.
+    /// Writes y, X and the corrected frame in raw units; the means of X and y, unless the frame is unusable.
     ///
     /// A value may exceed the range by noise and offset. One far outside would change its neighbours' gains
     /// by more than they can be.
@@ -202,7 +284,7 @@ impl SceneCorrection {
         frame: &[T],
         corrected: &mut [f32],
         workers: &Workers,
-    ) -> Result<Option<f64>> {
+    ) -> Result<Option<[f64; 2]>> {
         let (low, span, size) = (self.low, self.span, BAND * self.shape().cols);
         let (gain, offset) = (&self.coefficients.gain, &self.coefficients.offset);
         let cols = self.shape().cols;
@@ -227,9 +309,9 @@ impl SceneCorrection {
                 flat += u32::from(!differs);
             }
             // A sum is finite if all its terms are: those that are not outside are small.
-            [sum(own), f64::from(flat), f64::from(u8::from(outside))]
+            [sum(own), sum(raw), f64::from(flat), f64::from(u8::from(outside))]
         });
-        let [total, flat, outside] = fold(found);
+        let [total, level, flat, outside] = fold(found);
         if outside > 0.0 {
             let problem = format!(
                 "holds values more than one span outside of the range ({low}, {}): give the range of \
@@ -239,7 +321,8 @@ impl SceneCorrection {
             return Err(Error::value("frame", problem));
         }
         let usable = total.is_finite() && 2.0 * flat < self.shape().rows as f64;
-        Ok(usable.then_some(total / self.raw.len() as f64))
+        let pixels = self.raw.len() as f64;
+        Ok(usable.then_some([total / pixels, level / pixels]))
     }
 
     fn state(&mut self) -> State<'_> {
@@ -249,9 +332,10 @@ impl SceneCorrection {
             .map("offset", sizes, &mut self.coefficients.offset)
             .map("history_mean", sizes, &mut self.history.mean)
             .squares("history_variance", sizes, &mut self.history.variance)
+            .squares("masked", sizes, &mut self.masked)
             .count("frames", &mut self.frames)
             .count("taken", &mut self.taken);
-        own.and(self.method.state())
+        own.and(self.field.state()).and(self.floor.state()).and(self.method.state())
     }
 
     /// A copy of all that is remembered.
@@ -262,10 +346,38 @@ impl SceneCorrection {
     /// Goes on from a snapshot of a correction with the same shape and options.
     ///
     /// # Errors
-    /// [`Error::Value`] if the snapshot lacks a map or count, or one is of another size or not finite; then
-    /// nothing is changed.
+    /// [`Error::Value`] if the snapshot lacks a map or count, one is of another size or not finite, or no frames
+    /// lead to it; then nothing is changed.
     pub fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        self.state().restore(snapshot)
+        let before = self.snapshot();
+        self.state().restore(snapshot)?;
+        let masked = self.masked();
+        if let Err(error) = self.check().and_then(|()| self.mask(&masked)) {
+            self.state().restore(&before)?;
+            return Err(error);
+        }
+        Ok(())
+    }
+
+    /// Refuses a state without the gauge, with more frames that counted than there were, or values that frames
+    /// do not have.
+    fn check(&self) -> Result<()> {
+        let pixels = self.raw.len() as f64;
+        let [gain, offset] = [&self.coefficients.gain, &self.coefficients.offset];
+        let [gain, offset] = [gain, offset].map(|values| sum(values) / pixels);
+        if (gain - 1.0).abs() > GAUGE || offset.abs() > GAUGE {
+            let problem =
+                format!("has the mean gain {gain} and the mean offset {offset}, expected 1 and 0");
+            return Err(Error::value("state", problem));
+        }
+        if self.frames > self.taken {
+            let problem = format!("has {} frames that counted of {}", self.frames, self.taken);
+            return Err(Error::value("state", problem));
+        }
+        if !self.history.mean.iter().all(|mean| (-1.0..=2.0).contains(mean)) {
+            return Err(Error::value("state", "has a mean frame that is out of the range"));
+        }
+        self.method.check()
     }
 }
 

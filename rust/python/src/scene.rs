@@ -187,6 +187,27 @@ impl PySceneCorrection {
         image(py, found, shape)
     }
 
+    /// Number of frames that were refused since they are far from the ones around them.
+    fn foreign(&self, py: Python<'_>) -> PyResult<u64> {
+        run::brief(py, |_| Ok(self.lock().foreign()))
+    }
+
+    /// Share of the field that does not move, from 51 frames on.
+    fn still(&self, py: Python<'_>) -> PyResult<Option<f64>> {
+        run::brief(py, |_| Ok(self.lock().still()))
+    }
+
+    /// Standard deviation of the pattern that is left, on the scale [0, 1].
+    fn floor(&self, py: Python<'_>, workers: Option<NonZeroUsize>) -> PyResult<Option<f64>> {
+        run::brief(py, |_| Ok(self.lock().floor(&Workers::new(workers)?)))
+    }
+
+    /// Masks pixels.
+    fn mask(&self, py: Python<'_>, mask: PyReadonlyArray2<'_, bool>) -> PyResult<()> {
+        let mask = mask.as_slice()?;
+        run::brief(py, |_| self.lock().mask(mask))
+    }
+
     /// Gain of each pixel, and offset on the scale [0, 1].
     fn coefficients(&self, py: Python<'_>) -> PyResult<(Map, Map)> {
         let (gain, offset, shape) = run::brief(py, |_| {

@@ -32,13 +32,6 @@ pub(super) fn fold<const N: usize>(sums: Vec<[f64; N]>) -> [f64; N] {
     sums.into_iter().fold([0.0; N], |total, each| std::array::from_fn(|i| total[i] + each[i]))
 }
 
-/// Index within 0..size of a place that may lie outside, reflected so that the edge pixel repeats:
-/// −1 becomes 0.
-pub(super) fn reflected(place: isize, size: usize) -> usize {
-    let (period, place) = (2 * size as isize, place.rem_euclid(2 * size as isize));
-    place.min(period - 1 - place) as usize
-}
-
 /// Index within 0..size of a place that may lie outside, reflected about the edge pixel: −1 becomes 1.
 pub(super) fn mirrored(place: isize, size: usize) -> usize {
     let period = (2 * size as isize - 2).max(1);
@@ -52,8 +45,6 @@ mod tests {
 
     #[test]
     fn places_outside_are_reflected() {
-        let symmetric: Vec<_> = (-4..8).map(|place| reflected(place, 4)).collect();
-        assert_eq!(symmetric, [3, 2, 1, 0, 0, 1, 2, 3, 3, 2, 1, 0]);
         let mirror: Vec<_> = (-3..7).map(|place| mirrored(place, 4)).collect();
         assert_eq!(mirror, [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
         assert_eq!(mirrored(5, 1), 0);

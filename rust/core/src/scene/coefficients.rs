@@ -36,6 +36,36 @@ impl Coefficients {
         });
     }
 
+    /// Gives what the mean gain and the mean offset lost back to each pixel in proportion to its part, and
+    /// holds the gauge.
+    pub(super) fn hold_gauge_by(&mut self, part: &[f32], workers: &Workers) {
+        let size = BAND * self.shape.cols;
+        let pixels = self.shape.len() as f64;
+        let sums = workers.map_pairs(
+            &mut self.gain,
+            &mut self.offset,
+            [size, size],
+            |index, gain, offset| {
+                let part = &part[index * size..][..gain.len()];
+                let taken: f64 = gain.iter().zip(part).map(|(g, part)| f64::from(g * part)).sum();
+                [sum(gain), sum(offset), taken, sum(part)]
+            },
+        );
+        let [gains, offsets, taken, parts] = fold(sums);
+        if taken > 0.0 {
+            let factor = ((pixels - gains) / taken) as f32;
+            let shift = (offsets / parts) as f32;
+            let parts = bands!(size; &mut self.gain, &mut self.offset);
+            workers.each(parts, |index, (gain, offset)| {
+                for ((g, o), part) in gain.iter_mut().zip(offset).zip(&part[index * size..]) {
+                    *g += factor * part * *g;
+                    *o -= shift * part;
+                }
+            });
+        }
+        self.hold_gauge(workers);
+    }
+
     /// Holds mean(g) = 1 and mean(o) = 0: the corrected frame becomes (X − mean(o)) / mean(g).
     ///
     /// The errors that the methods reduce vanish for X = constant, so without a gauge the mean gain

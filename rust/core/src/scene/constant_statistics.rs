@@ -4,19 +4,25 @@
 //! constant-statistics constraint", IEEE Transactions on Image Processing 8 (1999) 1148–1151; here with
 //! the neighbourhood in the place of the array, whose scene differs from place to place.
 
-use super::bands::{BAND, bands};
-use super::coefficients::Coefficients;
+use super::bands::{BAND, bands, fold};
+use super::coefficients::{Coefficients, sum};
 use super::method::{Frame, Method};
 use super::motion::Motion;
 use super::neighbourhood::Squares;
 use super::options::{check_range, check_width};
 use super::state::State;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
 /// Least deviation over time that a gain is divided by, in that of the neighbourhood: a dead pixel has 0.
 const LEAST_DEVIATION: f32 = 0.1;
+
+/// Standard deviation of usual gains.
+const GAIN_SPREAD: f64 = 0.05;
+
+/// Largest share of noise that counts.
+const MOST_NOISE: f64 = 0.9;
 
 /// Least deviation of a neighbourhood: below it nothing has changed.
 const NOTHING: f32 = 1e-9;
@@ -79,10 +85,27 @@ impl ConstantStatistics {
         });
     }
 
+    /// Frames after which the noise leaves as much of a gain's estimate as gains spread.
+    ///
+    /// With a share q of noise in the variance over time, the deviation over n frames errs by the share
+    /// √((q² + 2 q (1 − q)) / 2n), and a gain changes it by 1 − q of itself.
+    fn frames_of_noise(&self, workers: &Workers) -> f32 {
+        let size = BAND * self.shape.cols;
+        let lines = workers.map(self.shape.len().div_ceil(size), |index| {
+            let end = self.shape.len().min((index + 1) * size);
+            [sum(&self.variance[index * size..end])]
+        });
+        let variance = fold(lines)[0] / self.shape.len() as f64;
+        let share =
+            (f64::from(self.motion.noise) / variance.max(f64::MIN_POSITIVE)).min(MOST_NOISE);
+        let kept = (1.0 - share) * GAIN_SPREAD;
+        (share * (2.0 - share) / (2.0 * kept * kept)) as f32
+    }
+
     /// Finds the coefficients that give each pixel the statistics of its neighbourhood.
     fn equalise(&self, coefficients: &mut Coefficients, workers: &Workers) {
         let (shape, cols) = (self.shape, self.shape.cols);
-        let prior = self.prior as f32;
+        let prior = self.prior as f32 + self.frames_of_noise(workers);
         let row_of = |values: &'_ [f32], row: usize, line: &mut [f32]| {
             line.copy_from_slice(&values[row * cols..(row + 1) * cols]);
         };
@@ -122,7 +145,7 @@ impl Method for ConstantStatistics {
         coefficients: &mut Coefficients,
         workers: &Workers,
     ) -> bool {
-        if !self.motion.moved(frame.shape, frame.raw, workers) {
+        if !self.motion.moved(frame.raw, workers) {
             return false;
         }
         self.add(frame, workers);
@@ -134,6 +157,24 @@ impl Method for ConstantStatistics {
 
     fn width(&self) -> usize {
         self.width
+    }
+
+    /// Means of n frames have a variance of v/n, and change by v/early − v/n; a fifth is added for scenes that frames
+    /// have in common. Beyond the window they forget.
+    fn forgets(&self, early: u64, frames: u64) -> f64 {
+        if frames > self.window { 0.7 } else { 1.2 * early as f64 / (frames - early).max(1) as f64 }
+    }
+
+    /// Refuses counts beyond the window, and values that no frame has.
+    fn check(&self) -> Result<()> {
+        let counts = self.counts.iter().all(|count| *count <= self.window as f32);
+        let means = self.mean.iter().all(|mean| (-1.0..=2.0).contains(mean));
+        let pairs = self.deviation.iter().zip(&self.variance);
+        let roots = pairs.into_iter().all(|(d, v)| (d * d - v).abs() <= 1e-5 * v.max(1e-20));
+        if counts && means && roots {
+            return Ok(());
+        }
+        Err(Error::value("state", "holds statistics over time that no frames have"))
     }
 
     /// Pixels that are compared need the same frames: one that lacks its bright ones has another mean.

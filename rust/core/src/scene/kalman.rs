@@ -219,7 +219,7 @@ impl Method for Kalman {
         coefficients: &mut Coefficients,
         workers: &Workers,
     ) -> bool {
-        if !self.motion.moved(frame.shape, frame.raw, workers) {
+        if !self.motion.moved(frame.raw, workers) {
             return false;
         }
         self.add(frame, workers);
@@ -242,6 +242,27 @@ impl Method for Kalman {
             .count_below("count", &mut self.count, self.block)
             .count("blocks", &mut self.blocks)
             .and(self.motion.state())
+    }
+
+    /// As means over all frames: see `ConstantStatistics`.
+    fn forgets(&self, early: u64, frames: u64) -> f64 {
+        1.2 * early as f64 / (frames - early).max(1) as f64
+    }
+
+    /// Refuses variances that are not above 0, covariances beyond them, and sums of no frames.
+    fn check(&self) -> Result<()> {
+        let allowed = 1.0 + 1e-3;
+        let sound =
+            |[_, _, gg, oo, go]: &Estimate| *gg > 0.0 && *oo > 0.0 && go * go <= allowed * gg * oo;
+        let frames = self.count as f32;
+        // By Cauchy and Schwarz (Σ r)² ≤ n Σ r².
+        let summed = |[r, rr, .., n]: &Sums| {
+            (0.0..=frames).contains(n) && *rr >= 0.0 && r * r <= allowed * n * rr + 1e-6
+        };
+        if self.estimates.iter().all(sound) && self.sums.iter().all(summed) {
+            return Ok(());
+        }
+        Err(Error::value("state", "holds variances below 0, or sums that no frames have"))
     }
 
     fn variances(&self) -> Option<[Vec<f32>; 2]> {

@@ -2,7 +2,8 @@
 
 use super::bands::{BAND, bands};
 use super::coefficients::Coefficients;
-use super::method::{Frame, Method, step_at};
+use super::descent::{Descent, Pull};
+use super::method::{Frame, Method};
 use super::neighbourhood::{Image, Kernel};
 use super::stability::{check_step, kernel_bound};
 use super::state::State;
@@ -10,18 +11,29 @@ use crate::error::{Error, Result};
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
-/// g ← g + η E y, o ← o + η E with E = T − X and the mean T of the neighbours.
+/// The errors are E = T − X with the mean T of the neighbours.
 #[derive(Debug)]
 pub(super) struct LocalMean {
-    step: f32,
     kernel: Kernel,
+    descent: Descent,
+    errors: Vec<f32>,
+    part: Vec<f32>,
 }
+
+/// Noise in the errors at which the step is halved. The detail of a scene counts as noise; it is a third of this
+/// in the standard scene.
+const HALF: f64 = 0.1;
 
 impl LocalMean {
     pub(super) fn new(shape: Shape, step: f64, kernel: &[f64], sizes: [usize; 2]) -> Result<Self> {
         let weights = normalised(shape, kernel, sizes)?;
         check_step(step, kernel_bound(&weights, sizes)?, "this kernel")?;
-        Ok(Self { step: step as f32, kernel: Kernel::new(sizes, &weights) })
+        Ok(Self {
+            kernel: Kernel::new(sizes, &weights),
+            descent: Descent::new(shape, step, HALF),
+            errors: vec![0.0; shape.len()],
+            part: vec![1.0; shape.len()],
+        })
     }
 }
 
@@ -51,26 +63,24 @@ impl Method for LocalMean {
     ) -> bool {
         let cols = frame.shape.cols;
         let image = Image::new(frame.shape, frame.corrected);
-        let bands = bands!(BAND * cols; &mut coefficients.gain, &mut coefficients.offset);
-        workers.each(bands, |index, (gain, offset)| {
-            let (mut padded, mut target) = (Vec::new(), vec![0.0; cols]);
-            let rows = gain.chunks_mut(cols).zip(offset.chunks_mut(cols));
-            for (row, (gain, offset)) in rows.enumerate() {
+        let bands = bands!(BAND * cols; &mut self.errors, &mut self.part);
+        workers.each(bands, |index, (errors, part)| {
+            let mut padded = Vec::new();
+            let rows = errors.chunks_mut(cols).zip(part.chunks_mut(cols));
+            for (row, (errors, part)) in rows.enumerate() {
                 let row = index * BAND + row;
-                self.kernel.mean(image, row, &mut padded, &mut target);
-                let (raw, corrected) = frame.row(row);
-                for col in 0..cols {
-                    if frame.leaves_out(row, col) {
-                        continue;
-                    }
-                    let y = raw[col];
-                    let change = step_at(self.step, y) * (target[col] - corrected[col]);
-                    gain[col] += change * y;
-                    offset[col] += change;
+                self.kernel.mean(image, row, &mut padded, errors);
+                let (_, corrected) = frame.row(row);
+                for (col, (error, part)) in errors.iter_mut().zip(part).enumerate() {
+                    *part = if frame.leaves_out(row, col) { 0.0 } else { 1.0 };
+                    *error = *part * (*error - corrected[col]);
                 }
             }
         });
-        coefficients.hold_gauge(workers);
+        let pull = Pull { raw: frame.raw, errors: &self.errors, part: &self.part };
+        self.descent.follow(frame.level);
+        self.descent.take(&self.errors, workers);
+        self.descent.learn(&[pull], coefficients, workers);
         true
     }
 
@@ -79,6 +89,6 @@ impl Method for LocalMean {
     }
 
     fn state(&mut self) -> State<'_> {
-        State::default()
+        self.descent.state()
     }
 }

@@ -1,6 +1,6 @@
-//! Means over the neighbours of each pixel; at the edges the image is reflected.
+//! Means over the neighbours of each pixel; at the edges the image is reflected about the edge pixels, which do not repeat.
 
-use super::bands::reflected;
+use super::bands::mirrored;
 use crate::frames::Shape;
 
 /// An image of single precision.
@@ -17,7 +17,7 @@ impl<'a> Image<'a> {
 
     /// A row, reflected where it lies outside.
     fn row(&self, row: isize) -> &'a [f32] {
-        let row = reflected(row, self.shape.rows);
+        let row = mirrored(row, self.shape.rows);
         &self.values[row * self.shape.cols..(row + 1) * self.shape.cols]
     }
 }
@@ -26,8 +26,8 @@ impl<'a> Image<'a> {
 fn pad(row: &[f32], reach: usize, padded: &mut [f32]) {
     padded[reach..reach + row.len()].copy_from_slice(row);
     for i in 0..reach {
-        padded[reach - 1 - i] = row[reflected(-1 - i as isize, row.len())];
-        padded[reach + row.len() + i] = row[reflected((row.len() + i) as isize, row.len())];
+        padded[reach - 1 - i] = row[mirrored(-1 - i as isize, row.len())];
+        padded[reach + row.len() + i] = row[mirrored((row.len() + i) as isize, row.len())];
     }
 }
 
@@ -114,7 +114,7 @@ impl<F: Fn(usize, &mut [f32])> Squares<F> {
     }
 
     fn add(&mut self, row: isize, sign: f32) {
-        (self.values)(reflected(row, self.shape.rows), &mut self.line);
+        (self.values)(mirrored(row, self.shape.rows), &mut self.line);
         for (sum, value) in self.sums.iter_mut().zip(&self.line) {
             *sum += sign * value;
         }
@@ -172,7 +172,7 @@ mod tests {
         for (index, weight) in weights.iter().enumerate() {
             let row = (row + index / sizes[1]) as isize - (sizes[0] / 2) as isize;
             let col = (col + index % sizes[1]) as isize - (sizes[1] / 2) as isize;
-            sum += weight * f64::from(image.row(row)[reflected(col, image.shape.cols)]);
+            sum += weight * f64::from(image.row(row)[mirrored(col, image.shape.cols)]);
         }
         sum
     }

@@ -6,7 +6,8 @@
 
 use super::bands::{BAND, bands};
 use super::coefficients::Coefficients;
-use super::method::{Frame, Method, step_at};
+use super::descent::{Descent, Pull};
+use super::method::{Frame, Method};
 use super::moved::{Move, Own, difference, transposed};
 use super::options::check_range;
 use super::shift::PhaseCorrelation;
@@ -24,6 +25,12 @@ use crate::parallel::Workers;
 /// same coefficients, which doubles max(y² + 1): η < 2 / (2 · 2 · 2).
 const BOUND: f64 = 0.25;
 
+/// Noise of a frame at which the step is halved.
+const HALF: f64 = 0.02;
+
+/// Noise in E − Sᵀ E for each noise in a frame: 4 of its variances, where the move is by whole pixels.
+const WEIGHT: f64 = 2.0;
+
 /// A pair whose difference is larger than that of earlier pairs by this factor is not used. Up to it a frame
 /// of another scene adds √3 times their rms, √2 σ of a pattern σ, to the difference: by a step of 0.1 the
 /// pattern grows to √(1 + (0.1 · √3 · √2)²) σ, 3 %.
@@ -33,11 +40,12 @@ const ALIEN: f64 = 2.0;
 /// instead, so that after a lasting change pairs are used again.
 const REMEMBERED: f64 = 16.0;
 
-/// g ← g + η (E y₂ − (Sᵀ E) y₁), o ← o + η (E − Sᵀ E) with the difference E = S X₁ − X₂ of a pair, less its mean.
+/// The errors of the later frame are E = S X₁ − X₂, the difference of a pair less its mean, those of the earlier
+/// one −Sᵀ E.
 #[derive(Debug)]
 pub(super) struct Registered {
     shape: Shape,
-    step: f32,
+    descent: Descent,
     least_motion: f64,
     most_motion: f64,
     /// The least that is asked for, and that chance does not give.
@@ -60,6 +68,9 @@ struct Scratch {
     coefficients: Vec<f32>,
     error: Vec<f32>,
     transposed: Vec<f32>,
+    /// E − Sᵀ E, and the part of each pixel in the later and the earlier frame.
+    both: Vec<f32>,
+    parts: [Vec<f32>; 2],
 }
 
 /// Mean square of the differences of earlier pairs, and their number.
@@ -103,7 +114,7 @@ impl Registered {
         let amplitudes = transform.sizes().iter().product();
         Ok(Self {
             shape,
-            step: step as f32,
+            descent: Descent::new(shape, step, WEIGHT * HALF),
             least_motion,
             most_motion: most_motion as f64,
             agreement: agreement.max(correlation.chance(cutoff)),
@@ -119,6 +130,8 @@ impl Registered {
                 coefficients: empty(),
                 error: empty(),
                 transposed: empty(),
+                both: empty(),
+                parts: [empty(), empty()],
             },
         })
     }
@@ -132,11 +145,19 @@ impl Registered {
         coefficients: &mut Coefficients,
         workers: &Workers,
     ) -> bool {
-        let (shape, step) = (self.shape, self.step);
-        let Scratch { corrected, along, coefficients: spline, error, transposed: back } =
-            &mut self.scratch;
+        let shape = self.shape;
+        let Scratch {
+            corrected,
+            along,
+            coefficients: spline,
+            error,
+            transposed: back,
+            both,
+            parts,
+        } = &mut self.scratch;
         let (before, way) = (&self.before[..], Move::new(shape, shift));
         coefficients.apply(before, corrected, workers);
+        frame.fill.write(corrected);
         prefilter(shape, corrected, along, spline, workers);
         let left_out = saturated(frame, before, &way);
         let own = Own { values: frame.corrected, left_out: left_out.as_deref() };
@@ -145,24 +166,50 @@ impl Registered {
             return false;
         }
         transposed(shape, error, &way, [spline, along], back, workers);
+        fill_parts(shape, &way, left_out.as_deref(), parts, workers);
         let size = BAND * shape.cols;
-        let bands = bands!(size; &mut coefficients.gain, &mut coefficients.offset);
-        workers.each(bands, |index, (gain, offset)| {
-            let start = index * size;
-            let (first, second) = (&before[start..], &frame.raw[start..]);
-            let changes = error[start..].iter().zip(&back[start..]);
-            let frames = first.iter().zip(second).zip(changes);
-            for ((gain, offset), ((y1, y2), (error, back))) in
-                gain.iter_mut().zip(offset).zip(frames)
-            {
-                let (one, other) = (step_at(step, *y1) * back, step_at(step, *y2) * error);
-                *gain += other * y2 - one * y1;
-                *offset += other - one;
+        let bands = bands!(size; both, back);
+        workers.each(bands, |index, (both, back)| {
+            for ((both, back), error) in both.iter_mut().zip(back).zip(&error[index * size..]) {
+                *back = -*back;
+                *both = error + *back;
             }
         });
-        coefficients.hold_gauge(workers);
+        self.descent.take(both, workers);
+        let [own, other] = parts;
+        let pulls = [
+            Pull { raw: frame.raw, errors: error, part: own },
+            Pull { raw: before, errors: back, part: other },
+        ];
+        self.descent.learn(&pulls, coefficients, workers);
         true
     }
+}
+
+/// Writes the share of its own noise that each pixel of the later and of the earlier frame pulls on itself: 1 where
+/// the move is inside, and the diagonal of Sᵀ S.
+fn fill_parts(
+    shape: Shape,
+    way: &Move,
+    left_out: Option<&[bool]>,
+    [own, other]: &mut [Vec<f32>; 2],
+    workers: &Workers,
+) {
+    let (cols, [down, across]) = (shape.cols, way.diagonals(shape));
+    let [rows, columns] = &way.inside;
+    let bands = bands!(BAND * cols; own, other);
+    workers.each(bands, |index, (own, other)| {
+        let lines = own.chunks_mut(cols).zip(other.chunks_mut(cols)).enumerate();
+        for (line, (own, other)) in lines {
+            let row = index * BAND + line;
+            for col in 0..cols {
+                let inside = rows.contains(&row) && columns.contains(&col);
+                let used = inside && !left_out.is_some_and(|out| out[row * cols + col]);
+                own[col] = if used { 1.0 } else { 0.0 };
+                other[col] = down[row] * across[col];
+            }
+        }
+    });
 }
 
 /// Pixels of the later frame that are saturated, or whose place in the earlier one is within two pixels of
@@ -186,6 +233,7 @@ impl Method for Registered {
         coefficients: &mut Coefficients,
         workers: &Workers,
     ) -> bool {
+        self.descent.follow(frame.level);
         let spectrum = self.transform.of(frame.corrected, frame.mean as f32, workers);
         let (mut used, mut replace) = (false, self.frames == 0);
         if !replace {
@@ -193,7 +241,7 @@ impl Method for Registered {
             let [row, col] = shift.pixels;
             let far = row.abs().max(col.abs()) > self.most_motion;
             replace = far || shift.agreement < self.agreement;
-            if !replace && row.hypot(col) >= self.least_motion {
+            if !replace && row.hypot(col) >= self.least_motion && shift.shows {
                 used = self.learn(frame, shift.pixels, coefficients, workers);
                 replace = true;
             }
@@ -210,6 +258,10 @@ impl Method for Registered {
         1
     }
 
+    fn compares_frames(&self) -> bool {
+        true
+    }
+
     fn state(&mut self) -> State<'_> {
         let sizes = [self.shape.rows, self.shape.cols];
         let amplitudes = self.transform.sizes();
@@ -220,5 +272,6 @@ impl Method for Registered {
             .squares("usual", [1, 1], std::slice::from_mut(&mut self.usual.square))
             .count("frames_before", &mut self.frames)
             .count("pairs", &mut self.usual.pairs)
+            .and(self.descent.state())
     }
 }

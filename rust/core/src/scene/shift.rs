@@ -20,6 +20,10 @@ const NOTHING: f64 = 1e-30;
 /// Frames that show different scenes are taken for a pair this often, at most.
 const FALSE_ALARMS: f64 = 0.01;
 
+/// Largest share of the power of both frames that their difference has, moved by the shift: half of their power is
+/// noise then, or they are unrelated.
+const MOST_LEFT: f64 = 0.5;
+
 /// Phases for each independent one: Hann windows correlate the amplitudes of neighbouring frequencies by 2/3
 /// and 1/6, the phase factors of the cross spectrum by 0.308 and 0.017 along an axis, and 0.128, 0.0076 and
 /// 0.0005 across: 1 + 4·0.308 + 4·0.017 + 4·0.128 + 8·0.0076 + 4·0.0005.
@@ -48,6 +52,8 @@ pub(super) struct Shift {
     pub(super) pixels: [f64; 2],
     /// Mean cosine of the phases that the shift leaves: 1 for a perfect match, 0 by chance.
     pub(super) agreement: f64,
+    /// Whether both frames show one scene that moved.
+    pub(super) shows: bool,
 }
 
 impl PhaseCorrelation {
@@ -94,7 +100,24 @@ impl PhaseCorrelation {
         }
         let left = phases.iter().zip(&self.entries).map(|(p, (_, f))| turned(*p, *f, pixels)[0]);
         let agreement = left.sum::<f64>() / phases.len() as f64;
-        Shift { pixels, agreement }
+        let shows = self.shows(before, after, pixels);
+        Shift { pixels, agreement, shows }
+    }
+
+    /// Whether the shift leaves a small part of the power of both frames, and less than no shift leaves: in a scene
+    /// that stands still, wholly or half, a shift explains nothing.
+    fn shows(&self, before: &Spectrum, after: &Spectrum, pixels: [f64; 2]) -> bool {
+        let (mut power, mut left, mut unmoved) = (0.0, 0.0, 0.0);
+        for (entry, frequency) in &self.entries {
+            let [a, b, c, d] =
+                [&before.re, &before.im, &after.re, &after.im].map(|v| f64::from(v[*entry]));
+            let sum = a * a + b * b + c * c + d * d;
+            let cross = [c * a + d * b, d * a - c * b];
+            power += sum;
+            left += sum - 2.0 * turned(cross, *frequency, pixels)[0];
+            unmoved += sum - 2.0 * cross[0];
+        }
+        left < MOST_LEFT * power && left < unmoved
     }
 
     /// The best of all whole shifts within reach.

@@ -13,13 +13,21 @@ use crate::parallel::Workers;
 const POLE: f32 = -0.267_949_2;
 
 /// Steps after which the start of the recursion is forgotten.
-const REACH: usize = 14;
+pub(super) const REACH: usize = 14;
 
 /// Rows that are filtered side by side along the columns.
 const LANES: usize = 8;
 
 /// Rows of a band that is filtered along the rows.
 const BAND: usize = 64;
+
+/// Weight of the pixel `step` behind the first of four taps in the value that they give: the coefficients of an
+/// impulse are √3 z^|i|.
+pub(super) fn cardinal(taps: [f32; 4], step: isize) -> f32 {
+    let coefficient = |tap: usize| POLE.powi((tap as isize - 1 - step).unsigned_abs() as i32);
+    let sum: f32 = taps.iter().enumerate().map(|(tap, weight)| weight * coefficient(tap)).sum();
+    3.0_f32.sqrt() * sum
+}
 
 /// Coefficients of the spline through the values of an image; `along` is of its size.
 pub(super) fn prefilter(

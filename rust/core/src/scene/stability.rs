@@ -1,16 +1,18 @@
 //! Largest stable step of methods that descend along a gradient.
 //!
-//! A step changes g by η y E and o by η E with the error E = −L X of the corrected values X = A θ,
-//! θ = (g, o), A = (diag y, 1). So θ ← (1 − η Aᵀ L A) θ. With a symmetric L of eigenvalues in [0, λ] and
-//! A Aᵀ = y² + 1 ≤ 2 on the scale [0, 1] this is no expansion for
+//! A step changes g by η z E and o' by η E with z = y − m and the error E = −L X of the corrected values
+//! X = A θ, θ = (g, o'), A = (diag z, 1). So θ ← (1 − η Aᵀ L A) θ. With a symmetric L of eigenvalues in [0, λ] and
+//! A Aᵀ = z² + 1 ≤ 2 this is no expansion for
 //!
 //! ```text
-//! η < 2 / (λ · max(y² + 1)) = 1 / λ
+//! η < 2 / (λ · max(z² + 1)) = 1 / λ
 //! ```
 //!
-//! whatever the frames are. For a mean of neighbours L = 1 − K, and edges are reflected, so a kernel
-//! that is symmetric along both axes keeps L symmetric, with the eigenvalues 1 − K̂(ω). The mean of four
-//! has λ = 2. A scene that stays darker than 1 has a higher bound: y² + 1 = 1.28 on average gives 0.78.
+//! whatever the frames are. For a mean of neighbours L = 1 − K. Edges are reflected about the edge pixels, so for a
+//! kernel that is symmetric along both axes W L is symmetric, with weights W of ½ at an edge and ¼ in a corner, and
+//! L has the eigenvalues 1 − K̂(ω). W is diagonal, as the blocks of A are, so W Aᵀ L A = Aᵀ (W L) A is symmetric, and
+//! the bound holds in the norm θᵀ W θ. The mean of four has λ = 2. The errors of the frames themselves, noise and a
+//! scene that differs from its target, add to this: their part is what the step must be shortened for.
 //! Of other kernels 1 − K̂ = d is complex, and |1 − η d (y² + 1)| < 1 takes η < Re d / |d|².
 
 use std::f64::consts::PI;
