@@ -332,15 +332,15 @@ class TestFluxes:
         # A part of weak response and a dead pixel count for neither.
         shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
         truth = simulate.paper_sensitivity(shape, rng=3)
-        truth[:16, :16] *= 0.3
+        truth[:, :32] *= 0.3
         truth[30, 40] = 0
         beam, flux = simulate.gaussian_beam(shape, width=150), [1, 1.01, 0.99, 1.02, 0.98]
         frames = simulate.exposures(truth, beam, shifts, flux=flux)
         frames += 1e-3 * np.random.default_rng(4).standard_normal(frames.shape)
         with pytest.warns(IdentifiabilityWarning, match="tilt of the sensitivity undetermined"):
             cal = equipix.calibrate(frames, shifts, flux="fit")
-        assert (cal.flags[:16, :16] == 0).all()
-        assert (cal.sensitivity[:16, :16] < 0.5).all()
+        assert (cal.flags[:, :32] == 0).all()
+        assert (cal.sensitivity[:, :32] < 0.5).all()
         assert cal.flags[30, 40] != 0
         # Sums of 3072 terms of size 1, in double precision.
         assert np.abs(cal.tilt).max() < 1e-13

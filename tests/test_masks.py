@@ -139,7 +139,7 @@ def test_a_mask_of_another_shape_is_named_by_its_file(manifest, tmp_path, capsys
     file, frames = write_mask(tmp_path / "wrong.npy", np.zeros((3, 4), bool)), "frames/p0.tif"
     for command in (("calibrate", manifest), ("average", manifest.parent / frames)):
         assert run(*command, "-o", tmp_path / "out.tif", "--mask", file) == 1
-        assert f"error: {file}: 'mask' " in capsys.readouterr().err
+        assert f"error: {file}: --mask " in capsys.readouterr().err
 
 
 def test_a_mask_of_whole_numbers_is_refused_with_the_remedy():

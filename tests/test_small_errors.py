@@ -50,7 +50,7 @@ VARIANCE = np.full(5, NOISE**2)
     ("kind", "words"),
     [
         ("curved", r"response that is -(5|6|7)\.\d+% off a line at the largest signal"),
-        ("offset", r"an offset of -(8|9|10)\d?(\.\d)? DN in all values"),
+        ("offset", r"an offset of -(8|9|10)(\.\d+)?% of the largest signal"),
         ("crosstalk", r"crosstalk of (0\.[89]|1\.[012])\d% to each neighbour"),
     ],
 )

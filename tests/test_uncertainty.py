@@ -444,4 +444,4 @@ class TestOfAResult:
         assert told["sensitivity_std"] == pytest.approx(np.nanmedian(cal.sensitivity_std))
         assert told["sensitivity_std_is_exact_to"] <= DRAWS_EXACT_TO
         assert told["tilt_std"]["cols"] == again["tilt_std"]["cols"] == cal.tilt_std[1]
-        assert cal.correct(np.ones(cal.shape)).shape == cal.shape
+        assert cal.correct(np.full(cal.shape, 1000.0)).shape == cal.shape

@@ -304,15 +304,24 @@ def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
 def _usual(image: NDArray[Any]) -> NDArray[Any]:
     """Block medians, but of an odd block the median of the 5×5 blocks around.
 
-    A block is odd where its median is below half or above twice that of the blocks around: most of
-    its pixels are bad. In steep light every block may be so, hence this is for responses alone.
+    A block is odd where its median is below half or above twice that of the blocks around, and most
+    of these are within that of their median: most of its pixels are bad. Where half of a sensor
+    responds weakly no block is odd. In steep light every block may be so, hence this is for
+    responses alone.
     """
     medians, reach = _medians(image), _AROUND // 2
     padded = np.pad(medians, reach, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_AROUND, _AROUND))
     around = _nanmedian(windows, axis=(2, 3))
-    odd = (medians < DEAD_RESPONSE * around) | (medians * DEAD_RESPONSE > around)
+    usual = _are_alike(windows, around[..., None, None]).sum(axis=(2, 3))
+    most = 2 * usual > np.isfinite(windows).sum(axis=(2, 3))
+    odd = most & ~_are_alike(medians, around)
     return _of_pixels(np.where(odd, around, medians), image.shape)
+
+
+def _are_alike(values: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
+    """Which responses are between half and twice the usual one."""
+    return (values >= DEAD_RESPONSE * usual) & (values * DEAD_RESPONSE <= usual)
 
 
 def _medians(image: NDArray[Any]) -> NDArray[Any]:

@@ -60,13 +60,18 @@ class Filters:
     given: bool = True
 
     @classmethod
-    def of(cls, colours: Colours | None, image: Array) -> Filters | None:
+    def of(
+        cls, colours: Colours | None, image: Array, corner: tuple[int, int] = (0, 0)
+    ) -> Filters | None:
         """Filters of a sensor by an image (rows, cols) of light without structure of few pixels.
 
-        Where no colours are given those that stand out of the image; None where none do.
+        The image may be a part of the sensor that begins at `corner`. Where no colours are given
+        those that stand out of the image; None where none do.
         """
-        found = pattern_of(image) if colours is None else colours
-        return None if found is None else cls(found, responses(found, image), colours is not None)
+        found = pattern_of(image, corner) if colours is None else colours
+        if found is None:
+            return None
+        return cls(found, responses(found, image, corner), colours is not None)
 
     @property
     def words(self) -> str:
@@ -98,28 +103,29 @@ class Filters:
         return self.colours.map_of(self.response, shape)
 
 
-def mean_signal(values: Array, mask: Bools | None = None) -> Floats:
-    """Mean (rows, cols) over the frames (n, rows, cols) that have a usable value; else NaN."""
-    total, count = np.zeros(values.shape[1:]), np.zeros(values.shape[1:])
-    for k, each in enumerate(values):
-        known = np.isfinite(each)
-        if mask is not None:
-            known &= ~(mask[k] if mask.ndim == 3 else mask)
-        np.add(total, each, out=total, where=known)
-        count += known
-    return np.asarray(np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan)))
+def mean_signal(values: Array, mask: Bools | None = None) -> tuple[Floats, tuple[int, int]]:
+    """Mean over the frames (n, rows, cols) that have a usable value, else NaN, and its corner.
+
+    Of the middle of the sensor, in which responses are measured.
+    """
+    (row, col), (rows, cols) = _place(values.shape[1:], _MEASURED)
+    middle = np.s_[..., row : row + rows, col : col + cols]
+    known = np.isfinite(values[middle])
+    if mask is not None:
+        known &= ~mask[middle]
+    total = np.sum(values[middle], axis=0, dtype=np.float64, where=known)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / known.sum(axis=0)), (row, col)
 
 
-def responses(colours: Colours, image: Array) -> dict[str, float]:
+def responses(colours: Colours, image: Array, corner: tuple[int, int] = (0, 0)) -> dict[str, float]:
     """Response of each colour, of mean 1 over the pixels: ratios within blocks, their median.
 
     A colour without a pixel to measure, or without light, counts as 1.
     """
-    part, corner = _middle(image, _MEASURED)
-    planes = {
-        label: plane[tuple(slice(at, at + n) for at, n in zip(corner, part.shape, strict=True))]
-        for label, plane in colours.planes(image.shape)
-    }
+    part, (row, col) = _middle(image, _MEASURED, corner)
+    shape = row + part.shape[0], col + part.shape[1]
+    planes = {label: plane[row:, col:] for label, plane in colours.planes(shape)}
     means = np.array([_medians(np.where(each, part, np.nan)) for each in planes.values()])
     share = np.array([each.mean() for each in planes.values()])[:, None, None]
     known = np.isfinite(means)
@@ -137,13 +143,13 @@ def responses(colours: Colours, image: Array) -> dict[str, float]:
     return {label: value / mean for label, value in found.items()}
 
 
-def pattern_of(image: Array) -> Colours | None:
+def pattern_of(image: Array, corner: tuple[int, int] = (0, 0)) -> Colours | None:
     """Find a pattern of period 2 to 8 that stands out of an image; None where none does.
 
     The variance between the places of the period must exceed that of the pixels within a place: a
     smaller pattern flags nothing. Of periods that explain as much the shortest is taken.
     """
-    part, corner = _levelled(image)
+    part, corner = _levelled(image, corner)
     steps = range(1, LARGEST_PERIOD + 1)
     periods = [*product(steps, steps)][1:]
     places = {period: found for period in periods if (found := _Places.of(part, period))}
@@ -157,9 +163,9 @@ def pattern_of(image: Array) -> Colours | None:
     return places[period].labelled(turned)
 
 
-def _levelled(image: Array) -> tuple[Floats, tuple[int, int]]:
-    """The middle of an image over medians of blocks, and where it begins."""
-    part, corner = _middle(image, _SAMPLED)
+def _levelled(image: Array, corner: tuple[int, int]) -> tuple[Floats, tuple[int, int]]:
+    """The middle of an image over medians of blocks, and where it begins on the sensor."""
+    part, corner = _middle(image, _SAMPLED, corner)
     size = _size(part)
     usual = _medians(part).repeat(size, axis=0).repeat(size, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -171,13 +177,18 @@ def _size(part: Array) -> int:
     return int(min(BLOCK, *part.shape))
 
 
-def _middle(image: Array, most: int) -> tuple[Floats, tuple[int, int]]:
-    """The middle of an image, of whole blocks and at most so many pixels a side; its corner."""
-    size = _size(image)
-    sizes = [min(most, each) // size * size for each in image.shape]
-    row, col = ((each - part) // 2 for each, part in zip(image.shape, sizes, strict=True))
-    part = np.asarray(image[row : row + sizes[0], col : col + sizes[1]], np.float64)
-    return np.where(np.isfinite(part), part, np.nan), (row, col)
+def _place(shape: Sequence[int], most: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Corner and size of the middle, of whole blocks and at most so many pixels a side."""
+    size = min(BLOCK, *shape)
+    rows, cols = (min(most, each) // size * size for each in shape)
+    return ((shape[0] - rows) // 2, (shape[1] - cols) // 2), (rows, cols)
+
+
+def _middle(image: Array, most: int, corner: tuple[int, int]) -> tuple[Floats, tuple[int, int]]:
+    """The middle of an image that begins at `corner`, and where the middle begins."""
+    (row, col), (rows, cols) = _place(image.shape, most)
+    part = np.asarray(image[row : row + rows, col : col + cols], np.float64)
+    return np.where(np.isfinite(part), part, np.nan), (corner[0] + row, corner[1] + col)
 
 
 def _medians(part: Floats) -> Floats:

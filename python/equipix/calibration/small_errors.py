@@ -73,8 +73,9 @@ _CROSSTALK = Cause(
     0.03,
 )
 _OFFSET = Cause(
-    lambda size: f"an offset of {size:+.3g} DN in all values",
+    lambda size: f"an offset of {size:+.2%} of the largest signal in all values",
     "see that a dark of the same settings was subtracted, once, and is not flipped",
+    0.15,
 )
 _PATTERN = Cause(
     lambda size: f"the pattern of the dark, {size:+.1%} of it",
@@ -138,9 +139,10 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     An error a z of the values y changes M and L, and leaves a P z in the residuals r. P z is found
     by a fit of y + ε z to a central window: the change of the residuals is ε P z. So the estimate
     is a = ⟨r, P z⟩ / ⟨P z, P z⟩ in the products that weights make, and its variance
-    σ²/⟨P z, P z⟩ [1]_. What M and L absorb, such as a power law of the response, is not found.
-    Nothing is tested where the shifts have errors that are not refined, and where fluxes are
-    fitted, which take most of such errors: what is left is small and not of one cause.
+    σ²/⟨P z, P z⟩ [1]_, to which the noise of the dark adds. What M and L absorb, such as a power
+    law of the response, is not found. Nothing is tested where the shifts have errors that are not
+    refined, and where fluxes are fitted, which take most of such errors: what is left is small and
+    not of one cause.
 
     References
     ----------
@@ -188,13 +190,32 @@ def _tested(weighted: Weighted, options: FitOptions) -> Iterator[SmallError]:
         if other.ended != "converged" or not size * power**0.5 > _EXACT * solver:
             continue
         found = float(np.nansum(own * left)) / power
+        if cause is _PATTERN:
+            found += _noise_of_dark(weighted.exposures)
         if not abs(found) < cause.most:
             continue
-        std = (max(square, noise) / fit.degrees_of_freedom / power) ** 0.5
+        variance = max(square, noise) / fit.degrees_of_freedom / power
+        std = (variance + _by_noise_of_dark(weighted.exposures, window, left) / power**2) ** 0.5
         effect = abs(found / size) * _scatter(other, fit)
         explained = found**2 * power / (square - noise) if square > noise else np.nan
         share = np.nan if window.variance is None else explained
         yield SmallError(cause.words(found), cause.remedy, found / std, effect, share)
+
+
+def _noise_of_dark(exposures: Exposures) -> float:
+    """Share of the variance of the dark's pattern that is noise: all values lack it by itself."""
+    if exposures.dark is None or exposures.dark_variance is None:
+        return 0.0
+    return min(1.0, float(np.mean(exposures.dark_variance) / np.var(exposures.dark)))
+
+
+def _by_noise_of_dark(exposures: Exposures, window: Exposures, left: Floats) -> float:
+    """Variance of ⟨r, P z⟩ by the noise of the dark, which all measurements of a pixel share."""
+    if exposures.dark_variance is None:
+        return 0.0
+    roots = np.sqrt(window.weighted_squares(np.ones(left.shape)))
+    shared = np.nansum(roots * left, axis=0)
+    return float(np.mean(exposures.dark_variance) * np.sum(shared**2))
 
 
 def _scatter(other: Fit, fit: Fit) -> float:
@@ -218,7 +239,7 @@ def _errors(signal: Floats, window: Exposures) -> Iterator[tuple[Cause, Floats]]
     yield _CURVED, signal**2 / top
     yield _CROSSTALK, sum(np.roll(signal, n, axis) for n in (1, -1) for axis in (1, 2)) - 4 * signal
     if not window.offset:
-        yield _OFFSET, np.ones(signal.shape)
+        yield _OFFSET, np.full(signal.shape, top)
     if window.dark is not None and np.ptp(window.dark) > 0:
         yield _PATTERN, np.broadcast_to(window.dark - np.median(window.dark), signal.shape)
 

@@ -123,8 +123,8 @@ class WindowFit:
 
     @property
     def settled(self) -> bool:
-        """Whether F is as good as at its minimum."""
-        return self.error <= _FINER * self.noise
+        """Whether F is as good as at its minimum, as it is where nothing is left."""
+        return self.error <= _FINER * self.noise or self.left == 0
 
     @property
     def final(self) -> bool:

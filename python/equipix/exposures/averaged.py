@@ -212,11 +212,11 @@ class Averaged:
     @cached_property
     def filters(self) -> Filters | None:
         """Colour filters of the pixels, where they are given or stand out of the values."""
-        shown = mean_signal(self.values)
-        if self._is_counted:
-            medians = [float(np.nanmedian(each)) for each in self.values]
-            shown = self.values[int(np.argmax(medians))] - self.values[int(np.argmin(medians))]
-        return Filters.of(self.colours, shown)
+        if not self._is_counted:
+            return Filters.of(self.colours, *mean_signal(self.values))
+        medians = [float(np.nanmedian(each)) for each in self.values]
+        rise = self.values[int(np.argmax(medians))] - self.values[int(np.argmin(medians))]
+        return Filters.of(self.colours, rise)
 
     @property
     def _lowest(self) -> Floats:

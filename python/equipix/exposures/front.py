@@ -71,7 +71,7 @@ def exposures_of(
         )
         refuse_nothing(exposures, given)
         shown = mean_signal(exposures.values, exposures.mask)
-        return exposures.behind(Filters.of(measured.colours, shown))
+        return exposures.behind(Filters.of(measured.colours, *shown))
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
