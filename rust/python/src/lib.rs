@@ -1,6 +1,6 @@
 //! Python binding of [`equipix_core`], the module `equipix._native`.
 //!
-//! Every function views its arrays, calls the core through [`run::interruptible`] (which releases
+//! Every function views its arrays, calls the core through `run::interruptible` (which releases
 //! the GIL, shows progress and hears Ctrl-C), maps the error and wraps the result; nothing else.
 //! The Python layer hands over C-contiguous arrays in native byte order, so nothing is copied here.
 //!
