@@ -67,6 +67,7 @@ def test_components_are_counted_with_one_beam_and_for_each_colour_alone(cfa, arm
 def test_suggested_shifts_suffice_for_each_colour_alone(cfa, exposures, travel):
     shape = (48, 52)
     for found in plan.suggest(shape, exposures, travel, cfa=cfa, drift=1e-5):
+        assert np.ptp(found.shifts, axis=0).max() <= travel
         seen = plan.identify(shape, found.shifts, cfa=cfa)
         assert seen.components == 1
         assert set(seen.by_colour.values()) == {1}

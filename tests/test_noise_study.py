@@ -145,6 +145,7 @@ def test_error_bars_of_calibrations(draws, figure, sigma, frames):
     found, where = float(np.sqrt(np.mean(z))), f"σ {sigma:g}, {frames} frames"
     figure(f"z of calibrate, rounded, {where}", found, "0.97 to 1.03")
     figure(f"χ² of calibrate, rounded, {where}", float(np.mean(chi2)), "0.9 to 1.1")
+    assert np.mean(chi2) == pytest.approx(1, abs=0.1)
     # The map of standard deviations is exact to 2 % in each calibration.
     assert abs(found - 1) < 0.03 + 3 * (0.02 + 1 / np.sqrt(2 * truth.size)) / np.sqrt(len(z))
 
@@ -175,7 +176,7 @@ def test_an_8_bit_camera_with_two_frames_a_level(draws, figure, gain):
         float(np.mean(chi2)),
         "0.9 to 1.2",
     )
-    figure(f"C of levels left out, 8 bits, gain {gain:g}", float(np.max(left)), "below 0.3")
+    figure(f"C of levels left out, 8 bits, gain {gain:g}, median", np.median(left), "below 0.3")
     assert 0.9 < np.mean(chi2) < 1.2
     assert np.median(left) < 0.3
 
@@ -191,7 +192,13 @@ def test_staring_arrays_with_a_dark(figure, material, bits):
         warnings.simplefilter("ignore", equipix.errors.InverseWarning)
         response = nuc.fit(levels, order=3 if material == "HgCdTe" else 2)
     found = float(np.nanmean(response.reduced_chi2))
-    figure(f"χ² of nuc.fit, {material}, {bits} bits, 100 frames, dark", found, "0.9 to 1.1")
-    assert np.mean(response.flags != 0) < 1e-4 + 3 * np.sqrt(1e-4 / response.flags.size)
     # PtSi of 8 bits has all means of a level within some steps: rounding is alike at two levels.
-    assert abs(found - 1) < (0.35 if (material, bits) == ("PtSi", 8) else 0.1)
+    # The wanted 0.9 to 1.1 is missed there.
+    most = 0.35 if (material, bits) == ("PtSi", 8) else 0.1
+    figure(
+        f"χ² of nuc.fit, {material}, {bits} bits, 100 frames, dark",
+        found,
+        f"{1 - most:g} to {1 + most:g}",
+    )
+    assert np.mean(response.flags != 0) < 1e-4 + 3 * np.sqrt(1e-4 / response.flags.size)
+    assert abs(found - 1) < most

@@ -96,6 +96,8 @@ def test_no_message_names_a_keyword_beside_its_option(called):
         ("nuc", "use order='auto', and see by='gain'", "use --order auto, and see --by gain"),
         ("simulate", "exists; force=True (--force) replaces", "exists; --force replaces"),
         ("inspect", "or use robust=True", "or use robust=True"),
+        ("calibrate", "/data/flux_std.csv: holds 3", "/data/flux_std.csv: holds 3"),
+        ("calibrate", "/max_sweeps/a.tif: is empty", "/max_sweeps/a.tif: is empty"),
     ],
 )
 def test_forms_of_a_keyword(name, message, said):

@@ -371,8 +371,7 @@ def _saved(paths: list[Path], level: float | None, rejection: Rejection | None) 
 def _statistics(
     maps: tuple[Any, ...], dtype: np.dtype[Any], level: float | None
 ) -> FrameStatistics:
-    mean, variance, count, saturated, *known = maps
-    light_variance = known[0] if known else np.nan
+    mean, variance, count, saturated, light_variance = maps
     return FrameStatistics(
         mean,
         variance,

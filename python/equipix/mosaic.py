@@ -160,7 +160,8 @@ def pattern_of(image: Array, corner: tuple[int, int] = (0, 0)) -> Colours | None
     close = [period for period, rest in left.items() if rest <= _LEFT * least]
     period = min(close, key=lambda each: each[0] * each[1])
     turned = [at % step for at, step in zip(corner, period, strict=True)]
-    return places[period].labelled(turned)
+    colours = places[period].labelled(turned)
+    return None if colours.period == (1, 1) else colours
 
 
 def _levelled(image: Array, corner: tuple[int, int]) -> tuple[Floats, tuple[int, int]]:
@@ -212,7 +213,8 @@ class _Places(NamedTuple):
         """Take them from an image; None where pixels are few."""
         down, right = period
         rows, cols = image.shape[0] // down, image.shape[1] // right
-        if rows * cols < _FEWEST:
+        once = (down > 1 and rows < 2) or (right > 1 and cols < 2)
+        if once or rows * cols < _FEWEST:
             return None
         cut = image[: rows * down, : cols * right].reshape(rows, down, cols, right)
         stack = cut.transpose(1, 3, 0, 2).reshape(down, right, -1)
@@ -250,10 +252,12 @@ def _shortest(numbers: Array, axis: int) -> int:
 
 
 def _bayer(colours: Colours) -> list[str]:
-    """The two orders of Bayer's pattern that have such a diagonal; none of another pattern."""
+    """Orders of Bayer's pattern that have such a diagonal; none of another pattern."""
     if colours.period != (2, 2):
         return []
     (a, b), (c, d) = colours.pattern
+    if b == c and a == d:
+        return ["RGGB", "BGGR", "GRBG", "GBRG"]
     if b == c and b not in (a, d):
         return ["RGGB", "BGGR"]
     return ["GRBG", "GBRG"] if a == d and a not in (b, c) else []

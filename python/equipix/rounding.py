@@ -58,7 +58,7 @@ def unaveraged(v: ArrayLike) -> NDArray[Any]:
     Notes
     -----
     Below v = 0.02 the series converges slowly, and Poisson's formula of its derivative in v,
-    1 − Σ exp(−m²/4v)/√(4πv), leaves B = 1/12 + v − √(v/π) with an error below 1e-8.
+    1 − Σ exp(−m²/4v)/√(4πv), leaves B = 1/12 + v − √(v/π) with an error below 3e-8.
     """
     v = np.asarray(v, np.float64)
     if v.size and v.min() > _FINE:

@@ -290,9 +290,9 @@ class Calibration(ReadOnly):
         Returns
         -------
         float, or ndarray of shape (m,)
-            One for each image of weights, in the gauge mean(M) = 1; where free fluxes leave a tilt
-            undetermined, in that of slope 0, although a sum that depends on the tilt is as
-            uncertain as `tilt_std`.
+            One for each image of weights, in the gauge of the fit, mean(M) = 1 over all determined
+            pixels; where free fluxes leave a tilt undetermined, in that of slope 0, although a sum
+            that depends on the tilt is as uncertain as `tilt_std`.
 
         Raises
         ------

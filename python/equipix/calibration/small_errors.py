@@ -50,7 +50,17 @@ pattern and the one that it should have had, a half each."""
 _TOLERANCE, _PRODUCTS = 1e-7, 200
 """Exactness of the fits that are compared, and the products that they may take."""
 
-_STRONGER = {"sign", "unit", "repeated", "saturation", "variance", "prior", "drift"}
+_STRONGER = {
+    "sign",
+    "unit",
+    "orientation",
+    "repeated",
+    "saturation",
+    "variance",
+    "prior",
+    "drift",
+    "colour",
+}
 """Kinds of verdicts whose causes leave what looks like a small error."""
 
 
@@ -142,7 +152,7 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     σ²/⟨P z, P z⟩ [1]_, to which the noise of the dark adds. What M and L absorb, such as a power
     law of the response, is not found. Nothing is tested where the shifts have errors that are not
     refined, and where fluxes are fitted, which take most of such errors: what is left is small and
-    not of one cause.
+    not of one cause. Nor behind colour filters, where such an error differs between colours.
 
     References
     ----------
@@ -153,7 +163,9 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     # Errors of shifts that are not refined leave residuals of their own.
     given = weighted.exposures.positions.std is not None and fit.refinement != "refined"
     fitted = weighted.exposures.flux.kind in ("fit", "linear")
-    if given or fitted or fit.degrees_of_freedom < FEWEST or fit.ended != "converged":
+    if given or fitted or weighted.exposures.filters is not None:
+        return []
+    if fit.degrees_of_freedom < FEWEST or fit.ended != "converged":
         return []
     try:
         found = list(_tested(weighted, options))

@@ -52,7 +52,7 @@ TOO_WEAK = (
     "those of the frames"
 )
 
-_EXPLAINED = frozenset({"orientation", "pattern", "drift", "misfit", "prior"})
+_EXPLAINED = frozenset({"orientation", "pattern", "drift", "misfit", "prior", "colour"})
 """Kinds that name a cause, and are no news where the sign or the unit of the shifts is wrong."""
 
 _WHITE = frozenset({"noise", "signal"})

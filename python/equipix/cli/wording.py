@@ -32,7 +32,7 @@ def in_options(message: str, called: Any) -> str:
     for name, option in options.items():
         message = re.sub(rf"(?<!key )'{name}'(?! (?:in|of) )", option, message)
         if "_" in name:
-            message = re.sub(rf"(?<![\w'-]){name}(?![\w'=])", option, message)
+            message = re.sub(rf"(?<![\w'/.\\-]){name}(?![\w'=/\\]|\.\w)", option, message)
     for name in _python_only() - {each.name for each in parameters}:
         message = message.replace(f"'{name}'", f"'{name}' (in Python)")
     return message

@@ -17,7 +17,7 @@ from equipix.hardware.words import check_width, chosen_exponent, exponent_of
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from equipix.correction.protocol import Correction, cfa_of
+    from equipix.correction.protocol import Correction
 
 
 def content_of(

@@ -339,7 +339,8 @@ def _improved(
         others = np.delete(points, k, axis=0)
         places = _places(points[k], travel, rng)
         # A move by whole periods keeps what each colour has in common with the other positions.
-        places = points[k] + (places - points[k]) // period * period
+        # They are counted towards the position, which is within the travel.
+        places = points[k] + np.fix((places - points[k]) / period).astype(np.int64) * period
         scores = score(others, places)
         unmoved += 1
         for place in np.argsort(scores, kind="stable")[:_TRIED]:
