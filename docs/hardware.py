@@ -110,7 +110,7 @@ class Falls:
     Attributes
     ----------
     floats : float
-        By `reference.scene.LocalMean`, in double precision.
+        By `Loop`, in double precision.
     words : dict
         By the integer loop, for each width of both memories.
     error : float
@@ -158,14 +158,26 @@ def digitised(values: Any) -> Any:
     return np.clip(np.rint(values * 2**ADC_BITS), 0, 2**ADC_BITS - 1).astype(np.uint16)
 
 
-def in_floats(words: list[Any], step: float) -> tuple[LocalMean, float]:
+class Loop:
+    """The loop of `reference.adapt_words` in double precision: what no memory rounds."""
+
+    def __init__(self, shape: tuple[int, int], step: float) -> None:
+        self.gain, self.offset, self.step = np.ones(shape), np.zeros(shape), step
+
+    def update(self, y: Any) -> Any:
+        """Take a frame on [0, 1]; the errors E of its corrected values."""
+        corrected = self.gain * y + self.offset
+        error = neighbours(corrected, LocalMean.KERNEL) - corrected
+        self.gain = self.gain + self.step * error * y
+        self.offset = self.offset + self.step * error
+        self.gain, self.offset = self.gain - self.gain.mean() + 1, self.offset - self.offset.mean()
+        return error
+
+
+def in_floats(words: list[Any], step: float) -> tuple[Loop, float]:
     """The loop in double precision, and the rms of E over the last quarter of the frames."""
-    loop, squares = LocalMean(SCENE, step), []
-    for word in words:
-        y = word / 2**ADC_BITS
-        corrected = loop.gain * y + loop.offset
-        squares.append(np.mean((neighbours(corrected, loop.KERNEL) - corrected) ** 2))
-        loop.update(y)
+    loop = Loop(SCENE, step)
+    squares = [np.mean(loop.update(word / 2**ADC_BITS) ** 2) for word in words]
     return loop, float(np.sqrt(np.mean(squares[-len(squares) // 4 :])))
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from equipix import errors, hardware, reference
-from equipix.reference.scene import LocalMean
 
 SHAPE = (17, 23)
 
@@ -90,7 +89,7 @@ def test_at_the_bound_of_the_step_a_chequered_pattern_does_not_grow():
     spread = loop.update(frames).astype(float).std(axis=(1, 2))
     assert spread[-1] < 0.1 * spread[0]
     # The law behind the bound: twice the step makes it grow, in double precision.
-    floats = LocalMean((16, 16), 1.0)
+    floats = docs.Loop((16, 16), 1.0)
     for frame in frames[:20]:
         floats.update(frame / 2**16)
     assert (floats.gain * frames[0] / 2**16 + floats.offset).std() > 10 * spread[0] / 2**16
@@ -98,8 +97,7 @@ def test_at_the_bound_of_the_step_a_chequered_pattern_does_not_grow():
 
 def test_narrow_memories_stop_converging():
     found = docs.falls([16, 14, 8], exponent=6, seed=1, moving=800)
-    # LocalMean has the edge itself in place of a neighbour beyond it, in 6 % of the pixels.
-    assert found.words[16] == pytest.approx(found.floats, rel=0.06)
+    assert found.words[16] == pytest.approx(found.floats, rel=0.02)
     assert found.words[14] == pytest.approx(found.words[16], rel=0.02)
     assert found.words[8] < found.floats / 2
     assert found.stops_at == 8
