@@ -55,7 +55,7 @@ _NUMBERS = ("saturation", "reject", "step", "light_variance")
 _SAMPLED = 4096  # pixels that show the step between values
 _DARK = "dark_"  # before the names of the dark's pages
 
-_DARKER = 0.25
+DARKER = 0.25
 """Share of the dark by which frames are not darker than it: a dark drifts by less."""
 
 
@@ -484,10 +484,10 @@ def warn_of_bright_dark(statistics: FrameStatistics) -> None:
     if statistics.dark is None or not np.isfinite(statistics.mean).any():
         return
     level, below = np.nanmedian(statistics.dark.mean), -np.nanmedian(statistics.mean)
-    if level > 0 and below > _DARKER * level:
+    if level > 0 and below > DARKER * level:
         warn(
             f"the frames are darker than 'dark' by {below:.4g} of {level:.4g} DN in the median "
-            f"(limit {_DARKER:.0%}): see that frames and dark are not exchanged, and give frames "
+            f"(limit {DARKER:.0%}): see that frames and dark are not exchanged, and give frames "
             "from which no dark was subtracted",
             BrightDarkWarning,
         )

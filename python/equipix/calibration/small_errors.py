@@ -72,6 +72,8 @@ class Cause(NamedTuple):
     most: float = np.inf
 
 
+_SEE_DARK = "see that a dark of the same settings was subtracted, once, and is not flipped"
+
 _CURVED = Cause(
     lambda size: f"a response that is {size:+.2%} off a line at the largest signal",
     "correct the frames by response curves first (equipix.nuc.fit), or use less light",
@@ -84,12 +86,12 @@ _CROSSTALK = Cause(
 )
 _OFFSET = Cause(
     lambda size: f"an offset of {size:+.2%} of the largest signal in all values",
-    "see that a dark of the same settings was subtracted, once, and is not flipped",
+    _SEE_DARK,
     0.15,
 )
 _PATTERN = Cause(
     lambda size: f"the pattern of the dark, {size:+.1%} of it",
-    "see that a dark of the same settings was subtracted, once, and is not flipped",
+    _SEE_DARK,
 )
 
 

@@ -20,7 +20,7 @@ from equipix.errors import (
     warn,
 )
 from equipix.flags import usable
-from equipix.frames import FrameStatistics, average, refuse_subtracted
+from equipix.frames import DARKER, FrameStatistics, average, refuse_subtracted
 from equipix.io import (
     description,
     find_files,
@@ -49,10 +49,6 @@ _MARKED = (".tif", ".tiff", ".png")
 _MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
 detected."""
-
-
-_DARKER = 0.25
-"""Share of the dark by which raw frames are not darker than it: a dark drifts by less."""
 
 
 class Corrected(NamedTuple):
@@ -296,7 +292,7 @@ def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> No
         return
     offset = np.asarray(given.mean if isinstance(given, FrameStatistics) else given)
     level, below = np.nanmedian(offset), np.nanmedian(offset - frame)
-    if level > 0 and below > _DARKER * level:
+    if level > 0 and below > DARKER * level:
         warn(
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
             "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them",
