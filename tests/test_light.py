@@ -87,6 +87,81 @@ def test_frames_without_light_may_have_an_offset_that_varies():
     assert found.variance(np.zeros(3)) == pytest.approx(offset.var(ddof=1), rel=0.05)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.01])
+def test_missing_samples_in_structured_light_are_not_light_that_varies(share):
+    """Frames that miss a hundredth of the pixels, others each time, of values from 0 to 20 000."""
+    rng = np.random.default_rng(8)
+    signal = np.linspace(0, 20_000, SHAPE[1]) * np.ones(SHAPE)
+    frames = drifting(rng, signal, share, 16).astype(np.float64)
+    frames[rng.random(frames.shape) < 0.01] = np.nan
+    dark = equipix.average(drifting(rng, 0 * signal, 0, 16))
+    found = light_of(equipix.average(frames, dark=dark))
+    wanted = np.var(share * np.linspace(0.5, -0.5, 16), ddof=1)
+    # Means over 4752 of 4800 pixels that are spread by 5800 DN scatter by 8 of 10 000 DN. That is
+    # independent of the light, whose estimate has 2√(wanted) of it, in 15 degrees of freedom.
+    scatter = 0.58 * np.sqrt(0.01 / signal.size)
+    assert (found.relative > 0) == (share > 0)
+    spread = np.sqrt((4 * wanted * scatter**2 + 2 * scatter**4) / 15)
+    assert abs(found.relative - wanted) < 5 * spread
+    assert found.offset == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05])
+@pytest.mark.parametrize("lost", ["half of one", "a band of each"])
+def test_missing_blocks_of_frames_are_not_light_that_varies(lost, share):
+    """Half of one of 16 frames missing feigned 12.66 %."""
+    rng = np.random.default_rng(9)
+    signal = np.linspace(0, 20_000, SHAPE[1]) * np.ones(SHAPE)
+    frames = drifting(rng, signal, share, 16).astype(np.float64)
+    if lost == "half of one":
+        frames[3, :, :40] = np.nan
+    else:
+        for frame, band in zip(frames, range(0, 80, 5), strict=True):
+            frame[:, band : band + 20] = np.nan
+    dark = equipix.average(drifting(rng, 0 * signal, 0, 16))
+    found = light_of(equipix.average(frames, dark=dark))
+    assert (found.relative > 0) == (share > 0)
+    assert found.offset == 0
+    # A frame shows the light of its own pixels. Half of frame 3 has 1.5 times the light, and 6 %
+    # of the squared deviations; first values lack that frame, 1/16 of the light. A missing quarter
+    # changes the mean signal by up to a quarter, and so do the frames that first values lack.
+    wanted = np.var(share * np.linspace(0.5, -0.5, 16), ddof=1)
+    least, most = (0.86, 1.14) if lost == "half of one" else (0.75**4, 1.25**4)
+    assert least * wanted <= found.relative <= most * wanted
+
+
+@pytest.mark.parametrize("masked", ["half", "garbage"])
+@pytest.mark.parametrize("kind", ["whole", "float", "file"])
+def test_masked_pixels_show_no_light(kind, masked, tmp_path):
+    """With half of the pixels masked the variance was 0.25 of the true one."""
+    rng = np.random.default_rng(10)
+    frames = drifting(rng, even(rng), 0.05, 16, offset=0)
+    mask = np.zeros(SHAPE, bool)
+    if masked == "half":
+        mask[:30] = True
+        frames[:, mask] = 0
+    else:
+        mask[7] = True
+        frames[:, mask] = rng.integers(0, 65_535, (16, 1))
+    given = frames.astype(np.float32) if kind == "float" else frames
+    if kind == "file":
+        given = tmp_path / "f.tif"
+        write_frames(given, iter(frames), nbytes=frames.nbytes)
+    average = equipix.average(given, mask=mask)
+    means = frames[:, ~mask].mean(axis=1, dtype=np.float64)
+    # As in the test without a mask, with values up to 3000 here.
+    assert average.light_variance == pytest.approx(
+        means.var(ddof=1), abs=16 * 3000**2 * np.finfo(float).eps
+    )
+    wanted = np.var(0.05 * np.linspace(0.5, -0.5, 16), ddof=1)
+    # Frame means have noise of √(600/2400) of 2000 DN, over a scatter of 1.6 %: 0.8 % of the
+    # variance in 15 degrees of freedom, five times.
+    assert light_of(average).relative == pytest.approx(wanted, rel=0.04)
+    average.save(tmp_path / "a.npz")
+    again = equipix.average(tmp_path / "a.npz", mask=mask)
+    assert again.light_variance is None
+
+
 @pytest.mark.parametrize("share", [0.0, 0.05])
 def test_averages_and_frames_have_the_same_noise(share):
     rng = np.random.default_rng(5)

@@ -41,6 +41,7 @@ class Accumulator:
         dtype: str,
         shape: tuple[int, int],
         saturation: float | None,
+        mask: NDArray[Any] | None,
         workers: int | None,
     ) -> Accumulator: ...
     def add(self, frames: NDArray[Any]) -> None: ...
@@ -68,6 +69,7 @@ def apply_words(
 def average_files(
     paths: Sequence[str | PathLike[str]],
     saturation: float | None,
+    mask: NDArray[Any] | None,
     workers: int | None,
     progress: _Progress | None,
 ) -> _Statistics: ...

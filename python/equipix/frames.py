@@ -87,10 +87,14 @@ class FrameStatistics(ReadOnly):
         count.
     step : float
         Step between the values of the frames, in DN: 1 of whole numbers, 16 of 12 bits that were
-        shifted to 16; 0 of values that are not whole. See `equipix.rounding`.
+        shifted to 16; 0 of values that are not whole. See `equipix.rounding`. Of files that hold no
+        step it is found from the sums over frames; it is 0 where they are not whole, since the dark
+        that was subtracted is not kept.
     light_variance : float or None
-        Unbiased variance of the means of the frames over all pixels, in DN²: that of the light, and
-        of the noise over the number of pixels. None of one frame, or where it is not known.
+        Unbiased variance of the means of the frames over the pixels that are not masked, in DN²:
+        that of the light, and of the noise over the number of pixels. Where samples are missing it
+        is that of their differences to the first values of their pixels. None of one frame, or
+        where it is not known: a saved average does not show it without the pixels of another mask.
     """
 
     mean: NDArray[Any]
@@ -243,17 +247,18 @@ def average(
     level, rejection = as_level(saturation), None if reject is None else Rejection(reject)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     frames = _paths_or_frames(source)
+    out = None if mask is None else as_array("mask", mask, ndim=2)
     with naming_memory("averaging"):
         if isinstance(frames, list):
-            statistics = _average_files(frames, level, workers, progress, rejection)
+            statistics = _average_files(frames, level, out, workers, progress, rejection)
         else:
             given = batches(frames)
             statistics = _average_batches(
-                given, level, workers, progress, _length(source), rejection
+                given, level, out, workers, progress, _length(source), rejection
             )
         if reject is not None:
             statistics = dataclasses.replace(statistics, reject=float(reject))
-        return _masked(_subtract(statistics, offset), mask)
+        return _masked(_subtract(statistics, offset), out)
 
 
 def save_statistics(
@@ -283,16 +288,34 @@ def read_statistics(
     dark = None
     if _DARK + "mean" in pages:
         io.check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
-        dark = _of_pages(pages, content, _DARK)
+        dark = _of_pages(path, pages, content, _DARK)
     raw = content.get("raw", False)
-    return dataclasses.replace(_of_pages(pages, content), dark=dark, raw=raw)
+    statistics = dataclasses.replace(_of_pages(path, pages, content), dark=dark, raw=raw)
+    return statistics if "step" in content else _with_steps(statistics)
+
+
+def _with_steps(statistics: FrameStatistics) -> FrameStatistics:
+    """Find the steps of averages that were saved without: sums over frames still show them."""
+    dark, mean = statistics.dark, statistics.mean
+    if dark is not None:
+        dark, mean = _with_steps(dark), mean + dark.mean
+    step = _step(mean, statistics.variance, statistics.count)
+    return dataclasses.replace(statistics, dark=dark, step=step)
 
 
 def _of_pages(
-    pages: Mapping[str, NDArray[Any]], content: dict[str, Any], before: str = ""
+    path: str | PathLike[str],
+    pages: Mapping[str, NDArray[Any]],
+    content: dict[str, Any],
+    before: str = "",
 ) -> FrameStatistics:
     mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
     numbers = {name: content[before + name] for name in _NUMBERS if before + name in content}
+    for name, value in numbers.items():
+        if type(value) not in (int, float) and (name == "step" or value is not None):
+            raise FileError(
+                f"{path}: is damaged: its '{before}{name}' is {value!r}, expected a number"
+            )
     return FrameStatistics(mean, variance, of_mean, count, saturated, **numbers)
 
 
@@ -331,25 +354,33 @@ def _length(source: Any) -> int:
 def _average_files(
     names: list[Any],
     level: float | None,
+    mask: NDArray[Any] | None,
     workers: int | None,
     progress: Progress | None,
     rejection: Rejection | None,
 ) -> FrameStatistics:
     paths = io.find_files(names)
     if any(path.suffix.lower() == ".npz" for path in paths):
-        return _saved(paths, level, rejection)
+        return _saved(paths, level, mask, rejection)
     if rejection is None:
         with suppress(UnsupportedFileError):
-            maps = _native.average_files(paths, level, workers, progress)
+            if mask is not None:
+                _check_mask(mask, io.frame_format(paths[0])[0][1:])
+            maps = _native.average_files(paths, level, mask, workers, progress)
             return _statistics(maps, io.frame_format(paths[0])[1], level)
     if any(saved_shape(path) for path in paths):
-        return _saved(paths, level, rejection)
+        return _saved(paths, level, mask, rejection)
     stream = io.stream_frames(paths, workers=workers)
     given = batches(frame for _, frames in stream for frame in frames)
-    return _average_batches(given, level, workers, progress, len(paths), rejection)
+    return _average_batches(given, level, mask, workers, progress, len(paths), rejection)
 
 
-def _saved(paths: list[Path], level: float | None, rejection: Rejection | None) -> FrameStatistics:
+def _saved(
+    paths: list[Path],
+    level: float | None,
+    mask: NDArray[Any] | None,
+    rejection: Rejection | None,
+) -> FrameStatistics:
     """Read the one average that is given in the place of frames."""
     path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
     if others:
@@ -365,7 +396,8 @@ def _saved(paths: list[Path], level: float | None, rejection: Rejection | None) 
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
             f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
         )
-    return statistics
+    _check_mask(mask, statistics.mean.shape)
+    return statistics if mask is None else dataclasses.replace(statistics, light_variance=None)
 
 
 def _statistics(
@@ -406,6 +438,7 @@ def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
 def _average_batches(
     given: Iterator[NDArray[Any]],
     level: float | None,
+    mask: NDArray[Any] | None,
     workers: int | None,
     progress: Progress | None,
     total: int,
@@ -416,7 +449,8 @@ def _average_batches(
     everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
     if rejection is not None:
         dtype, everything = np.dtype(np.float64), rejection.cleaned(everything)
-    sums = _native.Accumulator(dtype.name, first.shape[1:], level, workers)
+    _check_mask(mask, first.shape[1:])
+    sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, workers)
     done = 0
     for batch in everything:
         sums.add(np.ascontiguousarray(unmasked(batch, dtype), dtype=dtype))
@@ -429,22 +463,26 @@ def _average_batches(
     return _statistics(maps, first.dtype, level)
 
 
-def _masked(statistics: FrameStatistics, mask: ArrayLike | None) -> FrameStatistics:
+def _check_mask(mask: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
+    """Refuse a mask of frames of that shape that is none, or leaves no pixel."""
+    if mask is None:
+        return
+    if mask.dtype != np.bool_ or mask.shape != shape:
+        raise InputError(
+            f"'mask' is {mask.dtype} of shape {mask.shape}, expected bool of shape {shape}, True "
+            f"= do not use{': give mask != 0' if mask.shape == shape else ''}"
+        )
+    if mask.all():
+        raise InputError("'mask' is True in every pixel, expected some pixels to use")
+
+
+def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStatistics:
     """Return averages without the pixels of a mask."""
     if mask is None:
         return statistics
-    array = as_array("mask", mask, ndim=2)
-    shape = statistics.mean.shape
-    if array.dtype != np.bool_ or array.shape != shape:
-        raise InputError(
-            f"'mask' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}, True "
-            f"= do not use{': give mask != 0' if array.shape == shape else ''}"
-        )
-    if array.all():
-        raise InputError("'mask' is True in every pixel, expected some pixels to use")
     maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
     for name, values in maps.items():
-        values[array] = 0 if name in _COUNTS else np.nan
+        values[mask] = 0 if name in _COUNTS else np.nan
     return dataclasses.replace(statistics, **maps)
 
 

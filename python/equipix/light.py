@@ -1,11 +1,14 @@
 r"""Light that varies between the frames of one level: what it adds to the scatter of each pixel.
 
 Frames of light 1 + δ make a pixel of signal μ scatter by μ² var(δ) besides its noise. The means of
-the frames over all N pixels show it: their variance is
+the frames show it. Where a share f of a pixel's samples is missing, frames are means over different
+pixels, so samples count there as differences to the first value of their pixel. With N = Σ (1 − f)
+samples in the average frame the means have the variance
 
-.. math:: V = \bar\mu^2 \operatorname{var}(\delta) + \overline{\sigma^2}/N ,
+.. math:: V = \bar\mu^2 \operatorname{var}(\delta) + \sum (1 - f) \sigma^2 / N^2 , \qquad
+    \bar\mu = \sum_\text{follow} (1 - f) \mu / N ,
 
-with the mean of the signals over the pixels that follow the light.
+with the signals of the pixels that follow the light.
 """
 
 from __future__ import annotations
@@ -69,15 +72,17 @@ def light_of(frames: FrameStatistics) -> Light:
     known = np.isfinite(frames.mean) & np.isfinite(frames.variance)
     if frames.light_variance is None or count < 2 or not known.any():
         return Light()
-    pixels = int(np.count_nonzero(known))
-    scatter = float(frames.variance[known].mean())
-    if frames.light_variance <= scatter_limit(count) * scatter / pixels:
+    share = np.where(known, frames.count / count, 0)
+    samples = float(share.sum())
+    scatter = float((share[known] * frames.variance[known]).sum()) / samples
+    variance = frames.light_variance
+    if variance <= scatter_limit(count) * scatter / samples:
         return Light()
     follows = known & (frames.saturated == 0)
-    mean = float(frames.mean[follows].sum()) / pixels
-    light = Light(offset=frames.light_variance)
-    if frames.light_variance < (_LARGEST * mean) ** 2:
-        light = Light(relative=frames.light_variance / mean**2)
+    mean = float((share[follows] * frames.mean[follows]).sum()) / samples
+    light = Light(offset=variance)
+    if variance < (_LARGEST * mean) ** 2:
+        light = Light(relative=variance / mean**2)
     common = float(light.variance(frames.mean[follows]).mean()) if follows.any() else 0.0
     own = max(float(frames.variance[follows].mean()) - common, 1e-3 * common)
     return light._replace(over_noise=common / own)

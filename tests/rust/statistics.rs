@@ -41,16 +41,24 @@ fn naive<T: Sample>(frames: &[T], shape: Shape, pixel: usize) -> (f64, f64) {
     (mean, if n < 2.0 { f64::NAN } else { scatter / (n - 1.0) })
 }
 
-/// Unbiased variance of the means of the frames over their finite samples.
+/// Unbiased variance of the means of the frames over their finite samples, each less the mean of the
+/// first 16 frames in which its pixel has one.
 fn of_light<T: Sample>(frames: &[T], shape: Shape) -> f64 {
-    let means: Vec<f64> = frames
-        .chunks(shape.len())
-        .map(|frame| frame.iter().map(|sample| sample.to_f64()).filter(|value| value.is_finite()))
-        .filter_map(|values| {
-            let (sum, count) = values.fold((0.0, 0), |(sum, count), v| (sum + v, count + 1));
-            (count > 0).then(|| sum / f64::from(count))
-        })
-        .collect();
+    let size = shape.len();
+    let mut first = vec![f64::NAN; size];
+    let mut means = Vec::new();
+    for batch in frames.chunks(16 * size) {
+        for (pixel, first) in first.iter_mut().enumerate().filter(|(_, first)| first.is_nan()) {
+            *first = naive(batch, shape, pixel).0;
+        }
+        for frame in batch.chunks(size) {
+            let values = frame.iter().zip(&first).map(|(sample, first)| sample.to_f64() - first);
+            let finite: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+            if !finite.is_empty() {
+                means.push(finite.iter().sum::<f64>() / finite.len() as f64);
+            }
+        }
+    }
     naive(&means, Shape::new(1, 1), 0).1
 }
 
@@ -98,8 +106,14 @@ proptest! {
     ) {
         let parts = merged(&frames, shape, &cuts, 2).unwrap();
         let count = frames.len() / shape.len();
+        let one = merged(&frames, shape, &[], 2).unwrap();
         let light = of_light(&frames, shape);
-        prop_assert!(close(parts.light_variance, light, count + shape.len(), 4e6));
+        prop_assert!(close(one.light_variance, light, count + shape.len(), 4e6));
+        // Parts have first values of their own, which are as good where no sample is missing.
+        let finite: Vec<f64> = frames.iter().map(|x: &f64| if x.is_nan() { 0.0 } else { *x }).collect();
+        let cut = merged(&finite, shape, &cuts, 2).unwrap();
+        let light = of_light(&finite, shape);
+        prop_assert!(close(cut.light_variance, light, count + shape.len(), 4e6));
         for pixel in 0..shape.len() {
             let (mean, variance) = naive(&frames, shape, pixel);
             prop_assert!(close(parts.mean[pixel], mean, count, 1e3));
@@ -113,6 +127,44 @@ proptest! {
         let three = merged(&frames, shape, &[], 3).unwrap();
         prop_assert_eq!(format!("{one:?}"), format!("{three:?}"));
     }
+}
+
+/// Variance of the light of frames of a ramp, of which this share is missing in one frame.
+fn light_of_ramp(missing: usize, mask: Option<&[bool]>) -> f64 {
+    let shape = Shape::new(40, 50);
+    let light = |frame: usize| 1.0 + 0.001 * frame as f64;
+    let value = |frame: usize, pixel: usize| {
+        if frame == 5 && pixel < missing { f64::NAN } else { light(frame) * pixel as f64 }
+    };
+    let frames: Vec<f64> =
+        (0..20).flat_map(|frame| (0..shape.len()).map(move |pixel| value(frame, pixel))).collect();
+    let mut sums = Accumulator::<f64>::new(shape, None).unwrap();
+    if let Some(mask) = mask {
+        sums = sums.masked(mask).unwrap();
+    }
+    let workers = Workers::new(None).unwrap();
+    sums.add(&Stack::new("frames", &frames, 20, shape).unwrap(), &workers, &Control::new())
+        .unwrap();
+    sums.finish().light_variance
+}
+
+#[test]
+fn blocks_of_missing_samples_are_no_light() {
+    let whole = light_of_ramp(0, None);
+    // Var(δ) of the ramp's mean, squared.
+    let wanted = 35.0 * (0.001_f64 * 999.5).powi(2);
+    assert!((whole / wanted - 1.0).abs() < 1e-9);
+    // One of 20 deviations counts for half of its pixels, which have 1.5 times the light.
+    assert!((light_of_ramp(1000, None) / wanted - 1.0).abs() < 2.0 / 20.0);
+}
+
+#[test]
+fn masked_pixels_show_no_light() {
+    let mask: Vec<bool> = (0..2000).map(|pixel| pixel >= 1000).collect();
+    let wanted = 35.0 * (0.001_f64 * 499.5).powi(2);
+    assert!((light_of_ramp(0, Some(&mask)) / wanted - 1.0).abs() < 1e-9);
+    let sums = Accumulator::<u8>::new(Shape::new(3, 4), None).unwrap();
+    assert!(matches!(sums.masked(&mask), Err(Error::Shape { argument: "mask", .. })));
 }
 
 #[test]

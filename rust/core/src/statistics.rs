@@ -16,6 +16,9 @@
 //!
 //! The light may vary between frames. What it does to all pixels together shows in the means of the
 //! frames over all pixels, whose variance is kept, one number, added frame by frame in their order.
+//! Pixels may be left out of these means. Where samples are missing, frames are means over different
+//! pixels: so a floating-point sample counts there as its difference to the first value of its pixel,
+//! the mean of the first batch in which it has samples.
 //!
 //! Samples that are not finite do not count. Saturated samples do: they are counted apart, and
 //! whoever uses the mean decides what to do with the pixel.
@@ -30,7 +33,7 @@ use crate::memory;
 use crate::parallel::Workers;
 
 mod light;
-use light::{FloatLight, Light, WholeLight, total_of_finite, total_of_whole};
+use light::{FloatLight, Light, WholeLight};
 
 /// Pixels of one block: their sums stay in the first-level cache while a batch passes.
 const BLOCK: usize = 1024;
@@ -51,7 +54,8 @@ pub struct Statistics {
     pub count: Vec<u32>,
     /// Number of samples at or above the saturation level.
     pub saturated: Vec<u32>,
-    /// Unbiased variance of the means of the frames over all pixels; NaN of fewer than two.
+    /// Unbiased variance of the means of the frames over the pixels that are not masked; NaN of fewer
+    /// than two.
     pub light_variance: f64,
 }
 
@@ -68,8 +72,6 @@ pub trait Summable: Sample {
     type Light: Light;
     /// The level that no sample exceeds, where the type has one.
     const FULL_SCALE: Option<f64>;
-    /// Sum and number of the samples that count.
-    fn total(samples: &[Self]) -> (f64, usize);
 }
 
 /// Partial sums of a block of pixels.
@@ -80,32 +82,32 @@ pub trait PartialSums<T>: Clone + std::fmt::Debug + Send + Sync {
     fn new(pixels: usize) -> Self;
     /// Adds the same block of several frames.
     fn add(&mut self, frames: &[&[T]], saturation: f64);
-    /// Adds what `other` has summed over the same pixels.
-    fn merge(&mut self, other: &Self);
+    /// Sum and number of the samples of each frame that was added, over the first values of pixels;
+    /// `left_out` is empty, or tells for each pixel whether it does not count.
+    fn totals(&self, frames: &[&[T]], left_out: &[bool]) -> Vec<(f64, usize)>;
+    /// Sum and number of the differences between the first values of `other` and these.
+    fn offsets(&self, other: &Self) -> (f64, usize);
+    /// Adds what `other` has summed over the same pixels; its first values are higher by `offset`.
+    fn merge(&mut self, other: &Self, offset: f64);
     /// Appends the block's pixels to `statistics`.
     fn finish(&self, statistics: &mut Statistics);
 }
 
 macro_rules! summable {
-    ($($sample:ty: $sums:ty, $light:ty, $full_scale:expr, $total:ident;)*) => {$(
+    ($($sample:ty: $sums:ty, $light:ty, $full_scale:expr;)*) => {$(
         impl Summable for $sample {
             type Sums = $sums;
             type Light = $light;
             const FULL_SCALE: Option<f64> = $full_scale;
-
-            #[inline(always)]
-            fn total(samples: &[Self]) -> (f64, usize) {
-                $total(samples)
-            }
         }
     )*};
 }
 
 summable! {
-    u8: ExactSums, WholeLight, Some(255.0), total_of_whole;
-    u16: ExactSums, WholeLight, Some(65535.0), total_of_whole;
-    f32: Moments, FloatLight, None, total_of_finite;
-    f64: Moments, FloatLight, None, total_of_finite;
+    u8: ExactSums, WholeLight, Some(255.0);
+    u16: ExactSums, WholeLight, Some(65535.0);
+    f32: Moments, FloatLight, None;
+    f64: Moments, FloatLight, None;
 }
 
 /// Σx and Σx² in whole numbers: 2³² samples of 16 bits fill 64.
@@ -140,7 +142,28 @@ impl<T: Sample + Into<u32>> PartialSums<T> for ExactSums {
         self.count += frames.len() as u32;
     }
 
-    fn merge(&mut self, other: &Self) {
+    #[inline(always)]
+    fn totals(&self, frames: &[&[T]], left_out: &[bool]) -> Vec<(f64, usize)> {
+        let whole = |sample: T| -> u64 { u64::from(Into::<u32>::into(sample)) };
+        let total = |samples: &&[T]| {
+            if left_out.is_empty() {
+                return (
+                    samples.iter().map(|&each| whole(each)).sum::<u64>() as f64,
+                    samples.len(),
+                );
+            }
+            let kept = samples.iter().zip(left_out).filter(|&(_, &out)| !out);
+            let (sum, count) = kept.fold((0, 0), |(sum, n), (&each, _)| (sum + whole(each), n + 1));
+            (sum as f64, count)
+        };
+        frames.iter().map(total).collect()
+    }
+
+    fn offsets(&self, _: &Self) -> (f64, usize) {
+        (0.0, 0)
+    }
+
+    fn merge(&mut self, other: &Self, _: f64) {
         self.count += other.count;
         self.sum.iter_mut().zip(&other.sum).for_each(|(a, b)| *a += b);
         self.squares.iter_mut().zip(&other.squares).for_each(|(a, b)| *a += b);
@@ -168,6 +191,8 @@ pub struct Moments {
     mean: Vec<f64>,
     scatter: Vec<f64>,
     saturated: Vec<u32>,
+    /// First value of each pixel; NaN where there is none yet.
+    first: Vec<f64>,
 }
 
 impl Moments {
@@ -183,8 +208,11 @@ impl Moments {
                 *saturated += u32::from(value >= saturation);
             }
         }
-        let sums = self.mean.iter_mut().zip(&self.count);
-        sums.for_each(|(sum, &count)| *sum /= f64::from(count.max(1)));
+        let sums = self.mean.iter_mut().zip(&mut self.first).zip(&self.count);
+        for ((mean, first), &count) in sums {
+            *mean /= f64::from(count.max(1));
+            *first = if count == 0 { f64::NAN } else { *mean };
+        }
     }
 
     /// The samples' scatter about the mean that is already there.
@@ -201,12 +229,13 @@ impl Moments {
 }
 
 impl<T: Sample> PartialSums<T> for Moments {
-    const BYTES: usize = 4 + 8 + 8 + 4;
+    const BYTES: usize = 4 + 8 + 8 + 4 + 8;
 
     fn new(pixels: usize) -> Self {
         let zeros = || vec![0.0; pixels];
         let counts = || vec![0; pixels];
-        Self { count: counts(), mean: zeros(), scatter: zeros(), saturated: counts() }
+        let first = vec![f64::NAN; pixels];
+        Self { count: counts(), mean: zeros(), scatter: zeros(), saturated: counts(), first }
     }
 
     #[inline(always)]
@@ -214,11 +243,32 @@ impl<T: Sample> PartialSums<T> for Moments {
         let mut batch = <Self as PartialSums<T>>::new(self.mean.len());
         batch.add_means(frames, saturation);
         batch.add_scatter(frames);
-        <Self as PartialSums<T>>::merge(self, &batch);
+        <Self as PartialSums<T>>::merge(self, &batch, 0.0);
     }
 
     #[inline(always)]
-    fn merge(&mut self, other: &Self) {
+    fn totals(&self, frames: &[&[T]], left_out: &[bool]) -> Vec<(f64, usize)> {
+        let total = |samples: &&[T]| {
+            let (mut sum, mut count) = (0.0, 0);
+            for (i, (sample, first)) in samples.iter().zip(&self.first).enumerate() {
+                let difference = sample.to_f64() - first;
+                if difference.is_finite() && left_out.get(i) != Some(&true) {
+                    (sum, count) = (sum + difference, count + 1);
+                }
+            }
+            (sum, count)
+        };
+        frames.iter().map(total).collect()
+    }
+
+    fn offsets(&self, other: &Self) -> (f64, usize) {
+        let pairs = self.first.iter().zip(&other.first).map(|(here, there)| there - here);
+        let known = pairs.filter(|difference| difference.is_finite());
+        known.fold((0.0, 0), |(sum, count), difference| (sum + difference, count + 1))
+    }
+
+    #[inline(always)]
+    fn merge(&mut self, other: &Self, offset: f64) {
         for i in 0..self.mean.len() {
             let (here, there) = (f64::from(self.count[i]), f64::from(other.count[i]));
             let share = there / (here + there).max(1.0);
@@ -227,6 +277,9 @@ impl<T: Sample> PartialSums<T> for Moments {
             self.scatter[i] += other.scatter[i] + delta * delta * here * share;
             self.count[i] += other.count[i];
             self.saturated[i] += other.saturated[i];
+            if self.first[i].is_nan() {
+                self.first[i] = other.first[i] - offset;
+            }
         }
     }
 
@@ -249,6 +302,7 @@ pub struct Accumulator<T: Summable> {
     saturation: f64,
     frames: u32,
     light: T::Light,
+    left_out: Vec<bool>,
     blocks: Vec<T::Sums>,
 }
 
@@ -268,7 +322,21 @@ impl<T: Summable> Accumulator<T> {
         memory::check(Self::bytes(shape), || format!("averaging frames of {shape}"))?;
         let blocks = (0..shape.len()).step_by(BLOCK);
         let blocks = blocks.map(|start| T::Sums::new(BLOCK.min(shape.len() - start))).collect();
-        Ok(Self { shape, saturation, frames: 0, light: T::Light::default(), blocks })
+        let (light, left_out) = (T::Light::default(), Vec::new());
+        Ok(Self { shape, saturation, frames: 0, light, left_out, blocks })
+    }
+
+    /// The same sums, of which pixels where `mask` is true show no light.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if it has not as many pixels as a frame.
+    pub fn masked(mut self, mask: &[bool]) -> Result<Self> {
+        if mask.len() != self.shape.len() {
+            let (got, wanted) = (format!("{} pixels", mask.len()), self.shape.to_string());
+            return Err(Error::Shape { argument: "mask", got, wanted });
+        }
+        self.left_out = mask.to_vec();
+        Ok(self)
     }
 
     /// Sizes of one frame.
@@ -296,7 +364,7 @@ impl<T: Summable> Accumulator<T> {
                 if control.is_cancelled() {
                     return Vec::new();
                 }
-                add_block(&mut block[0], batch, index * BLOCK, self.saturation)
+                add_block::<T>(&mut block[0], batch, index * BLOCK, self.saturation, &self.left_out)
             });
             control.check()?;
             for frame in 0..batch.len() {
@@ -308,7 +376,7 @@ impl<T: Summable> Accumulator<T> {
         Ok(())
     }
 
-    /// Adds what `other` has summed.
+    /// Adds what `other` has summed, with the same mask.
     ///
     /// # Errors
     /// As [`add`](Self::add), and [`Error::Value`] if the saturation levels differ.
@@ -319,8 +387,11 @@ impl<T: Summable> Accumulator<T> {
             return Err(Error::value("saturation", format!("is {there}, expected {here} as here")));
         }
         self.frames = self.total(other.frames as usize)?;
-        self.light.merge(&other.light);
-        self.blocks.iter_mut().zip(&other.blocks).for_each(|(a, b)| a.merge(b));
+        let pairs = self.blocks.iter().zip(&other.blocks).map(|(a, b)| a.offsets(b));
+        let (sum, count) = pairs.fold((0.0, 0), |(a, m), (b, n)| (a + b, m + n));
+        let offset = sum / count.max(1) as f64;
+        self.light.merge(&other.light, offset);
+        self.blocks.iter_mut().zip(&other.blocks).for_each(|(a, b)| a.merge(b, offset));
         Ok(())
     }
 
@@ -358,20 +429,22 @@ impl<T: Summable> Accumulator<T> {
 }
 
 /// Adds the pixels from `start` on of a batch of frames, by the widest vectors the processor has;
-/// the sum and number of those that count in each frame.
+/// the sum and number of those that show the light of each frame.
 fn add_block<T: Summable>(
     block: &mut T::Sums,
     batch: &[&[T]],
     start: usize,
     saturation: f64,
+    left_out: &[bool],
 ) -> Vec<(f64, usize)> {
     let pieces: Vec<&[T]> =
         batch.iter().map(|frame| &frame[start..frame.len().min(start + BLOCK)]).collect();
+    let left_out = &left_out[start.min(left_out.len())..left_out.len().min(start + BLOCK)];
     pulp::Arch::new().dispatch(
         #[inline(always)]
         || {
             block.add(&pieces, saturation);
-            pieces.iter().map(|samples| T::total(samples)).collect()
+            block.totals(&pieces, left_out)
         },
     )
 }

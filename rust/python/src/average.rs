@@ -7,7 +7,7 @@ use equipix_core::frames::{Shape, Stack};
 use equipix_core::io::{self, AnyFrames, Frames};
 use equipix_core::parallel::Workers;
 use equipix_core::statistics::{self, Statistics, Summable};
-use numpy::{Element, IntoPyArray, PyArray2, PyArrayMethods, PyReadonlyArray3};
+use numpy::{Element, IntoPyArray, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 
 use crate::{errors, run};
@@ -43,14 +43,16 @@ impl Accumulator {
         dtype: &str,
         shape: (usize, usize),
         saturation: Option<f64>,
+        mask: Option<PyReadonlyArray2<'_, bool>>,
         workers: Option<NonZeroUsize>,
     ) -> PyResult<Self> {
         let shape = Shape::new(shape.0, shape.1);
+        let mask = mask.as_ref().map(|mask| mask.as_slice()).transpose()?;
         let sums = match dtype {
-            "uint8" => statistics::Accumulator::new(shape, saturation).map(Sums::U8),
-            "uint16" => statistics::Accumulator::new(shape, saturation).map(Sums::U16),
-            "float32" => statistics::Accumulator::new(shape, saturation).map(Sums::F32),
-            _ => statistics::Accumulator::new(shape, saturation).map(Sums::F64),
+            "uint8" => sums(shape, saturation, mask).map(Sums::U8),
+            "uint16" => sums(shape, saturation, mask).map(Sums::U16),
+            "float32" => sums(shape, saturation, mask).map(Sums::F32),
+            _ => sums(shape, saturation, mask).map(Sums::F64),
         };
         let sums = sums.map_err(|error| errors::exception(py, &error))?;
         Ok(Self { sums, workers })
@@ -78,6 +80,18 @@ impl Accumulator {
     }
 }
 
+fn sums<T: Summable>(
+    shape: Shape,
+    saturation: Option<f64>,
+    mask: Option<&[bool]>,
+) -> equipix_core::Result<statistics::Accumulator<T>> {
+    let sums = statistics::Accumulator::new(shape, saturation)?;
+    match mask {
+        Some(mask) => sums.masked(mask),
+        None => Ok(sums),
+    }
+}
+
 fn add<T: Summable + Element>(
     sums: &mut statistics::Accumulator<T>,
     frames: &Bound<'_, PyAny>,
@@ -95,16 +109,18 @@ fn add<T: Summable + Element>(
 
 /// Mean, variance, count and number of saturated samples of all pages of all files.
 #[pyfunction]
-#[pyo3(signature = (paths, saturation, workers, progress))]
+#[pyo3(signature = (paths, saturation, mask, workers, progress))]
 pub(crate) fn average_files<'py>(
     py: Python<'py>,
     paths: Vec<PathBuf>,
     saturation: Option<f64>,
+    mask: Option<PyReadonlyArray2<'py, bool>>,
     workers: Option<NonZeroUsize>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Maps<'py>> {
+    let mask = mask.as_ref().map(|mask| mask.as_slice()).transpose()?;
     let statistics = run::interruptible(py, progress, |control| {
-        io::average(&paths, saturation, &Workers::new(workers)?, control)
+        io::average(&paths, saturation, mask, &Workers::new(workers)?, control)
     })?;
     maps(py, statistics)
 }

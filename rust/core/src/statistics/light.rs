@@ -1,13 +1,12 @@
 //! Variance of the means of frames over all pixels: of the light, where it varies between frames.
 
-use crate::frames::Sample;
-
 /// What is kept of the means of frames; its size does not depend on their number.
 pub trait Light: Clone + Default + std::fmt::Debug + Send + Sync {
     /// Adds a frame with this sum over so many samples.
     fn add(&mut self, sum: f64, samples: usize);
-    /// Adds what `other` has of later frames.
-    fn merge(&mut self, other: &Self);
+    /// Adds what `other` has of later frames, whose means count from a level that is higher by
+    /// `offset`.
+    fn merge(&mut self, other: &Self, offset: f64);
     /// Unbiased variance of the means; NaN of fewer than two.
     fn variance(&self) -> f64;
 }
@@ -24,10 +23,10 @@ pub struct WholeLight {
 impl Light for WholeLight {
     fn add(&mut self, sum: f64, samples: usize) {
         let sum = sum as u128; // exact: below 2⁵³
-        self.merge(&Self { frames: 1, samples, sum, squares: sum * sum });
+        self.merge(&Self { frames: 1, samples, sum, squares: sum * sum }, 0.0);
     }
 
-    fn merge(&mut self, other: &Self) {
+    fn merge(&mut self, other: &Self, _: f64) {
         self.frames += other.frames;
         self.samples = self.samples.max(other.samples);
         self.sum += other.sum;
@@ -58,13 +57,13 @@ pub struct FloatLight {
 impl Light for FloatLight {
     fn add(&mut self, sum: f64, samples: usize) {
         if samples > 0 {
-            self.merge(&Self { frames: 1.0, mean: sum / samples as f64, scatter: 0.0 });
+            self.merge(&Self { frames: 1.0, mean: sum / samples as f64, scatter: 0.0 }, 0.0);
         }
     }
 
-    fn merge(&mut self, other: &Self) {
+    fn merge(&mut self, other: &Self, offset: f64) {
         let share = other.frames / (self.frames + other.frames).max(1.0);
-        let delta = other.mean - self.mean;
+        let delta = other.mean + offset - self.mean;
         self.mean += delta * share;
         self.scatter += other.scatter + delta * delta * self.frames * share;
         self.frames += other.frames;
@@ -73,18 +72,4 @@ impl Light for FloatLight {
     fn variance(&self) -> f64 {
         if self.frames < 2.0 { f64::NAN } else { self.scatter / (self.frames - 1.0) }
     }
-}
-
-/// Sum and number of whole samples; exact.
-#[inline(always)]
-pub(super) fn total_of_whole<T: Sample + Into<u32>>(samples: &[T]) -> (f64, usize) {
-    let sum: u64 = samples.iter().map(|&sample| u64::from(sample.into())).sum();
-    (sum as f64, samples.len())
-}
-
-/// Sum and number of the finite samples.
-#[inline(always)]
-pub(super) fn total_of_finite<T: Sample>(samples: &[T]) -> (f64, usize) {
-    let finite = samples.iter().map(|sample| sample.to_f64()).filter(|value| value.is_finite());
-    finite.fold((0.0, 0), |(sum, count), value| (sum + value, count + 1))
 }
