@@ -7,6 +7,7 @@ mod choice;
 mod common;
 mod dense;
 mod descent;
+mod estimate;
 mod experiment;
 mod fit;
 mod fixed_point;

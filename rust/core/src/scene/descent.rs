@@ -14,8 +14,9 @@
 //!    gauge common to all would raise the gains of pixels that take part less often, as those of edges.
 //! 2. A step η leaves errors of the variance η σ²/2 or so. The step is therefore η / (1 + s²/h²), with the
 //!    noise s that the errors show and the noise h that halves it.
-//! 3. s² is half of the mean square by which errors differ from those two updates before. What persists is the
-//!    pattern, which is to be learned by long steps; updates that follow one another share a frame.
+//! 3. s² is half of the mean square by which errors differ from those two updates before, less a share of the mean
+//!    of their products. What persists is the pattern, which is to be learned by long steps, and the share is what
+//!    moves of it for each part that persists. Updates that follow one another have a frame in common.
 
 use super::bands::{BAND, bands, fold};
 use super::coefficients::{Coefficients, sum_of_squares};
@@ -37,6 +38,8 @@ pub(super) struct Descent {
     step: f64,
     /// Noise in the errors at which the step is halved.
     half: f64,
+    /// Mean square of what moves of the pattern in the errors, over that of what persists.
+    moving: f64,
     centre: f32,
     frames: u64,
     /// Errors of the two updates before.
@@ -56,11 +59,11 @@ pub(super) struct Pull<'a> {
 }
 
 impl Descent {
-    pub(super) fn new(shape: Shape, step: f64, half: f64) -> Self {
+    pub(super) fn new(shape: Shape, step: f64, half: f64, moving: f64) -> Self {
         let zeros = || vec![0.0; shape.len()];
         let before = [zeros(), zeros()];
         let (centre, variance, part) = (0.0, 0.0, zeros());
-        Self { shape, step, half, centre, frames: 0, before, variance, updates: 0, part }
+        Self { shape, step, half, moving, centre, frames: 0, before, variance, updates: 0, part }
     }
 
     /// Takes the raw values of a frame for the centre.
@@ -75,15 +78,17 @@ impl Descent {
         let size = BAND * self.shape.cols;
         let squares = workers.map_blocks(&mut self.before[0], size, |index, before| {
             let errors = &errors[index * size..][..before.len()];
+            let total = sum_of_squares(before) + sum_of_squares(errors);
             for (before, error) in before.iter_mut().zip(errors) {
                 *before -= error;
             }
-            let squares = sum_of_squares(before);
+            let apart = sum_of_squares(before);
             before.copy_from_slice(errors);
-            [squares]
+            [apart, (total - apart) / 2.0]
         });
         if self.updates >= 2 {
-            let variance = fold(squares)[0] / (2.0 * self.shape.len() as f64);
+            let [apart, products] = fold(squares).map(|sum| sum / self.shape.len() as f64);
+            let variance = (apart / 2.0 - self.moving * products).max(0.0);
             let share = 1.0 / (self.updates - 1).min(REMEMBERED) as f64;
             self.variance += (share * (variance - f64::from(self.variance))) as f32;
         }
@@ -127,5 +132,73 @@ impl Descent {
             .squares("noise", [1, 1], std::slice::from_mut(&mut self.variance))
             .count("frames_of_centre", &mut self.frames)
             .count("updates", &mut self.updates)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SHAPE: Shape = Shape { rows: 64, cols: 64 };
+    const DEVIATION: f32 = 0.01;
+
+    fn one() -> Workers {
+        Workers::new(std::num::NonZeroUsize::new(1)).unwrap()
+    }
+
+    /// Independent values of variance 1, other for each seed.
+    fn noise(seed: u64) -> Vec<f32> {
+        let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        let mut next = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            ((state >> 40) as f32 / (1 << 24) as f32 - 0.5) * 12.0_f32.sqrt()
+        };
+        (0..SHAPE.len()).map(|_| next()).collect()
+    }
+
+    /// The variance that 40 errors show: what persists, what changes with each move, and noise.
+    fn variance(moving: f64, persists: f32, moves: f32) -> f64 {
+        let (mut descent, pattern) = (Descent::new(SHAPE, 0.1, DEVIATION.into(), moving), noise(1));
+        for index in 0..40 {
+            let (moved, own) = (noise(100 + index), noise(200 + index));
+            let parts = pattern.iter().zip(&moved).zip(&own);
+            let errors = parts.map(|((p, m), n)| persists * p + moves * m + DEVIATION * n);
+            descent.take(&errors.collect::<Vec<_>>(), &one());
+        }
+        f64::from(descent.variance) / f64::from(DEVIATION).powi(2)
+    }
+
+    #[test]
+    fn a_pattern_is_no_noise() {
+        // 32 means over 4096 pixels, whose products of noise and pattern err by 10/√(32 · 4096) each at most.
+        let error = 5.0 * 0.03;
+        assert!((variance(0.0, 0.0, 0.0) - 1.0).abs() < error);
+        assert!((variance(0.0, 0.1, 0.0) - 1.0).abs() < error);
+        assert!((variance(0.5, 0.02, 0.02 / 2.0_f32.sqrt()) - 1.0).abs() < error);
+        assert!(variance(0.0, 0.02, 0.02 / 2.0_f32.sqrt()) > 2.5);
+        // A pattern that only persists is more than the share: never below 0.
+        assert_eq!(variance(0.5, 0.1, 0.0), 0.0);
+    }
+
+    #[test]
+    fn errors_pull_about_the_centre_by_a_step_that_noise_halves() {
+        let (raw, part) = (vec![0.75; SHAPE.len()], vec![1.0; SHAPE.len()]);
+        let signs = (0..SHAPE.len()).map(|pixel| if pixel % 2 == 0 { 0.01 } else { -0.01 });
+        let errors: Vec<f32> = signs.collect();
+        for (variance, step) in [(0.0, 0.1), (DEVIATION * DEVIATION, 0.05)] {
+            let mut descent = Descent::new(SHAPE, 0.1, DEVIATION.into(), 0.0);
+            descent.follow(0.25);
+            descent.variance = variance;
+            let mut learned = Coefficients::new(SHAPE);
+            let pull = Pull { raw: &raw, errors: &errors, part: &part };
+            descent.learn(&[pull], &mut learned, &one());
+            // X changes by η E ((y − m)² + 1) at the raw value, and by η E at the centre; of such errors the
+            // gauge takes nothing.
+            for (pixel, error) in errors.iter().enumerate() {
+                let at = |y: f32| learned.gain[pixel] * y + learned.offset[pixel] - y;
+                assert!((at(0.75) - step * error * 1.25).abs() < 4.0 * f32::EPSILON);
+                assert!((at(0.25) - step * error).abs() < 4.0 * f32::EPSILON);
+            }
+        }
     }
 }

@@ -118,3 +118,56 @@ fn mean_square(blocks: &[f32], others: &[f32]) -> f64 {
     let squares = blocks.iter().zip(others).map(|(a, b)| f64::from(a - b).powi(2));
     squares.sum::<f64>() / blocks.len() as f64
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f32::consts::TAU;
+
+    const SHAPE: Shape = Shape { rows: 64, cols: 64 };
+
+    /// Two waves that move by two pixels in a frame, or stand still left of a column, as a scene of a level.
+    fn frame(index: usize, still: usize, level: f32) -> Vec<f32> {
+        let value = |pixel: usize| {
+            let (row, col) = (pixel / SHAPE.cols, pixel % SHAPE.cols);
+            let moved = if col < still { 0.0 } else { 2.0 * index as f32 };
+            let angles = [(row as f32 + moved) / 40.0, (col as f32 + moved) / 56.0];
+            // Noise of half a percent, other in each frame and pixel.
+            let noise = ((pixel * 7919 + index * 6007) % 1009) as f32 / 1009.0 - 0.5;
+            level + 0.1 * (TAU * angles[0]).sin() + 0.1 * (TAU * angles[1]).sin() + 0.02 * noise
+        };
+        (0..SHAPE.len()).map(value).collect()
+    }
+
+    fn take(field: &mut Field, frame: &[f32]) -> bool {
+        field.takes(SHAPE, frame, true, &Workers::new(std::num::NonZeroUsize::new(1)).unwrap())
+    }
+
+    #[test]
+    fn the_share_of_the_field_that_stands_still_is_found() {
+        for (still, share) in [(0, 0.0), (32, 0.5), (64, 1.0)] {
+            let mut field = Field::new(SHAPE);
+            for index in 0..200 {
+                assert_eq!(field.still().is_some(), index as u64 >= LEAST_FRAMES);
+                assert!(take(&mut field, &frame(index, still, 0.5)));
+            }
+            // Of 64 blocks of noise one in twenty may exceed the ratio by chance.
+            assert!((field.still().unwrap() - share).abs() <= 3.0 / 64.0, "{still}");
+        }
+    }
+
+    #[test]
+    fn a_foreign_frame_changes_nothing_and_a_new_scene_costs_one() {
+        let mut field = Field::new(SHAPE);
+        for index in 0..40 {
+            assert!(take(&mut field, &frame(index, 0, 0.5)));
+        }
+        let (mean, variance, frames) = (field.mean.clone(), field.variance.clone(), field.frames);
+        assert!(!take(&mut field, &vec![0.0; SHAPE.len()]));
+        assert_eq!((&field.mean, &field.variance, field.frames), (&mean, &variance, frames));
+        assert!(take(&mut field, &frame(41, 0, 0.5)));
+        assert!(!take(&mut field, &frame(42, 0, 0.9)));
+        assert!(take(&mut field, &frame(43, 0, 0.9)));
+        assert_eq!(field.foreign, 2);
+    }
+}

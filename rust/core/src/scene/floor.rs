@@ -66,3 +66,33 @@ impl Floor {
             .count("late_frames", second)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::Shape;
+
+    #[test]
+    fn the_change_is_that_of_the_pattern_since_the_earlier_copy() {
+        let workers = Workers::new(std::num::NonZeroUsize::new(1)).unwrap();
+        let mut now = Coefficients::new(Shape::new(4, 6));
+        let mut floor = Floor::new(&now);
+        floor.follow(FIRST / 2, &now);
+        floor.follow(FIRST, &now);
+        assert!(floor.change(&now, 0.5, &workers).is_none());
+        for (pixel, (gain, offset)) in now.gain.iter_mut().zip(&mut now.offset).enumerate() {
+            let sign = if pixel % 2 == 0 { 1.0 } else { -1.0 };
+            (*gain, *offset) = (*gain + 0.25 * sign, *offset + 0.0625 * sign);
+        }
+        floor.follow(2 * FIRST, &now);
+        // Neither the same number of frames again nor one that is no power of two makes a copy.
+        floor.follow(2 * FIRST, &Coefficients::new(now.shape));
+        floor.follow(3 * FIRST, &Coefficients::new(now.shape));
+        // A change that all pixels have in common is no pattern.
+        now.offset.iter_mut().for_each(|offset| *offset += 0.5);
+        assert_eq!(floor.change(&now, 0.5, &workers), Some((0.1875, FIRST)));
+        assert_eq!(floor.change(&now, -0.25, &workers), Some((0.0, FIRST)));
+        floor.follow(4 * FIRST, &now);
+        assert_eq!(floor.change(&now, 0.5, &workers), Some((0.0, 2 * FIRST)));
+    }
+}

@@ -49,7 +49,7 @@ impl Gated {
         check_step(step, kernel_bound(&even, [width; 2])?, "the mean of this width")?;
         Ok(Self {
             shape,
-            descent: Descent::new(shape, step, HALF),
+            descent: Descent::new(shape, step, HALF, 0.0),
             width,
             threshold: threshold as f32,
             texture: texture as f32,

@@ -30,7 +30,7 @@ impl LocalMean {
         check_step(step, kernel_bound(&weights, sizes)?, "this kernel")?;
         Ok(Self {
             kernel: Kernel::new(sizes, &weights),
-            descent: Descent::new(shape, step, HALF),
+            descent: Descent::new(shape, step, HALF, 0.0),
             errors: vec![0.0; shape.len()],
             part: vec![1.0; shape.len()],
         })

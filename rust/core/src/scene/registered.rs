@@ -31,6 +31,10 @@ const HALF: f64 = 0.02;
 /// Noise in E − Sᵀ E for each noise in a frame: 4 of its variances, where the move is by whole pixels.
 const WEIGHT: f64 = 2.0;
 
+/// A pattern p is (S + Sᵀ) p − (1 + Sᵀ S) p in E − Sᵀ E. Of a white one, moved by whole pixels, the first part, which
+/// changes with the move, has half of the mean square of the second.
+const MOVING: f64 = 0.5;
+
 /// A pair whose difference is larger than that of earlier pairs by this factor is not used. Up to it a frame
 /// of another scene adds √3 times their rms, √2 σ of a pattern σ, to the difference: by a step of 0.1 the
 /// pattern grows to √(1 + (0.1 · √3 · √2)²) σ, 3 %.
@@ -114,7 +118,7 @@ impl Registered {
         let amplitudes = transform.sizes().iter().product();
         Ok(Self {
             shape,
-            descent: Descent::new(shape, step, WEIGHT * HALF),
+            descent: Descent::new(shape, step, WEIGHT * HALF, MOVING),
             least_motion,
             most_motion: most_motion as f64,
             agreement: agreement.max(correlation.chance(cutoff)),
