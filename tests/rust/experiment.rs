@@ -71,8 +71,3 @@ pub(crate) fn experiments() -> impl Strategy<Value = Experiment> {
         })
     })
 }
-
-/// What rounding leaves of F where everything is fitted exactly: the residuals are not 0 then.
-pub(crate) fn rounding_of_objective(experiment: &Experiment) -> f64 {
-    experiment.frames.len() as f64 * (10.0 * f64::EPSILON).powi(2)
-}

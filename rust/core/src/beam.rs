@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::frames::Shape;
-use crate::geometry::{Rotation, Taps, Walk, whole_number};
+use crate::geometry::{Rotation, Taps, Walk, nearest_whole, whole_number};
 use crate::parallel::{Add, Workers};
 
 /// The beam L on its padded grid, row by row, in the units of the frames.
@@ -75,7 +75,7 @@ impl<V: AsRef<[f64]> + Sync> Beam<V> {
 impl Beam<&[f64]> {
     /// The cell that the first pixel sees at a shift along one axis, and the fraction of a cell behind it.
     fn place(&self, shift: f64, axis: usize) -> (i64, f64) {
-        let cell = self.origin[axis].round();
+        let cell = nearest_whole(self.origin[axis]);
         let place = shift + (self.origin[axis] - cell);
         // Rounding must not make a cell's own value depend on the cells beside it.
         let at_cell = whole_number(place).filter(|_| self.coefficients.is_none());

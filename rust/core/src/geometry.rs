@@ -19,4 +19,4 @@ mod whole;
 pub use placement::{Geometry, Placement, View, Walk};
 pub use rotation::Rotation;
 pub(crate) use taps::{TAPS, Taps};
-pub(crate) use whole::whole_number;
+pub(crate) use whole::{nearest_whole, whole_number};

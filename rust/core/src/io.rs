@@ -54,7 +54,7 @@ pub enum AnyFrames {
 
 /// Mean and variance of all pages of all files.
 ///
-/// `saturation` is as in [`Accumulator::new`]. Progress counts pages, in the stage "average".
+/// `saturation` is as in [`Accumulator::new`], `mask` as in [`Accumulator::masked`]. Progress counts pages, in the stage "average".
 ///
 /// # Errors
 /// [`Error::File`] or [`Error::Unsupported`] for the first file, in the order given, that is not
@@ -63,14 +63,15 @@ pub enum AnyFrames {
 pub fn average(
     paths: &[PathBuf],
     saturation: Option<f64>,
+    mask: Option<&[bool]>,
     workers: &Workers,
     control: &Control,
 ) -> Result<Statistics> {
     let first = paths.first().ok_or_else(|| Error::value("source", "names no file"))?;
     let format = format(first, control)?;
     match format.depth {
-        Depth::Eight => average_as::<u8>(paths, format, saturation, workers, control),
-        Depth::Sixteen => average_as::<u16>(paths, format, saturation, workers, control),
+        Depth::Eight => average_as::<u8>(paths, format, saturation, mask, workers, control),
+        Depth::Sixteen => average_as::<u16>(paths, format, saturation, mask, workers, control),
     }
 }
 
@@ -288,6 +289,7 @@ fn average_as<T: FileSample>(
     paths: &[PathBuf],
     format: Format,
     saturation: Option<f64>,
+    mask: Option<&[bool]>,
     workers: &Workers,
     control: &Control,
 ) -> Result<Statistics> {
@@ -297,6 +299,9 @@ fn average_as<T: FileSample>(
     memory::check(bytes, || format!("averaging frames of {}", format.shape))?;
     let mut buffer = vec![T::default(); size * format.shape.len()];
     let mut sums = Accumulator::<T>::new(format.shape, saturation)?;
+    if let Some(mask) = mask {
+        sums = sums.masked(mask)?;
+    }
     let (mut done, mut total) = (0, paths.len());
     for files in paths.chunks(size) {
         let found = workers.map(files.len(), |index| pages(&files[index], control));

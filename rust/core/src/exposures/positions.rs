@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::frames::Shape;
-use crate::geometry::{Geometry, Rotation, whole_number};
+use crate::geometry::{Geometry, Rotation, nearest_whole, whole_number};
 
 /// The position of each exposure in the beam.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,7 +35,7 @@ impl Positions {
             // The smallest shift has the most digits behind the point.
             let along = self.shifts.iter().map(|shift| shift[axis]);
             let smallest = along.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or_default();
-            let part = smallest - (smallest - 0.5).ceil();
+            let part = smallest - nearest_whole(smallest);
             whole_number(smallest).map_or(part, |_| 0.0)
         });
         let is_common = |shift: &[f64; 2]| {
@@ -50,7 +50,7 @@ impl Positions {
     pub(crate) fn on_grid(&self, shifts: &[[f64; 2]]) -> Vec<[f64; 2]> {
         let Some(fraction) = self.fraction() else { return shifts.to_vec() };
         let on_grid =
-            |shift: &[f64; 2]| [0, 1].map(|axis| (shift[axis] - fraction[axis]).round_ties_even());
+            |shift: &[f64; 2]| [0, 1].map(|axis| nearest_whole(shift[axis] - fraction[axis]));
         shifts.iter().map(on_grid).collect()
     }
 
@@ -63,7 +63,7 @@ impl Positions {
 
     /// The places at the nearest whole shifts on the grid of the beam.
     pub(crate) fn whole(&self, sensor: Shape) -> Result<Geometry> {
-        let nearest = |shift: &[f64; 2]| shift.map(|d| d.round_ties_even() as i64);
+        let nearest = |shift: &[f64; 2]| shift.map(|d| nearest_whole(d) as i64);
         let shifts: Vec<_> = self.on_grid(&self.shifts).iter().map(nearest).collect();
         Geometry::new(sensor, &shifts, &self.rotations)
     }

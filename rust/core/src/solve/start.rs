@@ -6,6 +6,7 @@ use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
+use crate::geometry::nearest_whole;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
 use crate::parallel::Workers;
 use crate::reduced::ConjugateGradients;
@@ -102,7 +103,7 @@ fn moved<T: Real>(
     };
     // To the nearest cell, where the start has another fraction of a pixel.
     let fraction = positions.fraction().unwrap_or_default();
-    let origin = [0, 1].map(|axis| (beam.origin[axis] + fraction[axis]).round() as i64);
+    let origin = [0, 1].map(|axis| nearest_whole(beam.origin[axis] + fraction[axis]) as i64);
     let source = Source { shape: beam.shape, origin, value };
     let mut shifts = positions.on_grid(&positions.shifts);
     if let Some(prior) = ShiftPrior::of(positions).filter(|_| start.refinement.is_done()) {
