@@ -207,12 +207,16 @@ def test_foreign_frames_are_noticed_and_change_nothing(name, kind):
     assert method.frames_foreign == 1
 
 
-def test_a_range_that_frames_do_not_reach_is_named():
+def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_path):
     method = scene.LocalMean(SHAPE, "uint16")
     for frame in MovingScene(seed=1, shape=SHAPE).frames(20):
         method.update(np.clip(np.rint(16383 * frame.values), 0, 16383).astype(np.uint16))
-    with pytest.warns(errors.UnusedInputWarning, match=r"data_range=\(0, 16383\).*--bit-depth 14"):
-        method.result()
+    method.save(tmp_path / "state.npz")
+    for each in (method, scene.load(tmp_path / "state.npz")):
+        with pytest.warns(
+            errors.UnusedInputWarning, match=r"data_range=\(0, 16383\).*--bit-depth 14"
+        ):
+            each.result()
 
 
 def test_gains_that_spread_are_named():

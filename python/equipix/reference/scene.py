@@ -55,14 +55,17 @@ class Descent:
     """Gain and offset that follow errors, with a step that follows their noise.
 
     The gain belongs to the raw value less the mean of those so far. `half` is the noise that halves
-    the step: half of the mean square by which errors differ from those two updates before.
+    the step: half of the mean square by which errors differ from those two updates before, less
+    `moving` of the mean of their products.
     """
 
     CENTRE, REMEMBERED = 1000, 32
 
-    def __init__(self, shape: tuple[int, int], step: float, half: float) -> None:
+    def __init__(
+        self, shape: tuple[int, int], step: float, half: float, moving: float = 0.0
+    ) -> None:
         self.gain, self.offset = np.ones(shape), np.zeros(shape)
-        self.step, self.half = step, half
+        self.step, self.half, self.moving = step, half, moving
         self.centre, self.frames = 0.0, 0
         self.noise, self.updates = 0.0, 0
         self.before: list[Floats] = []
@@ -78,7 +81,9 @@ class Descent:
         Noise takes a share of the gain of each pixel that takes part; it is given back by parts.
         """
         if len(self.before) == 2:
-            square = np.mean((errors - self.before.pop(0)) ** 2) / 2
+            before = self.before.pop(0)
+            persists = self.moving * np.mean(errors * before)
+            square = max(np.mean((errors - before) ** 2) / 2 - persists, 0)
             self.updates += 1
             self.noise += (square - self.noise) / min(self.updates, self.REMEMBERED)
         self.before.append(errors)
@@ -154,7 +159,7 @@ class Registered(Descent):
         cutoff: float = 0.1,
         agreement: float = 0.3,
     ) -> None:
-        super().__init__(shape, step, half=2 * 0.02)
+        super().__init__(shape, step, half=2 * 0.02, moving=0.5)
         self.least, self.most = least_motion, most_motion
         self.cutoff, self.agreement = cutoff, agreement
         self.usual, self.pairs = 0.0, 0

@@ -87,7 +87,8 @@ class SceneCorrection:
         self._workers = positive_workers(workers)
         self._options = options
         self._native = self._made()
-        self._mask, self._peak, self._masked_at = _mask_of(mask, self._shape), -np.inf, 0
+        self._mask, self._masked_at = _mask_of(mask, self._shape), 0
+        self._peak: float | None = None
         if self._mask.any():
             self._native.mask(self._mask)
 
@@ -191,7 +192,7 @@ class SceneCorrection:
             level = float(np.iinfo(raw.dtype).max)
         self._native.update(taken, corrected, saturation=level, workers=self._workers)
         if np.isfinite(top := float(raw.max())):
-            self._peak = max(self._peak, top)
+            self._peak = top if self._peak is None else max(self._peak, top)
         self._mask_unresponsive()
         return corrected
 
@@ -291,7 +292,7 @@ class SceneCorrection:
     def _warn_of_range(self) -> None:
         """Warn where the range is far wider than the frames: thresholds are shares of it."""
         low, high = self._range
-        if -np.inf < self._peak < low + _USED * (high - low):
+        if self._peak is not None and self._peak < low + _USED * (high - low):
             bits = max(int(np.ceil(np.log2(max(self._peak, 1) + 1))), 1)
             warn(
                 f"the largest value is {self._peak:g} DN, less than {_USED:.0%} of the range "
@@ -323,6 +324,7 @@ class SceneCorrection:
             "saturation": self._saturation,
             "options": self._options,
             "counts": dict(counts),
+            "peak": self._peak,
         }
         mask = {"mask": self._mask.astype(np.float32)}
         write_state(path, dict(maps) | mask, content, force=force)
@@ -385,6 +387,8 @@ class SceneCorrection:
             ]
             made._native.restore(list(maps.items()), counts)
             made._masked_at = made.frames_taken
+            peak = content["peak"]
+            made._peak = None if peak is None else number("peak", peak)
             check_digest(maps, content)
         except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
             raise FileError(f"{path}: is damaged: {error}") from error

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 KIND = "state of a correction from the scene"
 """The kind in the metadata of the file."""
 
-FORMAT = 2
+FORMAT = 3
 """Number of the file format; a file with another one is refused."""
 
-_CONTENT = frozenset({"method", "shape", "data_range", "saturation", "options", "counts"})
+_CONTENT = frozenset({"method", "shape", "data_range", "saturation", "options", "counts", "peak"})
 """What is remembered beside the maps."""
 
 
@@ -75,7 +75,7 @@ def read_state(
     maps : dict of str to ndarray
         Maps by name, float32.
     content : dict
-        Method, shape, range, options and counts.
+        Method, shape, range, options, counts and the largest raw value.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def read_state(
     if content["format"] < FORMAT:
         raise FileError(
             f"{path}: has format {content['format']}, of an earlier version whose states lack the "
-            f"noise (format {FORMAT}): learn again"
+            f"noise or the largest value (format {FORMAT}): learn again"
         )
     if missing := _CONTENT - content.keys():
         raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")
