@@ -1,0 +1,131 @@
+"""Mistakes of a person with frames and darks: refused, or a finding, where data show them."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import errors, simulate
+
+SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
+
+
+class Bench:
+    """Raw frames of five positions and of the dark, of a beam with structure."""
+
+    def __init__(self, seed=1):
+        self.rng = np.random.default_rng(seed)
+        truth = simulate.paper_sensitivity(SHAPE, rng=self.rng)
+        self.offset = 200 + 10 * self.rng.standard_normal(SHAPE)
+        self.signals = [truth * simulate.signal.window(_beam, SHAPE, shift) for shift in SHIFTS]
+        self.dark = self.take(0 * truth)
+        self.frames = [self.take(signal) for signal in self.signals]
+
+    def take(self, signal, count=16):
+        """Frames of whole numbers, with noise of 9 DN² and a tenth of the signal."""
+        std = np.sqrt(9 + 0.1 * signal)
+        values = self.offset + signal + std * self.rng.standard_normal((count, *SHAPE))
+        return np.rint(values).astype(np.uint16)
+
+
+def _beam(row, col):
+    lump = np.exp(-((row - 25) ** 2 + (col - 45) ** 2) / 60**2)
+    return 6000 * lump * (1 + 0.1 * np.sin(row / 7 + col / 11))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench()
+
+
+def findings(frames, dark):
+    """Kinds and messages of the verdicts."""
+    if not isinstance(dark, equipix.FrameStatistics) and dark.ndim == 3:
+        dark = equipix.average(dark)
+    averages = [equipix.average(each, dark=dark) for each in frames]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        found = equipix.calibrate(averages, SHIFTS).verdicts
+    return {verdict.kind: verdict.message for verdict in found}
+
+
+def test_without_a_mistake_there_is_no_finding(bench):
+    assert findings(bench.frames, bench.dark) == {}
+
+
+@pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
+def test_one_exposure_that_is_flipped_is_named(bench, axis):
+    frames = list(bench.frames)
+    frames[2] = np.flip(frames[2], axis)
+    assert "exposure 2" in findings(frames, bench.dark)["misfit"]
+
+
+@pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
+def test_some_exposures_that_are_flipped_are_a_misfit(bench, axis):
+    frames = [np.flip(each, axis) if k in (1, 3) else each for k, each in enumerate(bench.frames)]
+    assert "misfit" in findings(frames, bench.dark)
+
+
+@pytest.mark.parametrize(("axis", "name"), [(1, "rows"), (2, "columns")])
+def test_exposures_that_are_all_flipped_contradict_the_sign(bench, axis, name):
+    """A flipped sensor moves the other way."""
+    flipped = [np.flip(each, axis) for each in bench.frames]
+    found = findings(flipped, np.flip(bench.dark, axis))
+    assert f"reverse the sign of the shifts along {name}" in found["sign"]
+
+
+def test_a_flipped_dark_is_named(bench):
+    found = findings(bench.frames, np.flip(bench.dark, 2))
+    assert "pattern of the dark" in found["misfit"]
+    assert "is not flipped" in found["misfit"]
+
+
+def test_a_dark_subtracted_twice_is_named(bench):
+    """Averages keep its pattern; of an array only the offset of all values is left."""
+    found = findings(bench.frames, 2 * bench.dark)
+    assert "pattern of the dark" in found["misfit"]
+    assert "once" in found["misfit"]
+    assert "offset of" in findings(bench.frames, 2 * bench.dark.mean(axis=0))["misfit"]
+
+
+def test_a_dark_subtracted_by_half_is_named_where_it_is_large():
+    """Half of 800 DN is 7 % of this light; half of 200 DN is below what residuals show."""
+    bench = Bench()
+    bench.offset += 600
+    dark = bench.take(np.zeros(SHAPE)).mean(axis=0)
+    frames = [bench.take(signal) for signal in bench.signals]
+    assert "offset of" in findings(frames, dark / 2)["misfit"]
+
+
+@pytest.mark.parametrize("share", [1.0, 1.2])
+def test_a_dark_as_bright_as_the_light_is_refused(bench, share):
+    dark = bench.take(share * bench.signals[0])
+    with pytest.raises(errors.InputError, match="is there light, and is the right dark"):
+        findings(bench.frames, dark)
+
+
+def test_frames_and_dark_that_are_exchanged_are_refused(bench):
+    with pytest.raises(errors.InputError, match=r"is the (right dark|dark that of these frames)"):
+        findings([bench.take(0 * bench.signals[0]) for _ in SHIFTS], bench.frames[0])
+
+
+def test_a_dark_that_holds_a_tenth_of_the_light_is_a_drift(bench):
+    """The light of an unmoved beam is missing in all exposures; a hundredth shows nowhere."""
+    assert [*findings(bench.frames, bench.take(0.1 * bench.signals[0]))] == ["drift"]
+
+
+def test_positions_in_the_place_of_frames_are_refused(bench):
+    frames = np.array([each.mean(axis=0) for each in bench.frames])
+    with pytest.raises(errors.InputError, match=r"'frames' has shape \(5, 2\), expected 3"):
+        equipix.calibrate(SHIFTS, frames)
+
+
+@pytest.mark.parametrize(("place", "mixed"), [(0, (0, 1)), (1, (1, 3)), (4, (0, 1, 2, 3, 4))])
+def test_two_positions_in_one_average_are_a_misfit(bench, place, mixed):
+    """As a pattern of names that takes files of several positions."""
+    frames = list(bench.frames)
+    frames[place] = np.concatenate([frames[k] for k in mixed])
+    assert "misfit" in findings(frames, bench.dark)
