@@ -25,8 +25,14 @@ def test_a_pattern_is_read_in_each_form(cfa):
 
 
 def test_a_pattern_writes_itself_as_it_is_read():
-    for cfa in (*BAYER, QUAD, X_TRANS):
+    for cfa in (*BAYER, QUAD, X_TRANS, "RGBW/", "R/G/G/B"):
         assert str(Colours.of(cfa)) == cfa
+    for rows in (1, 2, 4, 8):
+        for cols in (1, 2, 4):
+            labels = np.resize(list("RGBWC"), (rows, cols))
+            assert Colours.of(str(Colours.of(labels))) == Colours.of(labels)
+    long = Colours.of([["R", "Gr"], ["Gb", "B"]])
+    assert Colours.of(long.written) == long
     assert Colours.of(None) is None
 
 
@@ -36,6 +42,7 @@ def test_a_pattern_writes_itself_as_it_is_read():
         ("RGB", "'RGB', expected four letters"),
         ("", "expected four letters"),
         ("RG/G", "expected four letters"),
+        ("/", "expected four letters"),
         ([["R", "G"], ["G"]], "expected four letters"),
         ([["R", ""]], "expected four letters"),
         (1.5, "expected four letters"),

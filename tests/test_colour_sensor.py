@@ -1,13 +1,15 @@
 """Sensors behind colour filters: calibrated, fitted to levels, corrected, by each colour."""
 
+import dataclasses
 import doctest
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import equipix
-from equipix import cross_pattern, errors, metrics, nuc, plan, simulate
+from equipix import cross_pattern, errors, io, metrics, nuc, plan, simulate
 from equipix.colour import Colours
 from equipix.mosaic import pattern_of
 
@@ -52,6 +54,12 @@ class TestCalibrate:
         assert np.mean((cal.sensitivity * cal.cfa.map_of(cal.colour_response, SHAPE))[good]) == (
             pytest.approx(1, abs=1e-12)
         )
+
+    def test_metadata_keep_labels_of_several_letters(self):
+        truth, _ = sensor("RGGB")
+        cfa = [["red", "green"], ["green", "blue"]]
+        cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2), cfa=cfa)
+        assert cal.metadata["options"]["cfa"] == cfa
 
     @pytest.mark.filterwarnings(NAMED)
     def test_without_a_cfa_the_pattern_is_named_and_nothing_flagged(self):
@@ -218,7 +226,76 @@ class TestUniformSource:
         with pytest.warns(errors.MisfitWarning, match="cfa='RGGB' or cfa='BGGR'"):
             response = nuc.fit(self.levels(truth, raw=raw))
         np.testing.assert_array_equal(response.flags == 0, good)
-        assert nuc.find_defects(response).counts["unusable"] == (~good).sum()
+        with pytest.warns(errors.MisfitWarning, match="cfa='RGGB' or cfa='BGGR'"):
+            assert nuc.find_defects(response).counts["unusable"] == (~good).sum()
+        assert nuc.find_defects(response, cfa="RGGB").counts["unusable"] == (~good).sum()
+
+    def test_a_dark_colour_is_no_defect(self, run, tmp_path):
+        """A filter that lets a twentieth through, which alone is like a pixel without response."""
+        deep = {"R": 0.35, "G": 1.0, "B": 0.05}
+        truth = simulate.filtered(simulate.paper_sensitivity(SHAPE, rng=1), "RGGB", response=deep)
+        truth[20, 20] *= 0.2
+        with pytest.warns(errors.MisfitWarning, match="cfa="):
+            response = nuc.fit(self.levels(truth, raw=False), mask=truth < 0)
+        path = tmp_path / "response.npz"
+        response = dataclasses.replace(response, flags=np.zeros(SHAPE, np.uint32))
+        response.save(path)
+        with pytest.warns(errors.MisfitWarning, match="cfa="):
+            found = nuc.find_defects(response)
+        named = nuc.find_defects(response, cfa="RGGB")
+        for each in (found, named):
+            assert np.flatnonzero(each.flags).tolist() == [20 * SHAPE[1] + 20]
+        status, out, err = run("nuc", "defects", path, "--json")
+        assert (status, json.loads(out)["unusable"]) == (0, 1)
+        assert "--cfa RGGB" in err
+        flagged = tmp_path / "flagged.npz"
+        status, _, err = run("nuc", "defects", path, "--cfa", "RGGB", "-o", flagged)
+        assert (status, err) == (0, "")
+        # The file keeps the filters, so that the red pixel is replaced by red ones.
+        red = np.where(planes("RGGB")["R"], 2000, 1000) * truth
+        for again in (equipix.load(flagged), response.with_flags(named.flags, cfa="RGGB")):
+            for exact in (False, True):
+                value = again.correct(red, dark=None, flagged="replace", exact=exact)
+                np.testing.assert_allclose(value[20, 20], value[20, 18], rtol=0.01)
+            nuc.find_defects(again)
+            with pytest.raises(errors.InputError, match="'cfa' is 'BGGR', .* fitted with 'RGGB'"):
+                again.with_flags(named.flags, cfa="BGGR")
+
+    def test_another_pattern_than_that_of_the_response_is_refused(self):
+        truth, _ = sensor("RGGB")
+        response = nuc.fit(self.levels(truth, raw=False), cfa="RGGB")
+        with pytest.raises(errors.InputError, match="'cfa' is 'BGGR', .* fitted with 'RGGB'"):
+            nuc.find_defects(response, cfa="BGGR")
+
+    def test_quality_is_measured_in_each_plane(self, run, tmp_path):
+        array = simulate.StaringArray.of("InSb", (32, 32), rng=1).with_causes(cfa="RGGB")
+        levels = [equipix.average(array.frames(e, 16, rng=k)) for k, e in enumerate((2e6, 1e7))]
+        response = nuc.fit(levels, cfa="RGGB")
+        assert not response.flags.any()
+        response.save(tmp_path / "response.npz")
+        frames = np.stack(list(array.frames(6e6, 8, rng=9)))
+        io.write_frames(tmp_path / "level.tif", iter(frames), nbytes=1)
+        given = ("nuc", "quality", tmp_path / "response.npz", tmp_path / "level.tif", "--json")
+        status, out, _ = run(*given)
+        found = json.loads(out)
+        assert (status, [*found]) == (0, ["R", "G1", "G2", "B"])
+        assert json.loads(run(*given, "--cfa", "RGGB")[1]) == found
+        status, _, err = run(*given, "--cfa", "BGGR")
+        assert status == 1
+        assert "--cfa is 'BGGR', but the correction was fitted with 'RGGB'" in err
+        cut = metrics.planes(response.correct(frames), "RGGB")
+        for name, each in found.items():
+            assert each["C"] == pytest.approx(metrics.correctability(cut[name]).ratio)
+            assert each["C"] < 1
+
+
+def test_a_staring_array_has_filters():
+    array = simulate.StaringArray.of("InSb", (32, 32), rng=1)
+    light, dark = array.electrons(1e6), array.electrons(0)
+    seen = array.with_causes(cfa="GRBG").electrons(1e6)
+    np.testing.assert_allclose(seen - dark, simulate.filtered(light - dark, "GRBG"), rtol=1e-9)
+    with pytest.raises(errors.InputError, match="no value for the colours"):
+        array.with_causes(cfa="CYYM")
 
 
 class TestReplacement:
@@ -277,7 +354,9 @@ class TestOthers:
         status, out, _ = run("calibrate", folder / "experiment.toml", "-o", output)
         assert status == 0
         assert "GRBG" in out
-        cal, truth = equipix.load(output), np.load(folder / "truth.npz")
+        cal = equipix.load(output)
+        with np.load(folder / "truth.npz") as file:
+            truth = dict(file)
         bad = np.zeros(cal.shape, bool)
         bad.flat[[*truth["dead"], *truth["hot"]]] = True
         assert not (cal.flags[~bad] != 0).any()

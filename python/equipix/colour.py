@@ -40,8 +40,8 @@ class Colours:
         Parameters
         ----------
         cfa : str, array_like of labels or None
-            Four letters are two rows of two: "RGGB". More rows are divided by "/", or given as a
-            sequence of texts or as an array of labels of shape (rows, cols).
+            Four letters are two rows of two: "RGGB". More rows are divided by "/", and one alone
+            ends with it: "RGBW/". Or a sequence of texts, or an array of labels (rows, cols).
 
         Returns
         -------
@@ -56,12 +56,12 @@ class Colours:
         if cfa is None:
             return None
         rows = cfa.pattern if isinstance(cfa, Colours) else _rows(cfa)
-        if not rows or len({len(row) for row in rows}) != 1 or not all(map(all, rows)):
+        if not rows or len(set(map(len, rows))) != 1 or not rows[0] or not all(map(all, rows)):
             raise InputError(
                 f"'cfa' is {cfa!r}, expected four letters such as 'RGGB', or rows of one length: "
                 "'RRGG/RRGG/GGBB/GGBB', or an array of labels"
             )
-        if max(len(rows), len(rows[0])) > LARGEST_PERIOD or not rows[0]:
+        if max(len(rows), len(rows[0])) > LARGEST_PERIOD:
             raise InputError(
                 f"'cfa' has a period of {len(rows)}×{len(rows[0])} pixels, expected at most "
                 f"{LARGEST_PERIOD}×{LARGEST_PERIOD}"
@@ -79,6 +79,11 @@ class Colours:
         return [list(row) for row in self.pattern]
 
     @property
+    def written(self) -> str | list[list[str]]:
+        """Text that `of` reads, or rows where a label is longer than a letter."""
+        return str(self) if set(map(len, self.labels)) == {1} else self.rows
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Each label once, in the order of reading."""
         return tuple(dict.fromkeys(label for row in self.pattern for label in row))
@@ -86,6 +91,8 @@ class Colours:
     def __str__(self) -> str:
         """Write the pattern as `of` reads it, where its labels are letters."""
         rows = ["".join(row) for row in self.pattern]
+        if len(rows) == 1:
+            return f"{rows[0]}/"
         return ("" if self.period == (2, 2) else "/").join(rows)
 
     def numbers(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -125,7 +132,8 @@ def planes_of(colours: Colours | None, shape: tuple[int, ...]) -> Iterator[Bools
 def _rows(cfa: ArrayLike) -> tuple[tuple[str, ...], ...]:
     """Rows of labels of a pattern as the caller gave it; none of what is no pattern."""
     if isinstance(cfa, str):
-        cfa = cfa.split("/") if "/" in cfa else [cfa[:2], cfa[2:]] if len(cfa) == 4 else []
+        divided = cfa.removesuffix("/").split("/")
+        cfa = divided if "/" in cfa else [cfa[:2], cfa[2:]] if len(cfa) == 4 else []
     try:
         given = np.asarray(cfa)
     except ValueError:  # rows of several lengths

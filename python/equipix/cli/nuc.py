@@ -10,17 +10,17 @@ import typer
 
 from equipix._check import naming_memory
 from equipix._types import By
-from equipix.cli.options import Force, Json, Mask, Sensor, Workers, naming_mask
+from equipix.cli.options import Cfa, Force, Json, Mask, Sensor, Workers, naming_mask
 from equipix.cli.summary import flagged as flag_counts
 from equipix.cli.summary import summary
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import warn_of_corrected
-from equipix.correction.protocol import check_sensor
+from equipix.correction.protocol import check_sensor, named_cfa
 from equipix.experiment.levels import LevelExperiment
 from equipix.experiment.provenance import origin_of
 from equipix.io import SUFFIXES, find_files, read_frames, read_mask, refuse_inputs, refuse_saved
 from equipix.loading import load, load_response
-from equipix.metrics import correctability, roughness, three_d_noise
+from equipix.metrics import correctability, planes, roughness, three_d_noise
 from equipix.nuc.bad_pixels import find_defects
 from equipix.nuc.limits import DefectLimits
 
@@ -107,6 +107,7 @@ def defects(
     misfit_limit: Annotated[
         float, typer.Option(help="Largest deviation of reduced chi2, in sigmas.")
     ] = DefectLimits.misfit,
+    cfa: Cfa = None,
     sensor: Sensor = None,
     force: Force = False,
     as_json: Json = False,
@@ -126,8 +127,9 @@ def defects(
     curves = load_response(response)
     check_sensor(curves, sensor)
     with naming_memory("finding bad pixels"):
-        found = find_defects(curves, None if not frames else _raw(frames, response), limits=limits)
-    flagged = curves.with_flags(found.flags)
+        raw = None if not frames else _raw(frames, response)
+        found = find_defects(curves, raw, cfa=cfa, limits=limits)
+    flagged = curves.with_flags(found.flags, cfa=cfa)
     if output is not None:
         flagged.save(output, force=force)
     result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
@@ -143,22 +145,37 @@ def quality(
     confidence: Annotated[
         float, typer.Option(help="Probability of the confidence interval.")
     ] = 0.95,
+    cfa: Cfa = None,
     sensor: Sensor = None,
     as_json: Json = False,
 ) -> None:
-    """Show spatial over temporal noise of corrected frames, and its parts."""
+    """Show spatial over temporal noise of corrected frames, and its parts.
+
+    Behind colour filters that of each plane: of the correction's, or of --cfa, where it names none.
+    """
     loaded = load(correction)
     check_sensor(loaded, sensor)
+    colours = named_cfa(loaded, cfa)
     with naming_memory("measuring quality"):
-        result = _quality(loaded, _raw(frames, correction), confidence)
+        corrected = _corrected(loaded, _raw(frames, correction))
+        if colours is None:
+            result = _quality(corrected, confidence)
+        else:
+            cut = [planes(each, colours) for each in corrected]
+            result = {name: _quality([each[name] for each in cut], confidence) for name in cut[0]}
     show_result(result, as_json=as_json)
 
 
-def _quality(correction: Correction, raw: Array, confidence: float) -> dict[str, Any]:
+def _corrected(correction: Correction, raw: Array) -> list[Array]:
+    """Corrected frames without flagged pixels, with them, and with them replaced."""
+    return [correction.correct(raw, flagged=flagged) for flagged in ("nan", "keep", "replace")]
+
+
+def _quality(corrected: list[Array], confidence: float) -> dict[str, Any]:
     """Measure spatial over temporal noise of corrected frames, and its parts."""
-    good = correctability(correction.correct(raw), confidence=confidence)
-    every = correctability(correction.correct(raw, flagged="keep"), confidence=confidence)
-    replaced = correction.correct(raw, flagged="replace")
+    usable, kept, replaced = corrected
+    good = correctability(usable, confidence=confidence)
+    every = correctability(kept, confidence=confidence)
     noise = asdict(three_d_noise(replaced))
     return {
         "frames": good.frames,

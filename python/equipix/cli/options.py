@@ -32,7 +32,7 @@ Cfa = Annotated[
     str | None,
     typer.Option(
         help="Colour filters of the pixels: RGGB, GRBG, GBRG or BGGR, or the rows of one period, "
-        "such as RRGG/RRGG/GGBB/GGBB."
+        "such as RRGG/RRGG/GGBB/GGBB, or RGBW/ of one row."
     ),
 ]
 Sensor = Annotated[

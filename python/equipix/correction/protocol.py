@@ -103,6 +103,23 @@ def cfa_of(correction: Correction) -> Colours | None:
     return Colours.of(named if own is None else own)
 
 
+def named_cfa(correction: Correction, cfa: ArrayLike | None) -> Colours | None:
+    """Return the colour filters of a correction, or `cfa`, which must be no others.
+
+    Raises
+    ------
+    InputError
+        If `cfa` is no pattern, or another than that of the correction.
+    """
+    own, given = cfa_of(correction), Colours.of(cfa)
+    if own is not None and given not in (None, own):
+        raise InputError(
+            f"'cfa' is {str(given)!r}, but the correction was fitted with {str(own)!r}: "
+            "leave it out"
+        )
+    return given if own is None else own
+
+
 def check_sensor(correction: Correction, sensor: str | None) -> None:
     """Refuse frames of a sensor of another name than that of the correction."""
     if sensor is None:

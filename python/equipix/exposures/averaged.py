@@ -19,6 +19,7 @@ from equipix.defects import (
     refuse_saturated,
 )
 from equipix.errors import InputError
+from equipix.exposures.blind import blind_pixels
 from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
 from equipix.frames import same_statistics
 from equipix.light import NAMED, Light, light_of
@@ -311,8 +312,10 @@ class Averaged:
         models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
         usual = 1.0 if self.filters is None else self.filters.map_of(self.saturated.shape)
-        dead: Bools = dead_pixels(self._signals, models, usual) & measured
-        return dead
+        dead: Bools = dead_pixels(self._signals, models, usual)
+        if models is not None:
+            dead |= blind_pixels(self._signals, models, usual)
+        return dead & measured
 
     @property
     def _signals(self) -> Array:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from equipix._types import Array
 
 
-def planes(frames: ArrayLike, cfa: ArrayLike) -> dict[str, Array]:
+def planes(frames: ArrayLike, cfa: ArrayLike | Colours) -> dict[str, Array]:
     """Cut frames into one plane for each pixel of a period of the colour filters.
 
     Parameters

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix._check import as_array, check_type, naming_memory
-from equipix.errors import InputError
+from equipix.errors import EquipixWarning, InputError, warn
 from equipix.metrics.moments import moments, signed_root
 
 if TYPE_CHECKING:
@@ -49,8 +49,9 @@ class EmvaTransfer:
     responsivity : float
         R, slope of the signal over the light, in DN per unit of `light`.
     quantum_efficiency : float
-        R/K, where the light is in photons per pixel; NaN where it is above 1.1, so that the light
-        is in another unit. Another unit may also make a number below that, which nothing shows.
+        R/K, where the light is in photons per pixel; NaN, with a warning, where it is above 1.1, so
+        that the light is in another unit. Another unit may also make a number below that, which
+        nothing shows.
     saturation_dn : float
         Signal, less the dark, at the level of the largest temporal noise.
     linearity_error : float
@@ -92,6 +93,11 @@ def emva_transfer(
         If the numbers of levels do not fit, values are not finite, too few levels lie below
         saturation, `dark` is brighter than `bright`, or their light does not differ, or the signal
         falls by more than 5 % where the light rises.
+
+    Warns
+    -----
+    EquipixWarning
+        If the quantum efficiency would be above 1.1: the light is not in photons per pixel.
 
     Notes
     -----
@@ -141,12 +147,11 @@ def emva_transfer(
     if not gain > 0:
         raise InputError(f"'bright': the noise does not rise with the signal, the gain is {gain:g}")
     read = float(off[:, 1].mean()) - 1 / 12
-    efficiency = responsivity / gain
     return EmvaTransfer(
         gain,
         signed_root(read) / gain,
         responsivity,
-        efficiency if efficiency <= _MOST_EFFICIENT else float("nan"),
+        _efficiency(responsivity / gain),
         saturation,
         _linearity_error(levels[linear], signal[linear]),
     )
@@ -179,6 +184,19 @@ def _refuse_falling(light: Floats, signal: Floats, linear: Bools) -> None:
             f" where the signal is {signal[before]:.6g} and {signal[after]:.6g} DN: expected light "
             "that rises with the signal, one value for each level in the order of 'bright'"
         )
+
+
+def _efficiency(found: float) -> float:
+    """Quantum efficiency, unless it is none."""
+    if found <= _MOST_EFFICIENT:
+        return found
+    warn(
+        f"'light' gives a quantum efficiency of {found:.4g} (limit {_MOST_EFFICIENT:g}), so it is "
+        "NaN: light in photons per pixel and exposure gives one; in another unit the responsivity "
+        "is in DN per that unit",
+        EquipixWarning,
+    )
+    return float("nan")
 
 
 def _slope(x: Floats, y: Floats) -> float:

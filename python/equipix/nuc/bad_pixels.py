@@ -9,7 +9,10 @@ import numpy as np
 
 from equipix._check import check_type, naming_memory
 from equipix._readonly import ReadOnly
+from equipix.correction.protocol import named_cfa
+from equipix.errors import MisfitWarning, warn
 from equipix.flags import set_bits, usable
+from equipix.mosaic import Filters
 from equipix.nuc.criteria import mean_slope, of_frames, of_response, too_few_for_flicker
 from equipix.nuc.limits import DefectLimits
 from equipix.nuc.misfit import common_misfit, warn_of_misfit
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from equipix._types import Array
+    from equipix.colour import Colours
     from equipix.frames import FrameStatistics
 
 __all__ = ["DefectLimits", "Defects", "find_defects"]
@@ -62,6 +66,7 @@ def find_defects(
     response: Response,
     frames: ArrayLike | FrameStatistics | None = None,
     *,
+    cfa: ArrayLike | None = None,
     limits: DefectLimits | None = None,
 ) -> Defects:
     """Find bad pixels by their response curves and by frames of one steady level.
@@ -73,24 +78,28 @@ def find_defects(
     frames : array_like of shape (n, rows, cols), or FrameStatistics, optional
         Raw frames of one steady even level, or their average; without them noise is not judged, and
         of an average flicker is not.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`, where the response was fitted
+        without: slopes are then compared within a colour.
     limits : DefectLimits, optional
         Limits of the criteria.
 
     Returns
     -------
     Defects
-        ``response.with_flags(defects.flags)`` is a response that has them.
+        ``response.with_flags(defects.flags, cfa=cfa)`` is a response that has them.
 
     Raises
     ------
     InputError
-        If an argument is of another type, or the frames are of another shape, fewer than two, or
-        without a value.
+        If an argument is of another type, the frames are of another shape, fewer than two, or
+        without a value, or `cfa` is no pattern or another than that of the response.
 
     Warns
     -----
     MisfitWarning
-        If the curves of most pixels are of another order, or the noise was not as stated.
+        If the curves of most pixels are of another order, or the noise was not as stated; if the
+        slopes show a pattern of colour filters that nobody has named.
     DriftWarning
         If frame means scatter by more than five times the noise of a pixel: they are then hardly
         frames of one level.
@@ -134,9 +143,10 @@ def find_defects(
     check_type("limits", limits, DefectLimits, "equipix.nuc.DefectLimits(noise=2.0, ...)")
     with naming_memory("finding bad pixels"):
         misfit = common_misfit(response)
-        found = of_response(response, limits, misfit)
+        colours, filters = _filters(response, named_cfa(response, cfa))
+        found = of_response(response, limits, misfit, filters)
         if frames is not None:
-            found |= of_frames(frames, usable(response.flags), limits, response.cfa)
+            found |= of_frames(frames, usable(response.flags), limits, colours)
     flags = response.flags.copy()
     for kind, pixels in found.items():
         set_bits(flags, kind, pixels)
@@ -149,3 +159,15 @@ def find_defects(
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
     warn_of_misfit(response, misfit)
     return Defects(flags, counts, named, misfit, limits, few)
+
+
+def _filters(response: Response, given: Colours | None) -> tuple[Colours | None, Filters | None]:
+    """Colours of the pixels, and filters of slopes that are not over the mean of a colour."""
+    if response.cfa is not None:
+        return response.cfa, None
+    filters = Filters.of(given, mean_slope(response))
+    if filters is None:
+        return None, None
+    if not filters.given:
+        warn(filters.words, MisfitWarning)
+    return filters.colours, filters

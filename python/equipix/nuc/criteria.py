@@ -12,7 +12,6 @@ from equipix.errors import InputError
 from equipix.frames import FrameStatistics
 from equipix.light import Light, light_of
 from equipix.metrics.moments import stack_of, temporal_of, warn_of_drift
-from equipix.mosaic import Filters
 from equipix.noise import MEDIAN_SQUARE, NoiseModel, photon_transfer, scatter_limit
 from equipix.nuc.curve import response_at
 from equipix.rounding import step_of
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
 
     from equipix._types import Array, Bools, Floats
     from equipix.colour import Colours
+    from equipix.mosaic import Filters
     from equipix.nuc.limits import DefectLimits
     from equipix.nuc.response import Response
 
@@ -43,14 +43,20 @@ def mean_slope(response: Response) -> Floats:
     return np.asarray(np.where(high > low, slope, 1 + response.deviation[1]))
 
 
-def of_response(response: Response, limits: DefectLimits, misfit: float) -> dict[str, Bools]:
-    """Bad pixels by their curves; `misfit` is that of the array."""
-    slope = mean_slope(response)
+def of_response(
+    response: Response, limits: DefectLimits, misfit: float, filters: Filters | None
+) -> dict[str, Bools]:
+    """Bad pixels by their curves; `misfit` is that of the array.
+
+    `filters` are those of slopes that are not over the mean of a colour.
+    """
+    usual = np.ones(response.shape) if filters is None else filters.map_of(response.shape)
+    slope = mean_slope(response) / usual
     known = np.isfinite(slope)
     low, high = response.limits
     whole = _range(response)
     found = {
-        "dead": _dead(response, slope, limits.response),
+        "dead": _dead(response, slope, usual, limits.response),
         "non_responding": slope * limits.gain < 1,
         "out_of_range": known & (high - low < limits.range * whole),
     }
@@ -113,17 +119,12 @@ def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
     return {"flickering": f"below {needed} frames"} if count < needed else {}
 
 
-def _dead(response: Response, slope: Floats, least: float) -> Bools:
+def _dead(response: Response, slope: Floats, usual: Floats, least: float) -> Bools:
     """Pixels that rise less than their neighbours, by more than the error of their slope."""
     if response.order == 0 or not np.isfinite(slope).any():
         return np.zeros(slope.shape, bool)
     # Of a line; that of a higher order at 0, which is larger than that of the mean slope.
-    std = np.sqrt(np.nan_to_num(response.variances[1]))
-    # With a `cfa` slopes are those over the mean of a colour; else a pattern may stand out of them.
-    filters = None if response.cfa is not None else Filters.of(None, slope)
-    if filters is not None:
-        usual = filters.map_of(slope.shape)
-        slope, std = slope / usual, std / usual
+    std = np.sqrt(np.nan_to_num(response.variances[1])) / usual
     return response_outliers(slope, lambda: std, least=least)[0]
 
 

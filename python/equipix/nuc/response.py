@@ -11,6 +11,7 @@ from equipix._check import as_array, naming_memory
 from equipix._readonly import ReadOnly
 from equipix.correction.apply import apply, apply_polynomial, dark_frame, is_stored
 from equipix.correction.depth import depth_of
+from equipix.correction.protocol import cfa_of, named_cfa
 from equipix.errors import InputError
 from equipix.flags import usable
 from equipix.nuc.curve import counted_from, response_at
@@ -201,7 +202,7 @@ class Response(ReadOnly):
                 flagged=flagged,
                 out=out,
                 depth=depth,
-                cfa=self.cfa,
+                cfa=cfa_of(self),
             )
         zero = np.zeros(self.shape) if offset is None else offset
 
@@ -215,7 +216,7 @@ class Response(ReadOnly):
             flagged=flagged,
             out=out,
             depth=depth,
-            cfa=self.cfa,
+            cfa=cfa_of(self),
         )
 
     @naming_memory("finding extrapolated values")
@@ -252,23 +253,28 @@ class Response(ReadOnly):
         low, high = self.valid_range if offset is None else self.valid_range + offset
         return np.asarray(~((raw >= low) & (raw <= high)))
 
-    def with_flags(self, flags: Array) -> Self:
+    def with_flags(self, flags: Array, *, cfa: ArrayLike | None = None) -> Self:
         """Return a copy with more flags, such as those of `find_defects`.
 
         Parameters
         ----------
         flags : ndarray, shape (rows, cols), of whole numbers
             Bits of `equipix.Flag`, combined with those that are there by OR.
+        cfa : str or array_like of labels, optional
+            Colour filters of the pixels, as for `find_defects`, where the response was fitted
+            without: flagged pixels are then replaced within a colour. Curves do not change.
 
         Returns
         -------
         Response
-            The copy; these flags survive saving.
+            The copy; these flags survive saving, and so do filters, as ``cfa`` of the sensor in
+            `metadata`.
 
         Raises
         ------
         InputError
-            If the shape or dtype does not fit, or a number is not one of 32 bits.
+            If the shape or dtype does not fit, a number is not one of 32 bits, or `cfa` is no
+            pattern or another than that of the response.
         """
         more = as_array("flags", flags, ndim=2)
         if more.shape != self.shape or more.dtype.kind not in "iu":
@@ -281,7 +287,10 @@ class Response(ReadOnly):
             raise InputError(
                 f"'flags' holds {wrong[0]}, expected bits of equipix.Flag: 0 to {_LARGEST}"
             )
-        return replace(self, flags=self.flags | more.astype(np.uint32))
+        colours, metadata = named_cfa(self, cfa), self.metadata
+        if colours not in (None, self.cfa):
+            metadata = {**metadata, "sensor": {**metadata.get("sensor", {}), "cfa": colours.rows}}
+        return replace(self, flags=self.flags | more.astype(np.uint32), metadata=metadata)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads.

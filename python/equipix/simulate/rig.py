@@ -228,7 +228,7 @@ class VirtualExperiment:
                 for k in each[1:]
             ],
             truth=vars(self.truth),
-            cfa=None if self.cfa is None else str(self.cfa),
+            cfa=None if self.cfa is None else self.cfa.written,
         )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from equipix._check import as_array, check_bit_depth, check_shape
 from equipix.errors import InputError
 from equipix.simulate.blackbody import band_photons
+from equipix.simulate.signal import filtered
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -83,6 +84,9 @@ class StaringArray:
         Bits of the ADC, 8 to 16; a full well is its largest number, less a tenth of the range.
     seed : int
         Of the phases of the drift.
+    cfa : str or array_like of labels, optional
+        Colour filters of the pixels, as for `equipix.calibrate`: each gets the share of the light
+        that `filtered` gives its colour.
 
     Raises
     ------
@@ -127,11 +131,14 @@ class StaringArray:
     well_e: float = 2e7
     bit_depth: int = 14
     seed: int = 0
+    cfa: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_shape(self.shape)
         check_bit_depth(self.bit_depth)
+        if self.cfa is not None:
+            filtered(np.ones((1, 1)), self.cfa)
         for name in ("doubling_k", "well_e", "band_start_um"):
             if not getattr(self, name) > 0:
                 raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
@@ -273,6 +280,8 @@ class StaringArray:
         wrong = light[~(np.isfinite(light) & (light >= 0))]
         if wrong.size:
             raise InputError(f"'light_e' holds {wrong.flat[0]:g}, expected finite numbers from 0")
+        if self.cfa is not None:
+            light = filtered(np.broadcast_to(light, self.shape), self.cfa)
         dark = self._maps["dark_e"] * 2 ** (warmer_k / self.doubling_k)
         collected = self._maps["area"] * (self._maps["sensitivity"] * light + dark)
         return np.asarray(np.clip(collected, 0, self.well_e))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,7 +53,7 @@ class Recording:
         Images of the hole before and after each move, from the first exposure on.
     truth : dict
         What a calibration should find, by name.
-    cfa : str or None
+    cfa : str, list of list of str, or None
         Colour filters of the camera.
     """
 
@@ -62,7 +63,7 @@ class Recording:
     exposures: list[Stream]
     moves: list[tuple[Stream, Stream]]
     truth: dict[str, Any]
-    cfa: str | None = None
+    cfa: str | list[list[str]] | None = None
 
 
 def write_experiment(
@@ -103,7 +104,7 @@ def _manifest(recording: Recording) -> str:
         "[sensor]",
         'name = "virtual"',
         f"bit_depth = {recording.bit_depth}",
-        *([] if recording.cfa is None else [f'cfa = "{recording.cfa}"']),
+        *([] if recording.cfa is None else [f"cfa = {json.dumps(recording.cfa)}"]),
         "",
         "[dark]",
         'frames = "dark/dark.tif"',
