@@ -9,6 +9,10 @@ import pytest
 
 import equipix
 from equipix import Flag, errors, nuc, simulate
+from equipix.colour import Colours
+from equipix.defects import response_outliers
+from equipix.exposures.averaged import Averaged
+from equipix.exposures.blind import blind_pixels
 from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
@@ -300,6 +304,123 @@ class TestRegions:
         noisy = 3000 * beams + rng.standard_normal(beams.shape)
         found = equipix.calibrate(noisy, shifts, variance=np.ones(5))
         np.testing.assert_array_equal((found.flags & Flag.DO_NOT_USE) != 0, truth == 0)
+
+    @pytest.mark.parametrize("factor", [2, 2.5, 5])
+    @pytest.mark.parametrize("edge", [64, 73, "oblique"])
+    def test_no_good_pixel_beside_a_step_of_the_response_is_hot(self, factor, edge):
+        """672 of 12 288 were, where the step does not lie between blocks; bad ones are found."""
+        rng = np.random.default_rng(1)
+        row, col = np.indices((96, 128))
+        weak = col + 0.3 * row < 80 if edge == "oblique" else col < edge
+        response = (1 + 0.02 * rng.standard_normal(weak.shape)) / np.where(weak, factor, 1)
+        bad = np.zeros(weak.shape, bool)
+        bad[5::40, [60, 62, 75, 90]] = True
+        response[bad & weak] *= 6 * factor
+        response[bad & ~weak] = 0
+        dead, hot = response_outliers(response, lambda: np.full(weak.shape, 1e-3))
+        np.testing.assert_array_equal(hot, bad & weak)
+        assert dead[bad & ~weak].all()
+        assert edge == "oblique" or not dead[~bad].any()
+
+    @staticmethod
+    def outliers(usual, seed=1):
+        """What is dead and hot among pixels of these responses, of 2 % scatter."""
+        rng = np.random.default_rng(seed)
+        response = usual * (1 + 0.02 * rng.standard_normal(usual.shape))
+        response += 1e-4 * rng.standard_normal(usual.shape)
+        return response_outliers(response, lambda: np.full(usual.shape, 1e-4))
+
+    @pytest.mark.parametrize("edge", [56, 61, 64, 67])
+    @pytest.mark.parametrize(
+        ("side", "bad", "wanted"),
+        [(0.0, 0.2, "dead"), (0.15, 0.2, "dead"), (0.7, 0.4, "dead"), (1.3, 2.5, "hot")],
+    )
+    def test_a_bad_pixel_beside_a_step_is_found(self, side, bad, wanted, edge):
+        usual = np.ones((96, 128))
+        usual[:, :edge] = side
+        usual[20::24, edge] = usual[31::24, edge + 5] = bad
+        dead, hot = self.outliers(usual)
+        found = {"dead": dead, "hot": hot}
+        np.testing.assert_array_equal(found.pop(wanted)[:, edge:], usual[:, edge:] == bad)
+        assert not found.popitem()[1][:, edge:].any()
+
+    @pytest.mark.parametrize("edge", [56, 61, 64, 67])
+    @pytest.mark.parametrize("side", [0.0, -0.01])
+    def test_beside_a_dead_half_no_good_pixel_is_bad(self, side, edge):
+        """With a negative median all pixels there were hot."""
+        usual = np.ones((96, 128))
+        usual[:, :edge] = side
+        dead, hot = self.outliers(usual)
+        assert not hot.any()
+        assert not dead[:, edge:].any()
+        assert dead[:, 48:edge].all()
+
+    def averages(self, truth, beam, shifts, seed=1):
+        """Averages of 16 frames of noise of 3 DN."""
+        rng = np.random.default_rng(seed)
+        dark, *levels = [
+            100 + each + 3 * rng.standard_normal((16, *truth.shape))
+            for each in (0 * truth, *simulate.exposures(truth, beam, shifts))
+        ]
+        dark = equipix.average(np.rint(dark).astype(np.uint16))
+        return [equipix.average(np.rint(each).astype(np.uint16), dark=dark) for each in levels]
+
+    @pytest.mark.parametrize(
+        "region", [np.s_[:9, :], np.s_[:, 60:70], np.s_[20:32, 30:42], np.s_[40:52, 84:96]]
+    )
+    def test_a_calibration_leaves_it_out_before_the_fit(self, region):
+        """Nine rows at the edge did not converge in 3000 passes; without any it takes 12."""
+        shape, shifts = (90, 96), equipix.cross_pattern(7, 11)
+        truth = simulate.paper_sensitivity(shape, rng=2)
+        beam = simulate.gaussian_beam(shape, amplitude=8000, width=60)
+        dead = np.zeros(shape, bool)
+        dead[region] = True
+        cal = equipix.calibrate(self.averages(np.where(dead, 0, truth), beam, shifts), shifts)
+        assert cal.converged
+        assert cal.sweeps <= 40
+        np.testing.assert_array_equal((cal.flags & Flag.DEAD) > 0, dead)
+        error = simulate.relative_error(np.where(dead, np.nan, cal.sensitivity), truth)
+        assert np.nanstd(error) < 2e-3
+
+    @pytest.mark.parametrize("edge", [1e-3, 15.0], ids=["sharp", "fading"])
+    def test_what_has_no_light_in_the_beam_is_not_dead(self, edge):
+        """A disc that ends within a pixel, and one that fades, moved over the sensor."""
+        shape, shifts = (60, 80), equipix.cross_pattern(5, 7)
+
+        def beam(row, col):
+            radius = np.hypot(row - 30, col - 40)
+            return 8000 / (1 + np.exp(np.clip((radius - 24) / edge, -500, 500)))
+
+        averaged = Averaged.of(self.averages(np.ones(shape), beam, shifts))
+        assert not blind_pixels(averaged.values, averaged.models(averaged.noise)).any()
+
+    @pytest.mark.parametrize("given", [True, False])
+    def test_pixels_of_a_weak_colour_are_not_dead(self, given):
+        """With a twentieth of the light of green 339 of 1164 good blue pixels were."""
+        shape, shifts = (60, 80), equipix.cross_pattern(5, 7)
+        plain = simulate.paper_sensitivity(shape, rng=2)
+        truth = simulate.filtered(plain, "RGGB", response={"R": 0.5, "G": 1, "B": 0.05})
+        dead = np.zeros(shape, bool)
+        dead[20:32, 30:42] = True
+        beam = simulate.gaussian_beam(shape, amplitude=120, width=400)
+        frames = self.averages(np.where(dead, 0, truth), beam, shifts)
+        averaged = Averaged.of(frames, colours=Colours.of("RGGB") if given else None)
+        found = averaged.findings(averaged.noise).dead
+        # Blue pixels are no brighter than noise, so that nothing sets the dead ones apart.
+        blue = Colours.of("RGGB").numbers(shape) == 2
+        np.testing.assert_array_equal(found, dead & ~blue)
+
+    @pytest.mark.parametrize(("shifts", "found"), [([(0, 5), (5, 0)], 0), ([(0, 5), (0, 11)], 800)])
+    def test_a_shadow_is_dead_only_where_all_shifts_run_along_it(self, shifts, found):
+        """The shadow of a wire, of ten rows; its pixels have no light in any exposure."""
+
+        def beam(row, col):
+            return np.where((row >= 30) & (row < 40), 0.0, 8000.0) + 0 * col
+
+        averages = self.averages(np.ones((60, 80)), beam, [(0, 0), *shifts])
+        averaged = Averaged.of(averages)
+        blind = blind_pixels(averaged.values, averaged.models(averaged.noise))
+        assert np.count_nonzero(blind) == found
 
     def test_a_hot_region_is_found(self):
         rng = np.random.default_rng(12)

@@ -41,6 +41,15 @@ _ROUNDS = 3
 _BLOCK = 16
 """Side of the blocks of pixels whose median is what is usual there."""
 
+_STEP = 1.1
+"""Response of a block over that of the one beside it from which a step may lie between them."""
+
+_LARGEST_STEP = 10.0
+"""Response of a block over that of the one beside it up to which both may be good."""
+
+_SQUARE = 3
+"""Side of a square with a pixel in its corner, in which pixels beside a step are compared."""
+
 _AROUND = 5
 """Side of the square of blocks that a block is compared with."""
 
@@ -54,15 +63,15 @@ class Findings(ReadOnly):
     saturated : ndarray of bool or None
         A sample reaches the saturation level in some exposure.
     dead : ndarray of bool or None
-        No response to light: see `dead_pixels`.
+        No response to light: see `dead_pixels` and `equipix.exposures.blind`.
     hot : ndarray of bool or None
         A high dark level or much dark noise: see `hot_pixels`.
     noisy : ndarray of bool or None
         More scatter between frames than the noise explains: see `noisy_pixels`.
     contradictory : ndarray of bool or None
         Another response before than after some moment, as under dust that fell; or most of the
-        measurements left out by a robust calibration. The fit flags them, and their sensitivity
-        counts neither for its mean nor for its slope.
+        measurements left out by a robust calibration, or all but one. The fit flags them, and their
+        sensitivity counts neither for its mean nor for its slope.
     faint : ndarray of bool or None
         Light so weak that the noise of the dark leaves M less known than in bright pixels; treated
         likewise.
@@ -280,7 +289,18 @@ def response_outliers(
     dead, hot : ndarray of bool, shape (rows, cols)
         Of the two kinds; the neighbours' sensitivity is the median of a block of 16×16 pixels, or
         of the 5×5 blocks around where that is below half or above twice theirs: of a region of
-        bad pixels that fills most of a block.
+        bad pixels that fills most of a block. Beside a step of the response it is that of the
+        pixel's own side.
+
+    Notes
+    -----
+    The medians of adjacent blocks differ by more than a tenth beside a step. The neighbours there
+    are those of a square of 3×3 that has the pixel in its corner. Of the four squares that counts
+    whose values are lowest, or highest for a hot pixel: at an edge one of them lies on the pixel's
+    own side. A square across a straight edge holds two pixels of the own side, so its second
+    largest value counts, or second smallest, which no single bad pixel moves. It is limited to the
+    range of the medians. For a dead pixel those below a tenth of the largest are left out: dead
+    regions.
     """
     dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
     with np.errstate(invalid="ignore"):
@@ -288,11 +308,18 @@ def response_outliers(
         lowest, highest = (f.reduce(sensitivity, axis=None) for f in (np.fmin, np.fmax))
         if not lowest < max(least, DEAD_RESPONSE) * highest:
             return dead, hot
-    usual, deviation = _usual(sensitivity), std()
-    for found, sign, limit in ((dead, -1, least), (hot, 1, 1 / DEAD_RESPONSE)):
-        beyond = sign * (sensitivity - limit * usual).ravel()
-        suspects = np.flatnonzero(beyond > 0)
-        found.flat[suspects] = beyond[suspects] > SIGMAS * deviation.flat[suspects]
+    # The noise of a dead region may make its median negative.
+    usual, deviation = np.maximum(_usual(sensitivity), 0), std()
+    lowest, highest = _range_around(usual)
+    for found, sign, limit, extreme in (
+        (dead, -1, least, highest),
+        (hot, 1, 1 / DEAD_RESPONSE, lowest),
+    ):
+        beyond = sign * (sensitivity - limit * _of_pixels(extreme, sensitivity.shape))
+        suspects = np.nonzero(beyond > 0)
+        around = _on_its_side(sensitivity, usual, suspects, sign)
+        beyond = sign * (sensitivity[suspects] - limit * around)
+        found[suspects] = beyond > SIGMAS * deviation[suspects]
     return dead, hot
 
 
@@ -302,7 +329,7 @@ def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _usual(image: NDArray[Any]) -> NDArray[Any]:
-    """Block medians, but of an odd block the median of the 5×5 blocks around.
+    """Medians of blocks, but of an odd block the median of the 5×5 blocks around.
 
     A block is odd where its median is below half or above twice that of the blocks around, and most
     of these are within that of their median: most of its pixels are bad. Where half of a sensor
@@ -316,7 +343,46 @@ def _usual(image: NDArray[Any]) -> NDArray[Any]:
     usual = _are_alike(windows, around[..., None, None]).sum(axis=(2, 3))
     most = 2 * usual > np.isfinite(windows).sum(axis=(2, 3))
     odd = most & ~_are_alike(medians, around)
-    return _of_pixels(np.where(odd, around, medians), image.shape)
+    return np.where(odd, around, medians)
+
+
+def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Lowest and highest response of each block and those beside it.
+
+    Blocks below `least` times the highest do not count.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(usual, 1, mode="edge"), (3, 3))
+    highest = np.fmax.reduce(windows, axis=(2, 3))
+    counted = np.where(windows >= least * highest[..., None, None], windows, np.nan)
+    return np.fmin.reduce(counted, axis=(2, 3)), highest
+
+
+def _on_its_side(
+    image: NDArray[Any], usual: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int
+) -> NDArray[Any]:
+    """Usual response of those pixels, beside a step that of the pixel's side of it."""
+    blocks = tuple(each // _BLOCK for each in pixels)
+    lowest, highest = (each[blocks] for each in _range_around(usual))
+    least, _ = _range_around(usual, 1 / _LARGEST_STEP if sign < 0 else 0.0)
+    beside = np.clip(_alike_beside(image, pixels, sign), least[blocks], highest)
+    stepped = (highest > _STEP * lowest) & np.isfinite(beside)
+    return np.asarray(np.where(stepped, beside, usual[blocks]))
+
+
+def _alike_beside(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int) -> NDArray[Any]:
+    """Usual response in the square beside each pixel where it is lowest (`sign` -1) or highest."""
+    rows, cols = pixels
+    reach = _SQUARE - 1
+    padded = sign * np.pad(image, reach, mode="reflect")
+    squares = []
+    for down, right in itertools.product((-1, 1), repeat=2):
+        steps = itertools.islice(itertools.product(range(_SQUARE), repeat=2), 1, None)
+        beside = [
+            padded[rows + reach + down * row, cols + reach + right * col] for row, col in steps
+        ]
+        # NaN is sorted behind all numbers.
+        squares.append(np.sort(beside, axis=0)[1])
+    return np.asarray(sign * np.fmax.reduce(squares))
 
 
 def _are_alike(values: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:

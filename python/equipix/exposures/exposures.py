@@ -169,7 +169,7 @@ class Exposures(ReadOnly):
         first = (shape - sizes) // 2
         rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
         part = (..., rows, cols)
-        variance, mask = self.variance, self.mask
+        variance, mask, dark = self.variance, self.mask, self.dark_variance
         return dataclasses.replace(
             self,
             values=np.ascontiguousarray(self.values[part]),
@@ -180,7 +180,7 @@ class Exposures(ReadOnly):
             mask=None if mask is None else np.ascontiguousarray(mask[part]),
             findings=Findings(),
             dark=None if self.dark is None else self.dark[part],
-            dark_variance=None,
+            dark_variance=None if dark is None else np.ascontiguousarray(dark[part]),
             filters=None,
         )
 
