@@ -12,6 +12,8 @@ import pytest
 
 import equipix
 from equipix import Flag, NoiseModel, errors, io, simulate
+from equipix.calibration import weights
+from equipix.calibration.robust import rejected
 
 pytestmark = [
     # Frames with dust that is not left out, and variances that are wrong on purpose.
@@ -168,6 +170,41 @@ def test_a_pixel_that_contradicts_itself_is_flagged():
     cal = equipix.calibrate(frames, CROSS, robust=True)
     assert cal.flags[40, 50] & Flag.UNRELIABLE_FLAT
     assert cal.flags[40, 50] & Flag.DO_NOT_USE
+
+
+@pytest.mark.parametrize("kept", [2, 3, 5])
+def test_a_pixel_none_of_whose_values_agree_is_flagged(kept):
+    """Of two that differ nothing shows which is right."""
+    rng, truth, beam = sensor(8)
+    frames = simulate.exposures(truth, beam, CROSS)
+    frames += NOISE * rng.standard_normal(frames.shape)
+    frames[:, 40, 50] *= [1, 0.5, 1.4, 0.7, 1.9]
+    mask = np.zeros(frames.shape, bool)
+    mask[kept:, 40, 50] = True
+    cal = equipix.calibrate(frames, CROSS, robust=True, mask=mask)
+    assert cal.flags[40, 50] & Flag.UNRELIABLE_FLAT
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
+@pytest.mark.parametrize("seed", range(3))
+def test_the_search_ends_where_pixels_have_few_values(seed, monkeypatch):
+    """It left the last values of a pixel out and used them again in turn, to the last round."""
+    rng, truth, beam = sensor(seed)
+    frames = simulate.exposures(truth, beam, CROSS)
+    false = rng.random(frames.shape) < 0.01
+    frames[false] *= rng.uniform(0.7, 0.98, false.sum())
+    frames += NOISE * rng.standard_normal(frames.shape)
+    mask = rng.random(frames.shape) < 0.3
+    rounds = []
+
+    def counted(*args):
+        rounds.append(rejected(*args))
+        return rounds[-1]
+
+    monkeypatch.setattr(weights, "rejected", counted)
+    equipix.calibrate(frames, CROSS, robust=True, mask=mask)
+    # It used to go on to its limit of 20 rounds.
+    assert len(rounds) < 20
 
 
 def test_without_noise_nothing_is_left_out():

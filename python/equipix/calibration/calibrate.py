@@ -286,12 +286,12 @@ def calibrated(
     drift = lamp_drift(weighted, residuals)
     contradicted = bool(widths) or (drift is not None and drift.is_certain)
     test = test.among_fluxes(contradicted=contradicted)
-    misfits = misfit(weighted, residuals)
+    misfits = misfit(weighted, residuals, options.fit)
     differ = contradiction(weighted, residuals, flags)
     weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
     found = verdicts.on_fit(weighted, options, test, drift, misfits, widths, differ)
     found = verdicts.unexplained(found, advice) + verdicts.on_noise(frames)
-    found = with_small_errors(found, weighted, residuals, options.fit)
+    found = with_small_errors(found, weighted, flags, residuals, options.fit)
     found = with_coverage(found, weighted, flags)
     # Before the error bars, which may be refused or interrupted.
     verdicts.say(found)
@@ -334,7 +334,7 @@ def _metadata(
         "robust": options.robust,
     }
     if exposures.filters is not None and exposures.filters.given:
-        chosen["cfa"] = str(exposures.filters.colours)
+        chosen["cfa"] = exposures.filters.colours.written
     if exposures.positions.std is not None:
         chosen["shifts"] = fit.refinement
     metadata: dict[str, Any] = {

@@ -28,9 +28,9 @@ _BINS = 16
 _FAINT = 0.1
 """Spread of the signals, relative to their mean, below which nothing can grow with them."""
 
-_WORST, _EXCHANGED, _ALONE = 6, 1.25, 2.0
+_WORST, _EXCHANGED, _PAIRS = 6, 1.25, 4
 """Exposures that are compared as exchanged; how many times their squares those of such are at most
-when they are exchanged in the beam that was fitted to both; how many times as many others have."""
+when they are exchanged in the beam that was fitted to both; how many pairs are fitted so."""
 
 
 class Part(NamedTuple):
@@ -60,12 +60,12 @@ def by_illumination(residuals: Floats, signal: Floats, slopes: Floats, noise: fl
     return _explained(residuals, [signal, *slopes, *(signal * place for place in places)], noise)
 
 
-def exchanged(residuals: Floats, light: Floats, response: Floats) -> tuple[int, int] | None:
-    """Find two exposures each of which fits at the place of the other.
+def maybe_exchanged(residuals: Floats, light: Floats, response: Floats) -> list[tuple[int, int]]:
+    """Find pairs of exposures each of which may fit at the place of the other, the likeliest first.
 
     Squares of residuals of both, each at the place of the other, are compared with those at their
-    own. The beam was fitted to the wrong places, so they need not be fewer, but by far the fewest
-    of all pairs of the six exposures with the most residuals.
+    own. The beam was fitted to the wrong places, so they need not be fewer. Pairs of the six
+    exposures with the most residuals are compared.
     """
     squares = np.nansum(residuals**2, axis=(1, 2))
     worst = np.sort(np.argsort(squares)[::-1][:_WORST])
@@ -77,9 +77,8 @@ def exchanged(residuals: Floats, light: Floats, response: Floats) -> tuple[int, 
         (int(i), int(j)): (at_the_other(i, j) + at_the_other(j, i)) / (squares[i] + squares[j])
         for i, j in combinations(worst, 2)
     }
-    pair, *others = sorted(shares, key=lambda each: shares[each])
-    is_alone = bool(others) and shares[others[0]] > _ALONE * shares[pair]
-    return pair if is_alone and shares[pair] < _EXCHANGED else None
+    likeliest = sorted(shares, key=lambda each: shares[each])
+    return [pair for pair in likeliest[:_PAIRS] if shares[pair] < _EXCHANGED]
 
 
 def moves(residuals: Floats, signal: Floats, slopes: Floats) -> Floats:

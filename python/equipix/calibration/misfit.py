@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration import causes
+from equipix.calibration.exchanged import exchanged
 from equipix.calibration.residual_tests import lag_one
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
 from equipix.calibration.shift_errors import without_shift_errors
+from equipix.calibration.simulated_fit import simulated_chi2
 
 if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.calibration.residual_tests import Correlation
     from equipix.calibration.residuals import Residuals
     from equipix.calibration.weights import Weighted
+    from equipix.exposures.options import FitOptions
 
 _SIGMAS = 5.0
 """Standard errors that noise does not reach."""
@@ -46,9 +49,10 @@ class Misfit:
 
     Attributes
     ----------
-    chi2, std : float
-        Reduced χ², and its standard error where the model and the variances are right; NaN without
-        variances.
+    chi2 : float
+        Reduced χ²; NaN without variances.
+    limit : float or None
+        How far from 1 noise brings it; None where it is not beyond.
     correlation : Correlation
         That of neighbouring residuals, along the axis where it is the larger.
     cause : str
@@ -59,7 +63,7 @@ class Misfit:
     """
 
     chi2: float
-    std: float
+    limit: float | None
     correlation: Correlation
     cause: str
     remedy: str
@@ -76,11 +80,11 @@ class Misfit:
     @property
     def words(self) -> str:
         """What is wrong, the value, the limit and the remedy."""
-        limit = max(_LEAST, _SIGMAS * self.std)
-        if abs(self.chi2 - 1) > limit:
+        if self.limit is not None:
             return (
                 f"the residuals are {self.chi2**0.5:.3g} times as large as the variances predict "
-                f"(reduced chi-square {self.chi2:.3g}, expected 1 ± {limit:.2g}): {self.remedy}"
+                f"(reduced chi-square {self.chi2:.3g}, expected 1 ± {self.limit:.2g}): "
+                f"{self.remedy}"
             )
         return (
             f"residuals of neighbouring pixels are correlated by {self.correlation.size:.1%}, "
@@ -88,44 +92,66 @@ class Misfit:
         )
 
 
-def misfit(weighted: Weighted, residuals: Residuals) -> Misfit | None:
+def misfit(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Misfit | None:
     """Test the residuals of a fit; None where nothing speaks against it.
 
     Notes
     -----
-    Two questions. Where variances are known, reduced χ² must be within five standard errors
-    √(2/dof) of 1, or within 3 %. And residuals of neighbouring pixels must not be correlated by
-    more than five standard errors and 1 %, which requires no variances. A fit that has not come to
-    its minimum, or data without noise, answer neither.
+    Two questions. Where variances are known, reduced χ² must be within five standard errors of 1,
+    or within 3 %; where it is not, and the degrees of freedom leave a doubt, these are those of
+    simulated noise. And residuals of neighbouring pixels must not be correlated by more than five
+    standard errors and 1 %, which requires no variances. A fit that has not come to its minimum, or
+    data without noise, answer neither.
     """
     inexactness = residuals.inexactness
     if weighted.fit.degrees_of_freedom < FEWEST or not inexactness < 1:
         return None
     known = weighted.exposures.knows_noise
     chi2 = weighted.reduced_chi2 if known else float("nan")
-    left = without_shift_errors(weighted, residuals)
+    left, unexplained = without_shift_errors(weighted, residuals), 1.0
     if left is not residuals:
-        chi2 *= float(np.nansum(left.values**2) / np.nansum(residuals.values**2))
+        unexplained = float(np.nansum(left.values**2) / np.nansum(residuals.values**2))
         residuals = left
-    std = (2 / weighted.fit.degrees_of_freedom) ** 0.5 if known else float("nan")
-    limit = max(_LEAST, _SIGMAS * std)
-    high = chi2 * (1 - inexactness**2) > 1 + limit
-    low = chi2 < 1 - limit
+    chi2, std = unexplained * chi2, weighted.chi2_std if known else float("nan")
+    high, low = _beyond(chi2, std, inexactness)
+    # F over all measurements needs no degrees of freedom: their number is at most that.
+    if low or (high and not chi2 * residuals.share > 1 + _limit(std)):
+        simulated = simulated_chi2(weighted, options)
+        if simulated is not None:
+            chi2, std = unexplained * simulated.value, simulated.std
+            high, low = _beyond(chi2, std, inexactness)
     largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
     correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
     correlated &= inexactness <= EXACT
     if not (high or low or correlated):
         return None
-    cause, remedy = _cause(weighted, residuals, largest, correlated=bool(correlated), low=bool(low))
-    return Misfit(chi2, std, largest, cause, remedy)
+    cause, remedy = _cause(
+        weighted, residuals, largest, options, correlated=bool(correlated), low=low
+    )
+    return Misfit(chi2, _limit(std) if high or low else None, largest, cause, remedy)
+
+
+def _limit(std: float) -> float:
+    return max(_LEAST, _SIGMAS * std)
+
+
+def _beyond(chi2: float, std: float, inexactness: float) -> tuple[bool, bool]:
+    """Whether χ² is above what noise reaches, and below."""
+    return chi2 * (1 - inexactness**2) > 1 + _limit(std), chi2 < 1 - _limit(std)
 
 
 def _cause(
-    weighted: Weighted, residuals: Residuals, largest: Correlation, *, correlated: bool, low: bool
+    weighted: Weighted,
+    residuals: Residuals,
+    largest: Correlation,
+    options: FitOptions,
+    *,
+    correlated: bool,
+    low: bool,
 ) -> tuple[str, str]:
     """The likely cause and its remedy."""
     if correlated:
-        found = _common(weighted, residuals, largest)
+        found = _common(weighted, residuals, largest, options)
         if found is not None:
             return found
     values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
@@ -156,7 +182,7 @@ def _cause(
 
 
 def _common(
-    weighted: Weighted, residuals: Residuals, largest: Correlation
+    weighted: Weighted, residuals: Residuals, largest: Correlation, options: FitOptions
 ) -> tuple[str, str] | None:
     """A cause of correlated residuals: fluxes, shifts, rows, columns, one place, fine structure."""
     values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
@@ -166,19 +192,26 @@ def _common(
     if found is not None and found[0] == "flux":
         return found
     light, response = (_flat(each) for each in (residuals.light, residuals.response))
-    if (pair := causes.exchanged(values, light, response)) is not None:
+    pairs = causes.maybe_exchanged(values, light, response)
+    if (pair := exchanged(weighted.exposures, pairs, options)) is not None:
         return "order", (
             f"exposures {pair[0]} and {pair[1]} (from 0) fit better each at the shift of the "
             "other: check the order of the frames and of 'shifts'"
         )
-    if _is_fine(weighted, residuals):
+    slopes = np.stack([_flat(each) for each in residuals.slopes])
+    by_exposures = causes.by_illumination(values, signal, slopes, noise).explained
+    lines = [causes.by_lines(values, axis, noise).explained for axis in (1, 2)]
+    # A spline's finest pattern follows what moves, or rows that flicker; what is itself finer
+    # leaves residuals that no few numbers for each exposure explain.
+    few = max(by_exposures if found is not None else 0.0, *lines)
+    is_explained = few > _MOST * float(np.nansum(values**2))
+    if not is_explained and _is_fine(weighted, residuals):
         return "structure", (
             "the beam is finer than a spline of one knot a pixel can follow (periods below some "
             f"{_FINE:g} pixels): move by whole pixels, or defocus the beam"
         )
     if found is not None:
         return found
-    slopes = np.stack([_flat(each) for each in residuals.slopes])
     remaining = causes.by_shifts(values, signal, slopes, noise).remaining
     for axis, name in ((2, "rows"), (1, "columns")):
         parts = [causes.by_lines(each, axis, noise).explained for each in (values, remaining)]

@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix.calibration.error_bars import with_dark_misfit
 from equipix.calibration.residuals import EXACT, FEWEST
 from equipix.calibration.verdicts import Verdict
-from equipix.errors import InputError, InsufficientMemoryError
+from equipix.calibration.weights import Weighted
+from equipix.calibration.window_fit import if_there_is_light, window_of
 from equipix.exposures.options import FitOptions
+from equipix.flags import usable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from equipix._native import Fit
-    from equipix._types import Floats
+    from equipix._types import Array, Floats
     from equipix.calibration.residuals import Residuals
-    from equipix.calibration.weights import Weighted
     from equipix.exposures.exposures import Exposures
 
 _SIGMAS = 6.0
@@ -30,14 +32,12 @@ _AS_LIKELY = 10.0
 than one in a hundred of wrong causes are better by so much."""
 
 _CLEAR, _FAINTEST = 30.0, 0.05
-"""Signal over noise that all but this share of values must have. The noise of M and L displaces the
-estimate by 1.2 √N of its standard error over the square of that, with N values."""
+"""Signal over noise that all but this share of values must have. Where the noise of M and L is
+larger, more than its square displaces the estimate."""
 
-_MEASUREMENTS = 2**17
-"""Most measurements of the window that is fitted again for each cause."""
-
-_STEP = 0.05
-"""Size of the error that is added, over the signal, rms: its effect is nearly linear."""
+_STEP = 0.005
+"""Size of the error that is added, over the signal, rms: its effect is nearly linear. Of 0.05 the
+rest displaced crosstalk by four standard errors where the dark was that of one frame."""
 
 _EXACT = 10.0
 """What it leaves in the residuals over what the solver may leave there."""
@@ -120,13 +120,22 @@ class SmallError:
 
 
 def with_small_errors(
-    found: list[Verdict], weighted: Weighted, residuals: Residuals, options: FitOptions
+    found: list[Verdict],
+    weighted: Weighted,
+    flags: Array,
+    residuals: Residuals,
+    options: FitOptions,
 ) -> list[Verdict]:
-    """Verdicts, with that on small errors: where no other one explains them better."""
+    """Verdicts, with that on small errors: where no other one explains them better.
+
+    Values of flagged pixels that are not proportional to light are none, and residuals of a beam
+    finer than its spline have their cause.
+    """
     kinds = {each.kind for each in found}
-    if kinds & _STRONGER or not residuals.inexactness <= EXACT:
+    if kinds & _STRONGER or not residuals.inexactness <= EXACT or weighted.excess > 1:
         return found
-    errors = small_errors(weighted, options)
+    exposures = weighted.exposures.without(~usable(flags))
+    errors = small_errors(weighted._replace(exposures=exposures), options)
     if not errors or ("misfit" in kinds and not errors[0].share > _MOST):
         return found
     others = [each for each in found if each.kind != "misfit"]
@@ -151,8 +160,10 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     An error a z of the values y changes M and L, and leaves a P z in the residuals r. P z is found
     by a fit of y + ε z to a central window: the change of the residuals is ε P z. So the estimate
     is a = ⟨r, P z⟩ / ⟨P z, P z⟩ in the products that weights make, and its variance
-    σ²/⟨P z, P z⟩ [1]_, to which the noise of the dark adds. What M and L absorb, such as a power
-    law of the response, is not found. Nothing is tested where the shifts have errors that are not
+    σ²/⟨P z, P z⟩ [1]_, to which the noise of the dark adds. Noise is also in M, L and z: without
+    any error of the values ⟨r, P z⟩ has a mean that is quadratic in it. That of fits of simulated
+    noise of both signs is subtracted. What M and L absorb, such as a power law of the response, is
+    not found. Nothing is tested where the shifts have errors that are not
     refined, and where fluxes are fitted, which take most of such errors: what is left is small and
     not of one cause. Nor behind colour filters, where such an error differs between colours.
 
@@ -169,29 +180,29 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
         return []
     if fit.degrees_of_freedom < FEWEST or fit.ended != "converged":
         return []
-    try:
-        found = list(_tested(weighted, options))
-    except (InputError, InsufficientMemoryError):
-        # All arguments are valid for the whole sensor: the window has too little light or memory.
-        return []
-    found.sort(key=lambda each: -abs(each.sigmas))
+    found = sorted(_tested(weighted, options) or [], key=lambda each: -abs(each.sigmas))
     least = max(_SIGMAS**2, found[0].sigmas ** 2 - _AS_LIKELY) if found else 0.0
     return [each for each in found if each.sigmas**2 >= least]
 
 
-def _tested(weighted: Weighted, options: FitOptions) -> Iterator[SmallError]:
+@if_there_is_light
+def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     """Each error that is tested."""
-    window, start = _window(weighted)
+    window, start = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)
     fit = window.fit(exact, start)
+    part = with_dark_misfit(Weighted(window, fit, None), options)
     own = _scaled(window, fit, options)
-    square, noise = float(np.nansum(own**2)), weighted.noise_variance * fit.degrees_of_freedom
+    square, noise = float(np.nansum(own**2)), part.noise_variance * part.expected_misfit
     signal = window.values - window.residuals(fit, options.workers)
-    clear = np.sqrt(window.weighted_squares(signal**2) / weighted.noise_variance)
+    clear = np.sqrt(window.weighted_squares(signal**2) / part.noise_variance)
     if not (np.isfinite(clear).any() and np.nanquantile(clear, _FAINTEST) > _CLEAR):
-        return
-    whole = float(np.nansum(clear**2) * weighted.noise_variance) ** 0.5
-    for cause, error in _errors(signal, window):
+        return []
+    whole = float(np.nansum(clear**2) * part.noise_variance) ** 0.5
+    roots = np.sqrt(window.weighted_squares(np.ones(signal.shape)))
+    noisy = [_simulated(part, signal, sign, exact) for sign in (1, -1)]
+    found = []
+    for number, (cause, error) in enumerate(_errors(signal, window)):
         if not np.isfinite(error).any():
             continue
         size = _STEP * float(np.sqrt(np.nanmean(signal**2) / np.nanmean(error**2)))
@@ -203,33 +214,67 @@ def _tested(weighted: Weighted, options: FitOptions) -> Iterator[SmallError]:
         solver = float(fit.error_estimate[-1] + other.error_estimate[-1]) * whole
         if other.ended != "converged" or not size * power**0.5 > _EXACT * solver:
             continue
-        found = float(np.nansum(own * left)) / power
-        if cause is _PATTERN:
-            found += _noise_of_dark(weighted.exposures)
-        if not abs(found) < cause.most:
+        by_noise = np.mean([each.product(number, roots * error - left) for each in noisy], axis=0)
+        estimate = (float(np.nansum(own * left)) - float(by_noise.sum())) / power
+        if not abs(estimate) < cause.most:
             continue
-        variance = max(square, noise) / fit.degrees_of_freedom / power
-        std = (variance + _by_noise_of_dark(weighted.exposures, window, left) / power**2) ** 0.5
-        effect = abs(found / size) * _scatter(other, fit)
-        explained = found**2 * power / (square - noise) if square > noise else np.nan
+        variance = max(part.noise_variance, part.reduced_chi2) * power
+        if window.dark_variance is not None:
+            variance += float(np.sum(window.dark_variance * np.nansum(roots * left, axis=0) ** 2))
+        # What is quadratic in noise scatters in the measurements as in the simulation.
+        variance += 2 * float(np.sum((by_noise - by_noise.mean()) ** 2))
+        sigmas = estimate * power / variance**0.5
+        effect = abs(estimate / size) * _scatter(other, fit)
+        explained = estimate**2 * power / (square - noise) if square > noise else np.nan
         share = np.nan if window.variance is None else explained
-        yield SmallError(cause.words(found), cause.remedy, found / std, effect, share)
+        found.append(SmallError(cause.words(estimate), cause.remedy, sigmas, effect, share))
+    return found
 
 
-def _noise_of_dark(exposures: Exposures) -> float:
-    """Share of the variance of the dark's pattern that is noise: all values lack it by itself."""
-    if exposures.dark is None or exposures.dark_variance is None:
-        return 0.0
-    return min(1.0, float(np.mean(exposures.dark_variance) / np.var(exposures.dark)))
+class _Simulated(NamedTuple):
+    """A fit of the expected signal with noise.
+
+    `residuals` are times √w, `errors` those of its signal times √w, and `change` is the signal over
+    the expected one.
+    """
+
+    residuals: Floats
+    errors: list[Floats]
+    change: Floats
+
+    def product(self, number: int, absorbed: Floats) -> Floats:
+        """Sum of r · P z over the exposures of each pixel, for the error of that number.
+
+        `absorbed` is what M and L took of the error in the expected signal. Residuals are
+        orthogonal to all that changes of M and L add to the signal, so to the same relative
+        changes of this one.
+        """
+        left = self.errors[number] - absorbed * self.change
+        return np.asarray(np.nansum(self.residuals * left, axis=0))
 
 
-def _by_noise_of_dark(exposures: Exposures, window: Exposures, left: Floats) -> float:
-    """Variance of ⟨r, P z⟩ by the noise of the dark, which all measurements of a pixel share."""
-    if exposures.dark_variance is None:
-        return 0.0
-    roots = np.sqrt(window.weighted_squares(np.ones(left.shape)))
-    shared = np.nansum(roots * left, axis=0)
-    return float(np.mean(exposures.dark_variance) * np.sum(shared**2))
+def _simulated(part: Weighted, signal: Floats, sign: int, options: FitOptions) -> _Simulated:
+    """Fit the signal with noise as large as that of the measurements and of the dark.
+
+    The mean over both signs of the noise has only what is quadratic in it.
+    """
+    window, rng = part.exposures, np.random.default_rng(0)
+    values, dark = signal.copy(), window.dark
+    if window.dark_variance is not None:
+        error = sign * np.sqrt(window.dark_variance) * rng.standard_normal(window.shape)
+        values += error
+        dark = None if dark is None else dark - error
+    for k, each in enumerate(values):
+        scale = sign * part.noise_variance**0.5 * window.deviation(k)
+        each += scale * rng.standard_normal(window.shape)
+    values = np.where(np.isfinite(signal), values, window.values).astype(window.values.dtype)
+    noisy = dataclasses.replace(window, values=values, dark=dark)
+    fit = noisy.fit(options, part.fit)
+    roots = np.sqrt(noisy.weighted_squares(np.ones(signal.shape)))
+    found = values - noisy.residuals(fit, options.workers)
+    change = np.divide(found, signal, where=signal != 0, out=np.ones(signal.shape))
+    errors = [roots * error for _, error in _errors(found, noisy)]
+    return _Simulated(_scaled(noisy, fit, options), errors, change)
 
 
 def _scatter(other: Fit, fit: Fit) -> float:
@@ -238,24 +283,22 @@ def _scatter(other: Fit, fit: Fit) -> float:
     return float(np.std(other.sensitivity[lit] / fit.sensitivity[lit]))
 
 
-def _window(weighted: Weighted) -> tuple[Exposures, Fit | None]:
-    """All exposures and their fit, or a central window of large ones."""
-    exposures = weighted.exposures
-    side = int((_MEASUREMENTS / len(exposures)) ** 0.5)
-    if side >= max(exposures.shape):
-        return exposures, weighted.fit
-    return exposures.window(side), None
-
-
 def _errors(signal: Floats, window: Exposures) -> Iterator[tuple[Cause, Floats]]:
     """Errors of a unit size, and their words at a size."""
     top = float(np.nanmax(signal))
     yield _CURVED, signal**2 / top
-    yield _CROSSTALK, sum(np.roll(signal, n, axis) for n in (1, -1) for axis in (1, 2)) - 4 * signal
+    yield _CROSSTALK, _from_neighbours(signal)
     if not window.offset:
         yield _OFFSET, np.full(signal.shape, top)
     if window.dark is not None and np.ptp(window.dark) > 0:
         yield _PATTERN, np.broadcast_to(window.dark - np.median(window.dark), signal.shape)
+
+
+def _from_neighbours(signal: Floats) -> Floats:
+    """Σ (neighbour − own); a pixel at the edge has fewer neighbours."""
+    wide = np.pad(signal, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    along_rows, along_cols = np.diff(wide[:, :, 1:-1], 2, axis=1), np.diff(wide[:, 1:-1], 2, axis=2)
+    return np.asarray(along_rows + along_cols)
 
 
 def _scaled(window: Exposures, fit: Fit, options: FitOptions) -> Floats:

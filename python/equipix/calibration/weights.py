@@ -25,8 +25,11 @@ if TYPE_CHECKING:
 _ROUGH = 1e-3
 """Tolerance of a fit that only predicts how much signal to expect: its noise is larger."""
 
-_MOST_ROUNDS = 20
+_MOST_ROUNDS = 60
 """Most rounds of fitting and leaving out; a grain of dust takes three or four."""
+
+_FEWEST = 2
+"""Fewest measurements of a pixel that confirm each other."""
 
 
 class Weighted(NamedTuple):
@@ -46,17 +49,30 @@ class Weighted(NamedTuple):
 
     @property
     def reduced_chi2(self) -> float:
-        """F over its expectation, or the variance of a value of weight 1; NaN where undetermined.
-
-        The expectation of F is the degrees of freedom and what the noise of the dark adds.
-        """
+        """F over that expected, or the variance of a value of weight 1; NaN where undetermined."""
         freedom = self.fit.degrees_of_freedom
         if freedom <= 0:
             return float("nan")
         if self.exposures.knows_noise:
-            return self.fit.misfit / (freedom + self.dark_misfit)
+            return self.fit.misfit / self.expected_misfit
         left = self.fit.misfit - self.dark_misfit
         return left / freedom if left > 0 or self.dark_misfit == 0 else float("nan")
+
+    @property
+    def expected_misfit(self) -> float:
+        """F where variances are right: degrees of freedom, and what the noise of the dark adds."""
+        return self.fit.degrees_of_freedom + self.dark_misfit
+
+    @property
+    def chi2_std(self) -> float:
+        """Standard error of reduced χ² where variances are known and right.
+
+        In a pixel with f degrees of freedom, of which one has the variance 1 + m by the noise of
+        the dark, F has the variance 2f + 4m + 2m².
+        """
+        added, pixels = self.dark_misfit, int(np.isfinite(self.fit.sensitivity).sum())
+        variance = 2 * self.fit.degrees_of_freedom + 4 * added + 2 * added**2 / max(pixels, 1)
+        return float(np.sqrt(variance)) / self.expected_misfit
 
     @property
     def noise_variance(self) -> float:
@@ -90,16 +106,21 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
 def _robust_fit(
     exposures: Exposures, options: FitOptions, fit: Fit, middle: Floats | None
 ) -> Weighted:
-    """Leave out outliers and fit again, until nothing changes."""
+    """Leave out outliers and fit again, until nothing changes.
+
+    A measurement that was used again, and is left out once more, stays so: the search ends.
+    """
     given = exposures.usable()
     exposures, fit = without_fallen_dust(exposures, fit, options)
     usable = exposures.usable()
-    out = np.zeros_like(usable)
+    out, returned = np.zeros_like(usable), np.zeros_like(usable)
     kept = exposures
     for _ in range(_MOST_ROUNDS):
         former, out = out, rejected(exposures, fit, out, options)
+        out |= former & returned
         if np.array_equal(former, out):
             break
+        returned |= former & ~out
         if middle is not None:
             exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
         kept = contradictory_found(exposures.without(~usable | out), given)
@@ -108,8 +129,12 @@ def _robust_fit(
 
 
 def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
-    """Exposures with a finding for each pixel most of whose given measurements are left out."""
-    contradictory = given.sum(axis=0) > 2 * kept.usable().sum(axis=0)
+    """Exposures with a finding for each pixel whose measurements contradict each other.
+
+    Most of those given are left out, or so many that no two agree.
+    """
+    before, after = given.sum(axis=0), kept.usable().sum(axis=0)
+    contradictory = (before > 2 * after) | ((before > after) & (after < _FEWEST))
     found = union(kept.findings.contradictory, contradictory)
     findings = dataclasses.replace(kept.findings, contradictory=found)
     return dataclasses.replace(kept, findings=findings)

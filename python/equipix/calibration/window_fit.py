@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 
 from equipix.calibration.residual_tests import Correlation, in_blocks, lag_one
+from equipix.errors import InputError, InsufficientMemoryError
 from equipix.exposures.options import FitOptions
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats, Progress
     from equipix.exposures.exposures import Exposures
+
+_Asked = ParamSpec("_Asked")
+_Answer = TypeVar("_Answer")
 
 _COARSE, _MOST_COARSE = 1e-2, 300
 """Tolerance and most products of the first fits, sufficient in a beam with structure."""
@@ -38,6 +45,9 @@ as large residuals, everywhere."""
 _BLOCK, _MOST = 4, 2 / 3
 """Pixels along a block, and the share of blocks where the better fit must be better. A grain of
 dust changes F by more than noise does, but in few blocks only."""
+
+_MEASUREMENTS = 2**17
+"""Most measurements of a window that stands for the whole sensor."""
 
 _WHITE = 5.0
 """Standard errors of a correlation that white residuals do not reach."""
@@ -177,6 +187,30 @@ class WindowFit:
         squares: Array = np.square(self.residuals)
         odd = np.asarray(squares > _ODD**2 * np.nanmedian(squares))
         return np.asarray(odd & (odd.mean() < _RARE))
+
+
+def window_of(exposures: Exposures, fit: Fit) -> tuple[Exposures, Fit | None]:
+    """Return all exposures and their fit, or a central window of large ones, which has none yet."""
+    side = int((_MEASUREMENTS / len(exposures)) ** 0.5)
+    if side >= max(exposures.shape):
+        return exposures, fit
+    return exposures.window(side), None
+
+
+def if_there_is_light(question: Callable[_Asked, _Answer]) -> Callable[_Asked, _Answer | None]:
+    """Return a question of fits of a window that answers None in too little light or memory.
+
+    All arguments are valid for the whole sensor.
+    """
+
+    @functools.wraps(question)
+    def asked(*args: _Asked.args, **kwargs: _Asked.kwargs) -> _Answer | None:
+        try:
+            return question(*args, **kwargs)
+        except (InputError, InsufficientMemoryError):
+            return None
+
+    return asked
 
 
 def _named(progress: Progress) -> Progress:
