@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _FIRST = "/* equipix table: "
 
+_DIGEST = "SHA-256 of the lines above:"
+
 _TYPES = {"coarse": "uint16_t", "offset": "int16_t", "gain": "uint16_t", "flags": "uint32_t"}
 
 _NUMBERS = {
@@ -111,7 +113,7 @@ def _function(f: Format, lower: str) -> str:
 def _last(upper: str, above: str) -> str:
     """Last line, by which a file is known to be whole and as it was written."""
     digest = hashlib.sha256(above.encode()).hexdigest()
-    return f"#endif /* {upper}_H, SHA-256 of the lines above: {digest} */"
+    return f"#endif /* {upper}_H, {_DIGEST} {digest} */"
 
 
 def decoded(path: Path, data: bytes) -> Content:
@@ -126,6 +128,11 @@ def decoded(path: Path, data: bytes) -> Content:
     if guard is None or not last.startswith(f"#endif /* {guard[1]}_H"):
         raise FileError(f"{path}: has no last line '#endif' with its guard: incomplete")
     content = made(path, fields, {name: _words(path, text, name) for name in DTYPES})
+    if _DIGEST not in last:
+        raise FileError(
+            f"{path}: its last line has no SHA-256 of the lines above: an older version wrote it, "
+            "or the digest was removed: write the table again"
+        )
     if last != _last(guard[1], above + newline):
         raise FileError(
             f"{path}: was edited: the SHA-256 in its last line is not that of the lines above: "
