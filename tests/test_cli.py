@@ -78,6 +78,23 @@ def test_calibrate_reports_what_it_saved(run, experiment, tmp_path):
     assert saved.metadata["options"]["tolerance"] == 1e-4
 
 
+@pytest.mark.parametrize("frames", [20, 100, 500])
+def test_a_simulated_8_bit_camera_is_calibrated_without_false_pixels(run, tmp_path, frames):
+    """Its noise is below a step, so that rounding is a part of it; 2175 pixels were hot."""
+    folder, output = tmp_path / "experiment", tmp_path / "cal.npz"
+    given = ("--bit-depth", 8, "--frames", frames, "--shape", 120, 160)
+    assert run("simulate", "-o", folder, *given)[0] == 0
+    status, out, err = run("calibrate", folder / "experiment.toml", "-o", output, "--json")
+    assert (status, err) == (0, "")
+    saved = equipix.load(output)
+    with np.load(folder / "truth.npz") as file:
+        truth = dict(file)
+    bad = np.concatenate([truth["dead"], truth["hot"]])
+    np.testing.assert_array_equal(np.flatnonzero(saved.flags), np.sort(bad))
+    freedom = (5 - 2) * truth["sensitivity"].size
+    assert json.loads(out)["reduced_chi2"] == pytest.approx(1, abs=5 * np.sqrt(2 / freedom))
+
+
 def test_warnings_are_one_line_each(run, experiment, tmp_path):
     status, out, err = run(
         "calibrate", experiment, "-o", tmp_path / "cal.tif", "--max-sweeps", "2", "--json"
@@ -431,7 +448,7 @@ def read(descriptor):
 
 
 @pytest.mark.timing
-def test_ctrl_c_stops_the_solver_at_once(tmp_path_factory, tmp_path):
+def test_ctrl_c_stops_the_solver_at_once(stops_within, tmp_path_factory, tmp_path):
     # Short arms on a sensor of some size: to rounding takes many seconds.
     shape = (320, 400)
     virtual = simulate.experiment(
@@ -445,9 +462,7 @@ def test_ctrl_c_stops_the_solver_at_once(tmp_path_factory, tmp_path):
     output = tmp_path / "cal.tif"
     command = command_line("calibrate", experiment, "-o", output, "--tolerance", "1e-30")
     command += ["--method", "coordinate-descent"]
-    # The best of three: the machine may be busy with something else.
-    waits = [interrupted(list(command)) for _ in range(3)]
-    assert min(waits) < 0.5
+    assert stops_within(0.5, lambda: interrupted(list(command)))
     assert list(tmp_path.iterdir()) == []
 
 
