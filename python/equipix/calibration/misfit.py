@@ -15,6 +15,7 @@ from equipix.calibration.shift_errors import without_shift_errors
 from equipix.calibration.simulated_fit import simulated_chi2
 
 if TYPE_CHECKING:
+    from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
     from equipix.calibration.residual_tests import Correlation
     from equipix.calibration.residuals import Residuals
@@ -115,7 +116,8 @@ def misfit(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Mis
     chi2, std = unexplained * chi2, weighted.chi2_std if known else float("nan")
     high, low = _beyond(chi2, std, inexactness)
     # F over all measurements needs no degrees of freedom: their number is at most that.
-    if low or (high and not chi2 * residuals.share > 1 + _limit(std)):
+    surely = high and chi2 * residuals.share > 1 + _limit(std)
+    if (high or low) and not surely and not _is_counted(weighted.fit):
         simulated = simulated_chi2(weighted, options)
         if simulated is not None:
             chi2, std = unexplained * simulated.value, simulated.std
@@ -133,6 +135,11 @@ def misfit(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Mis
 
 def _limit(std: float) -> float:
     return max(_LEAST, _SIGMAS * std)
+
+
+def _is_counted(fit: Fit) -> bool:
+    """Whether degrees of freedom are only counted: neither penalty nor prior holds numbers."""
+    return fit.beam.coefficients is None and (fit.prior is None or not fit.prior.any())
 
 
 def _beyond(chi2: float, std: float, inexactness: float) -> tuple[bool, bool]:

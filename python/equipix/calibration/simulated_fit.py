@@ -50,7 +50,7 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     part = weighted
     if fit is None:
         part = with_dark_misfit(Weighted(window, window.fit(options), None), options)
-    right = _simulated(part, options)
+    right = simulated(part, options)
     other = Weighted(right, right.fit(options, part.fit), None)
     exact = sampled(other, workers=options.workers).inexactness <= EXACT
     if part.fit.degrees_of_freedom < FEWEST or not exact:
@@ -62,16 +62,23 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     return Chi2(left / factor / weighted.expected_misfit, std)
 
 
-def _simulated(part: Weighted, options: FitOptions) -> Exposures:
-    """Exposures with the values that the fit expects, and noise; as they are where it has none."""
+def simulated(part: Weighted, options: FitOptions, sign: int = 1) -> Exposures:
+    """Exposures of the values that a fit expects, and noise; as they are where it expects none.
+
+    The noise is that of the measurements, and an error of the dark that all exposures share. Both
+    are the same numbers in every call, times `sign`.
+    """
     window, rng = part.exposures, np.random.default_rng(0)
-    expected = window.values - window.residuals(part.fit, options.workers)
+    values, dark = window.values - window.residuals(part.fit, options.workers), window.dark
     if window.dark_variance is not None:
-        expected += np.sqrt(window.dark_variance) * rng.standard_normal(window.shape)
-    for k, values in enumerate(expected):
-        values += window.deviation(k) * rng.standard_normal(window.shape)
-    values = np.where(np.isfinite(expected), expected, window.values).astype(window.values.dtype)
-    return dataclasses.replace(window, values=values)
+        error = sign * np.sqrt(window.dark_variance) * rng.standard_normal(window.shape)
+        values += error
+        dark = None if dark is None else dark - error
+    for k, each in enumerate(values):
+        scale = sign * part.noise_variance**0.5 * window.deviation(k)
+        each += scale * rng.standard_normal(window.shape)
+    values = np.where(np.isfinite(values), values, window.values).astype(window.values.dtype)
+    return dataclasses.replace(window, values=values, dark=dark)
 
 
 def _follows_data(fit: Fit) -> Bools:

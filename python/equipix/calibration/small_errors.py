@@ -10,6 +10,7 @@ import numpy as np
 
 from equipix.calibration.error_bars import with_dark_misfit
 from equipix.calibration.residuals import EXACT, FEWEST
+from equipix.calibration.simulated_fit import simulated
 from equipix.calibration.verdicts import Verdict
 from equipix.calibration.weights import Weighted
 from equipix.calibration.window_fit import if_there_is_light, window_of
@@ -65,31 +66,44 @@ _STRONGER = {
 
 
 class Cause(NamedTuple):
-    """An error in words, at its size, the remedy, and the largest size that sensors have."""
+    """An error of a unit size for a signal and a dark, in words at its size, and the remedy."""
 
+    error: Callable[[Floats, Array], Floats]
     words: Callable[[float], str]
     remedy: str
     most: float = np.inf
+    """The largest size that sensors have."""
+
+
+def _from_neighbours(signal: Floats) -> Floats:
+    """Σ (neighbour − own); a pixel at the edge has fewer neighbours."""
+    wide = np.pad(signal, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    along_rows, along_cols = np.diff(wide[:, :, 1:-1], 2, axis=1), np.diff(wide[:, 1:-1], 2, axis=2)
+    return np.asarray(along_rows + along_cols)
 
 
 _SEE_DARK = "see that a dark of the same settings was subtracted, once, and is not flipped"
 
 _CURVED = Cause(
+    lambda signal, _: signal**2 / float(np.nanmax(signal)),
     lambda size: f"a response that is {size:+.2%} off a line at the largest signal",
     "correct the frames by response curves first (equipix.nuc.fit), or use less light",
     0.15,
 )
 _CROSSTALK = Cause(
+    lambda signal, _: _from_neighbours(signal),
     lambda size: f"crosstalk of {size:.2%} to each neighbour",
     "use a beam with less structure, or frames without sharpening or smoothing",
     0.03,
 )
 _OFFSET = Cause(
+    lambda signal, _: np.full(signal.shape, float(np.nanmax(signal))),
     lambda size: f"an offset of {size:+.2%} of the largest signal in all values",
     _SEE_DARK,
     0.15,
 )
 _PATTERN = Cause(
+    lambda signal, dark: np.broadcast_to(dark - np.median(dark), signal.shape),
     lambda size: f"the pattern of the dark, {size:+.1%} of it",
     _SEE_DARK,
 )
@@ -161,11 +175,12 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     by a fit of y + ε z to a central window: the change of the residuals is ε P z. So the estimate
     is a = ⟨r, P z⟩ / ⟨P z, P z⟩ in the products that weights make, and its variance
     σ²/⟨P z, P z⟩ [1]_, to which the noise of the dark adds. Noise is also in M, L and z: without
-    any error of the values ⟨r, P z⟩ has a mean that is quadratic in it. That of fits of simulated
-    noise of both signs is subtracted. What M and L absorb, such as a power law of the response, is
-    not found. Nothing is tested where the shifts have errors that are not
-    refined, and where fluxes are fitted, which take most of such errors: what is left is small and
-    not of one cause. Nor behind colour filters, where such an error differs between colours.
+    any error of the values ⟨r, P z⟩ has a mean that is quadratic in it. Where ⟨r, P z⟩ is larger
+    than noise, its mean over fits of simulated noise of both signs is subtracted. What M and L
+    absorb, such as a power law of the response, is not found. Nothing is tested where the shifts
+    have errors that are not refined, and where fluxes are fitted, which take most of such errors:
+    what is left is small and not of one cause. Nor behind colour filters, where such an error
+    differs between colours.
 
     References
     ----------
@@ -187,40 +202,40 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
 
 @if_there_is_light
 def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
-    """Each error that is tested."""
+    """Each error that is larger than noise."""
     window, start = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)
-    fit = window.fit(exact, start)
-    part = with_dark_misfit(Weighted(window, fit, None), options)
-    own = _scaled(window, fit, options)
+    part = with_dark_misfit(Weighted(window, window.fit(exact, start), None), options)
+    fit, own = part.fit, _scaled(window, part.fit, options)
     square, noise = float(np.nansum(own**2)), part.noise_variance * part.expected_misfit
-    signal = window.values - window.residuals(fit, options.workers)
-    clear = np.sqrt(window.weighted_squares(signal**2) / part.noise_variance)
+    squares = window.weighted_squares(_signal(part, options) ** 2)
+    clear = np.sqrt(squares / part.noise_variance)
     if not (np.isfinite(clear).any() and np.nanquantile(clear, _FAINTEST) > _CLEAR):
         return []
-    whole = float(np.nansum(clear**2) * part.noise_variance) ** 0.5
-    roots = np.sqrt(window.weighted_squares(np.ones(signal.shape)))
-    noisy = [_simulated(part, signal, sign, exact) for sign in (1, -1)]
+    whole = float(np.nansum(squares)) ** 0.5
+    roots = np.sqrt(window.weighted_squares(np.ones(window.values.shape)))
+    noisy: list[Weighted] = []
     found = []
-    for number, (cause, error) in enumerate(_errors(signal, window)):
-        if not np.isfinite(error).any():
-            continue
-        size = _STEP * float(np.sqrt(np.nanmean(signal**2) / np.nanmean(error**2)))
-        values = window.values + np.nan_to_num(size * error).astype(window.values.dtype)
-        changed = dataclasses.replace(window, values=values)
-        other = changed.fit(exact, fit)
-        left = (_scaled(changed, other, options) - own) / size
+    for cause in _causes(window):
+        left, other, size = _left_by(cause, part, exact)
         power = float(np.nansum(left**2))
         solver = float(fit.error_estimate[-1] + other.error_estimate[-1]) * whole
         if other.ended != "converged" or not size * power**0.5 > _EXACT * solver:
             continue
-        by_noise = np.mean([each.product(number, roots * error - left) for each in noisy], axis=0)
-        estimate = (float(np.nansum(own * left)) - float(by_noise.sum())) / power
-        if not abs(estimate) < cause.most:
-            continue
         variance = max(part.noise_variance, part.reduced_chi2) * power
         if window.dark_variance is not None:
             variance += float(np.sum(window.dark_variance * np.nansum(roots * left, axis=0) ** 2))
+        product = float(np.nansum(own * left))
+        if not abs(product) > _SIGMAS * variance**0.5:
+            continue
+        # The mean over both signs of the noise has only what is quadratic in it.
+        if not noisy:
+            both = (simulated(part, options, sign) for sign in (1, -1))
+            noisy = [Weighted(each, each.fit(exact, fit), None) for each in both]
+        by_noise = np.mean([_product(cause, each, exact) for each in noisy], axis=0)
+        estimate = (product - float(by_noise.sum())) / power
+        if not abs(estimate) < cause.most:
+            continue
         # What is quadratic in noise scatters in the measurements as in the simulation.
         variance += 2 * float(np.sum((by_noise - by_noise.mean()) ** 2))
         sigmas = estimate * power / variance**0.5
@@ -231,74 +246,45 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     return found
 
 
-class _Simulated(NamedTuple):
-    """A fit of the expected signal with noise.
-
-    `residuals` are times √w, `errors` those of its signal times √w, and `change` is the signal over
-    the expected one.
-    """
-
-    residuals: Floats
-    errors: list[Floats]
-    change: Floats
-
-    def product(self, number: int, absorbed: Floats) -> Floats:
-        """Sum of r · P z over the exposures of each pixel, for the error of that number.
-
-        `absorbed` is what M and L took of the error in the expected signal. Residuals are
-        orthogonal to all that changes of M and L add to the signal, so to the same relative
-        changes of this one.
-        """
-        left = self.errors[number] - absorbed * self.change
-        return np.asarray(np.nansum(self.residuals * left, axis=0))
+def _causes(window: Exposures) -> Iterator[Cause]:
+    """Errors that the measurements can show."""
+    yield _CURVED
+    yield _CROSSTALK
+    if not window.offset:
+        yield _OFFSET
+    if window.dark is not None and np.ptp(window.dark) > 0:
+        yield _PATTERN
 
 
-def _simulated(part: Weighted, signal: Floats, sign: int, options: FitOptions) -> _Simulated:
-    """Fit the signal with noise as large as that of the measurements and of the dark.
+def _left_by(cause: Cause, part: Weighted, options: FitOptions) -> tuple[Floats, Fit, float]:
+    """What an error of unit size leaves in residuals times √w; the fit that shows it, its size."""
+    window, signal = part.exposures, _signal(part, options)
+    dark = np.zeros(window.shape) if window.dark is None else window.dark
+    error = cause.error(signal, dark)
+    size = _STEP * float(np.sqrt(np.nanmean(signal**2) / np.nanmean(error**2)))
+    values = window.values + np.nan_to_num(size * error).astype(window.values.dtype)
+    changed = dataclasses.replace(window, values=values)
+    fit = changed.fit(options, part.fit)
+    left = _scaled(changed, fit, options) - _scaled(window, part.fit, options)
+    return left / size, fit, size
 
-    The mean over both signs of the noise has only what is quadratic in it.
-    """
-    window, rng = part.exposures, np.random.default_rng(0)
-    values, dark = signal.copy(), window.dark
-    if window.dark_variance is not None:
-        error = sign * np.sqrt(window.dark_variance) * rng.standard_normal(window.shape)
-        values += error
-        dark = None if dark is None else dark - error
-    for k, each in enumerate(values):
-        scale = sign * part.noise_variance**0.5 * window.deviation(k)
-        each += scale * rng.standard_normal(window.shape)
-    values = np.where(np.isfinite(signal), values, window.values).astype(window.values.dtype)
-    noisy = dataclasses.replace(window, values=values, dark=dark)
-    fit = noisy.fit(options, part.fit)
-    roots = np.sqrt(noisy.weighted_squares(np.ones(signal.shape)))
-    found = values - noisy.residuals(fit, options.workers)
-    change = np.divide(found, signal, where=signal != 0, out=np.ones(signal.shape))
-    errors = [roots * error for _, error in _errors(found, noisy)]
-    return _Simulated(_scaled(noisy, fit, options), errors, change)
+
+def _product(cause: Cause, part: Weighted, options: FitOptions) -> Floats:
+    """Sum of r · P z over the exposures of each pixel."""
+    left, *_ = _left_by(cause, part, options)
+    return np.asarray(np.nansum(_scaled(part.exposures, part.fit, options) * left, axis=0))
+
+
+def _signal(part: Weighted, options: FitOptions) -> Floats:
+    """The values that a fit expects."""
+    window = part.exposures
+    return np.asarray(window.values - window.residuals(part.fit, options.workers))
 
 
 def _scatter(other: Fit, fit: Fit) -> float:
     """Root mean square of the relative change of M from one fit to another."""
     lit = (fit.sensitivity > 0) & (fit.flags == 0)
     return float(np.std(other.sensitivity[lit] / fit.sensitivity[lit]))
-
-
-def _errors(signal: Floats, window: Exposures) -> Iterator[tuple[Cause, Floats]]:
-    """Errors of a unit size, and their words at a size."""
-    top = float(np.nanmax(signal))
-    yield _CURVED, signal**2 / top
-    yield _CROSSTALK, _from_neighbours(signal)
-    if not window.offset:
-        yield _OFFSET, np.full(signal.shape, top)
-    if window.dark is not None and np.ptp(window.dark) > 0:
-        yield _PATTERN, np.broadcast_to(window.dark - np.median(window.dark), signal.shape)
-
-
-def _from_neighbours(signal: Floats) -> Floats:
-    """Σ (neighbour − own); a pixel at the edge has fewer neighbours."""
-    wide = np.pad(signal, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    along_rows, along_cols = np.diff(wide[:, :, 1:-1], 2, axis=1), np.diff(wide[:, 1:-1], 2, axis=2)
-    return np.asarray(along_rows + along_cols)
 
 
 def _scaled(window: Exposures, fit: Fit, options: FitOptions) -> Floats:
