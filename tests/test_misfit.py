@@ -34,7 +34,8 @@ def found_in(frames, shifts, variance=NOISE**2, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", EquipixWarning)
         cal = equipix.calibrate(frames, shifts, variance=variance, tolerance=1e-4, **options)
-    return misfit(cal.weighted, sampled(cal.weighted), FitOptions(tolerance=1e-4))
+    options = FitOptions(tolerance=1e-4)
+    return misfit(cal.weighted, cal.flags, sampled(cal.weighted), options)
 
 
 def smooth():

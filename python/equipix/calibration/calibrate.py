@@ -286,7 +286,7 @@ def calibrated(
     drift = lamp_drift(weighted, residuals)
     contradicted = bool(widths) or (drift is not None and drift.is_certain)
     test = test.among_fluxes(contradicted=contradicted)
-    misfits = misfit(weighted, residuals, options.fit)
+    misfits = misfit(weighted, flags, residuals, options.fit)
     differ = contradiction(weighted, residuals, flags)
     weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
     found = verdicts.on_fit(weighted, options, test, drift, misfits, widths, differ)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix.calibration.window_fit import WindowFit
-from equipix.errors import InputError, InsufficientMemoryError
+from equipix.calibration.window_fit import WindowFit, if_there_is_light
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,22 +19,22 @@ _SIDE = 128
 """Pixels along a window that is fitted in either order."""
 
 _LEFT = 0.1
-"""Share of F that the right order leaves at most."""
+"""Share of F above noise that the right order leaves at most."""
 
 
+@if_there_is_light
 def exchanged(
     exposures: Exposures, pairs: Sequence[tuple[int, int]], options: FitOptions
 ) -> tuple[int, int] | None:
     """Return the pair of exposures that are exchanged, by fits of a central window; or None."""
-    window = exposures.window(_SIDE)
-    try:
-        left = {pair: WindowFit.of(_at_the_other(window, pair), options).left for pair in pairs}
-        given = WindowFit.of(window, options).left if left else 0.0
-    except (InputError, InsufficientMemoryError):
-        # All arguments are valid for the whole sensor: the window has too little light or memory.
+    if not pairs:
         return None
-    best = min(left, key=lambda pair: left[pair], default=None)
-    return best if best is not None and left[best] < _LEFT * given else None
+    window = exposures.window(_SIDE)
+    # In units of noise where that is known: an order explains what is above it.
+    noise = 1.0 if exposures.knows_noise else 0.0
+    left = {pair: WindowFit.of(_at_the_other(window, pair), options).left - noise for pair in pairs}
+    best = min(left, key=lambda pair: left[pair])
+    return best if left[best] < _LEFT * (WindowFit.of(window, options).left - noise) else None
 
 
 def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:

@@ -10,9 +10,10 @@ import numpy as np
 from equipix.calibration import causes
 from equipix.calibration.exchanged import exchanged
 from equipix.calibration.residual_tests import lag_one
-from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable
+from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable, tested
 from equipix.calibration.shift_errors import without_shift_errors
-from equipix.calibration.simulated_fit import simulated_chi2
+from equipix.calibration.simulated_fit import simulated_chi2, squares
+from equipix.flags import usable
 
 if TYPE_CHECKING:
     from equipix._native import Fit
@@ -93,16 +94,18 @@ class Misfit:
         )
 
 
-def misfit(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Misfit | None:
+def misfit(
+    weighted: Weighted, flags: Array, residuals: Residuals, options: FitOptions
+) -> Misfit | None:
     """Test the residuals of a fit; None where nothing speaks against it.
 
     Notes
     -----
-    Two questions. Where variances are known, reduced χ² must be within five standard errors of 1,
-    or within 3 %; where it is not, and the degrees of freedom leave a doubt, these are those of
-    simulated noise. And residuals of neighbouring pixels must not be correlated by more than five
-    standard errors and 1 %, which requires no variances. A fit that has not come to its minimum, or
-    data without noise, answer neither.
+    Two questions. Where variances are known, reduced χ² of the pixels that are not flagged must be
+    within five standard errors of 1, or within 3 %; where it is not, and the degrees of freedom
+    leave a doubt, these are those of simulated noise. And residuals of neighbouring pixels must not
+    be correlated by more than five standard errors and 1 %, which requires no variances. A fit that
+    has not come to its minimum, or data without noise, answer neither.
     """
     inexactness = residuals.inexactness
     if weighted.fit.degrees_of_freedom < FEWEST or not inexactness < 1:
@@ -115,6 +118,9 @@ def misfit(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Mis
         residuals = left
     chi2, std = unexplained * chi2, weighted.chi2_std if known else float("nan")
     high, low = _beyond(chi2, std, inexactness)
+    if high or low:
+        chi2 *= _share_of_good(weighted, flags, options)
+        high, low = _beyond(chi2, std, inexactness)
     # F over all measurements needs no degrees of freedom: their number is at most that.
     surely = high and chi2 * residuals.share > 1 + _limit(std)
     if (high or low) and not surely and not _is_counted(weighted.fit):
@@ -135,6 +141,18 @@ def misfit(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Mis
 
 def _limit(std: float) -> float:
     return max(_LEAST, _SIGMAS * std)
+
+
+def _share_of_good(weighted: Weighted, flags: Array, options: FitOptions) -> float:
+    """Reduced χ² without pixels that are flagged, which may follow no model, over that with all."""
+    exposures, fit = weighted.exposures, weighted.fit
+    flagged = tested(fit) & ~usable(flags)
+    times = sum((exposures.usable(k) & flagged).astype(np.intp) for k in range(len(exposures)))
+    freedom = float(np.maximum(np.subtract(times, 1), 0).sum())
+    if freedom == 0:
+        return 1.0
+    left = fit.misfit - squares(exposures, fit, flagged, options)
+    return left / fit.misfit / (1 - freedom / weighted.expected_misfit)
 
 
 def _is_counted(fit: Fit) -> bool:

@@ -11,7 +11,8 @@ from equipix.exposures.positions import in_beam
 from equipix.shifts import nearest_whole
 
 if TYPE_CHECKING:
-    from equipix._types import Array, Floats
+    from equipix._native import Fit
+    from equipix._types import Array, Bools, Floats
     from equipix.calibration.weights import Weighted
     from equipix.exposures.positions import Positions
 
@@ -106,9 +107,7 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
                 values[k, b] -= fit.offset[part]
     if exposures.mask is not None:
         values[np.broadcast_to(exposures.mask[..., rows, :], shape)] = np.nan
-    if fit.prior is not None:
-        # There M follows its prior, so residuals are no test of the model.
-        values[:, fit.prior[rows] > 0] = np.nan
+    values[:, ~tested(fit)[rows]] = np.nan
     variance = exposures.variance
     if variance is not None:
         deep = variance[:, rows] if variance.ndim == 3 else variance[:, None, None, None]
@@ -119,6 +118,11 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
     share = fit.degrees_of_freedom / measured
     error = float(fit.error_estimate[-1])
     return Residuals(values, light, response, rows, share, weighted.noise_variance, error)
+
+
+def tested(fit: Fit) -> Bools:
+    """Pixels whose residuals test the model: of which M does not follow its prior."""
+    return np.ones(fit.sensitivity.shape, bool) if fit.prior is None else fit.prior == 0
 
 
 def bands(count: int, most: int) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from equipix.calibration.error_bars import with_dark_misfit
-from equipix.calibration.residuals import EXACT, FEWEST, sampled
+from equipix.calibration.residuals import EXACT, FEWEST, sampled, tested
 from equipix.calibration.weights import Weighted
 from equipix.calibration.window_fit import if_there_is_light, window_of
 
@@ -55,9 +55,9 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     exact = sampled(other, workers=options.workers).inexactness <= EXACT
     if part.fit.degrees_of_freedom < FEWEST or not exact:
         return None
-    free = _follows_data(part.fit)
-    factor = _squares(right, other.fit, free, options) / part.expected_misfit
-    left = _squares(weighted.exposures, weighted.fit, _follows_data(weighted.fit), options)
+    free = tested(part.fit)
+    factor = squares(right, other.fit, free, options) / part.expected_misfit
+    left = squares(weighted.exposures, weighted.fit, tested(weighted.fit), options)
     std = float(np.hypot(weighted.chi2_std, part.chi2_std))
     return Chi2(left / factor / weighted.expected_misfit, std)
 
@@ -81,12 +81,7 @@ def simulated(part: Weighted, options: FitOptions, sign: int = 1) -> Exposures:
     return dataclasses.replace(window, values=values, dark=dark)
 
 
-def _follows_data(fit: Fit) -> Bools:
-    """Whether M of a pixel follows no prior."""
-    return np.ones(fit.sensitivity.shape, bool) if fit.prior is None else fit.prior == 0
-
-
-def _squares(exposures: Exposures, fit: Fit, where: Bools, options: FitOptions) -> float:
+def squares(exposures: Exposures, fit: Fit, where: Bools, options: FitOptions) -> float:
     """Σ w r² of some pixels, one exposure at a time: large sensors must fit."""
     total = 0.0
     for k in range(len(exposures)):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from equipix.calibration.error_bars import with_dark_misfit
-from equipix.calibration.residuals import EXACT, FEWEST
+from equipix.calibration.residuals import EXACT, FEWEST, tested
 from equipix.calibration.simulated_fit import simulated
 from equipix.calibration.verdicts import Verdict
 from equipix.calibration.weights import Weighted
@@ -48,7 +48,7 @@ _MOST = 0.4
 """Share of the excess of a misfit from which an error is its cause: a flipped dark leaves its own
 pattern and the one that it should have had, a half each."""
 
-_TOLERANCE, _PRODUCTS = 1e-7, 200
+_TOLERANCE, _PRODUCTS = 1e-8, 200
 """Exactness of the fits that are compared, and the products that they may take."""
 
 _STRONGER = {
@@ -290,8 +290,6 @@ def _scatter(other: Fit, fit: Fit) -> float:
 def _scaled(window: Exposures, fit: Fit, options: FitOptions) -> Floats:
     """Residuals times the roots of their weights; NaN where nothing is known."""
     residuals = window.residuals(fit, options.workers)
-    if fit.prior is not None:
-        # There M follows its prior, so residuals are no test of the model.
-        residuals[:, fit.prior > 0] = np.nan
+    residuals[:, ~tested(fit)] = np.nan
     squares = window.weighted_squares(np.square(residuals))
     return np.asarray(np.copysign(np.sqrt(squares), residuals))

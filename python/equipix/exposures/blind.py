@@ -36,8 +36,8 @@ def blind_pixels(signals: Array, models: Sequence[NoiseModel], usual: Array | fl
     ndarray of bool, shape (rows, cols)
         True where no exposure has a signal above six standard deviations of the dark, and where
         along rows or columns the nearest other pixels on both sides see so much light in every
-        exposure that a good pixel here would be ten times above that. One side may be the edge of
-        the sensor.
+        exposure that a good pixel here would be ten times above that; and where along rows and
+        columns these are such pixels themselves. One side may be the edge of the sensor.
 
     Notes
     -----
@@ -57,7 +57,13 @@ def blind_pixels(signals: Array, models: Sequence[NoiseModel], usual: Array | fl
         return dark
     light /= usual
     wanted = np.broadcast_to(_WELL_ABOVE / usual, dark.shape)
-    return dark & (_between_lit(dark, light, wanted) | _between_lit(dark.T, light.T, wanted.T).T)
+    found = dark & (_between_lit(dark, light, wanted) | _between_lit(dark.T, light.T, wanted.T).T)
+    # What such pixels enclose along rows and columns is where dead rows cross dead columns, as in
+    # the corners of a frame of them.
+    dark &= ~found
+    edges, half = found.astype(np.float64), np.full(dark.shape, 0.5)
+    enclosed = _between_lit(dark, edges, half) & _between_lit(dark.T, edges.T, half.T).T
+    return found | (dark & enclosed)
 
 
 def _between_lit(dark: Bools, light: Array, wanted: Array) -> Bools:

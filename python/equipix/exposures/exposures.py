@@ -12,6 +12,7 @@ from equipix import _native
 from equipix._check import naming_memory
 from equipix._readonly import ReadOnly
 from equipix.defects import Findings
+from equipix.shifts import nearest_whole
 
 if TYPE_CHECKING:
     from typing import Self
@@ -253,7 +254,7 @@ class Exposures(ReadOnly):
         turn = int(self.positions.rotation[exposure])
         rows, cols = self.shape if turn % 180 == 0 else self.shape[::-1]
         corner = np.add(fit.beam.origin, fit.shifts[exposure])
-        row, col = np.ceil(corner - 0.5).astype(int)
+        row, col = nearest_whole(corner).astype(int)
         return np.rot90(grid[row : row + rows, col : col + cols], turn // 90)
 
     def _compiled(self, options: FitOptions) -> _native.Exposures:
