@@ -83,11 +83,11 @@ class Descent:
         if len(self.before) == 2:
             before = self.before.pop(0)
             persists = self.moving * np.mean(errors * before)
-            square = max(np.mean((errors - before) ** 2) / 2 - persists, 0)
+            square = np.mean((errors - before) ** 2) / 2 - persists
             self.updates += 1
             self.noise += (square - self.noise) / min(self.updates, self.REMEMBERED)
         self.before.append(errors)
-        step = self.step / (1 + self.noise / self.half**2)
+        step = self.step / (1 + max(self.noise, 0) / self.half**2)
         taken = np.zeros(self.gain.shape)
         for y, error, part in pulls:
             depth = y - self.centre
