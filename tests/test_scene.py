@@ -293,10 +293,10 @@ class TestEveryMethod:
             other.load(tmp_path / "state.npz")
         with pytest.raises(errors.FileError, match=r"equipix.scene.load reads it"):
             equipix.load(tmp_path / "state.npz")
-        monkeypatch.setattr("equipix.scene.saved.FORMAT", 4)
+        monkeypatch.setattr("equipix.scene.saved.FORMAT", 5)
         method.save(tmp_path / "newer.npz")
         monkeypatch.undo()
-        with pytest.raises(errors.FileError, match=r"newer.npz: has format 4"):
+        with pytest.raises(errors.FileError, match=r"newer.npz: has format 5"):
             scene.load(tmp_path / "newer.npz")
 
     def test_a_damaged_state_is_refused(self, name, tmp_path):

@@ -14,10 +14,13 @@ SHAPE = (64, 64)
 NAMES = tuple(scene.METHODS)
 WANTED = {0.01: 15, 0.02: 15, 0.05: 8, 0.1: 4}
 """Falls of Registered after 20 000 frames of this noise, at a contrast of 10 %."""
+WIDE = (128, 128)
+FLOORS = (600, 1000, 1060, 2000, 2060)
+"""Frames at which the floor is tested: its copies are made at powers of two, as 1024."""
 
 
-def made(name, **options):
-    return scene.METHODS[name](SHAPE, (0, 1), workers=1, **options)
+def made(name, shape=SHAPE, **options):
+    return scene.METHODS[name](shape, (0, 1), workers=1, **options)
 
 
 def run(moving, method, count, every=25):
@@ -148,22 +151,39 @@ def test_the_standard_scene_has_no_finding(name):
             assert not method.result().flags.any()
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", NAMES)
-def test_a_calibrated_camera_loses_at_most_the_floor_that_is_stated(name):
-    """A pattern of 0.1 % of the range, which is below what the methods leave."""
-    moving = MovingScene(
-        seed=2, shape=SHAPE, gain_spread=0.001, offset_spread=0.001, noise=0.01, stop=(0, 0)
-    )
-    method = made(name)
-    for frame in moving.frames(2500):
-        method.update(frame.values)
-    before, after = (
-        moving.residual_pattern(gain, offset, 0.5)
-        for gain, offset in ((np.ones(SHAPE), np.zeros(SHAPE)), (method.gain, method.offset))
-    )
-    assert method.result().metadata["scene"]["floor_dn"] == method.floor
-    assert after < np.hypot(before, method.floor)
-    assert method.floor < 1.5 * after
+def test_a_calibrated_camera_loses_at_most_the_floor_that_is_stated(name, draws, figure):
+    """A pattern of 0.1 % of the range, which is below what the methods leave, at 128×128 pixels.
+
+    The errors are waves of some ten pixels or more, of which a smaller array has too few: at 64×64
+    the pattern of a single experiment scatters by twice as much about the one that is stated.
+    """
+    ones, ratios, worse = np.ones(WIDE), [], []
+    for seed in draws(24):
+        moving = MovingScene(
+            seed=seed, shape=WIDE, gain_spread=0.001, offset_spread=0.001, noise=0.01, stop=(0, 0)
+        )
+        method = made(name, WIDE)
+        total = 0.0
+        for count, frame in enumerate(moving.frames(FLOORS[-1]), 1):
+            method.update(frame.values)
+            total += frame.level
+            if count in FLOORS:
+                before, after = (
+                    moving.residual_pattern(gain, offset, total / count)
+                    for gain, offset in ((ones, 0 * ones), (method.gain, method.offset))
+                )
+                ratios.append(after / method.floor)
+                worse.append(np.sqrt(max(after**2 - before**2, 0)) / method.floor)
+        assert method.result().metadata["scene"]["floor_dn"] == method.floor
+    figure(f"pattern over the stated floor, {name}, largest", max(ratios), "1 or less")
+    figure(f"what is added to the pattern, over that floor, {name}", max(worse), "1 or less")
+    figure(f"stated floor over the pattern, {name}, largest", 1 / min(ratios), "1.5 or less")
+    # Half of what Kalman leaves are waves beyond 28 pixels, of which the array has (128/28)² π, 66:
+    # a single rms of them scatters by 1/√(2 · 66) about the one that is stated.
+    assert max(worse) <= (1.09 if name == "kalman" else 1)
+    assert min(ratios) >= 1 / 1.5
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -225,7 +245,7 @@ def test_gains_that_spread_are_named():
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("page", ["gain", "history_mean", "field_mean", "late_gain"])
+@pytest.mark.parametrize("page", ["gain", "history_mean", "field_mean", "late_pattern"])
 def test_a_state_of_which_a_value_was_changed_is_refused(name, page, tmp_path):
     method = made(name)
     for frame in MovingScene(seed=1, shape=SHAPE).frames(60):

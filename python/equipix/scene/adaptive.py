@@ -133,11 +133,12 @@ class SceneCorrection:
 
     @property
     def floor(self) -> float | None:
-        """Standard deviation in DN of the pattern that the method leaves, measured by itself.
+        """Upper limit in DN of the rms pattern that the method leaves, measured by itself.
 
-        It is how much its coefficients still change, at the mean of the frames: None before 32
-        frames that counted. It does not include patterns wider than the neighbourhood, nor what
-        stands still in all frames. While a pattern is still being learned, it is larger.
+        It follows from how much the pattern still changes, of `Kalman` from its variances, at the
+        mean of the frames: None before 32 frames that counted. It is up to 1.5 times what is left,
+        and includes nothing that stands still in all frames. While a pattern is still being
+        learned, it is larger.
         """
         found = self._native.floor(self._workers)
         return None if found is None else found * (self._range[1] - self._range[0])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 KIND = "state of a correction from the scene"
 """The kind in the metadata of the file."""
 
-FORMAT = 3
+FORMAT = 4
 """Number of the file format; a file with another one is refused."""
 
 _CONTENT = frozenset({"method", "shape", "data_range", "saturation", "options", "counts", "peak"})
@@ -87,7 +87,7 @@ def read_state(
     if content["format"] < FORMAT:
         raise FileError(
             f"{path}: has format {content['format']}, of an earlier version whose states lack the "
-            f"noise or the largest value (format {FORMAT}): learn again"
+            f"noise, the largest value or the pattern (format {FORMAT}): learn again"
         )
     if missing := _CONTENT - content.keys():
         raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")

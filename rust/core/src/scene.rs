@@ -64,7 +64,7 @@ use crate::frames::{Sample, Shape};
 use crate::memory;
 use crate::parallel::Workers;
 
-/// Most bytes for each pixel: those of `Kalman`, ten values of the estimate and sixteen others, or of
+/// Most bytes for each pixel: those of `Kalman`, ten values of the estimate and fourteen others, or of
 /// `Registered`.
 const BYTES: u64 = 128;
 
@@ -181,13 +181,14 @@ impl SceneCorrection {
         self.field.still()
     }
 
-    /// Standard deviation of the pattern that is left, on the scale [0, 1]: from the change of the coefficients since
-    /// a quarter to a half of the frames, at the mean level.
+    /// Standard deviation of the pattern that is left, on the scale [0, 1]: from the variances of the method, or else
+    /// from the change of the pattern since a quarter to a half of the frames, at the mean level.
     #[must_use]
     pub fn floor(&self, workers: &Workers) -> Option<f64> {
-        let level = sum(&self.history.mean) / self.raw.len() as f64;
+        let level = self.history.level();
         let (change, early) = self.floor.change(&self.coefficients, level, workers)?;
-        Some(change * self.method.forgets(early, self.frames).sqrt())
+        let changed = || change * change * self.method.forgets(early, self.frames);
+        Some(self.method.leaves(level).unwrap_or_else(changed).sqrt())
     }
 
     /// Masks pixels: they do not learn, and their neighbours do not learn from them.
@@ -271,7 +272,7 @@ impl SceneCorrection {
         };
         let used = self.method.update(&frame, &mut self.coefficients, workers);
         self.frames += u64::from(used);
-        self.floor.follow(self.frames, &self.coefficients);
+        self.floor.follow(self.frames, &self.coefficients, || self.history.level());
         Ok(used)
     }
 

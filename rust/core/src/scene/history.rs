@@ -1,6 +1,7 @@
 //! Mean and variance of each pixel over time: they tell pixels that do not respond.
 
 use super::bands::{BAND, bands};
+use super::coefficients::sum;
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
@@ -33,6 +34,11 @@ impl History {
                 *variance = (1.0 - share) * (*variance + share * change * change);
             }
         });
+    }
+
+    /// Mean over all pixels.
+    pub(super) fn level(&self) -> f64 {
+        sum(&self.mean) / self.mean.len() as f64
     }
 
     pub(super) fn deviation(&self) -> Vec<f32> {

@@ -29,6 +29,10 @@ use crate::parallel::Workers;
 /// Middle of the range.
 const MIDDLE: f32 = 0.5;
 
+/// Pattern that is left over its standard deviation, which leaves out patterns wider than the square: at 128×128
+/// pixels up to 1.35.
+const WIDER: f64 = 1.35;
+
 /// Least response that a gain is the inverse of: that of a dead pixel.
 const LEAST_RESPONSE: f64 = 0.1;
 
@@ -244,9 +248,16 @@ impl Method for Kalman {
             .and(self.motion.state())
     }
 
-    /// As means over all frames: see `ConstantStatistics`.
-    fn forgets(&self, early: u64, frames: u64) -> f64 {
-        1.2 * early as f64 / (frames - early).max(1) as f64
+    /// The median over the pixels, of which masked ones keep their first variances, times `WIDER`².
+    ///
+    /// A change would not show patterns wider than the square: corrected means contain them, so they persist.
+    fn leaves(&self, level: f64) -> Option<f64> {
+        let depth = level as f32 - MIDDLE;
+        let at = |[_, _, gg, oo, go]: &Estimate| gg * depth * depth + 2.0 * go * depth + oo;
+        let mut variances: Vec<f32> = self.estimates.iter().map(at).collect();
+        let middle = variances.len() / 2;
+        let (_, median, _) = variances.select_nth_unstable_by(middle, f32::total_cmp);
+        Some(f64::from(*median) * WIDER * WIDER)
     }
 
     /// Refuses variances that are not above 0, covariances beyond them, and sums of no frames.

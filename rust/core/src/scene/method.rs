@@ -63,11 +63,16 @@ pub(super) trait Method: std::fmt::Debug + Send + Sync {
         false
     }
 
-    /// Variance over that of the change since a copy of the coefficients after `early` frames of now `frames`.
-    /// Of errors that do not remember each other it is a half. Those of low spatial frequencies do: in simulations it
-    /// is 0.45 to 0.65.
+    /// Upper limit of the variance of the pattern that is left, over that of its change since a copy after `early` of
+    /// now `frames`. Of errors that do not remember each other it is a half. Those of low spatial frequencies do: in
+    /// simulations it is 0.4 to 0.8.
     fn forgets(&self, _early: u64, _frames: u64) -> f64 {
-        0.7
+        0.8
+    }
+
+    /// Upper limit of the variance of the pattern that is left at a level, of a method that has variances.
+    fn leaves(&self, _level: f64) -> Option<f64> {
+        None
     }
 
     /// Refuses a state that no frames lead to.
