@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -320,7 +321,7 @@ class TestRegions:
         dead, hot = response_outliers(response, lambda: np.full(weak.shape, 1e-3))
         np.testing.assert_array_equal(hot, bad & weak)
         assert dead[bad & ~weak].all()
-        assert edge == "oblique" or not dead[~bad].any()
+        assert not dead[~bad].any()
 
     @staticmethod
     def outliers(usual, seed=1):
@@ -333,16 +334,45 @@ class TestRegions:
     @pytest.mark.parametrize("edge", [56, 61, 64, 67])
     @pytest.mark.parametrize(
         ("side", "bad", "wanted"),
-        [(0.0, 0.2, "dead"), (0.15, 0.2, "dead"), (0.7, 0.4, "dead"), (1.3, 2.5, "hot")],
+        [
+            (0.0, 0.2, "dead"),
+            (0.15, 0.1, "dead"),
+            (0.15, 0.2, "dead"),
+            (0.7, 0.4, "dead"),
+            (1.3, 2.5, "hot"),
+        ],
     )
-    def test_a_bad_pixel_beside_a_step_is_found(self, side, bad, wanted, edge):
+    @pytest.mark.parametrize("size", [(1, 1), (2, 1), (2, 2), (3, 1)])
+    def test_bad_pixels_beside_a_step_are_found(self, side, bad, wanted, edge, size):
+        """With one neighbour alone to spare neither pixel of a pair was, of 0.1 beside 0.15."""
         usual = np.ones((96, 128))
         usual[:, :edge] = side
-        usual[20::24, edge] = usual[31::24, edge + 5] = bad
+        for row, col in itertools.product(range(size[0]), range(size[1])):
+            usual[20 + row :: 24, edge + col] = usual[31 + row :: 24, edge + 5 + col] = bad
         dead, hot = self.outliers(usual)
         found = {"dead": dead, "hot": hot}
         np.testing.assert_array_equal(found.pop(wanted)[:, edge:], usual[:, edge:] == bad)
         assert not found.popitem()[1][:, edge:].any()
+
+    @pytest.mark.parametrize("angle", range(0, 360, 15))
+    @pytest.mark.parametrize("factor", [2.5, 5])
+    def test_beside_a_step_at_any_angle_no_good_pixel_is_bad(self, factor, angle):
+        """At the border of the sensor up to 4 were."""
+        row, col = np.indices((176, 176)) - 87.7
+        side = np.cos(np.radians(angle)) * col + np.sin(np.radians(angle)) * row
+        dead, hot = self.outliers(np.where(side < 0, 1 / factor, 1))
+        assert (np.count_nonzero(dead), np.count_nonzero(hot)) == (0, 0)
+
+    @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (2, 2)])
+    @pytest.mark.parametrize("edge", [56, 61, 64, 67])
+    def test_hot_pixels_beside_a_step_leave_good_ones_good(self, edge, size):
+        usual = np.ones((96, 128))
+        usual[:, :edge] = 0.25
+        for row, col in itertools.product(range(size[0]), range(size[1])):
+            usual[20 + row :: 24, edge - 1 - col] = usual[31 + row :: 24, edge - 2 - col] = 2
+        dead, hot = self.outliers(usual)
+        np.testing.assert_array_equal(hot, usual == 2)
+        assert not dead.any()
 
     @pytest.mark.parametrize("edge", [56, 61, 64, 67])
     @pytest.mark.parametrize("side", [0.0, -0.01])

@@ -47,8 +47,11 @@ _STEP = 1.1
 _LARGEST_STEP = 10.0
 """Response of a block over that of the one beside it up to which both may be good."""
 
-_SQUARE = 3
-"""Side of a square with a pixel in its corner, in which pixels beside a step are compared."""
+_REACH = 5
+"""Pixels on each side of a pixel in its row and column that it is compared with beside a step."""
+
+_OWN = 3
+"""Rank of their values that counts: the middle of one side, which two bad pixels do not move."""
 
 _AROUND = 5
 """Side of the square of blocks that a block is compared with."""
@@ -294,13 +297,20 @@ def response_outliers(
 
     Notes
     -----
-    The medians of adjacent blocks differ by more than a tenth beside a step. The neighbours there
-    are those of a square of 3×3 that has the pixel in its corner. Of the four squares that counts
-    whose values are lowest, or highest for a hot pixel: at an edge one of them lies on the pixel's
-    own side. A square across a straight edge holds two pixels of the own side, so its second
-    largest value counts, or second smallest, which no single bad pixel moves. It is limited to the
-    range of the medians. For a dead pixel those below a tenth of the largest are left out: dead
-    regions.
+    The medians of adjacent blocks differ by more than a tenth beside a step. A pixel there is
+    compared with the five pixels on each side of it in its row, and in its column. Beside a
+    straight step one of these sides at least is the pixel's own. So the third lowest of the ten is
+    no higher than usual for a pixel of the weak side. In a line along the step all are of the
+    pixel's own side, and the third lowest is usual there even if two are bad. Hence for a dead
+    pixel the higher of these values of its row and its column counts, for a hot one the lower of
+    the third highest. A pair, a block of 2×2 and three in a line along a step are found. The value
+    is limited to the range of the medians. For a dead pixel those below a tenth of the largest are
+    left out: dead regions.
+
+    Four or more in a line along a step may as well be a bend of it: beside 0.15 a column of 0.1 is
+    not told from the other side. They are found only if they are dead, or hot, beside that as well.
+    The same holds for a pixel beside a step at an angle to rows and columns, or of the outermost
+    row or column where a step meets it.
     """
     dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
     with np.errstate(invalid="ignore"):
@@ -311,13 +321,17 @@ def response_outliers(
     # The noise of a dead region may make its median negative.
     usual, deviation = np.maximum(_usual(sensitivity), 0), std()
     lowest, highest = _range_around(usual)
-    for found, sign, limit, extreme in (
-        (dead, -1, least, highest),
-        (hot, 1, 1 / DEAD_RESPONSE, lowest),
+    alive, _ = _range_around(usual, 1 / _LARGEST_STEP)
+    stepped = highest > _STEP * lowest
+    for found, sign, limit, extreme, floor in (
+        (dead, -1, least, highest, alive),
+        (hot, 1, 1 / DEAD_RESPONSE, lowest, lowest),
     ):
         beyond = sign * (sensitivity - limit * _of_pixels(extreme, sensitivity.shape))
         suspects = np.nonzero(beyond > 0)
-        around = _on_its_side(sensitivity, usual, suspects, sign)
+        blocks = suspects[0] // _BLOCK, suspects[1] // _BLOCK
+        beside = np.clip(_on_its_side(sensitivity, suspects, sign), floor[blocks], highest[blocks])
+        around = np.where(stepped[blocks], beside, usual[blocks])
         beyond = sign * (sensitivity[suspects] - limit * around)
         found[suspects] = beyond > SIGMAS * deviation[suspects]
     return dead, hot
@@ -357,32 +371,17 @@ def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any]
     return np.fmin.reduce(counted, axis=(2, 3)), highest
 
 
-def _on_its_side(
-    image: NDArray[Any], usual: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int
-) -> NDArray[Any]:
-    """Usual response of those pixels, beside a step that of the pixel's side of it."""
-    blocks = tuple(each // _BLOCK for each in pixels)
-    lowest, highest = (each[blocks] for each in _range_around(usual))
-    least, _ = _range_around(usual, 1 / _LARGEST_STEP if sign < 0 else 0.0)
-    beside = np.clip(_alike_beside(image, pixels, sign), least[blocks], highest)
-    stepped = (highest > _STEP * lowest) & np.isfinite(beside)
-    return np.asarray(np.where(stepped, beside, usual[blocks]))
-
-
-def _alike_beside(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int) -> NDArray[Any]:
-    """Usual response in the square beside each pixel where it is lowest (`sign` -1) or highest."""
+def _on_its_side(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int) -> NDArray[Any]:
+    """Usual response on each pixel's side of a step, to find dead (`sign` -1) or hot pixels."""
     rows, cols = pixels
-    reach = _SQUARE - 1
-    padded = sign * np.pad(image, reach, mode="reflect")
-    squares = []
-    for down, right in itertools.product((-1, 1), repeat=2):
-        steps = itertools.islice(itertools.product(range(_SQUARE), repeat=2), 1, None)
-        beside = [
-            padded[rows + reach + down * row, cols + reach + right * col] for row, col in steps
-        ]
-        # NaN is sorted behind all numbers.
-        squares.append(np.sort(beside, axis=0)[1])
-    return np.asarray(sign * np.fmax.reduce(squares))
+    # The differences go on beyond the border, so that a step at an angle does not turn back there.
+    padded = np.pad(image, _REACH, mode="reflect", reflect_type="odd")
+    steps = np.delete(np.arange(2 * _REACH + 1), _REACH)[:, None]
+    lines = padded[rows + steps, cols + _REACH], padded[rows + _REACH, cols + steps]
+    # A missing value may be of the pixel's own side.
+    known = [np.where(np.isnan(line), -np.inf, -sign * line) for line in lines]
+    ranked = [np.sort(line, axis=0)[_OWN - 1] for line in known]
+    return np.asarray(-sign * np.maximum(*ranked))
 
 
 def _are_alike(values: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
