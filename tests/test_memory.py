@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import equipix
+from equipix import cli
 from equipix.errors import EquipixError, InsufficientMemoryError
 from equipix.io import write_frames
 
@@ -273,6 +274,25 @@ def test_commands_on_frames_of_one_level_name_it(tmp_path, command, work):
     said = run(QUALITY, command, tmp_path / "response.tif", *write_files(tmp_path, shape))
     assert said.returncode == 1, said.stderr
     assert re.fullmatch(rf"equipix: error: {work}: .*\n", said.stderr), said.stderr
+
+
+@pytest.mark.parametrize("filters", [[], ["--cfa", "RGGB"]], ids=["plain", "colours"])
+def test_quality_holds_one_stack_of_corrected_frames(tmp_path, filters):
+    """Beside the raw frames, with less than another stack for means: with all three it is 4.2."""
+    shape = (100, 120)
+    response = equipix.nuc.fit(np.ones((2, *shape)) * [[[100.0]], [[200.0]]])
+    response.save(tmp_path / "response.npz")
+    frames = np.random.default_rng(1).normal(150, 3, (400, *shape)).astype(np.float32)
+    write_frames(tmp_path / "raw.tif", frames, nbytes=frames.nbytes)
+    arguments = ["nuc", "quality", str(tmp_path / "response.npz"), str(tmp_path / "raw.tif")]
+    tracemalloc.start()
+    try:
+        with pytest.raises(SystemExit, match="0"):
+            cli.main([*arguments, *filters])
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 3 * frames.nbytes
 
 
 CORRECT = """

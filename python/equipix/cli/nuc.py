@@ -25,7 +25,10 @@ from equipix.nuc.bad_pixels import find_defects
 from equipix.nuc.limits import DefectLimits
 
 if TYPE_CHECKING:
-    from equipix._types import Array
+    from collections.abc import Callable
+
+    from equipix._types import Array, Flagged
+    from equipix.colour import Colours
     from equipix.correction.protocol import Correction
 
 commands = typer.Typer()
@@ -157,38 +160,45 @@ def quality(
     check_sensor(loaded, sensor)
     colours = named_cfa(loaded, cfa)
     with naming_memory("measuring quality"):
-        corrected = _corrected(loaded, _raw(frames, correction))
-        if colours is None:
-            result = _quality(corrected, confidence)
-        else:
-            cut = [planes(each, colours) for each in corrected]
-            result = {name: _quality([each[name] for each in cut], confidence) for name in cut[0]}
+        result = _quality(loaded, _raw(frames, correction), colours, confidence)
     show_result(result, as_json=as_json)
 
 
-def _corrected(correction: Correction, raw: Array) -> list[Array]:
-    """Corrected frames without flagged pixels, with them, and with them replaced."""
-    return [correction.correct(raw, flagged=flagged) for flagged in ("nan", "keep", "replace")]
+def _quality(
+    correction: Correction, raw: Array, colours: Colours | None, confidence: float
+) -> dict[str, Any]:
+    """Measure spatial over temporal noise of corrected frames, and its parts; of each plane."""
 
+    def measured(flagged: Flagged, figure: Callable[[Array], Any]) -> dict[str, Any]:
+        # The corrected frames end here: of long series one stack at a time is held.
+        corrected = correction.correct(raw, flagged=flagged)
+        cut = {"": corrected} if colours is None else planes(corrected, colours)
+        return {name: figure(each) for name, each in cut.items()}
 
-def _quality(corrected: list[Array], confidence: float) -> dict[str, Any]:
-    """Measure spatial over temporal noise of corrected frames, and its parts."""
-    usable, kept, replaced = corrected
-    good = correctability(usable, confidence=confidence)
-    every = correctability(kept, confidence=confidence)
-    noise = asdict(three_d_noise(replaced))
-    return {
-        "frames": good.frames,
-        "pixels": good.pixels,
-        "C": good.ratio,
-        "C_from": good.low,
-        "C_to": good.high,
-        "C_with_flagged_pixels": every.ratio,
-        "spatial_variance": good.spatial_variance,
-        "temporal_variance": good.temporal_variance,
-        "noise_variances": noise,
-        "roughness": roughness(replaced.mean(axis=0)),
+    usable = measured("nan", lambda each: correctability(each, confidence=confidence))
+    kept = measured("keep", lambda each: correctability(each, confidence=confidence).ratio)
+    parts = measured(
+        "replace",
+        lambda each: {
+            "noise_variances": asdict(three_d_noise(each)),
+            "roughness": roughness(each.mean(axis=0)),
+        },
+    )
+    result = {
+        name: {
+            "frames": good.frames,
+            "pixels": good.pixels,
+            "C": good.ratio,
+            "C_from": good.low,
+            "C_to": good.high,
+            "C_with_flagged_pixels": kept[name],
+            "spatial_variance": good.spatial_variance,
+            "temporal_variance": good.temporal_variance,
+            **parts[name],
+        }
+        for name, good in usable.items()
     }
+    return result[""] if colours is None else result
 
 
 def _raw(source: list[str], correction: Path) -> Array:
