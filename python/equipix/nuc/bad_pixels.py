@@ -21,7 +21,7 @@ from equipix.nuc.response import Response
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from equipix._types import Array
+    from equipix._types import Array, Floats
     from equipix.colour import Colours
     from equipix.frames import FrameStatistics
 
@@ -143,8 +143,9 @@ def find_defects(
     check_type("limits", limits, DefectLimits, "equipix.nuc.DefectLimits(noise=2.0, ...)")
     with naming_memory("finding bad pixels"):
         misfit = common_misfit(response)
-        colours, filters = _filters(response, named_cfa(response, cfa))
-        found = of_response(response, limits, misfit, filters)
+        slope = mean_slope(response)
+        colours, filters = _filters(response, named_cfa(response, cfa), slope)
+        found = of_response(response, slope, limits, misfit, filters)
         if frames is not None:
             found |= of_frames(frames, usable(response.flags), limits, colours)
     flags = response.flags.copy()
@@ -153,7 +154,7 @@ def find_defects(
     few = too_few_for_flicker(frames, limits) if "flickering" in found else {}
     counts = {kind: int(np.count_nonzero(each)) for kind, each in found.items() if kind not in few}
     counts["unusable"] = int(np.count_nonzero(~usable(flags)))
-    gain = mean_slope(response) - 1
+    gain = slope - 1
     known = gain[np.isfinite(gain)]
     percentiles = np.percentile(known, PERCENTILES) if known.size else np.full(len(PERCENTILES), 0)
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
@@ -161,11 +162,13 @@ def find_defects(
     return Defects(flags, counts, named, misfit, limits, few)
 
 
-def _filters(response: Response, given: Colours | None) -> tuple[Colours | None, Filters | None]:
+def _filters(
+    response: Response, given: Colours | None, slope: Floats
+) -> tuple[Colours | None, Filters | None]:
     """Colours of the pixels, and filters of slopes that are not over the mean of a colour."""
     if response.cfa is not None:
         return response.cfa, None
-    filters = Filters.of(given, mean_slope(response))
+    filters = Filters.of(given, slope)
     if filters is None:
         return None, None
     if not filters.given:

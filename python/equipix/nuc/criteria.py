@@ -44,14 +44,20 @@ def mean_slope(response: Response) -> Floats:
 
 
 def of_response(
-    response: Response, limits: DefectLimits, misfit: float, filters: Filters | None
+    response: Response,
+    slope: Floats,
+    limits: DefectLimits,
+    misfit: float,
+    filters: Filters | None,
 ) -> dict[str, Bools]:
-    """Bad pixels by their curves; `misfit` is that of the array.
+    """Bad pixels by their curves of this mean slope; `misfit` is that of the array.
 
     `filters` are those of slopes that are not over the mean of a colour.
     """
-    usual = np.ones(response.shape) if filters is None else filters.map_of(response.shape)
-    slope = mean_slope(response) / usual
+    usual: Floats | float = 1.0
+    if filters is not None:
+        usual = filters.map_of(response.shape)
+        slope = slope / usual
     known = np.isfinite(slope)
     low, high = response.limits
     whole = _range(response)
@@ -119,7 +125,7 @@ def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
     return {"flickering": f"below {needed} frames"} if count < needed else {}
 
 
-def _dead(response: Response, slope: Floats, usual: Floats, least: float) -> Bools:
+def _dead(response: Response, slope: Floats, usual: Floats | float, least: float) -> Bools:
     """Pixels that rise less than their neighbours, by more than the error of their slope."""
     if response.order == 0 or not np.isfinite(slope).any():
         return np.zeros(slope.shape, bool)
