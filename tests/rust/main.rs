@@ -9,6 +9,7 @@ mod dense;
 mod descent;
 mod estimate;
 mod experiment;
+mod few_measurements;
 mod fit;
 mod fixed_point;
 mod fixed_point_limits;

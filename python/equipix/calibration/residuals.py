@@ -114,15 +114,20 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
         root = np.sqrt(deep, dtype=np.float64)
         values /= root
         response /= root
-    measured = max(int(np.count_nonzero(exposures.usable())), 1)
-    share = fit.degrees_of_freedom / measured
+    measured = int(np.count_nonzero(exposures.usable() & in_search(fit)))
+    share = fit.degrees_of_freedom / max(measured, 1)
     error = float(fit.error_estimate[-1])
     return Residuals(values, light, response, rows, share, weighted.noise_variance, error)
 
 
+def in_search(fit: Fit) -> Bools:
+    """Pixels whose measurements F contains."""
+    return np.ones(fit.sensitivity.shape, bool) if fit.few is None else ~fit.few
+
+
 def tested(fit: Fit) -> Bools:
     """Pixels whose residuals test the model: of which M does not follow its prior."""
-    return np.ones(fit.sensitivity.shape, bool) if fit.prior is None else fit.prior == 0
+    return in_search(fit) if fit.prior is None else in_search(fit) & (fit.prior == 0)
 
 
 def bands(count: int, most: int) -> Array:

@@ -77,6 +77,9 @@ pub struct Fit {
     /// The smallest Ritz value of a joint fit: near 0 where the measurements barely constrain some
     /// pattern.
     pub smallest_ritz: Option<f64>,
+    /// Pixels that were left out of the search, since few measurements are theirs, if there are such: F does not
+    /// contain their residuals.
+    pub few: Option<Vec<bool>>,
     /// The weights of the prior M = mean(M) on pixels in weak light, row by row, if there are such.
     pub prior: Option<Arc<[f64]>>,
 }

@@ -138,6 +138,8 @@ pub(crate) struct PyFit {
     refinement: Refinement,
     #[pyo3(get)]
     is_joint: bool,
+    #[pyo3(get)]
+    few: Option<Py<PyArray2<bool>>>,
     /// The weights of the prior of M on pixels in weak light.
     prior: Option<Arc<[f64]>>,
 }
@@ -238,6 +240,7 @@ impl PyFit {
             leaves_tilt: fit.leaves_tilt,
             refinement: fit.refinement,
             is_joint,
+            few: fit.few.map(|few| image(py, few, sensor)).transpose()?,
             prior: fit.prior,
         })
     }

@@ -116,6 +116,8 @@ pub(crate) struct Answer {
     /// F of the measurements alone.
     pub(crate) misfit: f64,
     pub(crate) degrees_of_freedom: i64,
+    /// The pixels that left the search, since their measurements are few; empty if there are none.
+    pub(crate) few: Vec<bool>,
     /// The weights of the prior of M; empty without one.
     pub(crate) prior: Vec<f64>,
     pub(crate) history: Vec<Look>,
@@ -325,6 +327,7 @@ fn answer(fit: Fit) -> Answer {
         labels: [fit.components.pixels, fit.components.cells],
         misfit: fit.misfit,
         degrees_of_freedom: fit.degrees_of_freedom,
+        few: fit.few.unwrap_or_default(),
         prior: fit.prior.map(|prior| prior.to_vec()).unwrap_or_default(),
         converged: fit.history.ended == Ended::Converged,
         history: looks.map(look).collect(),

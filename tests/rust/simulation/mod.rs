@@ -163,14 +163,18 @@ impl Experiment {
         self
     }
 
-    /// Variances that differ threefold from measurement to measurement, and every twentieth masked.
+    /// Variances that differ threefold from measurement to measurement, and every twentieth masked, but
+    /// for pixels of which that would leave so few that they leave the search.
     pub(crate) fn uneven(mut self) -> Self {
         let size = self.frames.len();
         if let Noise::Exposures(variance) = &self.noise {
             let uneven = (0..size).map(|i| variance[0] * (1.0 + 0.5 * random(90, i)));
             self.noise = Noise::Measurements(uneven.collect());
         }
-        self.mask = (0..size).map(|i| random(91, i) > 0.9).collect();
+        let (count, pixels) = (self.shifts.len(), self.shape[0] * self.shape[1]);
+        let masked = |i: usize| random(91, i) > 0.9;
+        let left = |p: usize| (0..count).filter(|k| !masked(k * pixels + p)).count();
+        self.mask = (0..size).map(|i| masked(i) && left(i % pixels) > 2.min(count - 1)).collect();
         self
     }
 }

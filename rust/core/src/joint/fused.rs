@@ -106,6 +106,8 @@ impl Fused {
                     Found { lights, m, inverse: &inverse[..cols], weights: &workspace.weights };
                 let flux = is_uneven.then_some(&pass.flux[..]);
                 pixels.shorten([weight, light], flux, row.chunks_exact_mut(width));
+                let square = length - 2 * width;
+                pass.few.in_row(index).iter().for_each(|col| row[square + col] = 0.0);
             }
         });
     }

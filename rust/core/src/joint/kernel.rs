@@ -64,6 +64,13 @@ impl Lines {
         self.values.fill(0.0);
     }
 
+    /// Makes the values of some columns 0, of so many exposures.
+    pub(crate) fn silence(&mut self, columns: &[usize], exposures: usize) {
+        for k in 0..if columns.is_empty() { 0 } else { exposures } {
+            columns.iter().for_each(|&col| self.of_mut(k)[col] = 0.0);
+        }
+    }
+
     /// The row of one exposure.
     #[inline(always)]
     pub(crate) fn of(&self, exposure: usize) -> &[f64] {
@@ -127,7 +134,7 @@ impl<'s> Row<'s> {
 }
 
 /// M and O at their closed forms, and what the pixels pull at the beam: c M w (y − c L M − O) in
-/// place of y; returns Σ w (y − c L M − O)².
+/// place of y; returns Σ w (y − c L M − O)² over all columns but some.
 ///
 /// ```text
 /// [Σ w e²  Σ w e] [M]   [Σ w e y]
@@ -148,6 +155,8 @@ pub(crate) struct Eliminate<'s> {
     /// The weights of the prior of M, and its mean; empty without one.
     pub(crate) prior: &'s [f64],
     pub(crate) mean: f64,
+    /// Columns that F leaves out.
+    pub(crate) few: &'s [usize],
 }
 
 impl pulp::NullaryFnOnce for Eliminate<'_> {
@@ -212,6 +221,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 squares[col] = pull * values[col];
                 values[col] = flux * sensitivity[col] * pull;
             }
+            self.few.iter().for_each(|&col| squares[col] = 0.0);
             objective += sum(squares);
         }
         objective

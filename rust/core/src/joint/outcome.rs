@@ -1,6 +1,8 @@
 //! What a state of the joint problem says besides its unknowns: components, values of the beam at its
 //! cells, and how many numbers the measurements determine.
 
+use std::ops::Range;
+
 use super::freedom::determined_share;
 use super::layout::Grid;
 use super::penalty::SMOOTHING;
@@ -8,13 +10,15 @@ use super::system::System;
 use crate::connectivity::{Components, Edges, Stretches};
 use crate::control::Control;
 use crate::error::Result;
+use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Rotation, View, whole_number};
 
 /// Measurements less unknowns.
 pub(crate) fn freedom<T: Real>(system: &System<'_, '_, T>) -> f64 {
-    let pixels = system.measured() * (1 + usize::from(system.pass.with_offset));
-    system.pass.exposures.used().saturating_sub(pixels + unknowns(system)).max(1) as f64
+    let pixels =
+        (system.measured() - system.pass.few.pixels) * (1 + usize::from(system.pass.with_offset));
+    system.used().saturating_sub(pixels + unknowns(system)).max(1) as f64
 }
 
 pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
@@ -28,23 +32,33 @@ pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     (determined_share(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
 }
 
-/// The components of pixels and cells. Along an axis where all shifts differ by whole numbers of pixels,
-/// a pixel hangs on one value of the beam; else on the two beside it, which is a necessary condition
-/// alone: then a Ritz value near 0 shows patterns that are not determined.
+/// The components of pixels and cells at the shifts found.
 pub(crate) fn components<T: Real>(
     system: &System<'_, '_, T>,
     control: &Control,
 ) -> Result<Components> {
-    let Grid { geometry, sensor, .. } = &system.pass.grid;
-    let shifts = &system.state.shifts;
+    connected(system.pass.exposures, &system.pass.grid, &system.state.shifts, &[], control)
+}
+
+/// The components of pixels and cells, without pixels that are left out, if any are. Along an axis where all
+/// shifts differ by whole numbers of pixels, a pixel hangs on one value of the beam; else on the two beside it,
+/// which is a necessary condition alone: then a Ritz value near 0 shows patterns that are not determined.
+pub(super) fn connected<T: Real>(
+    exposures: &Exposures<'_, T>,
+    grid: &Grid,
+    shifts: &[[f64; 2]],
+    left_out: &[bool],
+    control: &Control,
+) -> Result<Components> {
+    let Grid { geometry, sensor, .. } = grid;
     let whole = [0, 1].map(|axis| {
         let apart = |d: &[f64; 2]| d[axis] - shifts[0][axis];
         shifts.iter().all(|d| whole_number(apart(d)).is_some())
     });
-    let windows = system.pass.grid.windows(shifts);
+    let windows = grid.windows(shifts);
     let mut edges = Edges::new(sensor.len(), geometry.beam.len());
     let mut stretches = Stretches::new(*sensor, geometry.beam);
-    system.pass.exposures.for_each_stretch(control, |exposure, row, cols| {
+    let mut join = |exposure: usize, row: usize, cols: Range<usize>| {
         let window = &windows[exposure];
         let View { cells, rotation, .. } = geometry.views[window.view];
         let [down, along] = if window.swaps_axes { [whole[1], whole[0]] } else { whole };
@@ -62,6 +76,18 @@ pub(crate) fn components<T: Real>(
                     edges.add(row * sensor.cols + col, cell);
                 }
             }
+        }
+    };
+    exposures.for_each_stretch(control, |exposure, row, cols| {
+        let Some(left_out) = left_out.get(row * sensor.cols..(row + 1) * sensor.cols) else {
+            return join(exposure, row, cols);
+        };
+        let mut first = cols.start;
+        for alike in left_out[cols].chunk_by(|a, b| a == b) {
+            if !alike[0] {
+                join(exposure, row, first..first + alike.len());
+            }
+            first += alike.len();
         }
     })?;
     edges.components(control)

@@ -9,6 +9,7 @@
 use std::borrow::Cow;
 
 use super::bands::Bands;
+use super::few::Few;
 use super::kernel::{AROUND, Combine, Lines, Row};
 use super::layout::{Grid, Window};
 use super::workspace::{Sums, Workspace};
@@ -33,6 +34,9 @@ pub(crate) struct Pass<'m, 'a, T> {
     pub(crate) grid: Grid,
     pub(crate) windows: Vec<Window>,
     bands: Bands,
+    /// Pixels that pull at nothing, unless it is asked what they themselves are moved by.
+    pub(crate) few: Few,
+    pub(crate) few_pull: bool,
     /// c of each exposure.
     pub(crate) flux: Vec<f64>,
     pub(crate) with_offset: bool,
@@ -56,6 +60,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
         grid: Grid,
+        few: Few,
         with_flux: bool,
         workers: &'m Workers,
         control: &Control,
@@ -68,6 +73,8 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
             grid,
             windows: Vec::new(),
             bands: Bands::default(),
+            few,
+            few_pull: false,
             flux: Vec::new(),
             with_offset,
             with_flux,
@@ -116,7 +123,11 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 }
                 workspace.lines.rotate_left(1);
                 let parts = Row::of(row, count, sensor.cols);
-                work(pass, band * height + index, parts, &mut workspace, &mut found);
+                let number = band * height + index;
+                work(pass, number, parts, &mut workspace, &mut found);
+                if !pass.few_pull {
+                    workspace.values().silence(pass.few.in_row(number), count);
+                }
                 pass.gather(row, &mut workspace, &mut found);
                 pass.spread(index, &mut workspace, strips);
             }

@@ -31,6 +31,8 @@ impl<T: Real> System<'_, '_, T> {
                 self.pass.weigh_row(row_index, &mut workspace);
                 self.pass.see_slopes(&beams, row_index, &mut workspace);
                 for k in 0..count {
+                    let few = self.pass.few.in_row(row_index).iter();
+                    few.for_each(|col| workspace.weights[k * sensor.cols + col] = 0.0);
                     for col in 0..sensor.cols {
                         let at = k * sensor.cols + col;
                         let block = &mut found[col / size[1] * count + k];

@@ -14,6 +14,7 @@
 
 use std::ops::Range;
 
+use super::few::Few;
 use super::flux::Fluxes;
 use super::fused::Fused;
 use super::kernel::{Eliminate, Propagate};
@@ -67,6 +68,8 @@ pub(crate) struct System<'m, 'a, T> {
 }
 
 impl<'m, 'a, T: Real> System<'m, 'a, T> {
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn new(
         exposures: &'m Exposures<'a, T>,
         grid: Grid,
@@ -74,10 +77,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         state: State,
         workers: &'m Workers,
         control: &Control,
-    ) -> Self {
+    ) -> Result<Self> {
+        let few = Few::of(exposures, &grid, control)?;
         let with_flux = !fluxes.columns.is_empty();
-        Self {
-            pass: Pass::new(exposures, grid, with_flux, workers, control),
+        Ok(Self {
+            pass: Pass::new(exposures, grid, few, with_flux, workers, control),
             fluxes,
             shift_prior: None,
             misfit: 0.0,
@@ -95,7 +99,12 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             prior: None,
             of_prior: 0.0,
             state,
-        }
+        })
+    }
+
+    /// How many measurements the search uses.
+    pub(crate) fn used(&self) -> usize {
+        self.pass.exposures.used() - self.pass.few.measurements
     }
 
     /// Seeks the shifts too, by what is known of them, or no longer; returns what was known before.
@@ -209,8 +218,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass.see_slopes(&views, row_index, workspace);
             let (weights, values, sums) = workspace.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
-            let prior = of_row(row_index);
-            let eliminate = Eliminate { row, fluxes, weights, values, sums, singular, prior, mean };
+            let (prior, few) = (of_row(row_index), pass.few.in_row(row_index));
+            let eliminate =
+                Eliminate { row, fluxes, weights, values, sums, singular, prior, mean, few };
             found.objective += pulp::Arch::new().dispatch(eliminate);
         })
     }
@@ -429,6 +439,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                     *sum += if *m == 0.0 { 0.0 } else { pull / (flux * m) };
                 }
             }
+            pass.few.in_row(row_index).iter().for_each(|&col| row.change[col] = 0.0);
         });
         drop((views, beams));
         self.state.beam = beam;
@@ -488,8 +499,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         }
         let (sensor, count) = (self.pass.exposures.sensor(), self.pass.exposures.count());
         let sensitivity = &self.pass.row(row)[count * sensor.cols..][..sensor.cols];
-        for (weight, m) in weights.iter_mut().zip(&sensitivity[cols]) {
+        for (weight, m) in weights.iter_mut().zip(&sensitivity[cols.clone()]) {
             *weight *= (self.pass.flux[exposure] * m).powi(2);
+        }
+        for few in self.pass.few.in_row(row) {
+            if cols.contains(few) {
+                weights[few - cols.start] = 0.0;
+            }
         }
         weights
     }

@@ -65,7 +65,7 @@ fn with_system(
     let fluxes = Fluxes::new(&FLUX, &FluxKind::Known, SHIFTS, rotations);
     let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
     let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
-    let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control);
+    let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control).unwrap();
     system.linearise(&control).unwrap();
     visit(&mut system);
 }
@@ -179,7 +179,7 @@ fn the_matrix_of_waves_is_that_of_the_product() {
         theta: Vec::new(),
         shifts: shifts.to_vec(),
     };
-    let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control);
+    let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control).unwrap();
     system.linearise(&control).unwrap();
     let preconditioner = Preconditioner::new(&mut system, &control).unwrap();
     // A wave packet, then what the waves make of what it pulls.

@@ -21,7 +21,7 @@ impl<T: Real> System<'_, '_, T> {
         total
     }
 
-    /// D of each pixel without the prior; 0 without a measurement.
+    /// D of each pixel without the prior; 0 without a measurement that the search uses.
     pub(crate) fn information(&self) -> Vec<f64> {
         let mut information = Vec::with_capacity(self.pass.exposures.sensor().len());
         self.pass.for_rows(|[_, inverse, ..]| {
@@ -29,6 +29,11 @@ impl<T: Real> System<'_, '_, T> {
         });
         for (d, own) in information.iter_mut().zip(self.prior.iter().flat_map(|p| &p.weights)) {
             *d = (*d - own).max(0.0);
+        }
+        for (row, information) in
+            information.chunks_exact_mut(self.pass.exposures.sensor().cols).enumerate()
+        {
+            self.pass.few.in_row(row).iter().for_each(|&col| information[col] = 0.0);
         }
         information
     }
@@ -59,7 +64,7 @@ impl<T: Real> System<'_, '_, T> {
                 }
             }
         }
-        prior::variance(squares, self.pass.exposures.used(), freedom, freed)
+        prior::variance(squares, self.used(), freedom, freed)
     }
 
     /// Takes the mean of M over lit pixels as that of the prior, which in a joint fit is held between steps;

@@ -376,20 +376,22 @@ fn fit<T: Real>(
         degrees_of_freedom: 0,
         variance_is_known: exposures.variance_is_known(),
         history,
+        few: system.pass.few.image(exposures.sensor().cols),
         prior: system.prior.as_ref().map(|prior| {
             prior.weights.iter().map(|weight| weight * prior.mean * prior.mean).collect()
         }),
     })
 }
 
-/// Measurements less unknowns; each component has one unknown less than values, by its gauge.
+/// Measurements less unknowns of the search; each component has one unknown less than values, by its gauge.
 fn degrees_of_freedom<T: Real>(
     system: &System<'_, '_, T>,
     fit: &Fit,
     without_offset: usize,
 ) -> i64 {
-    let pixels = fit.components.pixels.iter().filter(|&&label| label != NONE).count();
+    let labels = fit.components.pixels.iter().filter(|&&label| label != NONE);
+    let pixels = labels.count() - system.pass.few.pixels;
     let offsets = if fit.offset.is_some() { pixels - without_offset } else { 0 };
     let unknowns = joint::unknowns(system) + pixels + offsets - fit.components.sizes.len();
-    system.pass.exposures.used() as i64 - unknowns as i64
+    system.used() as i64 - unknowns as i64
 }

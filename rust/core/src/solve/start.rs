@@ -46,7 +46,7 @@ pub(super) fn system<'m, 'a, T: Real>(
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
         None => (swept(exposures, &grid, &fluxes, workers, control)?, FIRST_SWEEPS),
     };
-    Ok((System::new(exposures, grid, fluxes, state, workers, control), swept))
+    Ok((System::new(exposures, grid, fluxes, state, workers, control)?, swept))
 }
 
 /// The state after some sweeps.

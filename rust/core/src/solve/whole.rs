@@ -70,6 +70,7 @@ pub(super) fn minimise<T: Real>(
         offset: None,
         flags: Vec::new(),
         degrees_of_freedom: degrees_of_freedom(exposures.used(), freed, &components),
+        few: None,
         prior: prior.map(|prior| prior.weights),
         components,
         misfit,

@@ -491,7 +491,7 @@ fn problem<'m, 'a, T: Real>(
         theta: vec![0.0; fluxes.columns.len()],
         shifts,
     };
-    let mut system = System::new(exposures, grid, fluxes, state, workers, control);
+    let mut system = System::new(exposures, grid, fluxes, state, workers, control)?;
     system.unit = solution.unit;
     Ok(system)
 }

@@ -56,8 +56,11 @@ impl Dark {
                         along += weights[col] * light[col];
                     }
                     row.change[col] = row.inverse[col] * along;
-                    found.objective += variance[col] * (sum - row.change[col] * along);
+                    workspace.sums[0][col] = variance[col] * (sum - row.change[col] * along);
                 }
+                let left = &mut workspace.sums[0][..cols];
+                pass.few.in_row(row_index).iter().for_each(|&col| left[col] = 0.0);
+                found.objective += left.iter().sum::<f64>();
             })?;
         let mut propagation = vec![0.0; variance.len()];
         add_change(system, &mut propagation);

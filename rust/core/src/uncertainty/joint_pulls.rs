@@ -13,7 +13,8 @@ pub(super) fn pull_of<T: Real>(
     offset: &[f64],
     control: &Control,
 ) -> Result<Vec<f64>> {
-    pull_by(system, control, |pass, row_index, row, workspace| {
+    system.pass.few_pull = true;
+    let pull = pull_by(system, control, |pass, row_index, row, workspace| {
         let cols = pass.exposures.sensor().cols;
         let (gain, offset) = (&gain[row_index * cols..], &offset[row_index * cols..]);
         let [_, i12, i22] = row.offset;
@@ -30,7 +31,9 @@ pub(super) fn pull_of<T: Real>(
                 *value = -flux * row.sensitivity[col] * weights[col] * change;
             }
         }
-    })
+    });
+    system.pass.few_pull = false;
+    pull
 }
 
 /// What pixels pull at the unknowns if `work` leaves their pulls in the workspace's values, with their

@@ -1,0 +1,125 @@
+//! Pixels with few measurements, which follow the beam and pull at nothing.
+//!
+//! A pixel that is measured once has no residual and no word on the beam. One that is measured twice, of many
+//! exposures, says little of the beam, and where masks leave many such pixels along the edge of what they leave, as of
+//! discs, the search follows their noise for thousands of passes. So they leave it: M follows the beam at its
+//! closed form, as that of all pixels does, but the pulls of their measurements are 0, in products, in D and in draws
+//! of noise. Their variance follows too, since that of any pixel is D⁻¹ and what S leaves open of the beam.
+//!
+//! They stay in it where they say what no other pixel does: where cells are seen by them alone, or where they join
+//! components.
+
+use super::layout::{Grid, MARGIN, Window};
+use super::outcome::connected;
+use crate::connectivity::NONE;
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::Exposures;
+use crate::frames::Real;
+
+/// Measurements that are few where there are more exposures.
+const FEW: u8 = 2;
+
+/// The columns of such pixels, by row of the sensor, and how many measurements and pixels that is.
+#[derive(Debug, Default)]
+pub(crate) struct Few {
+    rows: Vec<Vec<usize>>,
+    pub(crate) measurements: usize,
+    pub(crate) pixels: usize,
+}
+
+impl Few {
+    /// Those of exposures at the shifts that were given.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(crate) fn of<T: Real>(
+        exposures: &Exposures<'_, T>,
+        grid: &Grid,
+        control: &Control,
+    ) -> Result<Self> {
+        let (sensor, count) = (exposures.sensor(), exposures.count());
+        let is_whole = (0..count).all(|k| exposures.uniform_weight(k).is_some());
+        if count <= usize::from(FEW) || is_whole || exposures.offset() {
+            return Ok(Self::default());
+        }
+        let mut times = vec![0_u8; sensor.len()];
+        exposures.for_each_stretch(control, |_, row, cols| {
+            let pixels = &mut times[row * sensor.cols..][cols];
+            pixels.iter_mut().for_each(|times| *times = times.saturating_add(1));
+        })?;
+        let mut leaves: Vec<bool> = times.iter().map(|times| (1..=FEW).contains(times)).collect();
+        if !leaves.contains(&true) {
+            return Ok(Self::default());
+        }
+        stay_where_needed(&mut leaves, exposures, grid, control)?;
+        let mut shares = vec![[0; 2]; count];
+        exposures.for_each_stretch(control, |k, row, cols| {
+            let leaving =
+                leaves[row * sensor.cols..][cols.clone()].iter().filter(|leaves| **leaves);
+            shares[k] = [shares[k][0] + leaving.count(), shares[k][1] + cols.len()];
+        })?;
+        // What overlaps others so little is determined by such pixels.
+        if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
+            return Ok(Self::default());
+        }
+        let of_row = |row: &[bool]| (0..row.len()).filter(|&col| row[col]).collect::<Vec<_>>();
+        Ok(Self {
+            rows: leaves.chunks(sensor.cols).map(of_row).collect(),
+            measurements: shares.iter().map(|[leaving, _]| leaving).sum(),
+            pixels: leaves.iter().filter(|leaves| **leaves).count(),
+        })
+    }
+
+    /// Their columns in a row.
+    pub(crate) fn in_row(&self, row: usize) -> &[usize] {
+        self.rows.get(row).map_or(&[], Vec::as_slice)
+    }
+
+    /// Which of the pixels they are, if any.
+    pub(crate) fn image(&self, cols: usize) -> Option<Vec<bool>> {
+        let mut image = vec![false; self.rows.len() * cols];
+        for (row, few) in self.rows.iter().enumerate() {
+            few.iter().for_each(|col| image[row * cols + col] = true);
+        }
+        (self.pixels > 0).then_some(image)
+    }
+}
+
+/// Keeps those of which not all cells are seen by pixels that stay, and of one component.
+fn stay_where_needed<T: Real>(
+    leaves: &mut [bool],
+    exposures: &Exposures<'_, T>,
+    grid: &Grid,
+    control: &Control,
+) -> Result<()> {
+    let (sensor, positions) = (exposures.sensor(), exposures.positions());
+    let shifts = positions.on_grid(&positions.shifts);
+    let windows = grid.windows(&shifts);
+    let labels = connected(exposures, grid, &shifts, leaves, control)?.cells;
+    // As far as a fitted shift may move, and not at all where it does not.
+    let margin = if positions.std.is_some() { MARGIN } else { 0 };
+    let cells = |window: &Window, row: usize, col: usize, margin: usize| {
+        let places = grid.geometry.views[window.view].cells;
+        let (row, col, side) =
+            (row + window.row - margin, col + window.col - margin, grid.width + 2 * margin);
+        (0..side * side).map(move |i| places.at(row + i / side, col + i % side))
+    };
+    let mut seen = vec![false; labels.len()];
+    exposures.for_each_stretch(control, |k, row, cols| {
+        for col in cols.filter(|col| !leaves[row * sensor.cols + col]) {
+            cells(&windows[k], row, col, 0).for_each(|cell| seen[cell] = true);
+        }
+    })?;
+    let mut found = vec![NONE; sensor.len()];
+    exposures.for_each_stretch(control, |k, row, cols| {
+        for col in cols {
+            let pixel = row * sensor.cols + col;
+            leaves[pixel] &= cells(&windows[k], row, col, margin).all(|cell| seen[cell]);
+            for cell in cells(&windows[k], row, col, 0).filter(|&cell| labels[cell] != NONE) {
+                leaves[pixel] &= found[pixel] == NONE || found[pixel] == labels[cell];
+                found[pixel] = labels[cell];
+            }
+        }
+    })
+}

@@ -1,0 +1,98 @@
+//! Pixels with one or two measurements of more exposures: they follow the beam, which does not follow them.
+
+use crate::common::{Answer, Experiment, Lamp, Options, error_map, fit};
+use crate::simulation::{BETWEEN, CROSS, SHIFT_STD, Simulation, even, random};
+
+const TOLERANCE: f64 = 1e-9;
+const SHAPE: [usize; 2] = [16, 40];
+const PIXELS: usize = SHAPE[0] * SHAPE[1];
+const NOISE: f64 = 1e-3;
+
+/// Every tenth pixel is measured once or twice of five times, but for those at the edge, which see cells alone.
+fn few(pixel: usize) -> usize {
+    let [row, col] = [pixel / SHAPE[1], pixel % SHAPE[1]];
+    if !(5..11).contains(&row) || !(5..35).contains(&col) {
+        return 5;
+    }
+    match random(7, pixel) {
+        number if number > 0.9 => 1,
+        number if number > 0.8 => 2,
+        _ => 5,
+    }
+}
+
+/// An experiment whose mask leaves so many measurements of each pixel, in exposures that differ.
+fn with_few(experiment: Experiment, left: impl Fn(usize) -> usize) -> Experiment {
+    let count = experiment.shifts.len();
+    let used = |k: usize, pixel: usize| (k + pixel) % count < left(pixel);
+    let mask = (0..count * PIXELS).map(|i| !used(i / PIXELS, i % PIXELS)).collect();
+    Experiment { mask, ..experiment }
+}
+
+/// M over its mean in pixels with all measurements, which both answers know.
+fn in_common(answer: &Answer) -> Vec<f64> {
+    let known = (0..PIXELS).filter(|&pixel| few(pixel) == 5);
+    let sum: f64 = known.clone().map(|pixel| answer.sensitivity[pixel]).sum();
+    let mean = sum / known.count() as f64;
+    answer.sensitivity.iter().map(|m| m / mean).collect()
+}
+
+#[test]
+fn the_answer_of_others_is_that_without_them() {
+    for (shifts, lamp, std) in [
+        (BETWEEN, Lamp::Known, None),
+        (BETWEEN, Lamp::Free, None),
+        (CROSS, Lamp::Free, None),
+        (BETWEEN, Lamp::Free, Some(SHIFT_STD)),
+    ] {
+        let simulation = Simulation::seeing(even, SHAPE, &shifts).with_noise(NOISE, 5);
+        let mut experiment = simulation.experiment().with_lamp(lamp.clone());
+        if let Some(std) = std {
+            experiment = experiment.measured_to(&std);
+        }
+        let all = with_few(experiment.clone(), few);
+        let found = fit(&all, Options::to(TOLERANCE)).unwrap();
+        let none = |pixel| if few(pixel) < 5 { 0 } else { 5 };
+        let others = fit(&with_few(experiment, none), Options::to(TOLERANCE)).unwrap();
+        assert!(found.converged && others.converged);
+        assert!((0..PIXELS).all(|pixel| found.few[pixel] == (few(pixel) < 5)));
+        assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
+        assert_eq!(found.degrees_of_freedom, others.degrees_of_freedom);
+        // Free fluxes leave a tilt to the gauge, which is that of all pixels.
+        if found.leaves_tilt {
+            continue;
+        }
+        for (m, other) in in_common(&found).iter().zip(in_common(&others)) {
+            // Each is within its tolerance of the same minimum.
+            assert!(other.is_nan() || (m / other - 1.0).abs() < 10.0 * TOLERANCE);
+        }
+        let truth = simulation.sensitivity();
+        let std = error_map(&all, &found, 1).unwrap().std;
+        let left: Vec<usize> = (0..PIXELS).filter(|&pixel| found.few[pixel]).collect();
+        let z = left.iter().map(|&pixel| (found.sensitivity[pixel] - truth[pixel]) / std[pixel]);
+        let square = z.map(|z| z * z).sum::<f64>() / left.len() as f64;
+        // Five standard errors of the mean square of as many normal numbers.
+        assert!((square - 1.0).abs() < 5.0 * (2.0 / left.len() as f64).sqrt(), "{square}");
+    }
+}
+
+#[test]
+fn they_stay_where_most_are_such_or_they_join_components() {
+    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN[..3]).with_noise(NOISE, 6);
+    let experiment = simulation.experiment().with_lamp(Lamp::Free);
+    let found = fit(&with_few(experiment, |_| 2), Options::to(1e-6)).unwrap();
+    assert!(found.few.is_empty() && found.converged);
+    // The right half is seen by three exposures far away, and two columns by one exposure of each place.
+    let far = BETWEEN[..3].iter().map(|[row, col]| [*row, 36.0 - col]);
+    let shifts: Vec<[f64; 2]> = BETWEEN[..3].iter().copied().chain(far).collect();
+    let simulation = Simulation::seeing(even, SHAPE, &shifts).with_noise(NOISE, 6);
+    let used = |k: usize, col: usize| match col {
+        0..20 => k < 3,
+        20..22 => k == 0 || k == 3,
+        _ => k >= 3,
+    };
+    let mask = (0..6 * PIXELS).map(|i| !used(i / PIXELS, i % SHAPE[1])).collect();
+    let found = fit(&Experiment { mask, ..simulation.experiment() }, Options::to(1e-6)).unwrap();
+    assert!(found.few.is_empty() && found.converged);
+    assert!(found.labels[0].iter().all(|&label| label == 0));
+}

@@ -1,0 +1,80 @@
+"""Pixels with one or two measurements of more exposures follow the beam."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import simulate
+
+SHAPE = (64, 64)
+NOISE = 0.01
+
+
+def discs(seed, *, limb=0.9):
+    """Nine pictures of a disc that is darker at its limb, with spots, and their masks."""
+    rng = np.random.default_rng(seed)
+    spots = rng.uniform(-0.6, 0.6, (6, 2))
+    radius, centre = 0.4 * SHAPE[0], np.array(SHAPE) / 2
+
+    def beam(row, col):
+        r, c = (row - centre[0]) / radius, (col - centre[1]) / radius
+        light = 0.4 + 0.6 * np.sqrt(np.clip(1 - r**2 - c**2, 0, 1))
+        for spot in spots:
+            light = light * (1 - 0.3 * np.exp(-((r - spot[0]) ** 2 + (c - spot[1]) ** 2) / 0.02))
+        return light
+
+    shifts = rng.uniform(-6, 6, (9, 2))
+    truth = 1 + 0.03 * rng.standard_normal(SHAPE)
+    frames = simulate.exposures(truth, beam, shifts) + NOISE * rng.standard_normal((9, *SHAPE))
+    rows, cols = np.indices(SHAPE) - centre[:, None, None]
+    away = [np.hypot(rows + d, cols + e) for d, e in shifts]
+    return frames, shifts, np.array(away) > limb * radius, truth
+
+
+@pytest.mark.study
+def test_standard_deviations_of_discs_with_masks_of_their_own(draws, figure):
+    squares, few_squares = [], []
+    for seed in draws(20):
+        frames, shifts, mask, truth = discs(seed)
+        cal = equipix.calibrate(
+            frames, shifts, mask=mask, variance=np.full(9, NOISE**2), uncertainty=True
+        )
+        assert cal.converged
+        few = cal.weighted.fit.few
+        times = (~mask).sum(axis=0)
+        assert (times[few] <= 2).all()
+        known = np.isfinite(cal.sensitivity_std)
+        assert known[few].all()
+        z = (cal.sensitivity / (truth / truth[known].mean()) - 1) / cal.sensitivity_std
+        few_squares.append(np.mean(z[few] ** 2))
+        squares.append(np.mean(z[known & ~few] ** 2))
+    for name, found in (("few measurements", few_squares), ("others", squares)):
+        z = float(np.sqrt(np.mean(found)))
+        figure(f"z of pixels with {name}", z, "0.97 to 1.03")
+        # The scatter between experiments, of half a thousand pixels or more each.
+        error = 3 * np.std(found) / len(found) ** 0.5 if len(found) > 5 else 0.05
+        assert abs(z - 1) < 0.03 + error
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+def test_free_fluxes_and_refined_shifts_converge():
+    frames, shifts, mask, _ = discs(1, limb=1.0)
+    rng = np.random.default_rng(1)
+    frames *= rng.uniform(0.95, 1.05, 9)[:, None, None]
+    measured = shifts + 0.1 * rng.standard_normal(shifts.shape)
+    cal = equipix.calibrate(
+        frames, measured, mask=mask, variance=np.full(9, NOISE**2), flux="fit", shift_std=0.1
+    )
+    assert cal.converged
+    assert cal.sweeps <= 200
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+def test_experiments_of_two_exposures_keep_all_pixels():
+    frames, shifts, _, _ = discs(2)
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[1, 20:30, 20:30] = True
+    cal = equipix.calibrate(frames[:2], shifts[:2], mask=mask, variance=np.full(2, NOISE**2))
+    assert cal.weighted.fit.few is None
