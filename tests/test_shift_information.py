@@ -32,19 +32,19 @@ def smooth(rows, cols):
     return simulate.gaussian_beam(SHAPE, width=1000)(rows, cols)
 
 
-def experiment(beam, *, pattern=CROSS, seed=0, shape=SHAPE):
+def experiment(beam, *, pattern=CROSS, seed=0, shape=SHAPE, noise=NOISE, std=STD):
     """Exposures at shifts that were measured with an error, and the truth."""
     rng = np.random.default_rng(seed)
-    measured = pattern + STD * rng.standard_normal(pattern.shape)
+    measured = pattern + std * rng.standard_normal(pattern.shape)
     truth = 1 + rng.uniform(-0.05, 0.05, shape)
     frames = simulate.exposures(truth, beam, pattern)
-    frames += NOISE * rng.standard_normal(frames.shape)
+    frames += noise * rng.standard_normal(frames.shape)
     return frames, measured, truth
 
 
-def refined(frames, measured, **options):
-    variance = np.full(len(frames), NOISE**2)
-    return equipix.calibrate(frames, measured, variance=variance, shift_std=STD, **options)
+def refined(frames, measured, noise=NOISE, **options):
+    options = {"variance": np.full(len(frames), noise**2), "shift_std": STD} | options
+    return equipix.calibrate(frames, measured, **options)
 
 
 def rms_error(cal, truth):
@@ -138,3 +138,23 @@ class TestErrorBars:
             assert np.sqrt(np.mean(np.square(z_of_shifts))) == pytest.approx(
                 1, abs=4 * np.sqrt(1 / (2 * count))
             )
+
+    def test_noise_in_the_beam_is_no_information(self):
+        """Beside information I slopes have noise N, and shifts scatter by √(1 + N/I) of 1/√I.
+
+        The curvature with N stated 1/√(I + N), which is less than 1/√I.
+        """
+        by_noise = {}
+        for share in (1, 0.1):
+            noise, std = share * NOISE, share * STD
+            frames, measured, _ = experiment(
+                fringes(30, 0.03, crossed=True), shape=(96, 128), noise=noise, std=std
+            )
+            cal = refined(frames, measured, noise, shift_std=std, uncertainty=True)
+            by_noise[share] = cal.shift_std / share
+        # At a tenth of the noise N/I is a hundredth.
+        ratio = by_noise[1] / by_noise[0.1]
+        assert (ratio > 1).all()
+        # By sparse algebra with I and N of the true beam 1.0193. The noise of one beam scatters
+        # these deviations by 0.12 %: three of that.
+        assert ratio.mean() == pytest.approx(1.0193, abs=0.0036)

@@ -30,6 +30,7 @@ mod pixels;
 mod preconditioner;
 mod rim;
 mod shift_information;
+mod shift_noise;
 mod survey;
 mod system;
 #[cfg(test)]

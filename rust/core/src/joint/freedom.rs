@@ -15,49 +15,70 @@ use std::f64::consts::TAU;
 
 use super::layout::Window;
 use super::penalty::bent;
-use crate::geometry::Taps;
+use crate::coarse::{Complex, times};
+use crate::geometry::TAPS;
 
 /// Wave vectors along each axis.
 const WAVES: usize = 64;
 
 /// The mean of s/(s + τ g) over wave vectors, for exposures that weigh `shares` of all.
 pub(crate) fn determined_share(windows: &[Window], shares: &[f64], tau: f64) -> f64 {
-    let share = |_, measured: f64, penalty: f64| [measured / (measured + penalty)];
-    wave_means(windows, shares, tau, share)[0]
+    wave_means(windows, shares, tau, 1, |wave, sums| {
+        sums[0] += wave.measured / (wave.measured + wave.penalty);
+    })[0]
 }
 
-/// The means of quantities (q, s, τ g) over wave vectors q.
-pub(crate) fn wave_means<const N: usize>(
+/// A wave of the beam.
+pub(super) struct Wave {
+    /// q.
+    pub(super) vector: [f64; 2],
+    /// h_k e^{iq·d_k}, and their mean by ω.
+    pub(super) factors: Vec<Complex>,
+    pub(super) mean: Complex,
+    /// s.
+    pub(super) measured: f64,
+    /// τ g.
+    pub(super) penalty: f64,
+}
+
+/// The means over waves of so many quantities that `add` adds to sums.
+pub(super) fn wave_means(
     windows: &[Window],
     shares: &[f64],
     tau: f64,
-    quantities: impl Fn([f64; 2], f64, f64) -> [f64; N],
-) -> [f64; N] {
-    let mut sums = [0.0; N];
+    count: usize,
+    mut add: impl FnMut(&Wave, &mut [f64]),
+) -> Vec<f64> {
+    let mut sums = vec![0.0; count];
     for wave in 0..WAVES * WAVES {
         // Not at q = 0 itself, where both symbols are 0.
         let q = [wave / WAVES, wave % WAVES].map(|i| TAU * (i as f64 + 0.5) / WAVES as f64);
+        let factor = |window: &Window| {
+            factor(window, [window.along_rows.values, window.along_cols.values], q)
+        };
+        let factors: Vec<Complex> = windows.iter().map(factor).collect();
         let mut seen = 0.0;
-        let mut along = [0.0; 2];
-        for (window, share) in windows.iter().zip(shares) {
-            let ([a, b], [c, d]) = (
-                symbol(&window.along_rows, window.row, q[0]),
-                symbol(&window.along_cols, window.col, q[1]),
-            );
-            let h = [a * c - b * d, a * d + b * c];
+        let mut mean = [0.0; 2];
+        for (h, share) in factors.iter().zip(shares) {
             seen += share * (h[0] * h[0] + h[1] * h[1]);
-            along = [along[0] + share * h[0], along[1] + share * h[1]];
+            mean = [mean[0] + share * h[0], mean[1] + share * h[1]];
         }
-        let measured = (seen - along[0] * along[0] - along[1] * along[1]).max(0.0);
-        let found = quantities(q, measured, tau * (bent(q[0]) + bent(q[1])));
-        sums.iter_mut().zip(found).for_each(|(sum, value)| *sum += value);
+        let measured = (seen - mean[0] * mean[0] - mean[1] * mean[1]).max(0.0);
+        let penalty = tau * (bent(q[0]) + bent(q[1]));
+        add(&Wave { vector: q, factors, mean, measured, penalty }, &mut sums);
     }
-    sums.map(|sum| sum / (WAVES * WAVES) as f64)
+    sums.iter_mut().for_each(|sum| *sum /= (WAVES * WAVES) as f64);
+    sums
+}
+
+/// What an exposure with these taps along rows and columns makes of a wave.
+pub(super) fn factor(window: &Window, [rows, cols]: [[f64; TAPS]; 2], q: [f64; 2]) -> Complex {
+    times(symbol(&rows, window.row, q[0]), symbol(&cols, window.col, q[1]))
 }
 
 /// Σ_j t_j e^{iq(first + j)}, real and imaginary part.
-pub(super) fn symbol(taps: &Taps, first: usize, q: f64) -> [f64; 2] {
-    let terms = taps.values.iter().enumerate().map(|(j, t)| {
+pub(super) fn symbol(taps: &[f64; TAPS], first: usize, q: f64) -> Complex {
+    let terms = taps.iter().enumerate().map(|(j, t)| {
         let (sin, cos) = (q * (first + j) as f64).sin_cos();
         [t * cos, t * sin]
     });

@@ -25,8 +25,8 @@ const DISTANCES: [usize; 5] = [8, 16, 32, 64, 128];
 const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
 /// Cells beside one that its smoothed slope takes.
 const REACH: usize = 3;
-/// The structure is at least so many times what noise adds to the curvature N of F along shifts: standard
-/// deviations of shifts, which take both for structure, are too small by 1 + N/I, so by 5 % at most.
+/// The structure is at least so many times what noise adds to the curvature along shifts, or steps are too
+/// short. What error bars subtract of S (`shift_noise.rs`) is less than that, so the rest is positive.
 const OVER_NOISE: f64 = 20.0;
 
 /// The directions in the beam along which shifts are refined.
@@ -67,11 +67,12 @@ impl<T: Real> System<'_, '_, T> {
         let seen = self.weights.iter().filter(|&&weight| weight > 0.0).count() as f64;
         let slope = |q: f64| q.sin().powi(2);
         let smooth = |q: f64| (0.5 * q).cos().powi(8);
-        let means = wave_means(&windows, &shares, SMOOTHING, |q, determined, penalty| {
-            let noise = determined / (determined + penalty).powi(2);
-            let raw = q.map(|q| slope(q) * noise);
-            let smoothed = q.map(|q| slope(q) * smooth(q) * noise);
-            [raw[0], raw[1], smoothed[0], smoothed[1]]
+        let means = wave_means(&windows, &shares, SMOOTHING, 4, |wave, sums| {
+            let noise = wave.measured / (wave.measured + wave.penalty).powi(2);
+            for (axis, &q) in wave.vector.iter().enumerate() {
+                sums[axis] += slope(q) * noise;
+                sums[2 + axis] += slope(q) * smooth(q) * noise;
+            }
         });
         [[seen * means[0], seen * means[1]], [seen * means[2], seen * means[3]]]
     }

@@ -38,6 +38,8 @@ pub(crate) struct System<'m, 'a, T> {
     pub(crate) pass: Pass<'m, 'a, T>,
     pub(crate) fluxes: Fluxes,
     shift_prior: Option<ShiftPrior>,
+    /// N of `shift_noise.rs`, if products are S − N; else empty.
+    pub(super) shift_noise: Vec<f64>,
     /// F of the measurements alone, at the state last linearised.
     pub(crate) misfit: f64,
     /// The variance of a measurement of weight 1.
@@ -84,6 +86,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             pass: Pass::new(exposures, grid, few, with_flux, workers, control),
             fluxes,
             shift_prior: None,
+            shift_noise: Vec::new(),
             misfit: 0.0,
             unit: 1.0,
             pull: Vec::new(),
@@ -351,6 +354,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let pulls = prior.pull(&moves);
             let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
             of_shifts.for_each(|(product, pull)| *product += self.unit * pull);
+        }
+        if !self.shift_noise.is_empty() {
+            let feigned = self.centred_pulls(self.feigned_pulls(&moves));
+            let of_shifts = product[cells + params..].iter_mut().zip(feigned.as_flattened());
+            of_shifts.for_each(|(product, feigned)| *product -= feigned);
         }
         Ok(sums.largest)
     }

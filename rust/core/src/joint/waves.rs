@@ -127,8 +127,8 @@ impl Symbol for Taps<'_> {
     fn along(&self, axis: usize, exposure: usize, q: f64) -> Complex {
         let window = &self.windows[exposure];
         match axis {
-            0 => symbol(&window.along_rows, window.row, q),
-            _ => symbol(&window.along_cols, window.col, q),
+            0 => symbol(&window.along_rows.values, window.row, q),
+            _ => symbol(&window.along_cols.values, window.col, q),
         }
     }
 

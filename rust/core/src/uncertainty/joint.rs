@@ -9,7 +9,9 @@
 //! since the noise that moves a pixel alone and that which is left for x are independent (see
 //! `joint/system.rs`; with an offset, D is the pixel's matrix of 2 by 2). The first term is known; the
 //! second is the mean square of C x over draws S x = b of b with the covariance S. Priors and the
-//! penalty count as measurements of their own there: S⁻¹ is what they leave open too.
+//! penalty count as measurements of their own there: S⁻¹ is what they leave open too. Where shifts were
+//! refined S⁻¹ is (S − N)⁻¹ S (S − N)⁻¹ without the noise N of slopes (`joint/shift_noise.rs`): products are
+//! those of S − N, and draws have the covariance S.
 //!
 //! Three things stand beside S. A prior on fluxes leaves a tilt of M open that S does not see
 //! (`joint/flux.rs`): its covariance is added. Shifts that have a prior but were not refined are wrong by
@@ -99,6 +101,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             joint::Prior { weights, mean }
         });
         system.linearise(control)?;
+        system.leave_noise_out();
         let preconditioner = Preconditioner::new(&mut system, control)?;
         let determined: Vec<bool> = solution.sensitivity.iter().map(|m| m.is_finite()).collect();
         let pixels = determined.iter().zip(solution.flags);
@@ -287,7 +290,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 let kept = kept.flatten().zip(self.considered_variances());
                 let kept: f64 = kept.map(|(q, v)| q * q * v).sum();
                 let no_gain = vec![0.0; self.valid.len()];
-                Ok(self.search.energy + kept + self.variance_by_dark(&no_gain, control)?)
+                Ok(self.found_variance() + kept + self.variance_by_dark(&no_gain, control)?)
             }
             Functional::Offset => self.variance_of_offset(lack, control),
         }
@@ -310,7 +313,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let (pull, seen) = self.pull_of_gain(&gain, control)?;
         let others = self.others();
         self.apply_inverse(pull, lack, control)?;
-        variance += self.search.energy + self.variance_by_dark(&gain, control)?;
+        variance += self.found_variance() + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
             let mut x = std::mem::take(&mut self.search.x);
             x.truncate(others);
@@ -374,7 +377,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             workers.add_multiple(&mut pull, -height / size, &pulled);
         }
         self.apply_inverse(pull, lack, control)?;
-        Ok(variance + found + self.search.energy)
+        Ok(variance + found + self.found_variance())
     }
 
     /// How many unknowns come before the shifts.
@@ -395,7 +398,12 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         result
     }
 
-    /// S⁻¹ b, left in the search.
+    /// xᵀ S x at the x that the search found.
+    fn found_variance(&self) -> f64 {
+        self.search.energy + self.system.left_out(&self.search.x)
+    }
+
+    /// (S − N)⁻¹ b, left in the search.
     fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let Self { system, preconditioner, search, .. } = self;
         search.begin(system, preconditioner, b, control)?;

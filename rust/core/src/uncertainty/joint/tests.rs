@@ -131,7 +131,8 @@ fn draws_have_the_covariance_of_the_problem_and_are_independent() {
             let draws: Vec<Vec<f64>> =
                 (0..DRAWS).map(|draw| covariance.draw(draw, control).unwrap()).collect();
             for x in directions {
-                let energy = dot(&x, &product(&mut covariance.system, &x, control).unwrap());
+                let kept = dot(&x, &product(&mut covariance.system, &x, control).unwrap());
+                let energy = kept + covariance.system.left_out(&x);
                 let heights: Vec<f64> = draws.iter().map(|b| dot(&x, b) / energy.sqrt()).collect();
                 assert_unit_and_independent(&heights);
             }
