@@ -163,7 +163,7 @@ def test_a_calibrated_camera_loses_at_most_the_floor_that_is_stated(name, draws,
     the pattern of a single experiment scatters by twice as much about the one that is stated.
     """
     ones, ratios, worse = np.ones(WIDE), [], []
-    for seed in draws(24):
+    for seed in draws(20):
         moving = MovingScene(
             seed=seed, shape=WIDE, gain_spread=0.001, offset_spread=0.001, noise=0.01, stop=(0, 0)
         )
