@@ -113,8 +113,11 @@ fn stay_where_needed<T: Real>(
     })?;
     let mut found = vec![NONE; sensor.len()];
     exposures.for_each_stretch(control, |k, row, cols| {
-        for col in cols {
-            let pixel = row * sensor.cols + col;
+        for pixel in cols.map(|col| row * sensor.cols + col) {
+            if !leaves[pixel] {
+                continue;
+            }
+            let col = pixel % sensor.cols;
             leaves[pixel] &= cells(&windows[k], row, col, margin).all(|cell| seen[cell]);
             for cell in cells(&windows[k], row, col, 0).filter(|&cell| labels[cell] != NONE) {
                 leaves[pixel] &= found[pixel] == NONE || found[pixel] == labels[cell];

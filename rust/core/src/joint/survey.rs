@@ -31,9 +31,11 @@ impl<T: Real> System<'_, '_, T> {
                 self.pass.weigh_row(row_index, &mut workspace);
                 self.pass.see_slopes(&beams, row_index, &mut workspace);
                 for k in 0..count {
-                    let few = self.pass.few.in_row(row_index).iter();
-                    few.for_each(|col| workspace.weights[k * sensor.cols + col] = 0.0);
+                    let mut few = self.pass.few.in_row(row_index).iter().peekable();
                     for col in 0..sensor.cols {
+                        if few.next_if_eq(&&col).is_some() {
+                            continue;
+                        }
                         let at = k * sensor.cols + col;
                         let block = &mut found[col / size[1] * count + k];
                         let (weight, light) =
