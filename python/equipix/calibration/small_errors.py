@@ -208,7 +208,8 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     part = with_dark_misfit(Weighted(window, window.fit(exact, start), None), options)
     fit, own = part.fit, _scaled(window, part.fit, options)
     square, noise = float(np.nansum(own**2)), part.noise_variance * part.expected_misfit
-    squares = window.weighted_squares(_signal(part, options) ** 2)
+    signal = _signal(part, options)
+    squares = window.weighted_squares(signal**2)
     clear = np.sqrt(squares / part.noise_variance)
     if not (np.isfinite(clear).any() and np.nanquantile(clear, _FAINTEST) > _CLEAR):
         return []
@@ -216,7 +217,7 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     roots = np.sqrt(window.weighted_squares(np.ones(window.values.shape)))
     noisy: list[Weighted] = []
     found = []
-    for cause in _causes(window):
+    for cause in _causes(window, signal):
         left, other, size = _left_by(cause, part, exact)
         power = float(np.nansum(left**2))
         solver = float(fit.error_estimate[-1] + other.error_estimate[-1]) * whole
@@ -246,10 +247,11 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     return found
 
 
-def _causes(window: Exposures) -> Iterator[Cause]:
+def _causes(window: Exposures, signal: Floats) -> Iterator[Cause]:
     """Errors that the measurements can show."""
     yield _CURVED
-    yield _CROSSTALK
+    if np.isfinite(_from_neighbours(signal)).any():
+        yield _CROSSTALK
     if not window.offset:
         yield _OFFSET
     if window.dark is not None and np.ptp(window.dark) > 0:
