@@ -14,6 +14,7 @@
 
 mod bands;
 mod conjugate_gradients;
+mod connected;
 mod few;
 mod first_beam;
 mod flux;

@@ -9,8 +9,8 @@
 //! They stay in it where they say what no other pixel does: where cells are seen by them alone, or where they join
 //! components.
 
+use super::connected::connected;
 use super::layout::{Grid, MARGIN, Window};
-use super::outcome::connected;
 use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::error::Result;
