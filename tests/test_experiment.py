@@ -328,6 +328,12 @@ def write_tiff(path, array):
     tifffile.imwrite(path, array, photometric="minisblack")
 
 
+def test_values_that_the_bits_do_not_hold_are_refused(edited):
+    path = edited("bit_depth = 12", "bit_depth = 10")
+    with pytest.raises(errors.FileError, match=r"above 1023, .* correct 'bit_depth'"):
+        Experiment.load(path).run()
+
+
 @pytest.mark.parametrize(
     ("frames", "message"),
     [

@@ -41,6 +41,9 @@ _ENOUGH = 0.9
 _ABOVE = 3.0
 """Steps of a beam from cell to cell, in noise of a measurement, from which they are its own."""
 
+_FLAGGED = 0.1
+"""Share of degrees of freedom up to which those of flagged pixels are left out."""
+
 _FINE = 6.0
 """Shortest period, in pixels, that a spline through cells holds."""
 
@@ -149,7 +152,8 @@ def _share_of_good(weighted: Weighted, flags: Array, options: FitOptions) -> flo
     flagged = tested(fit) & ~usable(flags)
     times = sum((exposures.usable(k) & flagged).astype(np.intp) for k in range(len(exposures)))
     freedom = float(np.maximum(np.subtract(times, 1), 0).sum())
-    if freedom == 0:
+    # Of many side by side the cells that only they see would be unknowns less, too.
+    if not 0 < freedom < _FLAGGED * weighted.expected_misfit:
         return 1.0
     left = fit.misfit - squares(exposures, fit, flagged, options)
     return left / fit.misfit / (1 - freedom / weighted.expected_misfit)
@@ -182,8 +186,9 @@ def _cause(
     values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
     if low:
         return "noise", (
-            "the variances are too large, so error bars are too. Is the noise of the dark counted "
-            "in every exposure, or were the frames smoothed or clipped?"
+            "the variances are too large, so error bars are too. Are they those of one frame, not "
+            "of the mean, is the noise of the dark counted in every exposure, or were the frames "
+            "smoothed or clipped?"
         )
     noise = residuals.share * residuals.scale
     excess = float(np.nansum(values**2)) - noise * np.count_nonzero(np.isfinite(values))

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
+from equipix.errors import FileError
 from equipix.experiment.manifest import LevelManifest, Manifest, find_files
 from equipix.experiment.repeats import image_files, refuse_repeats
 from equipix.frames import average
@@ -91,5 +92,13 @@ class Described(ABC, Generic[_Manifest]):
             if progress is not None:
                 progress(done, total, f"averaging {name}")
 
-        level, files = self.manifest.sensor.saturation_level, find_files(self.path, entry)
-        return average(files, dark=dark, saturation=level, workers=workers, progress=report)
+        sensor, files = self.manifest.sensor, find_files(self.path, entry)
+        level = sensor.saturation_level
+        found = average(files, dark=dark, saturation=level, workers=workers, progress=report)
+        if sensor.bit_depth is not None and found.mean.max() > 2**sensor.bit_depth - 1:
+            raise FileError(
+                f"{self.path}: '{files[0].name}' of {name} holds means up to "
+                f"{found.mean.max():.0f} DN, above {2**sensor.bit_depth - 1}, the largest value "
+                f"that 'bit_depth' = {sensor.bit_depth} holds: correct 'bit_depth' in [sensor]"
+            )
+        return found
