@@ -181,6 +181,22 @@ def test_levels_with_light_that_varies_are_named_and_fitted():
     assert not response.flags.any()
 
 
+def test_a_light_frame_among_dark_frames_is_named():
+    """A newcomer was told to choose other shifts: pixels above the dark count as unresponsive."""
+    rng = np.random.default_rng(6)
+    light = simulate.gaussian_beam(SHAPE, amplitude=2000, width=60)
+    shifts = equipix.cross_pattern(5, 7)
+    raws = [
+        drifting(rng, each, 0, 16) for each in simulate.exposures(np.ones(SHAPE), light, shifts)
+    ]
+    darks = drifting(rng, np.zeros(SHAPE), 0, 16)
+    for stray in (False, True):
+        darks[-1] = raws[0][0] if stray else darks[-1]
+        dark = equipix.average(darks)
+        averaged = Averaged.of([equipix.average(raw, dark=dark) for raw in raws])
+        assert ("'dark': the offset varies" in averaged.unsteady) == stray
+
+
 @pytest.mark.study
 def test_error_bars_with_light_that_varies(draws, figure):
     """Sixteen frames an exposure, whose light falls by 5 %; with it in the noise z is 0.60."""

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from equipix.colour import Colours
     from equipix.frames import FrameStatistics
 
+_STRAY = 10.0
+"""Variance that dark frames have in common, over that of noise, which no drift of an offset has."""
+
 
 class Words(NamedTuple):
     """What messages call the argument of the measurements, and one of them."""
@@ -255,7 +258,9 @@ class Averaged:
 
     @property
     def unsteady(self) -> str:
-        """The exposure whose light varied most between its frames, in words; or nothing."""
+        """The exposure whose light varied most between its frames, or the dark; or nothing."""
+        if self.dark is not None and (stray := light_of(self.dark)).over_noise > _STRAY:
+            return f"'dark': {stray.words} (limit {_STRAY:g}). See that all its frames are dark"
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
         if not self.light[worst].is_large:
             return ""
