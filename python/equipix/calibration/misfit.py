@@ -286,7 +286,8 @@ def _of_exposures(
     if illumination > limit:
         return "illumination", (
             "the illumination changes its shape between exposures: keep lamp, optics and stray "
-            "light still, and take the exposures faster"
+            "light still, and take the exposures faster. Exposures in another order, flipped, or at "
+            "other shifts than given look the same: check these first"
         )
     return None
 

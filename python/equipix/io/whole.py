@@ -45,6 +45,8 @@ def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[P
     try:
         if target.is_dir():
             raise FileError(f"{target}: is a folder, expected the name of a file")
+        if not target.parent.exists():
+            raise FileError(f"{target}: there is no folder '{target.parent}': make it first")
         if target.exists() and not force:
             raise FileError(f"{target}: exists already; force=True (--force) replaces it")
         yield temporary
