@@ -63,6 +63,22 @@ def test_one_exposure_that_is_flipped_is_named(bench, axis):
     assert "exposure 2" in findings(frames, bench.dark)["misfit"]
 
 
+@pytest.mark.parametrize("variance", [None, 30.0], ids=["unknown", "known"])
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [((0,), "upside down"), ((1,), "mirrored left to right"), ((0, 1), "turned by 180 degrees")],
+)
+def test_one_array_that_is_flipped_is_named(bench, axes, words, variance):
+    """Without variances its white pattern went unnoticed: the error of M was 16 times as large."""
+    values = np.array([each.mean(axis=0) - bench.offset for each in bench.frames])
+    values[3] = np.flip(values[3], axes)
+    known = None if variance is None else np.full(5, variance)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        found = equipix.calibrate(values, SHIFTS, variance=known).verdicts
+    assert any(f"exposure 3 (from 0) fits better {words}" in each.message for each in found)
+
+
 @pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
 def test_some_exposures_that_are_flipped_are_a_misfit(bench, axis):
     frames = [np.flip(each, axis) if k in (1, 3) else each for k, each in enumerate(bench.frames)]

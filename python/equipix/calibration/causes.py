@@ -28,6 +28,10 @@ _BINS = 16
 _FAINT = 0.1
 """Spread of the signals, relative to their mean, below which nothing can grow with them."""
 
+_FAR_ABOVE = 4.0
+"""Mean square of an exposure over that of others from which it may be flipped: its pattern is then
+in its residuals, and a share 1/n of it in those of the others."""
+
 _WORST, _EXCHANGED, _PAIRS = 6, 1.25, 4
 """Exposures that are compared as exchanged; how many times their squares those of such are at most
 when they are exchanged in the beam that was fitted to both; how many pairs are fitted so."""
@@ -99,12 +103,23 @@ def by_lines(residuals: Floats, axis: int, noise: float) -> Part:
 
 def by_exposure(residuals: Floats, noise: float) -> tuple[float, int]:
     """What one exposure has beyond the median of all, and which: the worst."""
-    squares = np.nansum(residuals**2, axis=(1, 2))
-    count = np.isfinite(residuals).sum(axis=(1, 2))
-    mean = squares / np.maximum(count, 1)
+    mean, count = _mean_squares(residuals)
     worst = int(mean.argmax())
     usual = max(float(np.median(mean)), noise)
     return float((mean[worst] - usual) * count[worst]), worst
+
+
+def standing_out(residuals: Floats) -> int | None:
+    """Find the exposure whose mean square is far above that of the others; None if none is."""
+    mean, _ = _mean_squares(residuals)
+    worst = int(mean.argmax())
+    return worst if mean[worst] > _FAR_ABOVE * float(np.median(mean)) else None
+
+
+def _mean_squares(residuals: Floats) -> tuple[Floats, Array]:
+    """Mean square of each exposure, and of how many measurements."""
+    count = np.isfinite(residuals).sum(axis=(1, 2))
+    return np.nansum(residuals**2, axis=(1, 2)) / np.maximum(count, 1), count
 
 
 def by_region(residuals: Floats, noise: float) -> tuple[float, tuple[int, int]]:

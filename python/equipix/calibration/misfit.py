@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration import causes
-from equipix.calibration.exchanged import exchanged
+from equipix.calibration.misplaced import misplaced
 from equipix.calibration.residual_tests import lag_one
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable, tested
 from equipix.calibration.shift_errors import without_shift_errors
@@ -91,6 +91,8 @@ class Misfit:
                 f"(reduced chi-square {self.chi2:.3g}, expected 1 ± {self.limit:.2g}): "
                 f"{self.remedy}"
             )
+        if not abs(self.correlation.z) > _SIGMAS:
+            return self.remedy
         return (
             f"residuals of neighbouring pixels are correlated by {self.correlation.size:.1%}, "
             f"{abs(self.correlation.z):.0f} standard errors (limit {_SIGMAS:g}): {self.remedy}"
@@ -134,6 +136,12 @@ def misfit(
     largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
     correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
     correlated &= inexactness <= EXACT
+    if not correlated:
+        # The pattern of one exposure that is flipped is white, and needs no variance to be seen.
+        worst = causes.standing_out(_flat(residuals.values))
+        words = None if worst is None else misplaced(weighted.exposures, (), worst, options)
+        if words is not None:
+            return Misfit(chi2, _limit(std) if high or low else None, largest, "order", words)
     if not (high or low or correlated):
         return None
     cause, remedy = _cause(
@@ -223,11 +231,9 @@ def _common(
         return found
     light, response = (_flat(each) for each in (residuals.light, residuals.response))
     pairs = causes.maybe_exchanged(values, light, response)
-    if (pair := exchanged(weighted.exposures, pairs, options)) is not None:
-        return "order", (
-            f"exposures {pair[0]} and {pair[1]} (from 0) fit better each at the shift of the "
-            "other: check the order of the frames and of 'shifts'"
-        )
+    worst = causes.standing_out(values)
+    if (words := misplaced(weighted.exposures, pairs, worst, options)) is not None:
+        return "order", words
     slopes = np.stack([_flat(each) for each in residuals.slopes])
     by_exposures = causes.by_illumination(values, signal, slopes, noise).explained
     lines = [causes.by_lines(values, axis, noise).explained for axis in (1, 2)]
@@ -286,8 +292,8 @@ def _of_exposures(
     if illumination > limit:
         return "illumination", (
             "the illumination changes its shape between exposures: keep lamp, optics and stray "
-            "light still, and take the exposures faster. Exposures in another order, flipped, or at "
-            "other shifts than given look the same: check these first"
+            "light still, and take the exposures faster. Exposures in another order, flipped, or "
+            "at other shifts than given look the same: check these first"
         )
     return None
 

@@ -45,7 +45,7 @@ class Contradiction(NamedTuple):
             f"the data contradict '{self.name}': the {what} found differ from those given by "
             f"{self.factor:.1f} of their standard deviations, rms ({self.freedom} degrees of "
             f"freedom, expected 1). It was multiplied by {self.factor:.1f}, and the fit repeated: "
-            "check how they were measured"
+            "check how they were measured, and that no exposure is flipped or exchanged"
         )
 
 

@@ -1,0 +1,78 @@
+"""Exposures that fit far better in the place of another, or flipped."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.calibration.window_fit import WindowFit, if_there_is_light
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from equipix.exposures.exposures import Exposures
+    from equipix.exposures.options import FitOptions
+
+_SIDE = 128
+"""Pixels along a window that is fitted in either order."""
+
+_LEFT = 0.1
+"""Share of F above noise that the right order leaves at most."""
+
+_FLIPS = {"upside down": (0,), "mirrored left to right": (1,), "turned by 180 degrees": (0, 1)}
+
+
+@if_there_is_light
+def misplaced(
+    exposures: Exposures, pairs: Sequence[tuple[int, int]], worst: int | None, options: FitOptions
+) -> str | None:
+    """Which of these pairs is exchanged, or how the worst exposure is flipped, in words; or None.
+
+    Fits of a central window are compared, in all orders, with that as given.
+    """
+    window = exposures.window(_SIDE)
+    tried = {
+        f"exposures {i} and {j} (from 0) fit better each at the shift of the other: check the "
+        "order of the frames and of 'shifts'": _at_the_other(window, (i, j))
+        for i, j in pairs
+    }
+    if worst is not None:
+        tried |= {
+            f"exposure {worst} (from 0) fits better {flip}: give its frames as the others are, or "
+            "its 'rotation'": _flipped(exposures, window, worst, axes)
+            for flip, axes in _FLIPS.items()
+        }
+    if not tried:
+        return None
+    # In units of noise where that is known: an order explains what is above it.
+    noise = 1.0 if exposures.knows_noise else 0.0
+    left = {words: WindowFit.of(each, options).left - noise for words, each in tried.items()}
+    best = min(left, key=lambda words: left[words])
+    return best if left[best] < _LEFT * (WindowFit.of(window, options).left - noise) else None
+
+
+def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
+    """Return the exposures, each of two at the place of the other."""
+    order = np.arange(len(window))
+    order[list(pair)] = pair[::-1]
+    positions = window.positions
+    moved = dataclasses.replace(
+        positions,
+        shifts=positions.shifts[order],
+        rotation=positions.rotation[order],
+        std=None if positions.std is None else positions.std[order],
+    )
+    return dataclasses.replace(window, positions=moved)
+
+
+def _flipped(
+    exposures: Exposures, window: Exposures, exposure: int, axes: tuple[int, ...]
+) -> Exposures:
+    """Return the window with one exposure flipped about the middle of the sensor."""
+    first = (np.array(exposures.shape) - window.shape) // 2
+    rows, cols = (slice(a, a + size) for a, size in zip(first, window.shape, strict=True))
+    values = window.values.copy()
+    values[exposure] = np.flip(exposures.values[exposure], axes)[rows, cols]
+    return dataclasses.replace(window, values=values)
