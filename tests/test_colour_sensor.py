@@ -92,6 +92,30 @@ class TestCalibrate:
         light *= 1 + 0.01 * np.random.default_rng(1).standard_normal(shape)
         assert pattern_of(light) is None
 
+    @pytest.mark.parametrize(
+        ("given", "write"),
+        [
+            ("GRBG", r"cfa='RGGB' or cfa='BGGR'"),
+            ("RRGG/RRGG/GGBB/GGBB", r"cfa='RGGB'"),
+            ("BGGR", ""),
+        ],
+    )
+    def test_a_pattern_that_mixes_colours_is_named(self, given, write):
+        """Red and blue taken for the greens had no finding; red for blue cannot have one."""
+        truth, _ = sensor("RGGB")
+        frames, variance = exposures(truth), np.full(5, NOISE**2)
+        if not write:
+            assert equipix.calibrate(frames, CROSS, variance=variance, cfa=given).verdicts == ()
+            return
+        with pytest.warns(errors.MisfitWarning, match=f"pixels of one colour .* write {write}"):
+            equipix.calibrate(frames, CROSS, variance=variance, cfa=given)
+
+    def test_greens_that_differ_by_3_per_cent_are_one_colour(self):
+        truth, _ = sensor("RGGB", dead=0)
+        truth[::2, 1::2] *= 1.03
+        cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
+        assert cal.verdicts == ()
+
     def test_a_monochrome_sensor_is_calibrated_as_ever(self):
         truth, good = sensor(None)
         frames = exposures(truth)

@@ -37,6 +37,9 @@ _ROUNDING = 1e-6
 _SIGMAS = 6.0
 """Standard errors that noise does not reach."""
 
+_CONTRADICTS = 0.1
+"""Spread of responses within given colours that two greens of one colour do not have."""
+
 _APART = 0.05
 """Share of the range of responses that divides two colours."""
 
@@ -53,11 +56,14 @@ class Filters:
         Response of each colour; the mean over the pixels is 1.
     given : bool
         Whether the caller named the pattern, or the values alone show it.
+    shown : Colours or None
+        The pattern that the values show, where it contradicts the given one.
     """
 
     colours: Colours
     response: dict[str, float]
     given: bool = True
+    shown: Colours | None = None
 
     @classmethod
     def of(
@@ -71,11 +77,21 @@ class Filters:
         found = pattern_of(image, corner) if colours is None else colours
         if found is None:
             return None
-        return cls(found, responses(found, image, corner), colours is not None)
+        response = responses(found, image, corner)
+        if colours is None:
+            return cls(found, response, given=False)
+        part, at = _middle(image, _MEASURED, corner)
+        row, col = (each % period for each, period in zip(at, found.period, strict=True))
+        usual = found.map_of(response, (row + part.shape[0], col + part.shape[1]))
+        rest = cls.of(None, part / usual[row:, col:], at)
+        contradicts = rest is not None and rest.spread > _CONTRADICTS
+        return cls(found, response, shown=pattern_of(image, corner) if contradicts else None)
 
     @property
     def words(self) -> str:
-        """Name a pattern that the values alone show, and what to write."""
+        """Name a pattern that the values alone show, and what to write; or nothing."""
+        if self.given:
+            return "" if self.shown is None else self._contradicted
         rows, cols = self.colours.period
         if min(rows, cols) == 1:
             axis, period = ("columns", cols) if rows == 1 else ("rows", rows)
@@ -84,13 +100,20 @@ class Filters:
                 "the read-out have it, not colours. No pixel is flagged for it; see whether the "
                 "gains of the channels are adjusted"
             )
-        named = _bayer(self.colours)
-        write = " or ".join(f"cfa={each!r}" for each in named or [str(self.colours)])
-        known = ", whichever the data sheet names" if named else ""
         return (
             f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
             f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
-            f"the colours, and a corrected frame loses its white balance: write {write}{known}"
+            f"the colours, and a corrected frame loses its white balance: {_advice(self.colours)}"
+        )
+
+    @property
+    def _contradicted(self) -> str:
+        shown = self.shown or self.colours
+        rows, cols = shown.period
+        return (
+            f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: the "
+            f"response repeats every {rows} rows and {cols} columns otherwise than "
+            f"'{self.colours}', so colours are mixed: {_advice(shown)}"
         )
 
     @property
@@ -101,6 +124,12 @@ class Filters:
     def map_of(self, shape: tuple[int, ...]) -> Floats:
         """Return a map (rows, cols) of the response of each pixel's colour."""
         return self.colours.map_of(self.response, shape)
+
+
+def _advice(colours: Colours) -> str:
+    named = _bayer(colours)
+    write = " or ".join(f"cfa={each!r}" for each in named or [str(colours)])
+    return f"write {write}{', whichever the data sheet names' if named else ''}"
 
 
 def mean_signal(values: Array, mask: Bools | None = None) -> tuple[Floats, tuple[int, int]]:

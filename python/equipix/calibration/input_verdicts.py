@@ -59,9 +59,9 @@ def _on_units(exposures: Exposures) -> Verdict | None:
 
 
 def _on_filters(exposures: Exposures) -> Verdict | None:
-    """Verdict on a pattern of colour filters, or of the read-out, that nobody has named."""
+    """Verdict on a pattern of colour filters, or of the read-out, that is not the one named."""
     filters = exposures.filters
-    return None if filters is None or filters.given else Verdict("cfa", filters.words)
+    return Verdict("cfa", filters.words) if filters is not None and filters.words else None
 
 
 def _on_repeats(exposures: Exposures) -> Verdict | None:

@@ -171,6 +171,6 @@ def _filters(
     filters = Filters.of(given, slope)
     if filters is None:
         return None, None
-    if not filters.given:
+    if filters.words:
         warn(filters.words, MisfitWarning)
     return filters.colours, filters

@@ -238,7 +238,7 @@ def _filters(values: Array, colours: Colours | None) -> Filters | None:
     medians = [float(np.nanmedian(each)) for each in values]
     low, high = int(np.argmin(medians)), int(np.argmax(medians))
     found = Filters.of(colours, values[high] - values[low] if high != low else values[0])
-    if found is not None and not found.given:
+    if found is not None and found.words:
         warn(found.words, MisfitWarning)
     return found
 
