@@ -17,7 +17,7 @@ import pytest
 import equipix
 from equipix import FrameStatistics, average, cli, simulate
 from equipix.frames import load_statistics
-from equipix.io import read_frames
+from equipix.io import read_frames, write_frames
 
 SHAPE = (64, 80)
 
@@ -546,3 +546,15 @@ class TestPlan:
     )
     def test_refuses(self, run, arguments, words):
         refused(run("plan", "--shape", 64, 80, *arguments), words)
+
+
+def test_frames_of_different_things_are_noticed_in_an_average(run, tmp_path):
+    rng = np.random.default_rng(1)
+    for name, level in (("dark", 100), ("light", 2000)):
+        frames = np.rint(level + 3 * rng.standard_normal((4, 20, 24))).astype(np.uint16)
+        write_frames(tmp_path / f"{name}.tif", iter(frames), nbytes=frames.nbytes)
+    for source, words in (("light.tif", ""), ("*.tif", "see that all are of one measurement")):
+        status, _, said = run("average", tmp_path / source, "-o", tmp_path / f"out{len(words)}.npz")
+        assert status == 0
+        assert words in said
+        assert bool(words) == bool(said)

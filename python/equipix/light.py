@@ -30,6 +30,10 @@ NAMED = 0.1
 """Variance by the light over that of noise, above which it is worth a word."""
 
 
+STRAY = 10.0
+"""Variance in common over that of noise, which only frames of different things have."""
+
+
 class Light(NamedTuple):
     """Variance that all pixels of some frames have in common."""
 

@@ -12,12 +12,13 @@ from equipix.cli.options import Force, Json, Mask, Saturation, Sensor, Workers, 
 from equipix.cli.summary import of_statistics
 from equipix.cli.terminal import check_output, progress_bars, show_result
 from equipix.correction.files import Corrected, correct_files, is_folder
-from equipix.errors import InputError
+from equipix.errors import DriftWarning, InputError, warn
 from equipix.experiment.provenance import origin_of
 from equipix.experiment.repeats import refuse_repeated_files
 from equipix.frames import average as average_frames
 from equipix.frames import refuse_subtracted, saved_shape, warn_of_bright_dark
 from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
+from equipix.light import STRAY, light_of
 from equipix.loading import load
 
 commands = typer.Typer()
@@ -71,6 +72,8 @@ def average(
             progress=progress,
         )
     warn_of_bright_dark(frames)
+    if (light := light_of(frames)).over_noise > STRAY:
+        warn(f"{light.words} (limit {STRAY:g}): see that all are of one measurement", DriftWarning)
     frames.save(output, force=force)
     result = {"output": str(output), **of_statistics(frames)}
     show_result(result, as_json=as_json)

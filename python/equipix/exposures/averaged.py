@@ -22,7 +22,7 @@ from equipix.errors import InputError
 from equipix.exposures.blind import blind_pixels
 from equipix.exposures.clipping import Clipping, clipping_of, highest, unclipped
 from equipix.frames import same_statistics
-from equipix.light import NAMED, Light, light_of
+from equipix.light import NAMED, STRAY, Light, light_of
 from equipix.mosaic import Filters, mean_signal, pattern_of
 from equipix.noise import NoiseModel, photon_transfer
 
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.colour import Colours
     from equipix.frames import FrameStatistics
-
-_STRAY = 10.0
-"""Variance that dark frames have in common, over that of noise, which no drift of an offset has."""
 
 
 class Words(NamedTuple):
@@ -259,8 +256,8 @@ class Averaged:
     @property
     def unsteady(self) -> str:
         """The exposure whose light varied most between its frames, or the dark; or nothing."""
-        if self.dark is not None and (stray := light_of(self.dark)).over_noise > _STRAY:
-            return f"'dark': {stray.words} (limit {_STRAY:g}). See that all its frames are dark"
+        if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
+            return f"'dark': {stray.words} (limit {STRAY:g}). See that all its frames are dark"
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
         if not self.light[worst].is_large:
             return ""
