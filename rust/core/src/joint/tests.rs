@@ -70,7 +70,7 @@ fn with_system(
     visit(&mut system);
 }
 
-/// N: the sum of w c² M² B_i B_j over the measurements.
+/// N: the sum of w c² M² B_i B_j over the measurements of pixels that do not leave the search.
 fn dense(
     system: &System<'_, '_, f64>,
     flux: &[f64],
@@ -80,7 +80,8 @@ fn dense(
     let cells = system.state.beam.len();
     let [sensitivity, _] = system.pixels();
     let mut normal = vec![vec![0.0; cells]; cells];
-    for at in (0..mask.len()).filter(|&at| !mask[at]) {
+    let few = system.pass.few.image(SENSOR.cols).unwrap();
+    for at in (0..mask.len()).filter(|&at| !mask[at] && !few[at % SENSOR.len()]) {
         let (k, pixel) = (at / SENSOR.len(), at % SENSOR.len());
         let gain = flux[k] * sensitivity[pixel];
         let seen = taps(system, k, pixel);
