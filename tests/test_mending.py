@@ -144,5 +144,5 @@ def test_an_experiment_with_a_hot_pixel_in_its_spots(tmp_path):
     assert calibration.flags[row, col + 3] & equipix.Flag.HOT
     text = re.sub("bit_depth = 12", "bit_depth = 10", path.read_text())
     path.write_text(text)
-    with pytest.raises(errors.EquipixError, match="saturat"):
+    with pytest.raises(errors.EquipixError, match="correct 'bit_depth'"):
         Experiment.load(path).run()
