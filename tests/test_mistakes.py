@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
+from equipix.calibration.input_verdicts import on_input
+from equipix.exposures.front import exposures_of
 
 SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
 
@@ -145,3 +148,70 @@ def test_two_positions_in_one_average_are_a_misfit(bench, place, mixed):
     frames = list(bench.frames)
     frames[place] = np.concatenate([frames[k] for k in mixed])
     assert "misfit" in findings(frames, bench.dark)
+
+
+def arrays(bench):
+    """Mean frames without their offset, in DN."""
+    return np.array([each.mean(axis=0) - bench.offset for each in bench.frames])
+
+
+def verdicts(values, shifts=SHIFTS, **known):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        return equipix.calibrate(values, shifts, **known).verdicts
+
+
+@pytest.mark.parametrize("std", [None, 0.02], ids=["known", "prior"])
+@pytest.mark.parametrize("flux", [0.5, 2, 3])
+def test_a_flux_that_is_far_off_names_the_exposure(bench, flux, std):
+    """A factor of 2 made M fall by as much in five pixels: most counted as dead or hot."""
+    given = [1, 1, 1, flux, 1]
+    found = verdicts(arrays(bench), flux=given, flux_std=std)
+    assert found[0].kind == "flux"
+    assert "exposure 3 (from 0)" in found[0].message
+    assert f"for its flux of {flux:g}" in found[0].message
+    assert not {"drift", "misfit", "prior"} & {each.kind for each in found}
+
+
+@pytest.mark.parametrize("flux", [None, "fit"])
+def test_a_black_exposure_is_named(bench, flux):
+    values = arrays(bench)
+    values[1] = np.random.default_rng(1).normal(5, 3, SHAPE)
+    found = verdicts(values, flux=flux)
+    assert "exposure 1 (from 0) has" in {each.kind: each.message for each in found}["flux"]
+
+
+def test_a_tilted_sensitivity_is_no_wrong_flux(bench):
+    """The light falls by 1.2 between the same cells of the beam."""
+    tilt = np.linspace(1, 0.25, SHAPE[1])
+    values = np.array([tilt * each for each in bench.signals])
+    assert "flux" not in {each.kind for each in verdicts(values)}
+
+
+def test_shifts_in_millimetres_are_named(bench):
+    found = verdicts(arrays(bench), 0.0083 * SHIFTS)
+    assert "divide millimetres by the pixel pitch" in found[0].message
+
+
+def test_a_flipped_exposure_with_uncertain_shifts_is_named(bench):
+    """Its shift was widened instead, by as much as the flip needs."""
+    values = arrays(bench)
+    values[3] = values[3][:, ::-1]
+    found = verdicts(values, shift_std=0.05, variance=np.full(5, 30.0))
+    assert any("fits better mirrored left to right" in each.message for each in found)
+
+
+def test_a_finding_calls_an_exposure_by_its_name(bench):
+    values = arrays(bench)
+    values[3] *= 0.5
+    names = [f"position {k}" for k in range(5)]
+    exposures = exposures_of(values, SHIFTS)
+    (found,) = on_input(dataclasses.replace(exposures, names=tuple(names)))
+    assert "exposure 3 ('position 3') has 0.5 times the light" in found.message
+
+
+def test_a_prediction_outside_the_beam_is_refused(bench):
+    """Every value of it was NaN, without a word."""
+    cal = equipix.calibrate(np.array(bench.signals), SHIFTS)
+    with pytest.raises(errors.InputError, match=r"'shift' is \[500, 0\]: no exposure has observed"):
+        cal.predict((500, 0))

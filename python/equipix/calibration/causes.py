@@ -52,6 +52,11 @@ def by_flux(residuals: Floats, signal: Floats, noise: float) -> Part:
     return _explained(residuals, [signal], noise)
 
 
+def factors(residuals: Floats, signal: Floats) -> Floats:
+    """Errors of ln c of the exposures (n) that explain residuals best."""
+    return np.array([_coefficients(*each)[0] for each in _each_exposure(residuals, [signal])])
+
+
 def by_shifts(residuals: Floats, signal: Floats, slopes: Floats, noise: float) -> Part:
     """Part proportional to the signal of each exposure and to its slopes (2, n, rows, cols)."""
     return _explained(residuals, [signal, *slopes], noise)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from equipix.calibration.residuals import Residuals
     from equipix.calibration.weights import Weighted
     from equipix.colour import Colours
+    from equipix.exposures.exposures import Exposures
 
 _CHANCE = 1e-6
 """Probability below which noise is no explanation."""
@@ -109,17 +110,17 @@ def contradiction(weighted: Weighted, residuals: Residuals, flags: Array) -> str
         square = float(np.sum(weights * rest**2))
         size = (square / float(weights.sum())) ** 0.5
         if size > _LEAST and chi2_tail(square / scale, _freedom(weights)) < _CHANCE:
-            return _words(filters.colours, rest, size)
+            return _words(weighted.exposures, filters.colours, rest, size)
     return None
 
 
-def _words(colours: Colours, rest: Floats, size: float) -> str:
+def _words(exposures: Exposures, colours: Colours, rest: Floats, size: float) -> str:
     """What is wrong, the value, the limit and the remedy."""
     exposure, colour, _ = np.unravel_index(int(np.argmax(np.abs(rest))), rest.shape)
     largest = float(rest.flat[int(np.argmax(np.abs(rest)))])
     return (
         f"the colours contradict one beam for all: fluxes fitted for each colour differ by "
-        f"{size:.2%} rms, most in exposure {exposure}, by {largest:+.2%} for "
+        f"{size:.2%} rms, most in {exposures.name_of(int(exposure))}, by {largest:+.2%} for "
         f"{colours.labels[colour]!r} (limit {_LEAST:.2%}). The colour of the lamp varies over the "
         "beam, or from exposure to exposure: use a lamp of one colour over the beam, or calibrate "
         "each colour by itself, with 'mask' True for the others and shifts of "

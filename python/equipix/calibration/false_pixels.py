@@ -24,6 +24,9 @@ _WITHOUT_NOISE = 1e-3
 """The same below which they show no noise: of three values noise has it in two of a thousand
 pixels, of five in three of a million."""
 
+_DEFECTS = 0.2
+"""Share of the pixels up to which contradictions are those of pixels: else the model is wrong."""
+
 _SEVERAL = 3
 """Fewest values that show whether they have noise: M fits one, and nearly two."""
 
@@ -54,6 +57,8 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
         if false[hot].all():
             return others
     false &= suspect
+    if np.count_nonzero(false) > _DEFECTS * np.count_nonzero(np.isfinite(own)):
+        return weighted
     return _without(weighted, dead & false, hot & false, options) if false.any() else weighted
 
 

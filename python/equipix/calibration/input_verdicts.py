@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from equipix.calibration.brightness import on_brightness
 from equipix.calibration.verdicts import Verdict
 from equipix.exposures.clipping import clipping_advice
 from equipix.exposures.reach import micrometre_step
@@ -13,6 +16,10 @@ if TYPE_CHECKING:
     from equipix.exposures.exposures import Exposures
 
 
+_LEAST_MOVE = 0.5
+"""Least distance, in pixels, between shifts that are in pixels."""
+
+
 def on_input(exposures: Exposures) -> list[Verdict]:
     """Verdicts on exposures that the values given contradict."""
     found = [
@@ -20,6 +27,7 @@ def on_input(exposures: Exposures) -> list[Verdict]:
         _on_raw(exposures),
         Verdict("light", exposures.unsteady) if exposures.unsteady else None,
         _on_units(exposures),
+        _on_brightness(exposures),
         _on_repeats(exposures),
         _on_filters(exposures),
     ]
@@ -45,8 +53,16 @@ def _on_raw(exposures: Exposures) -> Verdict | None:
 
 
 def _on_units(exposures: Exposures) -> Verdict | None:
-    """Verdict on shifts that look like micrometres."""
+    """Verdict on shifts that look like millimetres, or like micrometres."""
     shifts = exposures.positions.shifts
+    most = float(np.ptp(shifts, axis=0).max())
+    if 0 < most < _LEAST_MOVE:
+        return Verdict(
+            "unit",
+            f"the shifts differ by {most:.2g} pixel at most (limit {_LEAST_MOVE:g}), from which "
+            "next to nothing follows. Expected are pixels: divide millimetres by the pixel pitch, "
+            "see 'From micrometres to pixels' in README",
+        )
     step = micrometre_step(shifts, exposures.shape)
     if step is None:
         return None
@@ -56,6 +72,12 @@ def _on_units(exposures: Exposures) -> Verdict | None:
         f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
         "pitch, see 'From micrometres to pixels' in README",
     )
+
+
+def _on_brightness(exposures: Exposures) -> Verdict | None:
+    """Verdict on one exposure with far more or less light than its flux says."""
+    words = on_brightness(exposures)
+    return None if words is None else Verdict("flux", words)
 
 
 def _on_filters(exposures: Exposures) -> Verdict | None:

@@ -81,11 +81,10 @@ class Drift(ReadOnly):
         return (
             f"the data contradict the fluxes: they differ from those given by {self.size:.1e}, rms "
             f"(standard error {self.flux_std:.1e}, {self.degrees_of_freedom} degrees of freedom). "
-            "Such a drift of the lamp probably hides a tilt of the sensitivity, edge to edge, of "
-            f"{rows:.1e} along rows and {cols:.1e} along columns (one standard deviation), which "
-            f"leaves no residual{self._words_of_trend}. Give 'flux' from a monitor of the lamp, "
-            "turn one exposure by 90 or 180 degrees and use flux='fit', or use larger shifts and "
-            "more exposures. In a smooth beam shifts that are wrong look the same"
+            "First check the shifts: in a smooth beam wrong ones look the same. A drift of the "
+            "lamp hides a tilt of the sensitivity, edge to edge, of probably "
+            f"{rows:.1e} along rows and {cols:.1e} along columns{self._words_of_trend}: give "
+            "'flux' from a monitor, or turn one exposure by 90 or 180 degrees and use flux='fit'"
         )
 
     @property
@@ -94,8 +93,8 @@ class Drift(ReadOnly):
         if not np.any(self.trend_tilt > self.tilt_std):
             return ""
         return (
-            f"; if it is linear in the order of the exposures, of {rows:.1e} and {cols:.1e}: then "
-            "give 'time' and flux='linear'"
+            f" ({rows:.1e} and {cols:.1e} if it is linear in the order of the exposures: then give "
+            "'time' and flux='linear')"
         )
 
     def variance_of(self, weights: Floats, response: Floats) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix.calibration import causes
 from equipix.calibration.misplaced import misplaced
-from equipix.calibration.residual_tests import lag_one
+from equipix.calibration.residual_tests import Correlation, lag_one
 from equipix.calibration.residuals import EXACT, FEWEST, on_sensor, testable, tested
 from equipix.calibration.shift_errors import without_shift_errors
 from equipix.calibration.simulated_fit import simulated_chi2, squares
@@ -18,9 +18,9 @@ from equipix.flags import usable
 if TYPE_CHECKING:
     from equipix._native import Fit
     from equipix._types import Array, Bools, Floats
-    from equipix.calibration.residual_tests import Correlation
     from equipix.calibration.residuals import Residuals
     from equipix.calibration.weights import Weighted
+    from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 
 _SIGMAS = 5.0
@@ -110,11 +110,17 @@ def misfit(
     within five standard errors of 1, or within 3 %; where it is not, and the degrees of freedom
     leave a doubt, these are those of simulated noise. And residuals of neighbouring pixels must not
     be correlated by more than five standard errors and 1 %, which requires no variances. A fit that
-    has not come to its minimum, or data without noise, answer neither.
+    has not come to its minimum, or data without noise, answer neither: of the first it is asked
+    only whether an exposure is flipped.
     """
     inexactness = residuals.inexactness
-    if weighted.fit.degrees_of_freedom < FEWEST or not inexactness < 1:
+    if weighted.fit.degrees_of_freedom < FEWEST:
         return None
+    if not inexactness < 1:
+        failed = weighted.fit.ended != "converged"
+        words = misplaced(weighted.exposures, (), None, options) if failed else None
+        nothing = Correlation(0.0, 0.0, 0.0)
+        return None if words is None else Misfit(float("nan"), None, nothing, "order", words)
     known = weighted.exposures.knows_noise
     chi2 = weighted.reduced_chi2 if known else float("nan")
     left, unexplained = without_shift_errors(weighted, residuals), 1.0
@@ -206,7 +212,7 @@ def _cause(
             "they grow with the signal: give 'variance' as a NoiseModel with photon noise, and see "
             "whether the response is linear"
         )
-    found = _local(values, residuals, noise, excess)
+    found = _local(weighted.exposures, values, residuals, noise, excess)
     if found is not None:
         return found
     if not correlated:
@@ -256,7 +262,7 @@ def _common(
                 f"they are common to the pixels of {name}, as noise of the read-out is: subtract "
                 "it with reference pixels. Error bars do not contain it"
             )
-    return _local(values, residuals, noise, excess)
+    return _local(weighted.exposures, values, residuals, noise, excess)
 
 
 def _of_exposures(
@@ -279,8 +285,14 @@ def _of_exposures(
     lines = [causes.by_lines(values, axis, noise).explained for axis in (1, 2)]
     limit = max(_MOST * excess, _ENOUGH * max(illumination, *lines))
     if causes.by_flux(values, signal, noise).explained > limit:
+        factors = causes.factors(values, signal)
+        worst = int(np.abs(factors).argmax())
+        # The sensitivity takes 1/n of what an error of a flux leaves.
+        error = factors[worst] / (1 - 1 / len(factors))
         return "flux", (
-            "exposures differ by a factor that no tilt explains: use flux='fit' or 'flux_std'"
+            "exposures differ by a factor that no tilt explains, most "
+            f"{weighted.exposures.name_of(worst)}, by some {error:+.0%}: use flux='fit' "
+            "or 'flux_std'"
         )
     if causes.by_shifts(values, signal, slopes, noise).explained > limit:
         stated = weighted.exposures.positions.std is not None
@@ -299,7 +311,7 @@ def _of_exposures(
 
 
 def _local(
-    values: Floats, residuals: Residuals, noise: float, excess: float
+    exposures: Exposures, values: Floats, residuals: Residuals, noise: float, excess: float
 ) -> tuple[str, str] | None:
     """A cause in one exposure or in one region."""
     explained, (row, col) = causes.by_region(values, noise)
@@ -313,7 +325,7 @@ def _local(
     # Sensitivity and beam each take 1/n of what is wrong with one exposure.
     if explained > _MOST * (1 - 1 / len(values)) ** 2 * excess:
         return "exposure", (
-            f"exposure {worst} (from 0) has the most: check it, leave it out or use robust=True"
+            f"{exposures.name_of(worst)} has the most: check it, leave it out or use robust=True"
         )
     return None
 

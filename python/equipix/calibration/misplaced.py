@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equipix.calibration.causes import standing_out
 from equipix.calibration.window_fit import WindowFit, if_there_is_light
 
 if TYPE_CHECKING:
@@ -30,18 +31,24 @@ def misplaced(
 ) -> str | None:
     """Which of these pairs is exchanged, or how the worst exposure is flipped, in words; or None.
 
-    Fits of a central window are compared, in all orders, with that as given.
+    Fits of a central window are compared, in all orders, with that as given. Shifts are held: those
+    that are found follow the mistake. Unless given, the worst exposure is that which stands out.
     """
+    exposures = dataclasses.replace(
+        exposures, positions=dataclasses.replace(exposures.positions, std=None)
+    )
     window = exposures.window(_SIDE)
+    given = WindowFit.of(window, options)
+    worst = standing_out(given.residuals) if worst is None else worst
     tried = {
-        f"exposures {i} and {j} (from 0) fit better each at the shift of the other: check the "
-        "order of the frames and of 'shifts'": _at_the_other(window, (i, j))
+        f"{exposures.name_of(i)} and {exposures.name_of(j)} fit better each at the shift of the "
+        "other: check the order of the frames and of 'shifts'": _at_the_other(window, (i, j))
         for i, j in pairs
     }
     if worst is not None:
         tried |= {
-            f"exposure {worst} (from 0) fits better {flip}: give its frames as the others are, or "
-            "its 'rotation'": _flipped(exposures, window, worst, axes)
+            f"{exposures.name_of(worst)} fits better {flip}: give its frames as the others are, "
+            "or its 'rotation'": _flipped(exposures, window, worst, axes)
             for flip, axes in _FLIPS.items()
         }
     if not tried:
@@ -50,7 +57,7 @@ def misplaced(
     noise = 1.0 if exposures.knows_noise else 0.0
     left = {words: WindowFit.of(each, options).left - noise for words, each in tried.items()}
     best = min(left, key=lambda words: left[words])
-    return best if left[best] < _LEFT * (WindowFit.of(window, options).left - noise) else None
+    return best if left[best] < _LEFT * (given.left - noise) else None
 
 
 def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
@@ -59,10 +66,7 @@ def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
     order[list(pair)] = pair[::-1]
     positions = window.positions
     moved = dataclasses.replace(
-        positions,
-        shifts=positions.shifts[order],
-        rotation=positions.rotation[order],
-        std=None if positions.std is None else positions.std[order],
+        positions, shifts=positions.shifts[order], rotation=positions.rotation[order]
     )
     return dataclasses.replace(window, positions=moved)
 
@@ -71,8 +75,6 @@ def _flipped(
     exposures: Exposures, window: Exposures, exposure: int, axes: tuple[int, ...]
 ) -> Exposures:
     """Return the window with one exposure flipped about the middle of the sensor."""
-    first = (np.array(exposures.shape) - window.shape) // 2
-    rows, cols = (slice(a, a + size) for a, size in zip(first, window.shape, strict=True))
     values = window.values.copy()
-    values[exposure] = np.flip(exposures.values[exposure], axes)[rows, cols]
+    values[exposure] = np.flip(exposures.values[exposure], axes)[exposures.middle(_SIDE)]
     return dataclasses.replace(window, values=values)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from equipix.calibration.misplaced import misplaced
 from equipix.calibration.residuals import sampled
 from equipix.calibration.shift_errors import flux_variance
 from equipix.calibration.significance import chi2_tail
@@ -29,13 +30,16 @@ _FACTOR = 1.5
 class Contradiction(NamedTuple):
     """A prior that the data contradict.
 
-    `name` is the keyword, `factor` the deviations in standard deviations, rms, and `freedom` the
-    number of combinations of the values that the data determine.
+    `name` is the keyword, `factor` the deviations in standard deviations, rms, `freedom` the
+    number of combinations of the values that the data determine, and `worst` the exposures with the
+    largest deviations, the largest first; `remedy` says what to check.
     """
 
     name: str
     factor: float
     freedom: int
+    worst: tuple[int, ...]
+    remedy: str = "check how they were measured, and that no exposure is flipped or exchanged"
 
     @property
     def words(self) -> str:
@@ -45,7 +49,7 @@ class Contradiction(NamedTuple):
             f"the data contradict '{self.name}': the {what} found differ from those given by "
             f"{self.factor:.1f} of their standard deviations, rms ({self.freedom} degrees of "
             f"freedom, expected 1). It was multiplied by {self.factor:.1f}, and the fit repeated: "
-            "check how they were measured, and that no exposure is flipped or exchanged"
+            f"{self.remedy}"
         )
 
 
@@ -58,9 +62,10 @@ def widened(weighted: Weighted, options: Options) -> tuple[Weighted, list[Contra
     taken without what the data do not determine: a common factor of the fluxes, where no exposure
     is turned also what is affine in the shifts, and a displacement common to all shifts. Their sum
     of squares follows χ² of the remaining degrees of freedom f where the prior is right, and is
-    less where the data hold little beside it. The factor is √(Σ x²/f).
+    less where the data hold little beside it. The factor is √(Σ x²/f). A flipped exposure, or two
+    that are exchanged, are fitted with shifts far from those given: those furthest are tried.
     """
-    found = contradictions(weighted)
+    found = [_explained(each, weighted, options) for each in contradictions(weighted)]
     if not found:
         return weighted, []
     exposures = weighted.exposures
@@ -76,6 +81,15 @@ def contradictions(weighted: Weighted) -> list[Contradiction]:
         return []
     asked = [_of_fluxes(weighted), _of_shifts(weighted)]
     return [each for each in asked if each is not None]
+
+
+def _explained(found: Contradiction, weighted: Weighted, options: Options) -> Contradiction:
+    """Say which exposure is flipped, or which two are exchanged, where that explains shifts."""
+    if found.name != "shift_std":
+        return found
+    first, second = found.worst
+    words = misplaced(weighted.exposures, [(first, second)], first, options.fit)
+    return found if words is None else found._replace(remedy=words)
 
 
 def _of_fluxes(weighted: Weighted) -> Contradiction | None:
@@ -106,18 +120,18 @@ def _contradiction(
     name: str, deviations: Floats, std: Floats, columns: Floats
 ) -> Contradiction | None:
     """Test deviations (n, axes), each axis without its part along the columns."""
-    total, freedom = 0.0, 0
+    total, freedom = np.zeros(len(deviations)), 0
     for values, scale in zip(deviations.T, std.T, strict=True):
         known = scale > 0
         left, unknowns = _rest(columns[known] / scale[known, None], values[known] / scale[known])
-        total += float(left @ left)
+        total[known] += left**2
         freedom += len(left) - unknowns
     if freedom < 1:
         return None
-    factor = (total / freedom) ** 0.5
-    if chi2_tail(total, freedom) >= _RARE or factor < _FACTOR:
+    factor = (float(total.sum()) / freedom) ** 0.5
+    if chi2_tail(float(total.sum()), freedom) >= _RARE or factor < _FACTOR:
         return None
-    return Contradiction(name, factor, freedom)
+    return Contradiction(name, factor, freedom, tuple(np.argsort(-total)[:2].tolist()))
 
 
 def _rest(columns: Array, values: Array) -> tuple[Floats, int]:

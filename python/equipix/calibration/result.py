@@ -414,7 +414,8 @@ class Calibration(ReadOnly):
         Raises
         ------
         InputError
-            If an argument has a wrong shape or value.
+            If an argument has a wrong shape or value, or no pixel stands in a part of the beam that
+            an exposure has observed.
 
         Examples
         --------
@@ -430,7 +431,14 @@ class Calibration(ReadOnly):
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
         (place,) = places_of(np.reshape(shift, (1, 2)), [rotation], [flux])
-        return signal_at(place, self._beam, self._response)
+        signal = signal_at(place, self._beam, self._response)
+        if not np.isfinite(signal).any():
+            raise InputError(
+                f"'shift' is {np.asarray(shift).tolist()}: no exposure has observed the beam where "
+                "a pixel with a sensitivity stands then. Ask for a position between those of the "
+                "exposures"
+            )
+        return signal
 
     def residuals(
         self,

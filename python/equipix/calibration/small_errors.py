@@ -19,6 +19,7 @@ from equipix.flags import usable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from typing import Self
 
     from equipix._native import Fit
     from equipix._types import Array, Floats
@@ -206,19 +207,19 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     window, start = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)
     part = with_dark_misfit(Weighted(window, window.fit(exact, start), None), options)
-    fit, own = part.fit, _scaled(window, part.fit, options)
+    here = _Fitted.of(window, part.fit, options)
+    fit, own, signal = part.fit, here.residuals, here.signal
     square, noise = float(np.nansum(own**2)), part.noise_variance * part.expected_misfit
-    signal = _signal(part, options)
     squares = window.weighted_squares(signal**2)
     clear = np.sqrt(squares / part.noise_variance)
     if not (np.isfinite(clear).any() and np.nanquantile(clear, _FAINTEST) > _CLEAR):
         return []
     whole = float(np.nansum(squares)) ** 0.5
     roots = np.sqrt(window.weighted_squares(np.ones(window.values.shape)))
-    noisy: list[Weighted] = []
+    noisy: list[_Fitted] = []
     found = []
     for cause in _causes(window, signal):
-        left, other, size = _left_by(cause, part, exact)
+        left, other, size = here.left_by(cause, exact)
         power = float(np.nansum(left**2))
         solver = float(fit.error_estimate[-1] + other.error_estimate[-1]) * whole
         if other.ended != "converged" or not size * power**0.5 > _EXACT * solver:
@@ -232,8 +233,8 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
         # The mean over both signs of the noise has only what is quadratic in it.
         if not noisy:
             both = (simulated(part, options, sign) for sign in (1, -1))
-            noisy = [Weighted(each, each.fit(exact, fit), None) for each in both]
-        by_noise = np.mean([_product(cause, each, exact) for each in noisy], axis=0)
+            noisy = [_Fitted.of(each, each.fit(exact, fit), options) for each in both]
+        by_noise = np.mean([each.product(cause, exact) for each in noisy], axis=0)
         estimate = (product - float(by_noise.sum())) / power
         if not abs(estimate) < cause.most:
             continue
@@ -258,29 +259,37 @@ def _causes(window: Exposures, signal: Floats) -> Iterator[Cause]:
         yield _PATTERN
 
 
-def _left_by(cause: Cause, part: Weighted, options: FitOptions) -> tuple[Floats, Fit, float]:
-    """What an error of unit size leaves in residuals times √w; the fit that shows it, its size."""
-    window, signal = part.exposures, _signal(part, options)
-    dark = np.zeros(window.shape) if window.dark is None else window.dark
-    error = cause.error(signal, dark)
-    size = _STEP * float(np.sqrt(np.nanmean(signal**2) / np.nanmean(error**2)))
-    values = window.values + np.nan_to_num(size * error).astype(window.values.dtype)
-    changed = dataclasses.replace(window, values=values)
-    fit = changed.fit(options, part.fit)
-    left = _scaled(changed, fit, options) - _scaled(window, part.fit, options)
-    return left / size, fit, size
+class _Fitted(NamedTuple):
+    """A window and its fit: residuals times √w, and the values that it expects."""
 
+    window: Exposures
+    fit: Fit
+    residuals: Floats
+    signal: Floats
 
-def _product(cause: Cause, part: Weighted, options: FitOptions) -> Floats:
-    """Sum of r · P z over the exposures of each pixel."""
-    left, *_ = _left_by(cause, part, options)
-    return np.asarray(np.nansum(_scaled(part.exposures, part.fit, options) * left, axis=0))
+    @classmethod
+    def of(cls, window: Exposures, fit: Fit, options: FitOptions) -> Self:
+        """Take both from one evaluation of the fit."""
+        residuals = window.residuals(fit, options.workers)
+        signal = np.asarray(window.values - residuals)
+        return cls(window, fit, _scaled(window, fit, residuals), signal)
 
+    def left_by(self, cause: Cause, options: FitOptions) -> tuple[Floats, Fit, float]:
+        """What an error of unit size leaves in residuals; the fit that shows it, its size."""
+        window, signal = self.window, self.signal
+        dark = np.zeros(window.shape) if window.dark is None else window.dark
+        error = cause.error(signal, dark)
+        size = _STEP * float(np.sqrt(np.nanmean(signal**2) / np.nanmean(error**2)))
+        values = window.values + np.nan_to_num(size * error).astype(window.values.dtype)
+        changed = dataclasses.replace(window, values=values)
+        fit = changed.fit(options, self.fit)
+        left = _scaled(changed, fit, changed.residuals(fit, options.workers)) - self.residuals
+        return left / size, fit, size
 
-def _signal(part: Weighted, options: FitOptions) -> Floats:
-    """The values that a fit expects."""
-    window = part.exposures
-    return np.asarray(window.values - window.residuals(part.fit, options.workers))
+    def product(self, cause: Cause, options: FitOptions) -> Floats:
+        """Sum of r · P z over the exposures of each pixel."""
+        left, *_ = self.left_by(cause, options)
+        return np.asarray(np.nansum(self.residuals * left, axis=0))
 
 
 def _scatter(other: Fit, fit: Fit) -> float:
@@ -289,9 +298,8 @@ def _scatter(other: Fit, fit: Fit) -> float:
     return float(np.std(other.sensitivity[lit] / fit.sensitivity[lit]))
 
 
-def _scaled(window: Exposures, fit: Fit, options: FitOptions) -> Floats:
+def _scaled(window: Exposures, fit: Fit, residuals: Floats) -> Floats:
     """Residuals times the roots of their weights; NaN where nothing is known."""
-    residuals = window.residuals(fit, options.workers)
     residuals[:, ~tested(fit)] = np.nan
     squares = window.weighted_squares(np.square(residuals))
     return np.asarray(np.copysign(np.sqrt(squares), residuals))

@@ -53,7 +53,8 @@ TOO_WEAK = (
 )
 
 _EXPLAINED = frozenset({"orientation", "pattern", "drift", "misfit", "prior", "colour"})
-"""Kinds that name a cause, and are no news where the sign or the unit of the shifts is wrong."""
+"""Kinds that name a cause, and are no news where the sign or the unit of the shifts is wrong, or
+the flux of an exposure."""
 
 _WHITE = frozenset({"noise", "signal"})
 """Causes of a misfit that neighbouring residuals do not have in common."""
@@ -68,6 +69,7 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "unit": IdentifiabilityWarning,
     "raw": MissingDarkWarning,
     "light": DriftWarning,
+    "flux": DriftWarning,
     "repeated": MisfitWarning,
     "partial": IdentifiabilityWarning,
     "sign": ShiftSignWarning,
@@ -128,8 +130,8 @@ def on_noise(frames: float | None) -> list[Verdict]:
 
 
 def unexplained(found: list[Verdict], advice: list[Verdict]) -> list[Verdict]:
-    """Verdicts that a wrong sign or unit of the shifts does not explain."""
-    if not {"sign", "unit"} & {each.kind for each in (*advice, *found)}:
+    """Verdicts that a wrong sign or unit of the shifts, or a wrong flux, does not explain."""
+    if not {"sign", "unit", "flux"} & {each.kind for each in (*advice, *found)}:
         return found
     return [each for each in found if each.kind not in _EXPLAINED]
 

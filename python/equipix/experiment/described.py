@@ -95,10 +95,10 @@ class Described(ABC, Generic[_Manifest]):
         sensor, files = self.manifest.sensor, find_files(self.path, entry)
         level = sensor.saturation_level
         found = average(files, dark=dark, saturation=level, workers=workers, progress=report)
-        if sensor.bit_depth is not None and found.mean.max() > 2**sensor.bit_depth - 1:
+        if sensor.largest is not None and found.mean.max() > sensor.largest:
             raise FileError(
                 f"{self.path}: '{files[0].name}' of {name} holds means up to "
-                f"{found.mean.max():.0f} DN, above {2**sensor.bit_depth - 1}, the largest value "
+                f"{found.mean.max():.0f} DN, above {sensor.largest}, the largest value "
                 f"that 'bit_depth' = {sensor.bit_depth} holds: correct 'bit_depth' in [sensor]"
             )
         return found

@@ -107,21 +107,25 @@ class Sensor(_Table):
 
     @model_validator(mode="after")
     def _level_within_depth(self) -> Self:
-        if self.saturation is None or self.bit_depth is None:
+        if self.saturation is None or self.largest is None:
             return self
-        largest = 2**self.bit_depth - 1
-        if self.saturation > largest:
+        if self.saturation > self.largest:
             raise _problem(
-                f"'saturation' in [sensor] is {self.saturation:g}, above {largest}, the largest "
-                f"value that 'bit_depth' = {self.bit_depth} holds: no value would reach it"
+                f"'saturation' in [sensor] is {self.saturation:g}, above {self.largest}, the "
+                f"largest value that 'bit_depth' = {self.bit_depth} holds: no value would reach it"
             )
         return self
 
     @property
+    def largest(self) -> int | None:
+        """Largest value that `bit_depth` holds, if it is given."""
+        return None if self.bit_depth is None else 2**self.bit_depth - 1
+
+    @property
     def saturation_level(self) -> float | None:
         """Level that counts as saturated: the given one, else the largest of `bit_depth`."""
-        if self.saturation is None and self.bit_depth is not None:
-            return float(2**self.bit_depth - 1)
+        if self.saturation is None and self.largest is not None:
+            return float(self.largest)
         return self.saturation
 
     @property

@@ -107,6 +107,7 @@ class Averaged:
         self.pedestal, self._is_counted = 0.0, False
         self._dtype = np.dtype(dtype)
         self._frames: list[int] = []
+        self._names: list[str] = []
         self._of_dark: list[float] = []
         self._points: list[Array] = []
         self._clipped: list[Clipping | None] = []
@@ -173,6 +174,7 @@ class Averaged:
         self.saturated |= saturates
         count = int(frames.count.max())
         self._frames.append(count)
+        self._names.append(name)
         self._screen(frames)
         if self.dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
@@ -254,6 +256,11 @@ class Averaged:
         return tuple(self._frames)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each exposure; empty where it has none."""
+        return tuple(self._names)
+
+    @property
     def unsteady(self) -> str:
         """The exposure whose light varied most between its frames, or the dark; or nothing."""
         if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
@@ -261,8 +268,9 @@ class Averaged:
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
         if not self.light[worst].is_large:
             return ""
+        which = self._words.place(worst, self._names[worst])
         return (
-            f"{self._words.place(worst)}: {self.light[worst].words} (limit {NAMED:g}). It was "
+            f"{which}: {self.light[worst].words} (limit {NAMED:g}). It was "
             f"taken out of the noise model. See that all frames are of one {self._words.one}, let "
             "the source settle, or average more frames"
         )

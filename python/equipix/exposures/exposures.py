@@ -72,6 +72,8 @@ class Exposures(ReadOnly):
         colour, so that all pixels are alike; `noise` and `dark` are in DN.
     relative : bool
         Whether the variances are relative, in an unknown unit.
+    names : tuple of str
+        What the user calls each exposure, if anything.
     """
 
     values: Array
@@ -89,6 +91,7 @@ class Exposures(ReadOnly):
     unsteady: str = ""
     filters: Filters | None = None
     relative: bool = False
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of exposures."""
@@ -99,6 +102,11 @@ class Exposures(ReadOnly):
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.values.shape[1:]
         return rows, cols
+
+    def name_of(self, exposure: int) -> str:
+        """Return how messages name an exposure."""
+        own = self.names[exposure] if self.names else ""
+        return f"exposure {exposure} ({repr(own) if own else 'from 0'})"
 
     def usable(self, exposure: int | slice = slice(None)) -> Bools:
         """Return which measurements may be used, of all exposures or of one."""
@@ -161,15 +169,22 @@ class Exposures(ReadOnly):
             variance=None if variance is None else variance[exposures],
             mask=mask[exposures] if mask is not None and mask.ndim == 3 else mask,
             noise=tuple(self.noise[k] for k in exposures) if self.noise else (),
+            names=tuple(self.names[k] for k in exposures) if self.names else (),
         )
+
+    def middle(self, side: int) -> tuple[slice, slice]:
+        """Return the rows and columns of the central part, at most `side` pixels along an axis."""
+        sizes = [min(size, side) for size in self.shape]
+        first = [(size - part) // 2 for size, part in zip(self.shape, sizes, strict=True)]
+        rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
+        return rows, cols
 
     def window(self, side: int) -> Self:
         """Return the central part of the sensor, at most `side` pixels along each axis."""
-        shape = np.array(self.shape)
-        sizes = np.minimum(shape, side)
-        first = (shape - sizes) // 2
-        rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
-        part = (..., rows, cols)
+        middle = self.middle(side)
+        first = np.array([each.start for each in middle])
+        sizes = np.array([each.stop for each in middle]) - first
+        part = (..., *middle)
         variance, mask, dark = self.variance, self.mask, self.dark_variance
         return dataclasses.replace(
             self,

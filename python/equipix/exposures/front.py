@@ -68,6 +68,7 @@ def exposures_of(
             clipped=measured.clipped,
             raw=(measured.raw or _is_unsigned(frames)) and not offset,
             unsteady=measured.unsteady,
+            names=measured.names,
         )
         refuse_nothing(exposures, given)
         shown = mean_signal(exposures.values, exposures.mask)
@@ -111,6 +112,7 @@ class Measured(NamedTuple):
     raw: bool = False
     unsteady: str = ""
     colours: Colours | None = None
+    names: tuple[str, ...] = ()
 
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
@@ -174,6 +176,7 @@ def _of_averaged(
         averaged.raw,
         averaged.unsteady,
         averaged.colours,
+        averaged.names,
     )
 
 

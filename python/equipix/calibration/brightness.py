@@ -1,0 +1,81 @@
+"""One exposure that is far brighter or darker than its flux says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from equipix.calibration.residuals import on_sensor
+from equipix.shifts import nearest_whole
+
+if TYPE_CHECKING:
+    from equipix._types import Array
+    from equipix.exposures.exposures import Exposures
+
+_FAR, _BLACK = 1.5, 20.0
+"""Factor from which light contradicts its flux: a sensitivity that halves from edge to edge feigns
+1.2 with shifts of a quarter of the sensor. The same where fluxes are free: such have no light."""
+
+_STDS = 5.0
+"""Standard deviations of a prior that a flux does not reach."""
+
+_ROWS, _FEWEST = 256, 100
+"""Rows that are compared, and fewest pixels of two exposures in the same cells of the beam."""
+
+
+def on_brightness(exposures: Exposures) -> str | None:
+    """Say which exposure has far more or less light than its flux says; None if not just one.
+
+    Wrong shifts in a steep beam make several exposures look so.
+    """
+    if len(set(exposures.positions.rotation.tolist())) > 1:
+        return None
+    found = _relative_light(exposures)
+    if np.isfinite(found).sum() < 3:
+        return None
+    found /= np.nanmedian(found)
+    flux = exposures.flux
+    limit = np.full(len(found), _BLACK if flux.kind == "fit" else _FAR)
+    if flux.std is not None:
+        limit = np.maximum(limit, np.exp(_STDS * flux.std))
+    (far,) = np.nonzero((found > limit) | (found < 1 / limit))
+    if len(far) != 1:
+        return None
+    (worst,) = far
+    given = "" if flux.kind == "fit" else f", for its flux of {flux.values[worst]:g}"
+    return (
+        f"{exposures.name_of(int(worst))} has {max(found[worst], 0.0):.2g} times the light of the "
+        f"others in the same cells of the beam{given} (expected 1, limit {limit[worst]:.3g} or its "
+        "inverse): check its frames and its flux, or leave it out"
+    )
+
+
+def _relative_light(exposures: Exposures) -> Array:
+    """Light of each exposure over that of a middle one, in cells that both see, for equal fluxes.
+
+    NaN of exposures that have too few of them in common.
+    """
+    shifts = on_sensor(exposures.positions)
+    middle = int(np.argmin(np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)))
+    moves = nearest_whole(shifts - shifts[middle]).astype(int)
+    step = max(1, exposures.shape[0] // _ROWS)
+    result = np.full(len(exposures), np.nan)
+    for k, move in enumerate(moves.tolist()):
+        here, there = (_common(each, exposures.shape, step) for each in (move, [-d for d in move]))
+        both = exposures.usable(k)[here] & exposures.usable(middle)[there]
+        if np.count_nonzero(both) < _FEWEST:
+            continue
+        light, usual = (
+            float(np.sum(exposures.values[number][place], where=both, dtype=np.float64))
+            for number, place in ((k, here), (middle, there))
+        )
+        if usual > 0:
+            result[k] = light / usual * exposures.flux.values[middle] / exposures.flux.values[k]
+    return result
+
+
+def _common(move: list[int], shape: tuple[int, int], step: int) -> tuple[slice, slice]:
+    """Rows, every `step`-th, and columns of a moved sensor that see what it saw before."""
+    (first, left), (end, right) = np.maximum(0, (np.negative(move), shape - np.maximum(move, 0)))
+    return slice(first, end, step), slice(left, right)
