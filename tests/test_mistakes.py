@@ -59,11 +59,13 @@ def test_without_a_mistake_there_is_no_finding(bench):
     assert findings(bench.frames, bench.dark) == {}
 
 
-@pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
-def test_one_exposure_that_is_flipped_is_named(bench, axis):
+@pytest.mark.parametrize(("axis", "words"), [(1, "upside down"), (2, "mirrored left to right")])
+def test_one_exposure_that_is_flipped_is_named(bench, axis, words):
+    """Its dark was not flipped with it."""
     frames = list(bench.frames)
     frames[2] = np.flip(frames[2], axis)
-    assert "exposure 2" in findings(frames, bench.dark)["misfit"]
+    found = findings(frames, bench.dark)["misfit"]
+    assert f"exposure 2 (from 0) fits better {words}" in found
 
 
 @pytest.mark.parametrize("variance", [None, 30.0], ids=["unknown", "known"])

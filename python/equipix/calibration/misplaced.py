@@ -74,7 +74,9 @@ def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
 def _flipped(
     exposures: Exposures, window: Exposures, exposure: int, axes: tuple[int, ...]
 ) -> Exposures:
-    """Return the window with one exposure flipped about the middle of the sensor."""
+    """Return the window with one exposure, before its dark, flipped about the sensor's middle."""
     values = window.values.copy()
-    values[exposure] = np.flip(exposures.values[exposure], axes)[exposures.middle(_SIDE)]
+    dark = 0.0 if exposures.dark is None else exposures.dark / exposures.response
+    flipped = np.flip(exposures.values[exposure] + dark, axes) - dark
+    values[exposure] = flipped[exposures.middle(_SIDE)]
     return dataclasses.replace(window, values=values)
