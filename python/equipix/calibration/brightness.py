@@ -29,7 +29,8 @@ def on_brightness(exposures: Exposures) -> str | None:
 
     Wrong shifts in a steep beam make several exposures look so.
     """
-    if len(set(exposures.positions.rotation.tolist())) > 1:
+    # Values with an offset are not proportional to light.
+    if exposures.offset or exposures.raw or len(set(exposures.positions.rotation.tolist())) > 1:
         return None
     found = _relative_light(exposures)
     if np.isfinite(found).sum() < 3:
