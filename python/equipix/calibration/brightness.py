@@ -10,7 +10,7 @@ from equipix.calibration.residuals import on_sensor
 from equipix.shifts import nearest_whole
 
 if TYPE_CHECKING:
-    from equipix._types import Array
+    from equipix._types import Array, Bools
     from equipix.exposures.exposures import Exposures
 
 _FAR, _BLACK = 1.5, 20.0
@@ -22,6 +22,9 @@ _STDS = 5.0
 
 _ROWS, _FEWEST = 256, 100
 """Rows that are compared, and fewest pixels of two exposures in the same cells of the beam."""
+
+_CLEAR = 10.0
+"""Standard deviations of noise that the light of an exposure, over these pixels, must be."""
 
 
 def on_brightness(exposures: Exposures) -> str | None:
@@ -37,14 +40,15 @@ def on_brightness(exposures: Exposures) -> str | None:
         return None
     found /= np.nanmedian(found)
     flux = exposures.flux
-    limit = np.full(len(found), _BLACK if flux.kind == "fit" else _FAR)
+    is_free = flux.kind in ("fit", "linear")
+    limit = np.full(len(found), _BLACK if is_free else _FAR)
     if flux.std is not None:
         limit = np.maximum(limit, np.exp(_STDS * flux.std))
     (far,) = np.nonzero((found > limit) | (found < 1 / limit))
     if len(far) != 1:
         return None
     (worst,) = far
-    given = "" if flux.kind == "fit" else f", for its flux of {flux.values[worst]:g}"
+    given = "" if is_free else f", for its flux of {flux.values[worst]:g}"
     return (
         f"{exposures.name_of(int(worst))} has {max(found[worst], 0.0):.2g} times the light of the "
         f"others in the same cells of the beam{given} (expected 1, limit {limit[worst]:.3g} or its "
@@ -67,13 +71,19 @@ def _relative_light(exposures: Exposures) -> Array:
         both = exposures.usable(k)[here] & exposures.usable(middle)[there]
         if np.count_nonzero(both) < _FEWEST:
             continue
-        light, usual = (
-            float(np.sum(exposures.values[number][place], where=both, dtype=np.float64))
-            for number, place in ((k, here), (middle, there))
-        )
-        if usual > 0:
-            result[k] = light / usual * exposures.flux.values[middle] / exposures.flux.values[k]
+        own, other = exposures.values[k][here], exposures.values[middle][there]
+        light, usual = (float(np.sum(each, where=both, dtype=np.float64)) for each in (own, other))
+        expected = usual * exposures.flux.values[k] / exposures.flux.values[middle]
+        if expected > _CLEAR * max(_noise(own, both), _noise(other, both)):
+            result[k] = light / expected
     return result
+
+
+def _noise(values: Array, used: Bools) -> float:
+    """Standard deviation of a sum of values, at most: of neighbours, which light changes too."""
+    both = used[:, 1:] & used[:, :-1]
+    steps = np.subtract(values[:, 1:], values[:, :-1], where=both, out=np.zeros(both.shape))
+    return float(np.sqrt(np.sum(steps**2) / 2))
 
 
 def _common(move: list[int], shape: tuple[int, int], step: int) -> tuple[slice, slice]:
