@@ -57,8 +57,11 @@ class TestPredict:
 
     def test_what_no_exposure_observed_is_nan(self, noise_free):
         cal = noise_free[3]
-        assert np.isnan(cal.predict((500, -500))).all()
-        assert np.isnan(cal.predict((-(10**6), 0), rotation=90)).all()
+        for shift, rotation in (((500, -500), 0), ((-(10**6), 0), 90)):
+            with pytest.raises(
+                errors.InputError, match="no exposure has observed the beam where a pixel"
+            ):
+                cal.predict(shift, rotation=rotation)
         rows = np.isnan(cal.predict((-3, 0))).all(axis=1)
         assert rows.tolist() == [True] * 2 + [False] * 28  # the grid begins at row −1
 
