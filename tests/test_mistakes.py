@@ -176,6 +176,18 @@ def test_a_flux_that_is_far_off_names_the_exposure(bench, flux, std):
     assert not {"drift", "misfit", "prior"} & {each.kind for each in found}
 
 
+def test_pixels_that_a_wrong_flux_contradicts_are_no_defects():
+    """Masked, they took the contradiction with them: chi-square of the rest was 0.99."""
+    truth = simulate.paper_sensitivity((100, 140), rng=1)
+    shifts = equipix.cross_pattern(7, 12)
+    frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam((100, 140)), shifts)
+    frames += 30 * np.random.default_rng(1).standard_normal(frames.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        cal = equipix.calibrate(frames, shifts, variance=np.full(5, 900.0), flux=[1, 1, 1, 2, 1])
+    assert cal.reduced_chi2 > 100
+
+
 @pytest.mark.parametrize("flux", [None, "fit"])
 def test_a_black_exposure_is_named(bench, flux):
     values = arrays(bench)
