@@ -341,11 +341,21 @@ def test_a_sample_has_the_residuals_of_its_rows():
 
 @pytest.mark.parametrize(("count", "most"), [(10, 3), (100, 500), (100, 64), (100, 0), (33, 33)])
 def test_bands_are_rows_of_the_sensor(count, most):
-    rows = bands(count, most)
+    rows = bands(np.full(count, 7), most)
     assert rows.min() >= 0
     assert rows.max() < count
     assert (np.diff(rows, axis=1) == 1).all()
-    assert len(np.unique(rows)) <= max(most, 64)
+    assert len(np.unique(rows)) == rows.size <= max(most, count if count < 64 else 64)
+
+
+def test_bands_lie_where_masks_leave_measurements():
+    """Of discs on a large sensor the first and the last rows hold nothing."""
+    measured = np.zeros(512)
+    measured[100:190] = measured[320:360] = 400
+    rows = bands(measured, 4 * 32)
+    assert len(rows) >= 3
+    assert (measured[rows].sum(axis=1) >= 16 * 400).all()
+    assert len(np.unique(rows)) == rows.size
 
 
 def test_what_most_pixels_are_flagged_for_is_a_misfit_of_a_positive_size():

@@ -80,17 +80,24 @@ class Residuals:
     @property
     def slopes(self) -> Floats:
         """Slopes M/σ · ∂(c L) along rows and columns, (2, n, ...): what errors of shifts leave."""
-        slopes = np.zeros((2, *self.light.shape))
-        for slope, axis in zip(slopes, (-2, -1), strict=True):
-            if self.light.shape[axis] > 1:
-                np.multiply(np.gradient(self.light, axis=axis), self.response, out=slope)
-        return slopes
+        return np.stack([_slope(self.light, axis) * self.response for axis in (-2, -1)])
+
+
+def _slope(light: Floats, axis: int) -> Floats:
+    """Mean of the steps to both neighbours, or to the one that is predicted; 0 without any."""
+    ends = [(0, 0)] * light.ndim
+    ends[axis] = (1, 1)
+    steps = np.pad(np.diff(light, axis=axis), ends, constant_values=np.nan)
+    both = np.stack([np.delete(steps, end, axis) for end in (0, -1)])
+    return np.asarray(np.nansum(both, axis=0) / np.maximum(np.isfinite(both).sum(axis=0), 1))
 
 
 def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None) -> Residuals:
     """Residuals of a fit, of at most about so many measurements."""
     exposures, fit = weighted.exposures, weighted.fit
-    rows = bands(exposures.shape[0], most // (len(exposures) * exposures.shape[1]))
+    every, searched, testing = range(len(exposures)), in_search(fit), tested(fit)
+    used = sum(np.count_nonzero(exposures.usable(k) & testing, axis=1) for k in every)
+    rows = bands(np.asarray(used), most // (len(exposures) * exposures.shape[1]))
     shape = (len(exposures), *rows.shape, exposures.shape[1])
     values, light, response = np.empty(shape), np.empty(shape), np.empty(shape)
     size = (rows.shape[1], exposures.shape[1])
@@ -105,16 +112,15 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
             values[k, b] = exposures.values[k, part] - light[k, b] * response[k, b]
             if fit.offset is not None:
                 values[k, b] -= fit.offset[part]
-    if exposures.mask is not None:
-        values[np.broadcast_to(exposures.mask[..., rows, :], shape)] = np.nan
-    values[:, ~tested(fit)[rows]] = np.nan
+    for k in every:
+        values[k, ~(exposures.usable(k) & testing)[rows]] = np.nan
     variance = exposures.variance
     if variance is not None:
         deep = variance[:, rows] if variance.ndim == 3 else variance[:, None, None, None]
         root = np.sqrt(deep, dtype=np.float64)
         values /= root
         response /= root
-    measured = int(np.count_nonzero(exposures.usable() & in_search(fit)))
+    measured = sum(np.count_nonzero(exposures.usable(k) & searched) for k in every)
     share = fit.degrees_of_freedom / max(measured, 1)
     error = float(fit.error_estimate[-1])
     return Residuals(values, light, response, rows, share, weighted.noise_variance, error)
@@ -130,13 +136,22 @@ def tested(fit: Fit) -> Bools:
     return in_search(fit) if fit.prior is None else in_search(fit) & (fit.prior == 0)
 
 
-def bands(count: int, most: int) -> Array:
-    """Rows (bands, rows of a band): all, as one band, or bands of some, spread evenly."""
-    number = most // _BAND
+def bands(measured: Array, most: int) -> Array:
+    """Rows (bands, rows of a band): all, as one band, or bands of some, spread evenly.
+
+    `measured` is the number of measurements of each row. Bands lie where these are at least half as
+    many as in the fullest band: masks, as of discs, may leave nothing in most rows.
+    """
+    count, number = len(measured), most // _BAND
     if number * _BAND >= count or count <= _BAND:
         return np.arange(count)[None]
-    first = np.linspace(0, count - _BAND, max(number, 2)).round().astype(int)
-    return np.asarray(first[:, None] + np.arange(_BAND))
+    inside = np.convolve(measured, np.ones(_BAND), "valid")
+    full = np.flatnonzero(inside >= inside.max() / 2)
+    first = [-_BAND]
+    for row in full[np.linspace(0, len(full) - 1, max(number, 2)).round().astype(int)].tolist():
+        if row >= first[-1] + _BAND:
+            first.append(row)
+    return np.array(first[1:])[:, None] + np.arange(_BAND)
 
 
 def on_sensor(positions: Positions) -> Floats:

@@ -55,6 +55,7 @@ _TOLERANCE, _PRODUCTS = 1e-8, 200
 _STRONGER = {
     "sign",
     "unit",
+    "flux",
     "orientation",
     "repeated",
     "saturation",

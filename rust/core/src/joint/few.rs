@@ -71,6 +71,11 @@ impl Few {
         })
     }
 
+    /// Sets the values of a row to 0 in them.
+    pub(crate) fn clear<T: Default>(&self, row: usize, values: &mut [T]) {
+        self.in_row(row).iter().for_each(|&col| values[col] = T::default());
+    }
+
     /// Their columns in a row.
     pub(crate) fn in_row(&self, row: usize) -> &[usize] {
         self.rows.get(row).map_or(&[], Vec::as_slice)

@@ -107,7 +107,7 @@ impl Fused {
                 let flux = is_uneven.then_some(&pass.flux[..]);
                 pixels.shorten([weight, light], flux, row.chunks_exact_mut(width));
                 let square = length - 2 * width;
-                pass.few.in_row(index).iter().for_each(|col| row[square + col] = 0.0);
+                pass.few.clear(index, &mut row[square..]);
             }
         });
     }

@@ -447,7 +447,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                     *sum += if *m == 0.0 { 0.0 } else { pull / (flux * m) };
                 }
             }
-            pass.few.in_row(row_index).iter().for_each(|&col| row.change[col] = 0.0);
+            pass.few.clear(row_index, row.change);
         });
         drop((views, beams));
         self.state.beam = beam;

@@ -33,7 +33,7 @@ impl<T: Real> System<'_, '_, T> {
         for (row, information) in
             information.chunks_exact_mut(self.pass.exposures.sensor().cols).enumerate()
         {
-            self.pass.few.in_row(row).iter().for_each(|&col| information[col] = 0.0);
+            self.pass.few.clear(row, information);
         }
         information
     }

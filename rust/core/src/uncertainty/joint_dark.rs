@@ -59,7 +59,7 @@ impl Dark {
                     workspace.sums[0][col] = variance[col] * (sum - row.change[col] * along);
                 }
                 let left = &mut workspace.sums[0][..cols];
-                pass.few.in_row(row_index).iter().for_each(|&col| left[col] = 0.0);
+                pass.few.clear(row_index, left);
                 found.objective += left.iter().sum::<f64>();
             })?;
         let mut propagation = vec![0.0; variance.len()];
