@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
 import equipix
 from equipix import simulate
+from equipix.errors import EquipixWarning
 
-SHAPE = (64, 64)
+SIDE = 64
 NOISE = 0.01
 
 
-def discs(seed, *, limb=0.9):
+def discs(seed, *, limb=0.9, side=SIDE, flux=None):
     """Nine pictures of a disc that is darker at its limb, with spots, and their masks."""
     rng = np.random.default_rng(seed)
+    shape = (side, side)
     spots = rng.uniform(-0.6, 0.6, (6, 2))
-    radius, centre = 0.4 * SHAPE[0], np.array(SHAPE) / 2
+    radius, centre = 0.4 * side, np.array(shape) / 2
 
     def beam(row, col):
         r, c = (row - centre[0]) / radius, (col - centre[1]) / radius
@@ -25,10 +29,12 @@ def discs(seed, *, limb=0.9):
             light = light * (1 - 0.3 * np.exp(-((r - spot[0]) ** 2 + (c - spot[1]) ** 2) / 0.02))
         return light
 
-    shifts = rng.uniform(-6, 6, (9, 2))
-    truth = 1 + 0.03 * rng.standard_normal(SHAPE)
-    frames = simulate.exposures(truth, beam, shifts) + NOISE * rng.standard_normal((9, *SHAPE))
-    rows, cols = np.indices(SHAPE) - centre[:, None, None]
+    shifts = rng.uniform(-0.1, 0.1, (9, 2)) * side
+    truth = 1 + 0.03 * rng.standard_normal(shape)
+    frames = simulate.exposures(truth, beam, shifts, flux=flux) + NOISE * rng.standard_normal(
+        (9, *shape)
+    )
+    rows, cols = np.indices(shape) - centre[:, None, None]
     away = [np.hypot(rows + d, cols + e) for d, e in shifts]
     return frames, shifts, np.array(away) > limb * radius, truth
 
@@ -60,9 +66,8 @@ def test_standard_deviations_of_discs_with_masks_of_their_own(draws, figure):
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 def test_free_fluxes_and_refined_shifts_converge():
-    frames, shifts, mask, _ = discs(1, limb=1.0)
     rng = np.random.default_rng(1)
-    frames *= rng.uniform(0.95, 1.05, 9)[:, None, None]
+    frames, shifts, mask, _ = discs(1, limb=1.0, flux=rng.uniform(0.95, 1.05, 9))
     measured = shifts + 0.1 * rng.standard_normal(shifts.shape)
     cal = equipix.calibrate(
         frames, measured, mask=mask, variance=np.full(9, NOISE**2), flux="fit", shift_std=0.1
@@ -74,7 +79,36 @@ def test_free_fluxes_and_refined_shifts_converge():
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 def test_experiments_of_two_exposures_keep_all_pixels():
     frames, shifts, _, _ = discs(2)
-    mask = np.zeros((2, *SHAPE), bool)
+    mask = np.zeros((2, SIDE, SIDE), bool)
     mask[1, 20:30, 20:30] = True
     cal = equipix.calibrate(frames[:2], shifts[:2], mask=mask, variance=np.full(2, NOISE**2))
     assert cal.weighted.fit.few is None
+
+
+@pytest.mark.study
+def test_large_discs_converge_and_raise_no_alarm(draws, figure):
+    passes = []
+    for seed in draws(20):
+        rng = np.random.default_rng(1000 + seed)
+        limb, flux = rng.uniform(0.8, 1.02), rng.uniform(0.95, 1.05, 9)
+        frames, shifts, mask, _ = discs(seed, limb=limb, side=512, flux=flux)
+        measured = shifts + 0.3 * rng.standard_normal(shifts.shape)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            # That free fluxes leave the tilt open is no alarm.
+            warnings.filterwarnings("ignore", message=".*tilt", category=EquipixWarning)
+            cal = equipix.calibrate(
+                frames,
+                measured,
+                mask=mask,
+                variance=np.full(9, NOISE**2),
+                flux="fit",
+                shift_std=0.3,
+            )
+        assert cal.converged
+        # Pixels that are measured once and alone see cells have no value, all others have.
+        times = (~mask).sum(axis=0)
+        assert np.isfinite(cal.sensitivity[times > 1]).all()
+        passes.append(cal.sweeps)
+    figure("most passes of discs of 512×512 pixels", max(passes), "at most 100")
+    assert max(passes) <= 100

@@ -77,6 +77,38 @@ fn the_answer_of_others_is_that_without_them() {
 }
 
 #[test]
+fn pixels_measured_once_are_lost_where_they_alone_see_cells() {
+    // The last columns see cells behind those of the others.
+    let times = |pixel: usize| if pixel % SHAPE[1] < 34 { 5 } else { 1 };
+    for std in [None, Some(SHIFT_STD)] {
+        let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 8);
+        let mut experiment = simulation.experiment().with_lamp(Lamp::Known);
+        if let Some(std) = std {
+            experiment = experiment.measured_to(&std);
+        }
+        let all = with_few(experiment.clone(), times);
+        let found = fit(&all, Options::to(TOLERANCE)).unwrap();
+        let none = |pixel| if times(pixel) < 5 { 0 } else { 5 };
+        let others = fit(&with_few(experiment, none), Options::to(TOLERANCE)).unwrap();
+        assert!(found.converged && others.converged);
+        assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
+        assert_eq!(found.degrees_of_freedom, others.degrees_of_freedom);
+        let std = error_map(&all, &found, 1).unwrap().std;
+        let mut lost = 0;
+        for (pixel, std) in std.iter().enumerate() {
+            let is_lost = found.sensitivity[pixel].is_nan();
+            assert_eq!(is_lost, times(pixel) == 1 && found.few.get(pixel) != Some(&true));
+            assert_eq!(is_lost, found.labels[0][pixel] < 0);
+            assert_eq!(is_lost, std.is_nan());
+            lost += usize::from(is_lost);
+        }
+        // Shifts that are sought may bring cells into sight, so then all six columns are lost.
+        let columns = if all.shift_std.is_some() { 6..7 } else { 1..6 };
+        assert!(columns.contains(&(lost / SHAPE[0])), "{lost}");
+    }
+}
+
+#[test]
 fn they_stay_where_most_are_such_or_they_join_components() {
     let simulation = Simulation::seeing(even, SHAPE, &BETWEEN[..3]).with_noise(NOISE, 6);
     let experiment = simulation.experiment().with_lamp(Lamp::Free);

@@ -7,7 +7,8 @@
 //! of noise. Their variance follows too, since that of any pixel is D⁻¹ and what S leaves open of the beam.
 //!
 //! They stay in it where they say what no other pixel does: where cells are seen by them alone, or where they join
-//! components.
+//! components. A pixel that is measured once says nothing there either, since its M follows any light. Cells that it
+//! alone sees would take any value, and with them its M: it is lost, as if it had not been measured.
 
 use super::connected::connected;
 use super::layout::{Grid, MARGIN, Window};
@@ -20,10 +21,12 @@ use crate::frames::Real;
 /// Measurements that are few where there are more exposures.
 const FEW: u8 = 2;
 
-/// The columns of such pixels, by row of the sensor, and how many measurements and pixels that is.
+/// The columns of such pixels and of lost ones, by row of the sensor, how many measurements both have, and how
+/// many pixels there are of the former.
 #[derive(Debug, Default)]
 pub(crate) struct Few {
     rows: Vec<Vec<usize>>,
+    lost: Vec<Vec<usize>>,
     pub(crate) measurements: usize,
     pub(crate) pixels: usize,
 }
@@ -53,20 +56,26 @@ impl Few {
             return Ok(Self::default());
         }
         stay_where_needed(&mut leaves, exposures, grid, control)?;
+        let goes = |pixel: usize| leaves[pixel] || times[pixel] == 1;
         let mut shares = vec![[0; 2]; count];
         exposures.for_each_stretch(control, |k, row, cols| {
-            let leaving =
-                leaves[row * sensor.cols..][cols.clone()].iter().filter(|leaves| **leaves);
-            shares[k] = [shares[k][0] + leaving.count(), shares[k][1] + cols.len()];
+            let going = cols.clone().filter(|col| goes(row * sensor.cols + col));
+            shares[k] = [shares[k][0] + going.count(), shares[k][1] + cols.len()];
         })?;
         // What overlaps others so little is determined by such pixels.
-        if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
+        if shares.iter().any(|[going, used]| 2 * going > *used) {
             return Ok(Self::default());
         }
-        let of_row = |row: &[bool]| (0..row.len()).filter(|&col| row[col]).collect::<Vec<_>>();
+        let by_row = |is_one: &dyn Fn(usize) -> bool| {
+            let of_row = |row: usize| {
+                (0..sensor.cols).filter(|col| is_one(row * sensor.cols + col)).collect()
+            };
+            (0..sensor.rows).map(of_row).collect()
+        };
         Ok(Self {
-            rows: leaves.chunks(sensor.cols).map(of_row).collect(),
-            measurements: shares.iter().map(|[leaving, _]| leaving).sum(),
+            rows: by_row(&|pixel| leaves[pixel]),
+            lost: by_row(&|pixel| times[pixel] == 1 && !leaves[pixel]),
+            measurements: shares.iter().map(|[going, _]| going).sum(),
             pixels: leaves.iter().filter(|leaves| **leaves).count(),
         })
     }
@@ -81,14 +90,33 @@ impl Few {
         self.rows.get(row).map_or(&[], Vec::as_slice)
     }
 
+    /// Whether lost pixels were sought.
+    pub(crate) const fn loses(&self) -> bool {
+        !self.lost.is_empty()
+    }
+
+    /// The columns of lost pixels in a row.
+    pub(crate) fn lost_in_row(&self, row: usize) -> &[usize] {
+        self.lost.get(row).map_or(&[], Vec::as_slice)
+    }
+
     /// Which of the pixels they are, if any.
     pub(crate) fn image(&self, cols: usize) -> Option<Vec<bool>> {
-        let mut image = vec![false; self.rows.len() * cols];
-        for (row, few) in self.rows.iter().enumerate() {
-            few.iter().for_each(|col| image[row * cols + col] = true);
-        }
-        (self.pixels > 0).then_some(image)
+        (self.pixels > 0).then(|| image(&self.rows, cols))
     }
+
+    /// Which of the pixels are lost; empty if none were sought.
+    pub(crate) fn lost(&self, cols: usize) -> Vec<bool> {
+        image(&self.lost, cols)
+    }
+}
+
+fn image(rows: &[Vec<usize>], cols: usize) -> Vec<bool> {
+    let mut image = vec![false; rows.len() * cols];
+    for (row, columns) in rows.iter().enumerate() {
+        columns.iter().for_each(|col| image[row * cols + col] = true);
+    }
+    image
 }
 
 /// Keeps those of which not all cells are seen by pixels that stay, and of one component.

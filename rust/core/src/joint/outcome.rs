@@ -33,7 +33,9 @@ pub(crate) fn components<T: Real>(
     system: &System<'_, '_, T>,
     control: &Control,
 ) -> Result<Components> {
-    connected(system.pass.exposures, &system.pass.grid, &system.state.shifts, &[], control)
+    let (exposures, grid) = (system.pass.exposures, &system.pass.grid);
+    let lost = system.pass.few.lost(exposures.sensor().cols);
+    connected(exposures, grid, &system.state.shifts, &lost, control)
 }
 
 /// L at the cells: Σ_j a_j B(u − j) with B = 1/6, 4/6, 1/6 at whole numbers; NaN where a coefficient

@@ -312,6 +312,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 }
             }
         }
+        self.lose(row, workspace);
     }
 
     /// The weights of one row of each exposure; those that are all the same stand in the workspace.
@@ -321,6 +322,22 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
             if self.exposures.uniform_weight(k).is_none() {
                 let _ = self.exposures.stretch(k, row, 0..cols, weights);
             }
+        }
+        self.lose(row, workspace);
+    }
+
+    /// Takes the weights of lost pixels out of those of a row.
+    fn lose(&self, row: usize, workspace: &mut Workspace) {
+        if !self.few.loses() {
+            return;
+        }
+        let cols = self.exposures.sensor().cols;
+        for (k, weights) in workspace.weights.chunks_exact_mut(cols).enumerate() {
+            if let Some(weight) = self.exposures.uniform_weight(k) {
+                // The row before may have lost others.
+                weights.fill(weight);
+            }
+            self.few.lost_in_row(row).iter().for_each(|&col| weights[col] = 0.0);
         }
     }
 

@@ -510,7 +510,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         for (weight, m) in weights.iter_mut().zip(&sensitivity[cols.clone()]) {
             *weight *= (self.pass.flux[exposure] * m).powi(2);
         }
-        for few in self.pass.few.in_row(row) {
+        let few = &self.pass.few;
+        for few in few.in_row(row).iter().chain(few.lost_in_row(row)) {
             if cols.contains(few) {
                 weights[few - cols.start] = 0.0;
             }

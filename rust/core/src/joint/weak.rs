@@ -58,7 +58,7 @@ impl<T: Real> System<'_, '_, T> {
                     let at = |part: Option<&[f64]>| part.map_or(0.0, |part| part[col]);
                     let light = at(part(k));
                     let left = value.to_f64() - light * at(sensitivity) - at(offset);
-                    if weight > 0.0 {
+                    if weight > 0.0 && at(part(count + 1)) > 0.0 {
                         squares.push(weight * left * left);
                     }
                 }
