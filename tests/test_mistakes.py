@@ -176,24 +176,47 @@ def test_a_flux_that_is_far_off_names_the_exposure(bench, flux, std):
     assert not {"drift", "misfit", "prior"} & {each.kind for each in found}
 
 
-def test_pixels_that_a_wrong_flux_contradicts_are_no_defects():
+@pytest.mark.parametrize("flux", [0.5, 2])
+def test_pixels_that_a_wrong_flux_contradicts_are_no_defects(flux):
     """Masked, they took the contradiction with them: chi-square of the rest was 0.99."""
-    truth = simulate.paper_sensitivity((100, 140), rng=1)
-    shifts = equipix.cross_pattern(7, 12)
-    frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam((100, 140)), shifts)
+    shape, shifts = (40, 50), equipix.cross_pattern(3, 5)
+    truth = simulate.paper_sensitivity(shape, rng=1)
+    frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
     frames += 30 * np.random.default_rng(1).standard_normal(frames.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", errors.EquipixWarning)
-        cal = equipix.calibrate(frames, shifts, variance=np.full(5, 900.0), flux=[1, 1, 1, 2, 1])
+        cal = equipix.calibrate(frames, shifts, variance=np.full(5, 900.0), flux=[1, 1, 1, flux, 1])
     assert cal.reduced_chi2 > 100
 
 
 @pytest.mark.parametrize("flux", [None, "fit"])
-def test_a_black_exposure_is_named(bench, flux):
+@pytest.mark.parametrize("black", [0, 1])
+def test_a_black_exposure_is_named(bench, flux, black):
     values = arrays(bench)
-    values[1] = np.random.default_rng(1).normal(5, 3, SHAPE)
-    found = verdicts(values, flux=flux)
-    assert "exposure 1 (from 0) has" in {each.kind: each.message for each in found}["flux"]
+    values[black] = np.random.default_rng(1).normal(5, 3, SHAPE)
+    found = {each.kind: each.message for each in verdicts(values, flux=flux)}
+    assert f"exposure {black} (from 0) has" in found["flux"]
+
+
+def test_a_sensitivity_that_halves_is_no_wrong_flux_at_large_shifts():
+    """Over 48 of 80 columns the light in the same cells falls by a factor of 1.5."""
+    shape, shifts = (60, 80), equipix.cross_pattern(5, 48)
+    truth = np.tile(np.linspace(1, 0.5, 80), (60, 1))
+    frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
+    frames += 30 * np.random.default_rng(1).standard_normal(frames.shape)
+    assert "flux" not in {each.kind for each in verdicts(frames, shifts)}
+
+
+def test_a_flipped_exposure_of_a_colour_sensor_is_named():
+    """Mirrored, an even number of columns exchanges the colours."""
+    shape, shifts = (64, 80), equipix.cross_pattern(5, 11)
+    truth = simulate.paper_sensitivity(shape, rng=1) * np.tile([[1, 0.5], [0.5, 0.7]], (32, 40))
+    frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
+    frames += 30 * np.random.default_rng(1).standard_normal(frames.shape)
+    frames[2] = frames[2, :, ::-1]
+    found = verdicts(frames, shifts, cfa="RGGB", variance=np.full(5, 900.0))
+    words = "exposure 2 (from 0) fits better mirrored left to right"
+    assert any(words in each.message for each in found), [each.message for each in found]
 
 
 def test_a_tilted_sensitivity_is_no_wrong_flux(bench):

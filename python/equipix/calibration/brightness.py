@@ -14,8 +14,11 @@ if TYPE_CHECKING:
     from equipix.exposures.exposures import Exposures
 
 _FAR, _BLACK = 1.5, 20.0
-"""Factor from which light contradicts its flux: a sensitivity that halves from edge to edge feigns
-1.2 with shifts of a quarter of the sensor. The same where fluxes are free: such have no light."""
+"""Factors from which light contradicts a flux that is known, and one that is fitted. The latter is
+of an exposure without light, or of the others."""
+
+_FALL = 4.0
+"""Factor by which a sensitivity may fall from edge to edge, which compares as light does."""
 
 _STDS = 5.0
 """Standard deviations of a prior that a flux does not reach."""
@@ -35,13 +38,21 @@ def on_brightness(exposures: Exposures) -> str | None:
     # Values with an offset are not proportional to light.
     if exposures.offset or exposures.raw or len(set(exposures.positions.rotation.tolist())) > 1:
         return None
-    found = _relative_light(exposures)
-    if np.isfinite(found).sum() < 3:
+    shifts = on_sensor(exposures.positions)
+    away = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)
+    # The first may itself be black.
+    for middle in np.argsort(away, kind="stable")[:2].tolist():
+        moves = nearest_whole(shifts - shifts[middle]).astype(int)
+        found = _relative_light(exposures, middle, moves)
+        if np.isfinite(found).sum() >= 3 and np.nanmedian(found) > 0:
+            break
+    else:
         return None
     found /= np.nanmedian(found)
     flux = exposures.flux
     is_free = flux.kind in ("fit", "linear")
-    limit = np.full(len(found), _BLACK if is_free else _FAR)
+    limit = np.maximum(_FAR, _FALL ** np.sum(np.abs(moves) / exposures.shape, axis=1))
+    limit = np.maximum(limit, _BLACK) if is_free else limit
     if flux.std is not None:
         limit = np.maximum(limit, np.exp(_STDS * flux.std))
     (far,) = np.nonzero((found > limit) | (found < 1 / limit))
@@ -56,26 +67,24 @@ def on_brightness(exposures: Exposures) -> str | None:
     )
 
 
-def _relative_light(exposures: Exposures) -> Array:
-    """Light of each exposure over that of a middle one, in cells that both see, for equal fluxes.
+def _relative_light(exposures: Exposures, middle: int, moves: Array) -> Array:
+    """Light of each exposure over that of the middle one, in cells that both see, for equal fluxes.
 
     NaN of exposures that have too few of them in common.
     """
-    shifts = on_sensor(exposures.positions)
-    middle = int(np.argmin(np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)))
-    moves = nearest_whole(shifts - shifts[middle]).astype(int)
     step = max(1, exposures.shape[0] // _ROWS)
     result = np.full(len(exposures), np.nan)
+    usable = exposures.usable(middle)
     for k, move in enumerate(moves.tolist()):
         here, there = (_common(each, exposures.shape, step) for each in (move, [-d for d in move]))
-        both = exposures.usable(k)[here] & exposures.usable(middle)[there]
+        both = exposures.usable(k)[here] & usable[there]
         if np.count_nonzero(both) < _FEWEST:
             continue
         own, other = exposures.values[k][here], exposures.values[middle][there]
         light, usual = (float(np.sum(each, where=both, dtype=np.float64)) for each in (own, other))
-        expected = usual * exposures.flux.values[k] / exposures.flux.values[middle]
-        if expected > _CLEAR * max(_noise(own, both), _noise(other, both)):
-            result[k] = light / expected
+        ratio = exposures.flux.values[k] / exposures.flux.values[middle]
+        if usual * ratio > _CLEAR * max(_noise(own, both), ratio * _noise(other, both)):
+            result[k] = light / (usual * ratio)
     return result
 
 

@@ -178,11 +178,12 @@ def calibrate(
         If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
         than half of the pixels that are not masked are determined (`Calibration.is_partial`); if
         free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly
-        degenerate with the sensitivity.
+        degenerate with the sensitivity; if shifts look like millimetres or micrometres.
     ConvergenceWarning
         If the tolerance was not reached.
     DriftWarning
-        If the data contradict the fluxes given: the lamp has drifted, which hides a tilt.
+        If the data contradict the fluxes given: the lamp has drifted, which hides a tilt, or one
+        flux is far off.
     MisfitWarning
         If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
         neighbouring pixels are correlated, or if residuals show a curved response, an offset of all

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix.calibration.pixel_flags import odd_pixels
-from equipix.calibration.residuals import FEWEST
+from equipix.calibration.residuals import FEWEST, in_search
 from equipix.exposures.front import union
 
 if TYPE_CHECKING:
@@ -50,14 +50,15 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
         false = own > _CONTRADICTORY * max(noise, error)
         several = np.isfinite(squares).sum(axis=0) >= _SEVERAL
         false |= several & (own < _WITHOUT_NOISE * noise) & (noise > error)
+    most = _DEFECTS * np.count_nonzero(np.isfinite(own))
     if hot.any() and weighted.fit.degrees_of_freedom >= FEWEST:
         others = _without(weighted, dead & false, hot, options)
         usual = max(_usual(others, _squares(others, options.fit.workers), options))
         false |= hot & (_of_cells(weighted, squares) > _CONTRADICTORY * usual)
-        if false[hot].all():
+        if false[hot].all() and np.count_nonzero((dead & false) | hot) <= most:
             return others
     false &= suspect
-    if np.count_nonzero(false) > _DEFECTS * np.count_nonzero(np.isfinite(own)):
+    if np.count_nonzero(false) > most:
         return weighted
     return _without(weighted, dead & false, hot & false, options) if false.any() else weighted
 
@@ -96,7 +97,8 @@ def _usual(weighted: Weighted, squares: Floats, options: Options) -> tuple[float
     exposures, fit = weighted.exposures, weighted.fit
     if fit.degrees_of_freedom < 1:
         return 0.0, np.inf
-    noise = np.nanmedian(_of_pixels(squares)) * exposures.usable().sum() / fit.degrees_of_freedom
+    measured = np.count_nonzero(exposures.usable() & in_search(fit))
+    noise = np.nanmedian(_of_pixels(squares)) * measured / fit.degrees_of_freedom
     # Without noise, only what the solver leaves would be compared.
     error = max(options.fit.tolerance, float(fit.error_estimate[-1]))
     power = np.square(exposures.values, dtype=np.float64)

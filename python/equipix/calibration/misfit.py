@@ -238,8 +238,10 @@ def _common(
     light, response = (_flat(each) for each in (residuals.light, residuals.response))
     pairs = causes.maybe_exchanged(values, light, response)
     worst = causes.standing_out(values)
-    if (words := misplaced(weighted.exposures, pairs, worst, options)) is not None:
-        return "order", words
+    if pairs or worst is not None:
+        words = misplaced(weighted.exposures, pairs, worst, options)
+        if words is not None:
+            return "order", words
     slopes = np.stack([_flat(each) for each in residuals.slopes])
     by_exposures = causes.by_illumination(values, signal, slopes, noise).explained
     lines = [causes.by_lines(values, axis, noise).explained for axis in (1, 2)]

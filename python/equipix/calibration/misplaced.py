@@ -74,9 +74,16 @@ def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
 def _flipped(
     exposures: Exposures, window: Exposures, exposure: int, axes: tuple[int, ...]
 ) -> Exposures:
-    """Return the window with one exposure, before its dark, flipped about the sensor's middle."""
+    """Return the window with one exposure flipped, as the camera wrote it, about the middle."""
     values = window.values.copy()
-    dark = 0.0 if exposures.dark is None else exposures.dark / exposures.response
-    flipped = np.flip(exposures.values[exposure] + dark, axes) - dark
-    values[exposure] = flipped[exposures.middle(_SIDE)]
+    middle = exposures.middle(_SIDE)
+    sizes = enumerate(zip(middle, exposures.shape, strict=True))
+    source = tuple(
+        slice(size - part.stop, size - part.start) if axis in axes else part
+        for axis, (part, size) in sizes
+    )
+    dark = 0.0 if exposures.dark is None else exposures.dark
+    response, dark = (np.broadcast_to(x, exposures.shape) for x in (exposures.response, dark))
+    frame = exposures.values[exposure][source] * response[source] + dark[source]
+    values[exposure] = (np.flip(frame, axes) - dark[middle]) / response[middle]
     return dataclasses.replace(window, values=values)

@@ -128,7 +128,9 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
 
 def in_search(fit: Fit) -> Bools:
     """Pixels whose measurements F contains."""
-    return np.ones(fit.sensitivity.shape, bool) if fit.few is None else ~fit.few
+    # Without a component, measurements are not used.
+    known = fit.component_labels >= 0
+    return known if fit.few is None else known & ~fit.few
 
 
 def tested(fit: Fit) -> Bools:

@@ -52,9 +52,11 @@ TOO_WEAK = (
     "those of the frames"
 )
 
-_EXPLAINED = frozenset({"orientation", "pattern", "drift", "misfit", "prior", "colour"})
-"""Kinds that name a cause, and are no news where the sign or the unit of the shifts is wrong, or
-the flux of an exposure."""
+_BY_FLUX = frozenset({"drift", "misfit", "prior", "colour"})
+"""Kinds that name a cause, and are no news where the flux of an exposure is wrong."""
+
+_BY_SHIFTS = _BY_FLUX | {"orientation", "pattern"}
+"""The same where the sign or the unit of the shifts is wrong."""
 
 _WHITE = frozenset({"noise", "signal"})
 """Causes of a misfit that neighbouring residuals do not have in common."""
@@ -131,9 +133,10 @@ def on_noise(frames: float | None) -> list[Verdict]:
 
 def unexplained(found: list[Verdict], advice: list[Verdict]) -> list[Verdict]:
     """Verdicts that a wrong sign or unit of the shifts, or a wrong flux, does not explain."""
-    if not {"sign", "unit", "flux"} & {each.kind for each in (*advice, *found)}:
-        return found
-    return [each for each in found if each.kind not in _EXPLAINED]
+    kinds = {each.kind for each in (*advice, *found)}
+    if {"sign", "unit"} & kinds:
+        return [each for each in found if each.kind not in _BY_SHIFTS]
+    return [each for each in found if "flux" not in kinds or each.kind not in _BY_FLUX]
 
 
 def on_standard_deviations(
@@ -184,8 +187,11 @@ def on_fit(
 ) -> list[Verdict]:
     """Verdicts on a fit, the most important first.
 
-    `colours` are words on their contradiction, which explains drifts and a misfit.
+    `colours` are words on their contradiction, which explains drifts and a misfit. One exposure
+    that is flipped explains the contradiction.
     """
+    if misfit is not None and misfit.cause == "order":
+        colours = None
     found = [
         _on_sign(test),
         _on_orientation(test),

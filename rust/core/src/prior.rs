@@ -111,7 +111,8 @@ pub(crate) fn held(weights: &[f64], information: &[f64], variance: f64) -> Vec<u
 ///
 /// that is 1 − h where M scatters as the prior supposes.
 pub(crate) fn freed(weights: &[f64], information: &[f64], variance: f64, scatter: f64) -> f64 {
-    let pixels = weights.iter().zip(information).filter(|(weight, _)| **weight > 0.0);
+    // Pixels without D are no unknowns of the search.
+    let pixels = weights.iter().zip(information).filter(|(weight, d)| **weight > 0.0 && **d > 0.0);
     let open = pixels.map(|(weight, d)| {
         let left = weight / (d + weight);
         left * left * (1.0 + d * scatter * scatter / variance)

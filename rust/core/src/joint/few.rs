@@ -7,8 +7,10 @@
 //! of noise. Their variance follows too, since that of any pixel is D⁻¹ and what S leaves open of the beam.
 //!
 //! They stay in it where they say what no other pixel does: where cells are seen by them alone, or where they join
-//! components. A pixel that is measured once says nothing there either, since its M follows any light. Cells that it
-//! alone sees would take any value, and with them its M: it is lost, as if it had not been measured.
+//! components. But a pixel that is measured once says nothing of cells that no other pixel sees, since its M follows
+//! any light: these cells would take any value, and with them its M. It is lost, as if it had not been measured.
+
+use std::ops::Range;
 
 use super::connected::connected;
 use super::layout::{Grid, MARGIN, Window};
@@ -21,14 +23,15 @@ use crate::frames::Real;
 /// Measurements that are few where there are more exposures.
 const FEW: u8 = 2;
 
-/// The columns of such pixels and of lost ones, by row of the sensor, how many measurements both have, and how
-/// many pixels there are of the former.
+/// The columns of such pixels and of lost ones, by row of the sensor.
 #[derive(Debug, Default)]
 pub(crate) struct Few {
     rows: Vec<Vec<usize>>,
     lost: Vec<Vec<usize>>,
-    pub(crate) measurements: usize,
+    /// How many pixels follow the beam.
     pub(crate) pixels: usize,
+    /// How many measurements the search does not use: theirs and those of lost pixels.
+    pub(crate) measurements: usize,
 }
 
 impl Few {
@@ -56,27 +59,25 @@ impl Few {
             return Ok(Self::default());
         }
         stay_where_needed(&mut leaves, exposures, grid, control)?;
-        let goes = |pixel: usize| leaves[pixel] || times[pixel] == 1;
-        let mut shares = vec![[0; 2]; count];
-        exposures.for_each_stretch(control, |k, row, cols| {
-            let going = cols.clone().filter(|col| goes(row * sensor.cols + col));
-            shares[k] = [shares[k][0] + going.count(), shares[k][1] + cols.len()];
-        })?;
+        let shares = shares(&leaves, exposures, control)?;
         // What overlaps others so little is determined by such pixels.
-        if shares.iter().any(|[going, used]| 2 * going > *used) {
-            return Ok(Self::default());
+        if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
+            leaves.fill(false);
         }
-        let by_row = |is_one: &dyn Fn(usize) -> bool| {
-            let of_row = |row: usize| {
-                (0..sensor.cols).filter(|col| is_one(row * sensor.cols + col)).collect()
-            };
-            (0..sensor.rows).map(of_row).collect()
-        };
+        let mut lost = alone(&times, &leaves, exposures, grid, control)?;
+        // No exposure may lose all its measurements.
+        if self::shares(&lost, exposures, control)?.iter().any(|[lost, used]| lost == used) {
+            lost.fill(false);
+        }
+        let count = |pixels: &[bool]| pixels.iter().filter(|is_one| **is_one).count();
+        let unused = leaves.iter().zip(&lost).map(|(leaves, lost)| *leaves || *lost);
+        let measurements =
+            unused.zip(&times).map(|(unused, n)| usize::from(unused) * usize::from(*n));
         Ok(Self {
-            rows: by_row(&|pixel| leaves[pixel]),
-            lost: by_row(&|pixel| times[pixel] == 1 && !leaves[pixel]),
-            measurements: shares.iter().map(|[going, _]| going).sum(),
-            pixels: leaves.iter().filter(|leaves| **leaves).count(),
+            pixels: count(&leaves),
+            measurements: measurements.sum(),
+            rows: columns(&leaves, sensor.cols),
+            lost: columns(&lost, sensor.cols),
         })
     }
 
@@ -85,14 +86,18 @@ impl Few {
         self.in_row(row).iter().for_each(|&col| values[col] = T::default());
     }
 
+    /// Sets values of some columns of a row to 0 in them and in lost pixels.
+    pub(crate) fn clear_all<T: Default>(&self, row: usize, cols: &Range<usize>, values: &mut [T]) {
+        for columns in [self.in_row(row), self.lost_in_row(row)] {
+            let first = columns.partition_point(|col| *col < cols.start);
+            let inside = columns[first..].iter().take_while(|col| **col < cols.end);
+            inside.for_each(|col| values[col - cols.start] = T::default());
+        }
+    }
+
     /// Their columns in a row.
     pub(crate) fn in_row(&self, row: usize) -> &[usize] {
         self.rows.get(row).map_or(&[], Vec::as_slice)
-    }
-
-    /// Whether lost pixels were sought.
-    pub(crate) const fn loses(&self) -> bool {
-        !self.lost.is_empty()
     }
 
     /// The columns of lost pixels in a row.
@@ -100,23 +105,105 @@ impl Few {
         self.lost.get(row).map_or(&[], Vec::as_slice)
     }
 
+    /// Whether any pixel is lost.
+    pub(crate) const fn has_lost(&self) -> bool {
+        !self.lost.is_empty()
+    }
+
     /// Which of the pixels they are, if any.
     pub(crate) fn image(&self, cols: usize) -> Option<Vec<bool>> {
         (self.pixels > 0).then(|| image(&self.rows, cols))
     }
 
-    /// Which of the pixels are lost; empty if none were sought.
+    /// Which of the pixels are lost; empty if none is.
     pub(crate) fn lost(&self, cols: usize) -> Vec<bool> {
         image(&self.lost, cols)
     }
 }
 
+/// The columns of some pixels by row; empty if there are none.
+fn columns(pixels: &[bool], cols: usize) -> Vec<Vec<usize>> {
+    let of_row = |row: &[bool]| (0..cols).filter(|&col| row[col]).collect();
+    let rows = if pixels.contains(&true) { pixels } else { &[] };
+    rows.chunks(cols).map(of_row).collect()
+}
+
+/// The inverse of [`columns`].
 fn image(rows: &[Vec<usize>], cols: usize) -> Vec<bool> {
     let mut image = vec![false; rows.len() * cols];
     for (row, columns) in rows.iter().enumerate() {
         columns.iter().for_each(|col| image[row * cols + col] = true);
     }
     image
+}
+
+/// How many measurements of each exposure are of some pixels, and of all.
+fn shares<T: Real>(
+    pixels: &[bool],
+    exposures: &Exposures<'_, T>,
+    control: &Control,
+) -> Result<Vec<[usize; 2]>> {
+    let (mut shares, width) = (vec![[0; 2]; exposures.count()], exposures.sensor().cols);
+    exposures.for_each_stretch(control, |k, row, cols| {
+        let own = pixels[row * width..][cols.clone()].iter().filter(|is_one| **is_one);
+        shares[k] = [shares[k][0] + own.count(), shares[k][1] + cols.len()];
+    })?;
+    Ok(shares)
+}
+
+/// The cells that a pixel sees through a window, and those as far around them as `margin`.
+fn cells<'g>(
+    grid: &'g Grid,
+    window: &Window,
+    row: usize,
+    col: usize,
+    margin: usize,
+) -> impl Iterator<Item = usize> + 'g {
+    let places = grid.geometry.views[window.view].cells;
+    let (row, col, side) =
+        (row + window.row - margin, col + window.col - margin, grid.width + 2 * margin);
+    (0..side * side).map(move |i| places.at(row + i / side, col + i % side))
+}
+
+/// Which cells some pixels see.
+fn seen_by<T: Real>(
+    is_one: impl Fn(usize) -> bool,
+    exposures: &Exposures<'_, T>,
+    grid: &Grid,
+    windows: &[Window],
+    control: &Control,
+) -> Result<Vec<bool>> {
+    let (mut seen, width) = (vec![false; grid.geometry.beam.len()], exposures.sensor().cols);
+    exposures.for_each_stretch(control, |k, row, cols| {
+        for col in cols.filter(|col| is_one(row * width + col)) {
+            cells(grid, &windows[k], row, col, 0).for_each(|cell| seen[cell] = true);
+        }
+    })?;
+    Ok(seen)
+}
+
+/// The pixels that are measured once, and see a cell that none does which is measured more often.
+fn alone<T: Real>(
+    times: &[u8],
+    leaves: &[bool],
+    exposures: &Exposures<'_, T>,
+    grid: &Grid,
+    control: &Control,
+) -> Result<Vec<bool>> {
+    let (mut alone, width) = (vec![false; times.len()], exposures.sensor().cols);
+    let positions = exposures.positions();
+    let windows = grid.windows(&positions.on_grid(&positions.shifts));
+    let stays = |pixel: usize| !leaves[pixel] && times[pixel] > 1;
+    let seen = seen_by(stays, exposures, grid, &windows, control)?;
+    exposures.for_each_stretch(control, |k, row, cols| {
+        for col in cols {
+            let pixel = row * width + col;
+            alone[pixel] = times[pixel] == 1
+                && !leaves[pixel]
+                && !cells(grid, &windows[k], row, col, 0).all(|cell| seen[cell]);
+        }
+    })?;
+    Ok(alone)
 }
 
 /// Keeps those of which not all cells are seen by pixels that stay, and of one component.
@@ -132,18 +219,8 @@ fn stay_where_needed<T: Real>(
     let labels = connected(exposures, grid, &shifts, leaves, control)?.cells;
     // As far as a fitted shift may move, and not at all where it does not.
     let margin = if positions.std.is_some() { MARGIN } else { 0 };
-    let cells = |window: &Window, row: usize, col: usize, margin: usize| {
-        let places = grid.geometry.views[window.view].cells;
-        let (row, col, side) =
-            (row + window.row - margin, col + window.col - margin, grid.width + 2 * margin);
-        (0..side * side).map(move |i| places.at(row + i / side, col + i % side))
-    };
-    let mut seen = vec![false; labels.len()];
-    exposures.for_each_stretch(control, |k, row, cols| {
-        for col in cols.filter(|col| !leaves[row * sensor.cols + col]) {
-            cells(&windows[k], row, col, 0).for_each(|cell| seen[cell] = true);
-        }
-    })?;
+    let stays = |pixel: usize| !leaves[pixel];
+    let seen = seen_by(stays, exposures, grid, &windows, control)?;
     let mut found = vec![NONE; sensor.len()];
     exposures.for_each_stretch(control, |k, row, cols| {
         for pixel in cols.map(|col| row * sensor.cols + col) {
@@ -151,8 +228,8 @@ fn stay_where_needed<T: Real>(
                 continue;
             }
             let col = pixel % sensor.cols;
-            leaves[pixel] &= cells(&windows[k], row, col, margin).all(|cell| seen[cell]);
-            for cell in cells(&windows[k], row, col, 0).filter(|&cell| labels[cell] != NONE) {
+            leaves[pixel] &= cells(grid, &windows[k], row, col, margin).all(|cell| seen[cell]);
+            for cell in cells(grid, &windows[k], row, col, 0).filter(|&cell| labels[cell] != NONE) {
                 leaves[pixel] &= found[pixel] == NONE || found[pixel] == labels[cell];
                 found[pixel] = labels[cell];
             }

@@ -312,7 +312,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 }
             }
         }
-        self.lose(row, workspace);
+        self.leave_lost_out(row, workspace);
     }
 
     /// The weights of one row of each exposure; those that are all the same stand in the workspace.
@@ -323,18 +323,18 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 let _ = self.exposures.stretch(k, row, 0..cols, weights);
             }
         }
-        self.lose(row, workspace);
+        self.leave_lost_out(row, workspace);
     }
 
     /// Takes the weights of lost pixels out of those of a row.
-    fn lose(&self, row: usize, workspace: &mut Workspace) {
-        if !self.few.loses() {
+    fn leave_lost_out(&self, row: usize, workspace: &mut Workspace) {
+        if !self.few.has_lost() {
             return;
         }
         let cols = self.exposures.sensor().cols;
         for (k, weights) in workspace.weights.chunks_exact_mut(cols).enumerate() {
             if let Some(weight) = self.exposures.uniform_weight(k) {
-                // The row before may have lost others.
+                // The row before may have other lost pixels.
                 weights.fill(weight);
             }
             self.few.lost_in_row(row).iter().for_each(|&col| weights[col] = 0.0);

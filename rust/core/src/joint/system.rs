@@ -510,12 +510,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         for (weight, m) in weights.iter_mut().zip(&sensitivity[cols.clone()]) {
             *weight *= (self.pass.flux[exposure] * m).powi(2);
         }
-        let few = &self.pass.few;
-        for few in few.in_row(row).iter().chain(few.lost_in_row(row)) {
-            if cols.contains(few) {
-                weights[few - cols.start] = 0.0;
-            }
-        }
+        self.pass.few.clear_all(row, &cols, &mut weights);
         weights
     }
 }
