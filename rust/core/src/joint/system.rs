@@ -33,6 +33,10 @@ use crate::parallel::Workers;
 /// A determinant that is rounding alone, of two columns that are degenerate in a pixel.
 const SINGULAR: f64 = 1e-12;
 
+/// The share that D and the rim keep of a measurement which M follows whatever it is, since it is the pixel's only
+/// one: it pulls at nothing, but cells that it sees are seen.
+const FOLLOWED: f64 = 1e-6;
+
 /// The problem at a state.
 pub(crate) struct System<'m, 'a, T> {
     pub(crate) pass: Pass<'m, 'a, T>,
@@ -472,8 +476,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let (weights, values, _) = workspace.parts();
             for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let pixels = weights.iter().zip(&*row.sensitivity);
-                for (value, (weight, m)) in values.of_mut(k).iter_mut().zip(pixels) {
-                    *value = weight * (flux * m) * (flux * m);
+                let lights = row.light[k * cols..].iter().zip(&*row.inverse);
+                let values = values.of_mut(k).iter_mut().zip(lights);
+                for ((value, (light, inverse)), (weight, m)) in values.zip(pixels) {
+                    let pulling = share_pulling(weight * light * light * inverse);
+                    *value = pulling * weight * (flux * m) * (flux * m);
                 }
             }
         })?;
@@ -506,11 +513,18 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let _ = self.pass.exposures.stretch(exposure, row, cols.clone(), &mut weights);
         }
         let (sensor, count) = (self.pass.exposures.sensor(), self.pass.exposures.count());
-        let sensitivity = &self.pass.row(row)[count * sensor.cols..][..sensor.cols];
-        for (weight, m) in weights.iter_mut().zip(&sensitivity[cols.clone()]) {
-            *weight *= (self.pass.flux[exposure] * m).powi(2);
+        let part = |index: usize| &self.pass.row(row)[index * sensor.cols..][cols.clone()];
+        let pixels = part(count).iter().zip(part(exposure)).zip(part(count + 1));
+        for (weight, ((m, light), inverse)) in weights.iter_mut().zip(pixels) {
+            let pulling = share_pulling(*weight * light * light * inverse);
+            *weight *= pulling * (self.pass.flux[exposure] * m).powi(2);
         }
         self.pass.few.clear_all(row, &cols, &mut weights);
         weights
     }
+}
+
+/// The share of its weight that a measurement pulls with, where w e² is this share of D = Σ w e² of its pixel.
+fn share_pulling(share: f64) -> f64 {
+    if (share - 1.0).abs() < FOLLOWED { FOLLOWED } else { 1.0 }
 }
