@@ -35,6 +35,9 @@ _CORRELATED = 0.01
 _MOST = 0.5
 """Share of an excess from which a cause is the likely one."""
 
+_NO_NOISE = 100.0
+"""Factor on all variances that is no mistake in noise, which is known to some factor."""
+
 _ENOUGH = 0.9
 """Share of what more unknowns explain from which fewer are the cause."""
 
@@ -132,6 +135,7 @@ def misfit(
     if high or low:
         chi2 *= _share_of_good(weighted, flags, options)
         high, low = _beyond(chi2, std, inexactness)
+    low = low and chi2 < 1 - _limit(std) - _rounding_share(weighted.exposures, residuals)
     # F over all measurements needs no degrees of freedom: their number is at most that.
     surely = high and chi2 * residuals.share > 1 + _limit(std)
     if (high or low) and not surely and not _is_counted(weighted.fit):
@@ -139,6 +143,7 @@ def misfit(
         if simulated is not None:
             chi2, std = unexplained * simulated.value, simulated.std
             high, low = _beyond(chi2, std, inexactness)
+            low = low and chi2 < 1 - _limit(std) - _rounding_share(weighted.exposures, residuals)
     largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
     correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
     correlated &= inexactness <= EXACT
@@ -183,6 +188,20 @@ def _beyond(chi2: float, std: float, inexactness: float) -> tuple[bool, bool]:
     return chi2 * (1 - inexactness**2) > 1 + _limit(std), chi2 < 1 - _limit(std)
 
 
+def _rounding_share(exposures: Exposures, residuals: Residuals) -> float:
+    """Share of the variances that rounding makes which frames do not average out.
+
+    Where the beam moves a pixel by less than a step between exposures, all of them round alike: M
+    follows that, and the residuals are without it.
+    """
+    shares = []
+    for k, model in enumerate(exposures.noise):
+        values = (exposures.values[k] * exposures.response)[residuals.rows]
+        signal = np.maximum(values[np.isfinite(values)], 0)
+        shares.append(np.mean(model.rounding(signal) / model.variance(signal)))
+    return float(np.mean(shares)) if shares else 0.0
+
+
 def _cause(
     weighted: Weighted,
     residuals: Residuals,
@@ -205,7 +224,8 @@ def _cause(
             "smoothed or clipped?"
         )
     noise = residuals.share * residuals.scale
-    excess = float(np.nansum(values**2)) - noise * np.count_nonzero(np.isfinite(values))
+    expected = noise * np.count_nonzero(np.isfinite(values))
+    excess = float(np.nansum(values**2)) - expected
     inside = np.where(_flat(_seen_by_all(weighted, residuals)), values, np.nan)
     if weighted.exposures.knows_noise and causes.by_signal(inside, signal) > _MOST:
         return "signal", (
@@ -215,6 +235,11 @@ def _cause(
     found = _local(weighted.exposures, values, residuals, noise, excess)
     if found is not None:
         return found
+    if not correlated and excess > _NO_NOISE * expected:
+        return "unknown", (
+            "noise is not so far from what was stated. Check the shifts, for a factor as of binning "
+            "or the pixel pitch, and that the variances are in the units of the values, squared"
+        )
     if not correlated:
         return "noise", (
             "they are white, so the variances are too small. Multiply them by reduced chi-square"

@@ -192,6 +192,9 @@ def on_fit(
     """
     if misfit is not None and misfit.cause == "order":
         colours = None
+    if misfit is not None and misfit.chi2 < 1 and weighted.exposures.clipped is not None:
+        # Values that saturate do not scatter.
+        misfit = None
     found = [
         _on_sign(test),
         _on_orientation(test),
@@ -360,9 +363,15 @@ def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
             ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
             "almost no light"
         )
+    sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
+    if error <= options.fit.tolerance:
+        return Verdict(
+            "convergence",
+            f"not converged after {sweeps} sweeps, which are too few to estimate the error: "
+            "probably most pixels saturate or have no light",
+        )
     return Verdict(
         "convergence",
-        f"not converged after {int(fit.sweeps[-1])} sweeps: the estimated error is "
-        f"{float(fit.error_estimate[-1]):.1e}, above the tolerance {options.fit.tolerance:g}"
-        f"{remedy}",
+        f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
+        f"tolerance {options.fit.tolerance:g}{remedy}",
     )

@@ -287,10 +287,14 @@ class Averaged:
     def dark_variance(self, noise: NoiseModel) -> Floats | None:
         """Variance of the dark that was subtracted from all, from the noise of one frame.
 
-        Of a dark that is not kept it is what the averages state; None without any.
+        Of a dark that is not kept it is what the averages state; None without any. One frame shows
+        no noise, and what exposures in bright light say of that of the dark may be far off: its
+        scatter between neighbours, which holds its pattern too, stands for it.
         """
         if self.dark is not None:
-            scatter = noise.scatter(0.0) / np.maximum(self.dark.count, 1)
+            is_one = self.dark.count.max() <= 1
+            of_frame = _between_neighbours(self.dark.mean) if is_one else noise.scatter(0.0)
+            scatter = of_frame / np.maximum(self.dark.count, 1)
             of_mean = noise.of_mean(int(self.dark.count.max()))
             return np.asarray(scatter + of_mean.rounding_apart(0.0, self.dark.mean))
         stated = float(np.mean(self._of_dark))
@@ -355,6 +359,15 @@ def _added_by_dark(frames: FrameStatistics, count: int) -> float:
     if count < 2:
         return 0.0
     return max(0.0, float(np.nanmedian(frames.variance_of_mean - frames.variance / count)))
+
+
+def _between_neighbours(frame: Array) -> float:
+    """Variance of pixels about their neighbours, in DN²: half that of differences.
+
+    Of normal differences 68.27 % lie within one standard deviation; bad pixels do not count.
+    """
+    steps = np.abs(np.diff(frame.ravel().astype(np.float64)))
+    return float(np.nanpercentile(steps, 68.27) ** 2 / 2)
 
 
 def _dark_points(dark: FrameStatistics) -> Array:

@@ -121,7 +121,10 @@ def filtered(
         raise InputError("'cfa' is None, expected a pattern such as 'RGGB'")
     missing = [label for label in colours.labels if label not in known]
     if missing:
-        raise InputError(f"'response' has no value for the colours {missing} of 'cfa'")
+        raise InputError(
+            f"'cfa' has the colours {missing}, whose response is not known (known: "
+            f"{', '.join(known)}): give 'response'"
+        )
     return np.asarray(plain * colours.map_of(known, plain.shape), np.float64)
 
 

@@ -1,0 +1,64 @@
+"""Calibrations of cameras that round coarsely, with few dark frames, or that saturate."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import Flag, simulate
+from equipix.errors import EquipixWarning
+
+SHAPE = (96, 120)
+
+
+def calibrated(*, binning=1, **camera):
+    """Calibrate simulated frames; give what was found, and z of the pixels that are usable."""
+    truth = simulate.paper_sensitivity(SHAPE, rng=1)
+    cross = equipix.cross_pattern(11, 19)
+    virtual = simulate.experiment(truth, simulate.gaussian_beam(SHAPE), cross, rng=101, **camera)
+    dark = equipix.average(virtual.dark())
+    frames = [equipix.average(virtual.frames(k), dark=dark) for k in range(len(cross))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EquipixWarning)
+        cal = equipix.calibrate(frames, binning * virtual.positions, uncertainty=True)
+    good = (cal.flags & Flag.DO_NOT_USE == 0) & np.isfinite(cal.sensitivity)
+    error = cal.sensitivity / cal.sensitivity[good].mean() - truth / truth[good].mean()
+    return cal, (error / cal.sensitivity_std)[good]
+
+
+@pytest.mark.parametrize(("gain", "frames", "bits"), [(0.0025, 100, 12), (0.0025, 20, 8)])
+def test_rounding_that_all_exposures_share_is_no_misfit(gain, frames, bits):
+    """M follows it: reduced chi-square is 0.53 and 0.84, and error bars are right or too large."""
+    cal, z = calibrated(gain_dn_per_e=gain, frames=frames, bit_depth=bits)
+    assert cal.verdicts == ()
+    assert 0.9 < np.sqrt(np.mean(z**2)) < 1.03
+
+
+@pytest.mark.parametrize("frames", [20, 300])
+def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
+    """Its noise was that of a line through bright light, up to five times too large, or none."""
+    cal, z = calibrated(frames=frames, dark_frames=1)
+    assert cal.verdicts == ()
+    # The dark's own pattern, of 2 to 3 DN beside a read noise of 2 DN, counts as noise.
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 1
+
+
+def test_clipped_values_do_not_say_that_variances_are_too_large():
+    cal, _ = calibrated(exposure_e=19500)
+    assert "saturation" in {verdict.kind for verdict in cal.verdicts}
+    assert not any("variances are too large" in verdict.message for verdict in cal.verdicts)
+
+
+def test_shifts_of_binned_pixels_are_no_matter_of_noise():
+    cal, _ = calibrated(binning=2, frames=4)
+    assert not any("variances are too small" in verdict.message for verdict in cal.verdicts)
+
+
+def test_an_estimate_below_the_tolerance_is_not_said_to_be_above_it():
+    """Almost all pixels saturate."""
+    cal, _ = calibrated(gain_dn_per_e=0.2, bit_depth=8)
+    (words,) = [verdict.message for verdict in cal.verdicts if verdict.kind == "convergence"]
+    assert "too few to estimate the error" in words
