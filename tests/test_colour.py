@@ -88,7 +88,7 @@ def test_too_little_travel_for_each_colour_is_refused():
 def test_a_filtered_sensitivity_has_the_responses_of_its_colours():
     truth = simulate.filtered(np.ones((4, 4)), QUAD, response={"R": 1, "G": 2, "B": 3})
     assert truth[[0, 0, 2, 3], [0, 2, 0, 3]].tolist() == [1, 2, 2, 3]
-    with pytest.raises(errors.InputError, match=r"'response' has no value for the colours \['W'\]"):
+    with pytest.raises(errors.InputError, match=r"\['W'\], whose response is not known"):
         simulate.filtered(np.ones((4, 4)), "RGBW")
 
 

@@ -237,8 +237,8 @@ def _cause(
         return found
     if not correlated and excess > _NO_NOISE * expected:
         return "unknown", (
-            "noise is not so far from what was stated. Check the shifts, for a factor as of binning "
-            "or the pixel pitch, and that the variances are in the units of the values, squared"
+            "noise is not so far from what was stated. Check the shifts, for a factor as of "
+            "binning or the pixel pitch, and that variances are in the units of the values, squared"
         )
     if not correlated:
         return "noise", (
