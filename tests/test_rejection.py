@@ -75,6 +75,17 @@ def test_clean_frames_keep_their_samples():
     np.testing.assert_allclose(found.variance, plain.variance, rtol=1e-6)
 
 
+@pytest.mark.parametrize("level", [20.0, 20.3, 20.5])
+@pytest.mark.parametrize("noise", [0.1, 0.3, 0.6, 1.0])
+def test_whole_numbers_keep_their_samples(noise, level):
+    """Where most were equal the noise counted as that of rounding, and its tails as outliers."""
+    frames = np.rint(np.random.default_rng(1).normal(level, noise, (20, 60, 60))).astype(np.uint8)
+    kept, whole = equipix.average(frames, reject=5), equipix.average(frames)
+    # Of 72 000 normal samples 0.04 lie beyond five standard deviations.
+    assert np.count_nonzero(kept.count < 20) <= 1
+    assert kept.variance.mean() == pytest.approx(whole.variance.mean(), rel=1e-3, abs=1e-9)
+
+
 @pytest.mark.parametrize(("sigmas", "bias"), [(5, 0.015), (4, 0.04), (3, 0.09)])
 @pytest.mark.parametrize("times", [1.5, 2.0, 2.5, 3.0, 10.0])
 def test_a_noisy_pixel_keeps_its_noise(times, sigmas, bias):

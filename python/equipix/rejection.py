@@ -175,7 +175,9 @@ class Rejection:
         pixels = pixels[np.argsort(centre.flat[pixels])]
         for group in np.array_split(pixels, min(_BINS, max(1, len(pixels) // _BINS))):
             samples = deviation.reshape(len(start), -1)[:, group]
-            common.flat[group] = max(floor, self._noise(samples, float(np.median(own.flat[group]))))
+            # Of whole numbers most may be equal, so that their median deviation is 0.
+            typical = max(floor, float(np.median(own.flat[group])))
+            common.flat[group] = max(floor, self._noise(samples, typical))
         return centre, common, np.maximum(own, _LEAST_OWN * common)
 
     def _noise(self, samples: Floats, sigma: float) -> float:
