@@ -63,3 +63,11 @@ def test_an_estimate_below_the_tolerance_is_not_said_to_be_above_it():
         cal, _ = calibrated(gain_dn_per_e=0.2, bit_depth=8)
     (words,) = [verdict.message for verdict in cal.verdicts if verdict.kind == "convergence"]
     assert "too few to estimate the error" in words
+
+
+def test_light_below_zero_is_refused():
+    beam = simulate.wavy_beam(SHAPE, contrast=0.5, rng=5)
+    with pytest.raises(equipix.errors.InputError, match="expected 0 or more"):
+        simulate.experiment(np.ones(SHAPE), beam, [(0, 0)] * 3, rng=1, frames=2).frames(
+            0
+        ).__next__()

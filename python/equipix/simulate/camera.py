@@ -160,6 +160,11 @@ class Camera:
         ndarray, shape (rows, cols), uint8 up to 8 bits, else uint16
             The next frame, in DN.
 
+        Raises
+        ------
+        InputError
+            With the first frame, if light is below 0 anywhere, or is no number.
+
         Notes
         -----
         Photons of a Poisson and read noise of a normal distribution. From 1000 electrons on, where
@@ -169,6 +174,11 @@ class Camera:
         """
         rng = np.random.default_rng(rng)
         electrons = light * self.response
+        if not (electrons >= 0).all():
+            raise InputError(
+                f"'light' goes down to {np.min(electrons):.3g} electrons, expected 0 or more "
+                "everywhere: is the beam below 0, as one of a large contrast?"
+            )
         normal = self._is_normal(electrons)
         mean = np.where(normal, electrons, 0.0)
         level = np.float32(self.gain_dn_per_e * mean + self.offset)
