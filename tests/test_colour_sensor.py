@@ -318,7 +318,7 @@ def test_a_staring_array_has_filters():
     light, dark = array.electrons(1e6), array.electrons(0)
     seen = array.with_causes(cfa="GRBG").electrons(1e6)
     np.testing.assert_allclose(seen - dark, simulate.filtered(light - dark, "GRBG"), rtol=1e-9)
-    with pytest.raises(errors.InputError, match="no value for the colours"):
+    with pytest.raises(errors.InputError, match="whose response is not known"):
         array.with_causes(cfa="CYYM")
 
 
