@@ -106,7 +106,7 @@ def test_large_discs_converge_and_raise_no_alarm(draws, figure):
                 shift_std=0.3,
             )
         assert cal.converged
-        # Pixels that are measured once and alone see cells have no value, all others have.
+        # Only pixels that are measured once may be without a value.
         times = (~mask).sum(axis=0)
         assert np.isfinite(cal.sensitivity[times > 1]).all()
         passes.append(cal.sweeps)

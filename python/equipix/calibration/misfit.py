@@ -135,7 +135,7 @@ def misfit(
     if high or low:
         chi2 *= _share_of_good(weighted, flags, options)
         high, low = _beyond(chi2, std, inexactness)
-    low = low and chi2 < 1 - _limit(std) - _rounding_share(weighted.exposures, residuals)
+    low = low and _is_low(chi2, std, weighted.exposures, residuals)
     # F over all measurements needs no degrees of freedom: their number is at most that.
     surely = high and chi2 * residuals.share > 1 + _limit(std)
     if (high or low) and not surely and not _is_counted(weighted.fit):
@@ -143,7 +143,7 @@ def misfit(
         if simulated is not None:
             chi2, std = unexplained * simulated.value, simulated.std
             high, low = _beyond(chi2, std, inexactness)
-            low = low and chi2 < 1 - _limit(std) - _rounding_share(weighted.exposures, residuals)
+            low = low and _is_low(chi2, std, weighted.exposures, residuals)
     largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
     correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
     correlated &= inexactness <= EXACT
@@ -188,18 +188,19 @@ def _beyond(chi2: float, std: float, inexactness: float) -> tuple[bool, bool]:
     return chi2 * (1 - inexactness**2) > 1 + _limit(std), chi2 < 1 - _limit(std)
 
 
-def _rounding_share(exposures: Exposures, residuals: Residuals) -> float:
-    """Share of the variances that rounding makes which frames do not average out.
+def _is_low(chi2: float, std: float, exposures: Exposures, residuals: Residuals) -> bool:
+    """Whether χ² is below what noise reaches without the rounding that frames do not average out.
 
     Where the beam moves a pixel by less than a step between exposures, all of them round alike: M
     follows that, and the residuals are without it.
     """
+    response = np.broadcast_to(exposures.response, exposures.shape)[residuals.rows]
     shares = []
     for k, model in enumerate(exposures.noise):
-        values = (exposures.values[k] * exposures.response)[residuals.rows]
+        values = exposures.values[k, residuals.rows] * response
         signal = np.maximum(values[np.isfinite(values)], 0)
         shares.append(np.mean(model.rounding(signal) / model.variance(signal)))
-    return float(np.mean(shares)) if shares else 0.0
+    return chi2 < 1 - _limit(std) - (float(np.mean(shares)) if shares else 0.0)
 
 
 def _cause(
