@@ -45,7 +45,8 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     .. [1] B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), section 6.5: the
        parametric bootstrap.
     """
-    options = dataclasses.replace(options, progress=None)
+    # Coordinate descent would take thousands of sweeps for large-scale errors of this fit alone.
+    options = dataclasses.replace(options, progress=None, method="multiscale")
     window, fit = window_of(weighted.exposures, weighted.fit)
     part = weighted
     if fit is None:
