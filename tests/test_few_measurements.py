@@ -85,14 +85,28 @@ def test_experiments_of_two_exposures_keep_all_pixels():
     assert cal.weighted.fit.few is None
 
 
+def with_edge(edge, rng, frames, mask):
+    """A circle, a threshold on noisy frames, or every second measurement along some eight pixels."""
+    if edge == "threshold":
+        return frames < 0.6
+    grown = mask.copy()
+    for step in (1, 2, 4):
+        for axis in (1, 2):
+            grown |= np.roll(grown, step, axis) | np.roll(grown, -step, axis)
+    missing = rng.random(mask.shape) < (0.5 if edge == "frayed" else 0)
+    return mask | (grown & missing)
+
+
 @pytest.mark.study
-def test_large_discs_converge_and_raise_no_alarm(draws, figure):
+@pytest.mark.parametrize("edge", ["circle", "threshold", "frayed"])
+def test_large_discs_converge_and_raise_no_alarm(edge, draws, figure):
     passes = []
     for seed in draws(20):
         rng = np.random.default_rng(1000 + seed)
         limb, flux = rng.uniform(0.8, 1.02), rng.uniform(0.95, 1.05, 9)
         frames, shifts, mask, _ = discs(seed, limb=limb, side=512, flux=flux)
         measured = shifts + 0.3 * rng.standard_normal(shifts.shape)
+        mask = with_edge(edge, rng, frames, mask)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             # That free fluxes leave the tilt open is no alarm.
@@ -106,9 +120,12 @@ def test_large_discs_converge_and_raise_no_alarm(draws, figure):
                 shift_std=0.3,
             )
         assert cal.converged
-        # Only pixels that are measured once may be without a value.
-        times = (~mask).sum(axis=0)
-        assert np.isfinite(cal.sensitivity[times > 1]).all()
+        if edge == "circle":
+            # Only pixels that are measured once may be without a value.
+            times = (~mask).sum(axis=0)
+            assert np.isfinite(cal.sensitivity[times > 1]).all()
         passes.append(cal.sweeps)
-    figure("most passes of discs of 512×512 pixels", max(passes), "at most 100")
-    assert max(passes) <= 100
+    name = f"most passes of discs of 512×512 pixels, edge of masks: {edge}"
+    figure(name, max(passes), "at most 100")
+    # Edges that are not clean are wanted in as many; what they take is in the record.
+    assert edge != "circle" or max(passes) <= 100

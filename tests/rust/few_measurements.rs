@@ -1,4 +1,5 @@
-//! Pixels with one or two measurements of more exposures: they follow the beam, which does not follow them.
+//! Pixels with one or two measurements of more exposures: they follow the beam, which does not follow them. And
+//! measurements that stand apart from others.
 
 use crate::common::{Answer, Experiment, Lamp, Options, error_map, fit};
 use crate::simulation::{BETWEEN, CROSS, SHIFT_STD, Simulation, even, random};
@@ -117,6 +118,65 @@ fn pixels_measured_once_are_lost_where_they_alone_see_cells() {
             assert_eq!(std.is_nan(), is_lost(pixel));
         }
     }
+}
+
+/// Whether a measurement is one of 2×2 of its exposure.
+fn is_firm(used: impl Fn(usize, usize) -> bool, k: usize, pixel: usize) -> bool {
+    let [row, col] = [pixel / SHAPE[1], pixel % SHAPE[1]].map(|at| at as i64);
+    let is_used = |row: i64, col: i64| {
+        let is_inside = (0..SHAPE[0] as i64).contains(&row) && (0..SHAPE[1] as i64).contains(&col);
+        is_inside && used(k, row as usize * SHAPE[1] + col as usize)
+    };
+    let corners = [[-1, -1], [-1, 0], [0, -1], [0, 0]].map(|[r, c]| [row + r, col + c]);
+    corners.iter().any(|[r, c]| (0..4).all(|i| is_used(r + i / 2, c + i % 2)))
+}
+
+#[test]
+fn measurements_apart_are_lost_where_no_firm_one_sees_their_cells() {
+    // Of the last columns each exposure has one pixel in three, as along a ragged edge.
+    let used =
+        |k: usize, pixel: usize| pixel % SHAPE[1] < 34 || random(60 + k as u64, pixel) > 2.0 / 3.0;
+    let at = |i: usize| (i / PIXELS, i % PIXELS);
+    let all = || (0..5 * PIXELS).map(at).filter(|&(k, pixel)| used(k, pixel));
+    let seen: std::collections::HashSet<_> = all()
+        .filter(|&(k, pixel)| is_firm(used, k, pixel))
+        .flat_map(|(k, pixel)| cells(pixel, BETWEEN[k]))
+        .collect();
+    let is_lost = |(k, pixel): (usize, usize)| {
+        !is_firm(used, k, pixel) && cells(pixel, BETWEEN[k]).any(|cell| !seen.contains(&cell))
+    };
+    let lost = all().filter(|&at| is_lost(at)).count();
+    let kept = all().filter(|&(k, pixel)| !is_firm(used, k, pixel) && !is_lost((k, pixel))).count();
+    assert!(lost > 10 && kept > 10, "{lost} {kept}");
+    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 10);
+    let masked = |is_out: &dyn Fn((usize, usize)) -> bool| Experiment {
+        mask: (0..5 * PIXELS).map(at).map(is_out).collect(),
+        ..simulation.experiment()
+    };
+    let found = fit(&masked(&|at| !used(at.0, at.1)), Options::to(TOLERANCE)).unwrap();
+    let others =
+        fit(&masked(&|at| !used(at.0, at.1) || is_lost(at)), Options::to(TOLERANCE)).unwrap();
+    assert!(found.converged && others.converged);
+    assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
+    // Degrees of freedom count cells by the weights of whole exposures, those of lost measurements too.
+    assert!(found.degrees_of_freedom.abs_diff(others.degrees_of_freedom) <= 1);
+    assert_eq!(found.labels[0], others.labels[0]);
+    for (m, other) in found.sensitivity.iter().zip(&others.sensitivity) {
+        assert!(m.is_nan() == other.is_nan());
+        // Each is within its tolerance of the same minimum.
+        assert!(other.is_nan() || (m / other - 1.0).abs() < 10.0 * TOLERANCE);
+    }
+}
+
+#[test]
+fn none_is_lost_where_most_stand_apart() {
+    // A mask like a chessboard.
+    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 11);
+    let is_black = |pixel: usize| (pixel / SHAPE[1] + pixel % SHAPE[1]).is_multiple_of(2);
+    let mask = (0..5 * PIXELS).map(|i| is_black(i % PIXELS)).collect();
+    let found = fit(&Experiment { mask, ..simulation.experiment() }, Options::to(1e-6)).unwrap();
+    assert!(found.converged);
+    assert!((0..PIXELS).all(|pixel| found.sensitivity[pixel].is_nan() == is_black(pixel)));
 }
 
 #[test]

@@ -23,6 +23,7 @@ mod fused;
 mod fused_kernel;
 mod kernel;
 mod layout;
+mod lost;
 mod memory;
 mod outcome;
 mod pass;

@@ -9,11 +9,15 @@
 //! They stay in it where they say what no other pixel does: where cells are seen by them alone, or where they join
 //! components. But a pixel that is measured once says nothing of cells that no other pixel sees, since its M follows
 //! any light: these cells would take any value, and with them its M. It is lost, as if it had not been measured.
+//!
+//! Lost are also measurements that stand apart from others of their exposure and see cells that no others determine
+//! (`lost.rs`).
 
 use std::ops::Range;
 
 use super::connected::connected;
-use super::layout::{Grid, MARGIN, Window};
+use super::layout::{Grid, MARGIN};
+use super::lost::{Lost, Survey};
 use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::error::Result;
@@ -23,14 +27,16 @@ use crate::frames::Real;
 /// Measurements that are few where there are more exposures.
 const FEW: u8 = 2;
 
-/// The columns of such pixels and of lost ones, by row of the sensor.
+/// The columns of such pixels, by row of the sensor, and lost measurements.
 #[derive(Debug, Default)]
 pub(crate) struct Few {
     rows: Vec<Vec<usize>>,
-    lost: Vec<Vec<usize>>,
+    pub(crate) lost: Lost,
+    /// Measured pixels of which all measurements are lost.
+    pub(crate) lost_pixels: Vec<usize>,
     /// How many pixels follow the beam.
     pub(crate) pixels: usize,
-    /// How many measurements the search does not use: theirs and those of lost pixels.
+    /// How many measurements the search does not use: theirs and lost ones.
     pub(crate) measurements: usize,
 }
 
@@ -49,35 +55,30 @@ impl Few {
         if count <= usize::from(FEW) || is_whole || exposures.offset() {
             return Ok(Self::default());
         }
-        let mut times = vec![0_u8; sensor.len()];
-        exposures.for_each_stretch(control, |_, row, cols| {
-            let pixels = &mut times[row * sensor.cols..][cols];
-            pixels.iter_mut().for_each(|times| *times = times.saturating_add(1));
-        })?;
+        let mut survey = Survey::new(exposures, grid, control);
+        survey.lost = survey.apart()?;
+        let times = survey.times()?;
         let mut leaves: Vec<bool> = times.iter().map(|times| (1..=FEW).contains(times)).collect();
-        if !leaves.contains(&true) {
-            return Ok(Self::default());
+        if leaves.contains(&true) {
+            stay_where_needed(&mut leaves, &survey)?;
+            // What overlaps others so little is determined by such pixels.
+            let shares = survey.shares(|_, pixel| leaves[pixel])?;
+            if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
+                leaves.fill(false);
+            }
+            survey.lost = lost_alone(&times, &leaves, &survey)?;
         }
-        stay_where_needed(&mut leaves, exposures, grid, control)?;
-        let shares = shares(&leaves, exposures, control)?;
-        // What overlaps others so little is determined by such pixels.
-        if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
-            leaves.fill(false);
-        }
-        let mut lost = alone(&times, &leaves, exposures, grid, control)?;
-        // No exposure may lose all its measurements.
-        if self::shares(&lost, exposures, control)?.iter().any(|[lost, used]| lost == used) {
-            lost.fill(false);
-        }
-        let count = |pixels: &[bool]| pixels.iter().filter(|is_one| **is_one).count();
-        let unused = leaves.iter().zip(&lost).map(|(leaves, lost)| *leaves || *lost);
-        let measurements =
-            unused.zip(&times).map(|(unused, n)| usize::from(unused) * usize::from(*n));
+        let lost_pixels = if survey.lost.is_empty() { Vec::new() } else { lost_pixels(&survey)? };
+        let leaving = (0..sensor.len()).filter(|&pixel| leaves[pixel]);
+        let of_row = |row: &[bool]| (0..sensor.cols).filter(|&col| row[col]).collect();
+        let rows = if leaves.contains(&true) { &leaves[..] } else { &[] };
         Ok(Self {
-            pixels: count(&leaves),
-            measurements: measurements.sum(),
-            rows: columns(&leaves, sensor.cols),
-            lost: columns(&lost, sensor.cols),
+            rows: rows.chunks(sensor.cols).map(of_row).collect(),
+            lost_pixels,
+            pixels: leaving.clone().count(),
+            measurements: leaving.map(|pixel| usize::from(times[pixel])).sum::<usize>()
+                + survey.lost.count(),
+            lost: survey.lost,
         })
     }
 
@@ -86,9 +87,15 @@ impl Few {
         self.in_row(row).iter().for_each(|&col| values[col] = T::default());
     }
 
-    /// Sets values of some columns of a row to 0 in them and in lost pixels.
-    pub(crate) fn clear_all<T: Default>(&self, row: usize, cols: &Range<usize>, values: &mut [T]) {
-        for columns in [self.in_row(row), self.lost_in_row(row)] {
+    /// Sets values of some columns of a row of an exposure to 0 in them and where measurements are lost.
+    pub(crate) fn clear_all<T: Default>(
+        &self,
+        exposure: usize,
+        row: usize,
+        cols: &Range<usize>,
+        values: &mut [T],
+    ) {
+        for columns in [self.in_row(row), self.lost.in_row(exposure, row)] {
             let first = columns.partition_point(|col| *col < cols.start);
             let inside = columns[first..].iter().take_while(|col| **col < cols.end);
             inside.for_each(|col| values[col - cols.start] = T::default());
@@ -100,136 +107,61 @@ impl Few {
         self.rows.get(row).map_or(&[], Vec::as_slice)
     }
 
-    /// The columns of lost pixels in a row.
-    pub(crate) fn lost_in_row(&self, row: usize) -> &[usize] {
-        self.lost.get(row).map_or(&[], Vec::as_slice)
-    }
-
-    /// Whether any pixel is lost.
-    pub(crate) const fn has_lost(&self) -> bool {
-        !self.lost.is_empty()
-    }
-
     /// Which of the pixels they are, if any.
     pub(crate) fn image(&self, cols: usize) -> Option<Vec<bool>> {
-        (self.pixels > 0).then(|| image(&self.rows, cols))
-    }
-
-    /// Which of the pixels are lost; empty if none is.
-    pub(crate) fn lost(&self, cols: usize) -> Vec<bool> {
-        image(&self.lost, cols)
-    }
-}
-
-/// The columns of some pixels by row; empty if there are none.
-fn columns(pixels: &[bool], cols: usize) -> Vec<Vec<usize>> {
-    let of_row = |row: &[bool]| (0..cols).filter(|&col| row[col]).collect();
-    let rows = if pixels.contains(&true) { pixels } else { &[] };
-    rows.chunks(cols).map(of_row).collect()
-}
-
-/// The inverse of [`columns`].
-fn image(rows: &[Vec<usize>], cols: usize) -> Vec<bool> {
-    let mut image = vec![false; rows.len() * cols];
-    for (row, columns) in rows.iter().enumerate() {
-        columns.iter().for_each(|col| image[row * cols + col] = true);
-    }
-    image
-}
-
-/// How many measurements of each exposure are of some pixels, and of all.
-fn shares<T: Real>(
-    pixels: &[bool],
-    exposures: &Exposures<'_, T>,
-    control: &Control,
-) -> Result<Vec<[usize; 2]>> {
-    let (mut shares, width) = (vec![[0; 2]; exposures.count()], exposures.sensor().cols);
-    exposures.for_each_stretch(control, |k, row, cols| {
-        let own = pixels[row * width..][cols.clone()].iter().filter(|is_one| **is_one);
-        shares[k] = [shares[k][0] + own.count(), shares[k][1] + cols.len()];
-    })?;
-    Ok(shares)
-}
-
-/// The cells that a pixel sees through a window, and those as far around them as `margin`.
-fn cells<'g>(
-    grid: &'g Grid,
-    window: &Window,
-    row: usize,
-    col: usize,
-    margin: usize,
-) -> impl Iterator<Item = usize> + 'g {
-    let places = grid.geometry.views[window.view].cells;
-    let (row, col, side) =
-        (row + window.row - margin, col + window.col - margin, grid.width + 2 * margin);
-    (0..side * side).map(move |i| places.at(row + i / side, col + i % side))
-}
-
-/// Which cells some pixels see.
-fn seen_by<T: Real>(
-    is_one: impl Fn(usize) -> bool,
-    exposures: &Exposures<'_, T>,
-    grid: &Grid,
-    windows: &[Window],
-    control: &Control,
-) -> Result<Vec<bool>> {
-    let (mut seen, width) = (vec![false; grid.geometry.beam.len()], exposures.sensor().cols);
-    exposures.for_each_stretch(control, |k, row, cols| {
-        for col in cols.filter(|col| is_one(row * width + col)) {
-            cells(grid, &windows[k], row, col, 0).for_each(|cell| seen[cell] = true);
+        let mut image = vec![false; self.rows.len() * cols];
+        for (row, columns) in self.rows.iter().enumerate() {
+            columns.iter().for_each(|col| image[row * cols + col] = true);
         }
-    })?;
-    Ok(seen)
+        (self.pixels > 0).then_some(image)
+    }
 }
 
-/// The pixels that are measured once, and see a cell that none does which is measured more often.
-fn alone<T: Real>(
-    times: &[u8],
-    leaves: &[bool],
-    exposures: &Exposures<'_, T>,
-    grid: &Grid,
-    control: &Control,
-) -> Result<Vec<bool>> {
-    let (mut alone, width) = (vec![false; times.len()], exposures.sensor().cols);
-    let positions = exposures.positions();
-    let windows = grid.windows(&positions.on_grid(&positions.shifts));
-    let stays = |pixel: usize| !leaves[pixel] && times[pixel] > 1;
-    let seen = seen_by(stays, exposures, grid, &windows, control)?;
-    exposures.for_each_stretch(control, |k, row, cols| {
-        for col in cols {
-            let pixel = row * width + col;
-            alone[pixel] = times[pixel] == 1
-                && !leaves[pixel]
-                && !cells(grid, &windows[k], row, col, 0).all(|cell| seen[cell]);
-        }
-    })?;
-    Ok(alone)
+/// What is lost, and pixels that are measured once and see a cell that none does which is measured more often; but
+/// no exposure may lose all its measurements.
+fn lost_alone<T: Real>(times: &[u8], leaves: &[bool], survey: &Survey<'_, '_, T>) -> Result<Lost> {
+    let width = survey.exposures.sensor().cols;
+    let seen = survey.seen_by(|_, pixel| !leaves[pixel] && times[pixel] > 1)?;
+    let is_alone = |k: usize, pixel: usize| {
+        let see_all = || survey.cells(k, pixel / width, pixel % width, 0).all(|cell| seen[cell]);
+        times[pixel] == 1 && !leaves[pixel] && !see_all()
+    };
+    let shares = survey.shares(is_alone)?;
+    let none_is_empty = shares.iter().all(|[alone, used]| alone < used);
+    survey.with_lost(|k, pixel| none_is_empty && is_alone(k, pixel))
+}
+
+/// The pixels that are measured, but of which all measurements are lost.
+fn lost_pixels<T: Real>(survey: &Survey<'_, '_, T>) -> Result<Vec<usize>> {
+    let used = survey.times()?;
+    let losing = survey.lost.pixels(survey.exposures.sensor().cols);
+    let mut pixels: Vec<_> = losing.filter(|&pixel| used[pixel] == 0).collect();
+    pixels.sort_unstable();
+    pixels.dedup();
+    Ok(pixels)
 }
 
 /// Keeps those of which not all cells are seen by pixels that stay, and of one component.
-fn stay_where_needed<T: Real>(
-    leaves: &mut [bool],
-    exposures: &Exposures<'_, T>,
-    grid: &Grid,
-    control: &Control,
-) -> Result<()> {
+fn stay_where_needed<T: Real>(leaves: &mut [bool], survey: &Survey<'_, '_, T>) -> Result<()> {
+    let Survey { exposures, grid, lost, control, .. } = survey;
     let (sensor, positions) = (exposures.sensor(), exposures.positions());
     let shifts = positions.on_grid(&positions.shifts);
-    let windows = grid.windows(&shifts);
-    let labels = connected(exposures, grid, &shifts, leaves, control)?.cells;
+    let is_out = |k: usize, row: usize, col: usize| {
+        leaves[row * sensor.cols + col] || lost.contains(k, row, col)
+    };
+    let labels = connected(exposures, grid, &shifts, is_out, control)?.cells;
     // As far as a fitted shift may move, and not at all where it does not.
     let margin = if positions.std.is_some() { MARGIN } else { 0 };
-    let stays = |pixel: usize| !leaves[pixel];
-    let seen = seen_by(stays, exposures, grid, &windows, control)?;
+    let seen = survey.seen_by(|_, pixel| !leaves[pixel])?;
     let mut found = vec![NONE; sensor.len()];
-    exposures.for_each_stretch(control, |k, row, cols| {
-        for pixel in cols.map(|col| row * sensor.cols + col) {
+    survey.for_each_stretch(|k, row, cols| {
+        for col in cols {
+            let pixel = row * sensor.cols + col;
             if !leaves[pixel] {
                 continue;
             }
-            let col = pixel % sensor.cols;
-            leaves[pixel] &= cells(grid, &windows[k], row, col, margin).all(|cell| seen[cell]);
-            for cell in cells(grid, &windows[k], row, col, 0).filter(|&cell| labels[cell] != NONE) {
+            leaves[pixel] &= survey.cells(k, row, col, margin).all(|cell| seen[cell]);
+            for cell in survey.cells(k, row, col, 0).filter(|&cell| labels[cell] != NONE) {
                 leaves[pixel] &= found[pixel] == NONE || found[pixel] == labels[cell];
                 found[pixel] = labels[cell];
             }

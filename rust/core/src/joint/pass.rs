@@ -326,18 +326,18 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         self.leave_lost_out(row, workspace);
     }
 
-    /// Takes the weights of lost pixels out of those of a row.
+    /// Takes the weights of lost measurements out of those of a row.
     fn leave_lost_out(&self, row: usize, workspace: &mut Workspace) {
-        if !self.few.has_lost() {
+        if self.few.lost.is_empty() {
             return;
         }
         let cols = self.exposures.sensor().cols;
         for (k, weights) in workspace.weights.chunks_exact_mut(cols).enumerate() {
             if let Some(weight) = self.exposures.uniform_weight(k) {
-                // The row before may have other lost pixels.
+                // The row before may have lost others.
                 weights.fill(weight);
             }
-            self.few.lost_in_row(row).iter().for_each(|&col| weights[col] = 0.0);
+            self.few.lost.in_row(k, row).iter().for_each(|&col| weights[col] = 0.0);
         }
     }
 

@@ -519,7 +519,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             let pulling = share_pulling(*weight * light * light * inverse);
             *weight *= pulling * (self.pass.flux[exposure] * m).powi(2);
         }
-        self.pass.few.clear_all(row, &cols, &mut weights);
+        self.pass.few.clear_all(exposure, row, &cols, &mut weights);
         weights
     }
 }

@@ -183,10 +183,10 @@ impl WeakLight {
         let range = range.map(|d| d * square);
         let found = self.decide(exposures, range, connected, workers, control)?;
         let Some(prior) = found else { return Ok(false) };
-        let (mean, lost) = (system.mean, system.pass.few.lost(exposures.sensor().cols));
+        let mean = system.mean;
         system.prior = prior.map(|prior| {
             let mut weights: Vec<f64> = prior.weights.iter().map(|w| w / (mean * mean)).collect();
-            weights.iter_mut().zip(&lost).filter(|(_, lost)| **lost).for_each(|(w, _)| *w = 0.0);
+            system.pass.few.lost_pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
             joint::Prior { weights, mean }
         });
         Ok(true)
