@@ -86,7 +86,7 @@ def test_experiments_of_two_exposures_keep_all_pixels():
 
 
 def with_edge(edge, rng, frames, mask):
-    """A circle, a threshold on noisy frames, or every second measurement along some eight pixels."""
+    """A circle, a threshold on noisy frames, or every second measurement along the edge."""
     if edge == "threshold":
         return frames < 0.6
     grown = mask.copy()
