@@ -191,6 +191,7 @@ class TestReducedChi2:
         assert mean == pytest.approx(1, abs=4 * chi2_scatter(cals[0], 5))
         return cals
 
+    @pytest.mark.study
     @pytest.mark.parametrize("shifts", [WIDE, equipix.cross_pattern(4, 6)], ids=["1 part", "4"])
     @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_known_variances(self, shifts):

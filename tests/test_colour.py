@@ -67,6 +67,7 @@ def test_components_are_counted_with_one_beam_and_for_each_colour_alone(cfa, arm
     assert f"each colour alone: {alone}" in repr(found)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("cfa", "exposures", "travel"),
     [("RGGB", 5, 20), ("BGGR", 7, 12), (QUAD, 6, 30), (X_TRANS, 6, 40)],

@@ -157,7 +157,7 @@ def calibrations(limits, turn=0):
 def test_the_bytes_named_are_those_it_takes(turn):
     """All that is counted is used, and the allocator's share covers what is not."""
     allocator = 2**26
-    refused, grown = calibrations([40, 2000], turn)
+    refused, grown = calibrations([60, 2000], turn)
     words = r"calibrating 5 exposures of \(1500, 1500\) needs (.*) MB \((\d+) bytes\) beside its"
     short, needed = re.match(words, refused).groups()
     assert float(short) == pytest.approx(int(needed) / 1e6, abs=0.05)

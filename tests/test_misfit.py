@@ -228,8 +228,9 @@ def test_error_bars_in_speckle_of_three_pixels_are_refused():
         cal.std_of(equipix.maps.tilt_weights(np.ones(SENSOR, bool)))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("period", "widened"), [(5.0, True), (10.0, False)])
-def test_error_bars_in_speckle_are_widened_or_left(period, widened):
+def test_error_bars_in_speckle_are_widened_or_left(period, widened, figure):
     """With 5 pixels a period residuals are a tenth larger than noise."""
     rms = []
     for seed in range(6):
@@ -237,6 +238,7 @@ def test_error_bars_in_speckle_are_widened_or_left(period, widened):
         z = (cal.sensitivity - truth) / cal.sensitivity_std
         rms.append(np.sqrt(np.mean(z**2)))
         assert (cal.weighted.excess > 1) == widened
+    figure(f"z in speckle of {period:g} pixels", float(np.mean(rms)), "0.95 to 1.3")
     # Errors of pixels have large scales in common, so the scatter between experiments counts, not
     # the number of pixels. Student's t with 5 degrees of freedom is beyond 4 in one of 100 cases.
     assert abs(np.mean(rms) - 1) < 4 * np.std(rms, ddof=1) / len(rms) ** 0.5

@@ -170,6 +170,7 @@ class TestIdentify:
 
 
 class TestNoise:
+    @pytest.mark.study
     @patterns
     @pytest.mark.parametrize("seed", [1, 2])
     def test_rms_and_map_agree_with_simulation(self, shape, shifts, width, seed):
@@ -222,6 +223,7 @@ class TestNoise:
 
 
 class TestDrift:
+    @pytest.mark.study
     @patterns
     @pytest.mark.parametrize("seed", [1, 2])
     def test_tilt_agrees_with_simulation(self, shape, shifts, width, seed):
@@ -259,6 +261,7 @@ class TestDrift:
 
 
 class TestShiftErrors:
+    @pytest.mark.study
     @pytest.mark.parametrize(
         ("shape", "shifts", "width"),
         [case for case in PATTERNS.values() if case[2]],
@@ -345,6 +348,7 @@ def cross():
 
 
 class TestSuggest:
+    @pytest.mark.study
     @pytest.mark.parametrize(
         ("exposures", "tilt", "noise", "seed"),
         [(5, 5, 1.1, 0), (5, 5, 1.1, 1), (9, 6, 0.75, 0), (9, 6, 0.75, 1)],

@@ -376,6 +376,7 @@ def test_the_operator_of_registered_is_symmetric_with_eigenvalues_up_to_four(mov
     assert values[-1] < 4
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("move", [(1.5, 1.5), (0.5, 0.5), (0.0, 0.5)])
 def test_an_even_pan_never_lets_a_pattern_grow(move):
     """Of the reference, without scene and noise: there one-sided differences grew at any step."""

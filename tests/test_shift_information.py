@@ -113,9 +113,10 @@ class TestFringes:
 
 
 class TestErrorBars:
+    @pytest.mark.study
     @pytest.mark.parametrize("contrast", [0.003, 0.01, 0.03, 0.1])
     @pytest.mark.parametrize("crossed", [False, True])
-    def test_z_scores_of_sensitivity_and_shifts(self, contrast, crossed):
+    def test_z_scores_of_sensitivity_and_shifts(self, contrast, crossed, figure):
         """Whether or not the shifts are refined, M and shifts are as far off as stated."""
         z_of_m, z_of_shifts = [], []
         # The measured shifts of seed 3 are 1.84 times as far off as stated (8 degrees of freedom,
@@ -131,6 +132,7 @@ class TestErrorBars:
                 centred = [d - d.mean(axis=0) for d in (cal.shifts, CROSS)]
                 z_of_shifts.append((centred[0] - centred[1]) / cal.shift_std)
         rms = np.sqrt(np.mean(np.square(z_of_m)))
+        figure(f"z of M in fringes of {contrast:g}, crossed: {crossed}", rms, "0.95 to 1.05")
         assert 0.95 < rms < 1.05
         if z_of_shifts:
             # Of n values, of which a fifth is taken out with the mean, an rms scatters by √(1/2n).

@@ -154,10 +154,11 @@ def test_averaged_frames():
         assert sign_of(frames, -SMALL_CROSS) == "contradicted"
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("size", [(4, 5), (12, 12)])
-def test_dust_is_no_verdict(size):
+def test_dust_is_no_verdict(size, draws):
     """An opaque grain in one exposure does more to F than chance, at borders by the sign."""
-    for seed in range(12):
+    for seed in draws(12):
         frames, shifts = experiment(seed, smooth)
         rng = np.random.default_rng([2, seed])
         exposure, row, col = rng.integers(5), rng.integers(22, 90), rng.integers(42, 110)
