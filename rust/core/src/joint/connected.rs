@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use super::layout::Grid;
+use super::lost::Lost;
 use crate::connectivity::{Components, Edges, Stretches};
 use crate::control::Control;
 use crate::error::Result;
@@ -10,7 +11,7 @@ use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::geometry::{Rotation, View, whole_number};
 
-/// The components of pixels and cells, without measurements that are left out, by exposure, row and column.
+/// The components of pixels and cells, without lost measurements and pixels that are left out, if any are.
 ///
 /// Along an axis where all shifts differ by whole numbers of pixels, a pixel hangs on one value of the beam; else
 /// on the two beside it, which is a necessary condition alone: then a Ritz value near 0 shows patterns that are not
@@ -19,7 +20,8 @@ pub(super) fn connected<T: Real>(
     exposures: &Exposures<'_, T>,
     grid: &Grid,
     shifts: &[[f64; 2]],
-    is_left_out: impl Fn(usize, usize, usize) -> bool,
+    lost: &Lost,
+    left_out: &[bool],
     control: &Control,
 ) -> Result<Components> {
     let Grid { geometry, sensor, .. } = grid;
@@ -31,9 +33,6 @@ pub(super) fn connected<T: Real>(
     let mut edges = Edges::new(sensor.len(), geometry.beam.len());
     let mut stretches = Stretches::new(*sensor, geometry.beam);
     let mut join = |exposure: usize, row: usize, cols: Range<usize>| {
-        if cols.is_empty() {
-            return;
-        }
         let window = &windows[exposure];
         let View { cells, rotation, .. } = geometry.views[window.view];
         let [down, along] = if window.swaps_axes { [whole[1], whole[0]] } else { whole };
@@ -54,12 +53,18 @@ pub(super) fn connected<T: Real>(
         }
     };
     exposures.for_each_stretch(control, |exposure, row, cols| {
-        let mut first = cols.start;
-        for col in cols.clone().filter(|&col| is_left_out(exposure, row, col)) {
-            join(exposure, row, first..col);
-            first = col + 1;
-        }
-        join(exposure, row, first..cols.end);
+        lost.split(exposure, row, cols, |cols| {
+            let Some(left_out) = left_out.get(row * sensor.cols..(row + 1) * sensor.cols) else {
+                return join(exposure, row, cols);
+            };
+            let mut first = cols.start;
+            for alike in left_out[cols].chunk_by(|a, b| a == b) {
+                if !alike[0] {
+                    join(exposure, row, first..first + alike.len());
+                }
+                first += alike.len();
+            }
+        });
     })?;
     edges.components(control)
 }

@@ -6,17 +6,16 @@
 //! closed form, as that of all pixels does, but the pulls of their measurements are 0, in products, in D and in draws
 //! of noise. Their variance follows too, since that of any pixel is D⁻¹ and what S leaves open of the beam.
 //!
-//! They stay in it where they say what no other pixel does: where cells are seen by them alone, or where they join
-//! components. But a pixel that is measured once says nothing of cells that no other pixel sees, since its M follows
-//! any light: these cells would take any value, and with them its M. It is lost, as if it had not been measured.
-//!
-//! Lost are also measurements that stand apart from others of their exposure and see cells that no others determine
-//! (`lost.rs`).
+//! They stay in it where they join components, where most measurements of an exposure are of such pixels, and, at
+//! whole shifts alone, where cells are seen by them alone. Between pixels such cells form strips of a few pixels, in
+//! which a pattern of M and its inverse in L fit as well, so measurements there are lost (`lost.rs`). Lost is also the
+//! measurement of a pixel that is measured once, where no other pixel sees its cells: its M follows any light. A pixel
+//! of which all measurements are lost has no M.
 
 use std::ops::Range;
 
 use super::connected::connected;
-use super::layout::{Grid, MARGIN};
+use super::layout::Grid;
 use super::lost::{Lost, Survey};
 use crate::connectivity::NONE;
 use crate::control::Control;
@@ -32,7 +31,7 @@ const FEW: u8 = 2;
 pub(crate) struct Few {
     rows: Vec<Vec<usize>>,
     pub(crate) lost: Lost,
-    /// Measured pixels of which all measurements are lost.
+    /// Pixels with lost measurements and no others.
     pub(crate) lost_pixels: Vec<usize>,
     /// How many pixels follow the beam.
     pub(crate) pixels: usize,
@@ -41,7 +40,7 @@ pub(crate) struct Few {
 }
 
 impl Few {
-    /// Those of exposures at the shifts that were given.
+    /// Those of exposures at the shifts that were given; none of two exposures, nor where an offset is sought.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
@@ -50,36 +49,45 @@ impl Few {
         grid: &Grid,
         control: &Control,
     ) -> Result<Self> {
-        let (sensor, count) = (exposures.sensor(), exposures.count());
+        let count = exposures.count();
         let is_whole = (0..count).all(|k| exposures.uniform_weight(k).is_some());
         if count <= usize::from(FEW) || is_whole || exposures.offset() {
             return Ok(Self::default());
         }
-        let mut survey = Survey::new(exposures, grid, control);
-        survey.lost = survey.apart()?;
-        let times = survey.times()?;
-        let mut leaves: Vec<bool> = times.iter().map(|times| (1..=FEW).contains(times)).collect();
-        if leaves.contains(&true) {
-            stay_where_needed(&mut leaves, &survey)?;
-            // What overlaps others so little is determined by such pixels.
-            let shares = survey.shares(|_, pixel| leaves[pixel])?;
-            if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
-                leaves.fill(false);
+        let mut survey = Survey::new(exposures, grid, control)?;
+        loop {
+            let times = survey.times()?;
+            let leaves = leaving(&times, &survey)?;
+            let lost = survey.undetermined(|pixel| !leaves[pixel] && times[pixel] > 1)?;
+            // Pixels that lose measurements may have few, whose cells are then seen by others.
+            if lost.count() <= survey.lost.count() {
+                return Ok(Self::new(&times, &leaves, survey));
             }
-            survey.lost = lost_alone(&times, &leaves, &survey)?;
+            survey.lost = lost;
+            // No exposure may lose all its measurements.
+            if !has_all_exposures(&survey)? {
+                return Ok(Self::default());
+            }
         }
-        let lost_pixels = if survey.lost.is_empty() { Vec::new() } else { lost_pixels(&survey)? };
-        let leaving = (0..sensor.len()).filter(|&pixel| leaves[pixel]);
-        let of_row = |row: &[bool]| (0..sensor.cols).filter(|&col| row[col]).collect();
-        let rows = if leaves.contains(&true) { &leaves[..] } else { &[] };
-        Ok(Self {
-            rows: rows.chunks(sensor.cols).map(of_row).collect(),
+    }
+
+    fn new<T: Real>(times: &[u8], leaves: &[bool], survey: Survey<'_, '_, T>) -> Self {
+        let cols = survey.exposures.sensor().cols;
+        let leaving = (0..leaves.len()).filter(|&pixel| leaves[pixel]);
+        let of_row = |row: &[bool]| (0..cols).filter(|&col| row[col]).collect();
+        let rows = if leaves.contains(&true) { leaves } else { &[] };
+        let mut lost_pixels = survey.lost.pixels(cols).concat();
+        lost_pixels.retain(|&pixel| times[pixel] == 0);
+        lost_pixels.sort_unstable();
+        lost_pixels.dedup();
+        Self {
+            rows: rows.chunks(cols).map(of_row).collect(),
             lost_pixels,
             pixels: leaving.clone().count(),
             measurements: leaving.map(|pixel| usize::from(times[pixel])).sum::<usize>()
                 + survey.lost.count(),
             lost: survey.lost,
-        })
+        }
     }
 
     /// Sets the values of a row to 0 in them.
@@ -88,18 +96,21 @@ impl Few {
     }
 
     /// Sets values of some columns of a row of an exposure to 0 in them and where measurements are lost.
-    pub(crate) fn clear_all<T: Default>(
+    pub(crate) fn clear_all<T: Copy + Default>(
         &self,
         exposure: usize,
         row: usize,
         cols: &Range<usize>,
         values: &mut [T],
     ) {
-        for columns in [self.in_row(row), self.lost.in_row(exposure, row)] {
-            let first = columns.partition_point(|col| *col < cols.start);
-            let inside = columns[first..].iter().take_while(|col| **col < cols.end);
-            inside.for_each(|col| values[col - cols.start] = T::default());
-        }
+        let own = self.in_row(row);
+        let inside = own[own.partition_point(|col| *col < cols.start)..].iter();
+        inside
+            .take_while(|col| **col < cols.end)
+            .for_each(|col| values[col - cols.start] = T::default());
+        let lost = self.lost.in_row(exposure, row).iter().map(|col| *col as usize);
+        lost.filter(|col| cols.contains(col))
+            .for_each(|col| values[col - cols.start] = T::default());
     }
 
     /// Their columns in a row.
@@ -117,42 +128,37 @@ impl Few {
     }
 }
 
-/// What is lost, and pixels that are measured once and see a cell that none does which is measured more often; but
-/// no exposure may lose all its measurements.
-fn lost_alone<T: Real>(times: &[u8], leaves: &[bool], survey: &Survey<'_, '_, T>) -> Result<Lost> {
-    let width = survey.exposures.sensor().cols;
-    let seen = survey.seen_by(|_, pixel| !leaves[pixel] && times[pixel] > 1)?;
-    let is_alone = |k: usize, pixel: usize| {
-        let see_all = || survey.cells(k, pixel / width, pixel % width, 0).all(|cell| seen[cell]);
-        times[pixel] == 1 && !leaves[pixel] && !see_all()
-    };
-    let shares = survey.shares(is_alone)?;
-    let none_is_empty = shares.iter().all(|[alone, used]| alone < used);
-    survey.with_lost(|k, pixel| none_is_empty && is_alone(k, pixel))
+fn has_all_exposures<T: Real>(survey: &Survey<'_, '_, T>) -> Result<bool> {
+    let mut is_left = vec![false; survey.exposures.count()];
+    survey.for_each_stretch(|k, _, _| is_left[k] = true)?;
+    Ok(is_left.iter().all(|is_left| *is_left))
 }
 
-/// The pixels that are measured, but of which all measurements are lost.
-fn lost_pixels<T: Real>(survey: &Survey<'_, '_, T>) -> Result<Vec<usize>> {
-    let used = survey.times()?;
-    let losing = survey.lost.pixels(survey.exposures.sensor().cols);
-    let mut pixels: Vec<_> = losing.filter(|&pixel| used[pixel] == 0).collect();
-    pixels.sort_unstable();
-    pixels.dedup();
-    Ok(pixels)
+/// Which pixels with so many measurements leave the search.
+fn leaving<T: Real>(times: &[u8], survey: &Survey<'_, '_, T>) -> Result<Vec<bool>> {
+    let mut leaves: Vec<bool> = times.iter().map(|times| (1..=FEW).contains(times)).collect();
+    if leaves.contains(&true) {
+        stay_where_needed(&mut leaves, survey)?;
+        let (width, mut shares) =
+            (survey.exposures.sensor().cols, vec![[0; 2]; survey.exposures.count()]);
+        survey.for_each_stretch(|k, row, cols| {
+            let own = leaves[row * width..][cols.clone()].iter().filter(|leaves| **leaves).count();
+            shares[k] = [shares[k][0] + own, shares[k][1] + cols.len()];
+        })?;
+        // What overlaps others so little is determined by such pixels.
+        if shares.iter().any(|[leaving, used]| 2 * leaving > *used) {
+            leaves.fill(false);
+        }
+    }
+    Ok(leaves)
 }
 
-/// Keeps those of which not all cells are seen by pixels that stay, and of one component.
+/// Keeps those that see several components of the others, and, where a cell is its own value, cells of none.
 fn stay_where_needed<T: Real>(leaves: &mut [bool], survey: &Survey<'_, '_, T>) -> Result<()> {
     let Survey { exposures, grid, lost, control, .. } = survey;
     let (sensor, positions) = (exposures.sensor(), exposures.positions());
     let shifts = positions.on_grid(&positions.shifts);
-    let is_out = |k: usize, row: usize, col: usize| {
-        leaves[row * sensor.cols + col] || lost.contains(k, row, col)
-    };
-    let labels = connected(exposures, grid, &shifts, is_out, control)?.cells;
-    // As far as a fitted shift may move, and not at all where it does not.
-    let margin = if positions.std.is_some() { MARGIN } else { 0 };
-    let seen = survey.seen_by(|_, pixel| !leaves[pixel])?;
+    let labels = connected(exposures, grid, &shifts, lost, leaves, control)?.cells;
     let mut found = vec![NONE; sensor.len()];
     survey.for_each_stretch(|k, row, cols| {
         for col in cols {
@@ -160,10 +166,13 @@ fn stay_where_needed<T: Real>(leaves: &mut [bool], survey: &Survey<'_, '_, T>) -
             if !leaves[pixel] {
                 continue;
             }
-            leaves[pixel] &= survey.cells(k, row, col, margin).all(|cell| seen[cell]);
-            for cell in survey.cells(k, row, col, 0).filter(|&cell| labels[cell] != NONE) {
-                leaves[pixel] &= found[pixel] == NONE || found[pixel] == labels[cell];
-                found[pixel] = labels[cell];
+            for label in survey.cells(k, row, col, 0).map(|cell| labels[cell]) {
+                if label == NONE {
+                    leaves[pixel] &= grid.is_spline();
+                } else {
+                    leaves[pixel] &= found[pixel] == NONE || found[pixel] == label;
+                    found[pixel] = label;
+                }
             }
         }
     })

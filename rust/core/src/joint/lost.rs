@@ -1,35 +1,37 @@
-//! Measurements that are lost, as if they had not been made.
+//! Measurements that the search leaves out, as if they had not been made.
 //!
-//! Along the ragged edge of a mask, pixels stand apart from all others of their exposure. Such a measurement sees up
-//! to 16 cells of a spline that hardly another one sees. It cannot determine them, the penalty does not reach all of
-//! them, and they take values of 1e8 that the search follows without an end. So a measurement is firm if it is one of
-//! 2×2 of its exposure, and one that is not firm is lost where it sees a cell that no firm one sees. What the
-//! others say does not change: these cells would have taken any value that fits it.
+//! Along the edge of a mask some cells of a spline are seen by few measurements. These do not determine them, the
+//! penalty does not reach all of them, and coefficients of 1e8 fit as well, which the search follows for thousands of
+//! passes. So a cell counts as determined where it is seen by a measurement in a block, one of 2×2 of its exposure, or
+//! by [`ENOUGH`] others; of pixels that are measured more often than [`few`](super::few) says. A measurement that is
+//! neither in a block nor of such a pixel is lost where it sees a cell that is not determined.
+//!
+//! Where most measurements of an exposure are in no block, as behind a mask of every second pixel, all count as if they
+//! were.
 
 use std::ops::Range;
 
-use super::layout::{Grid, Window};
+use super::layout::{Grid, MARGIN, Window};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
-use crate::geometry::Rotation;
+use crate::geometry::{Rotation, TAPS};
+
+/// Measurements outside blocks that determine a cell: as many as one of them sees cells.
+const ENOUGH: u8 = (TAPS * TAPS) as u8;
 
 /// The columns of lost measurements, by exposure and row; empty if there are none.
 #[derive(Debug, Default)]
 pub(crate) struct Lost {
-    columns: Vec<Vec<usize>>,
+    columns: Vec<Vec<u32>>,
     rows: usize,
 }
 
 impl Lost {
     /// Those in a row of an exposure, sorted.
-    pub(crate) fn in_row(&self, exposure: usize, row: usize) -> &[usize] {
+    pub(crate) fn in_row(&self, exposure: usize, row: usize) -> &[u32] {
         self.columns.get(exposure * self.rows + row).map_or(&[], Vec::as_slice)
-    }
-
-    pub(crate) fn contains(&self, exposure: usize, row: usize, col: usize) -> bool {
-        self.in_row(exposure, row).binary_search(&col).is_ok()
     }
 
     pub(crate) const fn is_empty(&self) -> bool {
@@ -40,10 +42,37 @@ impl Lost {
         self.columns.iter().map(Vec::len).sum()
     }
 
-    /// The pixels of all of them, of a sensor of so many columns.
-    pub(super) fn pixels(&self, cols: usize) -> impl Iterator<Item = usize> {
-        let rows = self.columns.iter().enumerate();
-        rows.flat_map(move |(i, own)| own.iter().map(move |col| i % self.rows * cols + col))
+    /// Their pixels in each exposure of a sensor of so many columns.
+    pub(crate) fn pixels(&self, cols: usize) -> Vec<Vec<usize>> {
+        let of_exposure = |lines: &[Vec<u32>]| {
+            let lines = lines.iter().enumerate();
+            lines
+                .flat_map(|(row, own)| own.iter().map(move |&col| row * cols + col as usize))
+                .collect()
+        };
+        self.columns.chunks(self.rows.max(1)).map(of_exposure).collect()
+    }
+
+    /// Calls `visit(columns)` for the parts of some columns between lost measurements.
+    pub(crate) fn split(
+        &self,
+        exposure: usize,
+        row: usize,
+        cols: Range<usize>,
+        mut visit: impl FnMut(Range<usize>),
+    ) {
+        let own = self.in_row(exposure, row);
+        let mut first = cols.start;
+        let inside = own[own.partition_point(|col| (*col as usize) < cols.start)..].iter();
+        for col in inside.map(|col| *col as usize).take_while(|col| *col < cols.end) {
+            if first < col {
+                visit(first..col);
+            }
+            first = col + 1;
+        }
+        if first < cols.end {
+            visit(first..cols.end);
+        }
     }
 }
 
@@ -54,6 +83,8 @@ pub(super) struct Survey<'e, 'a, T> {
     pub(super) control: &'e Control,
     pub(super) lost: Lost,
     windows: Vec<Window>,
+    /// Whether each measurement is in a block, by exposure and pixel.
+    blocks: Vec<bool>,
 }
 
 impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
@@ -61,10 +92,11 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
         exposures: &'e Exposures<'a, T>,
         grid: &'e Grid,
         control: &'e Control,
-    ) -> Self {
+    ) -> Result<Self> {
         let positions = exposures.positions();
         let windows = grid.windows(&positions.on_grid(&positions.shifts));
-        Self { exposures, grid, control, lost: Lost::default(), windows }
+        let blocks = blocks(exposures, grid.is_spline(), control)?;
+        Ok(Self { exposures, grid, control, lost: Lost::default(), windows, blocks })
     }
 
     /// Calls `visit(exposure, row, columns)` for the measurements that stand side by side.
@@ -73,39 +105,19 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
         mut visit: impl FnMut(usize, usize, Range<usize>),
     ) -> Result<()> {
         self.exposures.for_each_stretch(self.control, |k, row, cols| {
-            let mut first = cols.start;
-            for &col in self.lost.in_row(k, row).iter().filter(|col| cols.contains(col)) {
-                if first < col {
-                    visit(k, row, first..col);
-                }
-                first = col + 1;
-            }
-            if first < cols.end {
-                visit(k, row, first..cols.end);
-            }
+            self.lost.split(k, row, cols, |cols| visit(k, row, cols));
         })
     }
 
     /// How often each pixel is measured.
     pub(super) fn times(&self) -> Result<Vec<u8>> {
-        let Shape { cols: width, .. } = self.exposures.sensor();
-        let mut times = vec![0_u8; self.exposures.sensor().len()];
+        let sensor = self.exposures.sensor();
+        let mut times = vec![0_u8; sensor.len()];
         self.for_each_stretch(|_, row, cols| {
-            let pixels = &mut times[row * width..][cols];
+            let pixels = &mut times[row * sensor.cols..][cols];
             pixels.iter_mut().for_each(|times| *times = times.saturating_add(1));
         })?;
         Ok(times)
-    }
-
-    /// How many measurements of each exposure are such, by exposure and pixel, and all of them.
-    pub(super) fn shares(&self, is_such: impl Fn(usize, usize) -> bool) -> Result<Vec<[usize; 2]>> {
-        let width = self.exposures.sensor().cols;
-        let mut shares = vec![[0; 2]; self.exposures.count()];
-        self.for_each_stretch(|k, row, cols| {
-            let own = cols.clone().filter(|col| is_such(k, row * width + col));
-            shares[k] = [shares[k][0] + own.count(), shares[k][1] + cols.len()];
-        })?;
-        Ok(shares)
     }
 
     /// The cells that a pixel of an exposure sees, and those as far around them as `margin`.
@@ -123,87 +135,104 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
         (0..side * side).map(move |i| places.at(row + i / side, col + i % side))
     }
 
-    /// Which cells such measurements see, by exposure and pixel.
-    pub(super) fn seen_by(&self, is_such: impl Fn(usize, usize) -> bool) -> Result<Vec<bool>> {
-        let width = self.exposures.sensor().cols;
-        let mut seen = vec![false; self.grid.geometry.beam.len()];
+    /// The number of measurements of some pixels that see each cell; one in a block counts as enough.
+    pub(super) fn seeing(&self, is_one: impl Fn(usize) -> bool) -> Result<Vec<u8>> {
+        let sensor = self.exposures.sensor();
+        let mut seeing = vec![0; self.grid.geometry.beam.len()];
         self.for_each_stretch(|k, row, cols| {
-            let pixels: Vec<bool> = cols.clone().map(|col| is_such(k, row * width + col)).collect();
+            let in_block = &self.blocks[k * sensor.len() + row * sensor.cols..];
+            let weight = |col: usize| match (is_one(row * sensor.cols + col), in_block[col]) {
+                (true, true) => ENOUGH,
+                (true, false) => 1,
+                (false, _) => 0,
+            };
             let mut first = cols.start;
-            for alike in pixels.chunk_by(|a, b| a == b) {
-                if alike[0] {
-                    self.see(k, row, first..first + alike.len(), &mut seen);
+            while first < cols.end {
+                let counts = weight(first);
+                let alike = (first..cols.end).take_while(|&col| weight(col) == counts).count();
+                match counts {
+                    0 => {}
+                    ENOUGH => self.count(k, row, first..first + alike, ENOUGH, &mut seeing),
+                    _ => (first..first + alike)
+                        .for_each(|col| self.count(k, row, col..col + 1, counts, &mut seeing)),
                 }
-                first += alike.len();
+                first += alike;
             }
         })?;
-        Ok(seen)
+        Ok(seeing)
     }
 
-    /// Marks the cells that pixels side by side see.
-    fn see(&self, exposure: usize, row: usize, cols: Range<usize>, seen: &mut [bool]) {
+    /// Adds to the count of all cells that pixels side by side see.
+    fn count(&self, exposure: usize, row: usize, cols: Range<usize>, add: u8, counts: &mut [u8]) {
         let (window, width) = (&self.windows[exposure], self.grid.width);
         let view = &self.grid.geometry.views[window.view];
+        let mut count = |cell: usize| counts[cell] = counts[cell].saturating_add(add);
         if view.rotation != Rotation::None {
-            let cells = cols.flat_map(|col| self.cells(exposure, row, col, 0));
-            return cells.for_each(|cell| seen[cell] = true);
+            return cols.for_each(|col| self.cells(exposure, row, col, 0).for_each(&mut count));
         }
         for i in 0..width {
             let first = view.cells.at(row + window.row + i, cols.start + window.col);
-            seen[first..first + cols.len() + width - 1].fill(true);
+            (first..first + cols.len() + width - 1).for_each(&mut count);
         }
     }
 
-    /// Those that are lost, and such measurements, by exposure and pixel.
-    pub(super) fn with_lost(&self, is_such: impl Fn(usize, usize) -> bool) -> Result<Lost> {
+    /// The measurements that are lost where these pixels determine the cells: all those that see other cells, but for
+    /// those in blocks of these pixels.
+    pub(super) fn undetermined(&self, determine: impl Fn(usize) -> bool) -> Result<Lost> {
         let Shape { rows, cols: width } = self.exposures.sensor();
+        let seeing = self.seeing(&determine)?;
+        // As far as a fitted shift may move, and not at all where it does not.
+        let margin = if self.exposures.positions().std.is_some() { MARGIN } else { 0 };
         let mut columns = vec![Vec::new(); self.exposures.count() * rows];
         self.exposures.for_each_stretch(self.control, |k, row, cols| {
-            let is_lost =
-                |col: &usize| self.lost.contains(k, row, *col) || is_such(k, row * width + col);
-            columns[k * rows + row].extend(cols.filter(is_lost));
+            let of_row = &self.blocks[(k * rows + row) * width..];
+            let lost = cols.filter(|&col| {
+                let holds = of_row[col] && determine(row * width + col);
+                !holds && self.cells(k, row, col, margin).any(|cell| seeing[cell] < ENOUGH)
+            });
+            columns[k * rows + row].extend(lost.map(|col| col as u32));
         })?;
-        Ok(Lost { columns, rows })
-    }
-
-    /// Those that are not firm and see a cell that no firm one sees; none where that were more than half of an
-    /// exposure, as with masks of single pixels everywhere.
-    pub(super) fn apart(&self) -> Result<Lost> {
-        if !self.grid.is_spline() {
-            return Ok(Lost::default());
-        }
-        let (sensor, count) = (self.exposures.sensor(), self.exposures.count());
-        let mut firm = vec![false; count * sensor.len()];
-        self.for_each_stretch(|k, row, cols| {
-            firm[k * sensor.len() + row * sensor.cols..][cols].fill(true);
-        })?;
-        firm.chunks_mut(sensor.len()).for_each(|used| open(used, sensor));
-        let is_firm = |k: usize, pixel: usize| firm[k * sensor.len() + pixel];
-        let seen = self.seen_by(is_firm)?;
-        let is_apart = |k: usize, pixel: usize| {
-            let (row, col) = (pixel / sensor.cols, pixel % sensor.cols);
-            !is_firm(k, pixel) && !self.cells(k, row, col, 0).all(|cell| seen[cell])
-        };
-        let shares = self.shares(is_apart)?;
-        let is_rare = shares.iter().all(|[apart, used]| 2 * apart <= *used);
-        if is_rare && shares.iter().any(|[apart, _]| *apart > 0) {
-            return self.with_lost(is_apart);
-        }
-        Ok(Lost::default())
+        let is_empty = columns.iter().all(Vec::is_empty);
+        Ok(if is_empty { Lost::default() } else { Lost { columns, rows } })
     }
 }
 
-/// Leaves those pixels that are one of 2×2 which are set, or of as many as there are along an axis.
-fn open(image: &mut [bool], Shape { rows, cols }: Shape) {
+/// Whether each measurement is in a block; all are where a cell is its own value, and where most of an exposure are not.
+fn blocks<T: Real>(
+    exposures: &Exposures<'_, T>,
+    is_spline: bool,
+    control: &Control,
+) -> Result<Vec<bool>> {
+    let (sensor, count) = (exposures.sensor(), exposures.count());
+    let mut used = vec![false; count * sensor.len()];
+    exposures.for_each_stretch(control, |k, row, cols| {
+        used[k * sensor.len() + row * sensor.cols..][cols].fill(true);
+    })?;
+    let is_masked = |k: &usize| is_spline && exposures.uniform_weight(*k).is_none();
+    for k in (0..count).filter(is_masked) {
+        let used = &mut used[k * sensor.len()..][..sensor.len()];
+        let opened = opened(used, sensor, control)?;
+        let count = |image: &[bool]| image.iter().filter(|pixel| **pixel).count();
+        if 2 * count(&opened) >= count(used) {
+            used.copy_from_slice(&opened);
+        }
+    }
+    Ok(used)
+}
+
+/// The pixels that are one of 2×2 which are set, or of as many as there are along an axis.
+fn opened(image: &[bool], Shape { rows, cols }: Shape, control: &Control) -> Result<Vec<bool>> {
     let (height, width) = (rows.min(2), cols.min(2));
-    let mut kept = vec![false; image.len()];
+    let mut opened = vec![false; image.len()];
     for row in 0..=rows - height {
+        control.check()?;
+        let lines = [row, row + height - 1].map(|row| row * cols);
         for col in 0..=cols - width {
-            let mut block = (0..height * width).map(|i| (row + i / width) * cols + col + i % width);
-            if block.clone().all(|pixel| image[pixel]) {
-                block.by_ref().for_each(|pixel| kept[pixel] = true);
+            let corners = lines.map(|line| [line + col, line + col + width - 1]);
+            if corners.iter().flatten().all(|&pixel| image[pixel]) {
+                corners.iter().flatten().for_each(|&pixel| opened[pixel] = true);
             }
         }
     }
-    image.copy_from_slice(&kept);
+    Ok(opened)
 }

@@ -34,8 +34,7 @@ pub(crate) fn components<T: Real>(
     control: &Control,
 ) -> Result<Components> {
     let (exposures, grid) = (system.pass.exposures, &system.pass.grid);
-    let is_lost = |k, row, col| system.pass.few.lost.contains(k, row, col);
-    connected(exposures, grid, &system.state.shifts, is_lost, control)
+    connected(exposures, grid, &system.state.shifts, &system.pass.few.lost, &[], control)
 }
 
 /// L at the cells: Σ_j a_j B(u − j) with B = 1/6, 4/6, 1/6 at whole numbers; NaN where a coefficient

@@ -337,7 +337,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 // The row before may have lost others.
                 weights.fill(weight);
             }
-            self.few.lost.in_row(k, row).iter().for_each(|&col| weights[col] = 0.0);
+            self.few.lost.in_row(k, row).iter().for_each(|&col| weights[col as usize] = 0.0);
         }
     }
 
