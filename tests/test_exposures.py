@@ -216,6 +216,7 @@ class TestThreads:
             return np.ones(shape)
 
         fit = SimpleNamespace(
+            lost=[],
             shifts=[[0.0, 0.0], [1.0, 2.5], [0.0, 0.0]],
             flux=[1.0, 2.0, 1.0],
             beam=SimpleNamespace(light=light),

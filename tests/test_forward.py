@@ -53,8 +53,11 @@ CASES = {
 }
 
 
-def calibrated(case, *, masked=False):
-    """A calibration from noisy exposures, with what it was made from."""
+def calibrated(case, *, masked=None):
+    """A calibration from noisy exposures, with what it was made from.
+
+    `masked`: "some" of all measurements, or every second of the last columns ("frayed").
+    """
     options = dict(CASES[case])
     rng = np.random.default_rng(7)
     shifts = options.pop("shifts", CROSS)
@@ -71,8 +74,11 @@ def calibrated(case, *, masked=False):
         variance = (1e-6 * rng.uniform(0.5, 2, frames.shape)).astype(dtype)
     scale = variance if variance.ndim == 3 else variance[:, None, None]
     frames = (frames + np.sqrt(scale) * rng.standard_normal(frames.shape)).astype(dtype)
-    if masked:
+    if masked == "some":
         options["mask"] = rng.uniform(size=frames.shape) < 0.03
+    elif masked == "frayed":
+        last = np.arange(SHAPE[1]) >= SHAPE[1] - 8
+        options["mask"] = last & (rng.uniform(size=frames.shape) < 0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", equipix.errors.EquipixWarning)
         cal = equipix.calibrate(frames, shifts, variance=variance, **options)
@@ -82,16 +88,39 @@ def calibrated(case, *, masked=False):
 def squares_of(cal, frames, variance, mask):
     """Sum of squared residuals over variances, of the measurements that F contains."""
     residuals = cal.residuals(frames, variance=variance)
-    assert np.isfinite(residuals[~mask]).all()
-    few = cal.weighted.fit.few
-    used = ~mask if few is None else ~mask & ~few
+    fit = cal.weighted.fit
+    used = ~mask & np.isfinite(cal.sensitivity)
+    for k, lost in enumerate(fit.lost):
+        assert not mask[k].flat[lost].any()
+        used[k].flat[lost] = False
+    assert np.isfinite(residuals[used]).all()
+    if fit.few is not None:
+        used &= ~fit.few
     return np.sum(np.square(residuals[used], dtype=np.float64)), residuals
 
 
-@pytest.mark.parametrize("masked", [False, True], ids=["", "masked"])
+@pytest.mark.parametrize("masked", [None, "some"])
 @pytest.mark.parametrize("case", CASES)
 def test_residuals_are_those_that_were_minimised(case, masked):
     cal, frames, variance, mask = calibrated(case, masked=masked)
+    assert_minimised(cal, frames, variance, mask)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if "between" in case or case == "refined"])
+def test_residuals_without_measurements_that_are_lost_were_minimised(case):
+    cal, frames, variance, mask = calibrated(case, masked="frayed")
+    assert_minimised(cal, frames, variance, mask)
+    exposures, fit = cal.weighted.exposures, cal.weighted.fit
+    assert sum(map(len, fit.lost)) > 5
+    for k, lost in enumerate(fit.lost):
+        is_lost = np.zeros(SHAPE, bool)
+        is_lost.flat[lost] = True
+        missing = np.isnan(exposures.residual(fit, k, None))
+        known = exposures.usable(k) & np.isfinite(cal.sensitivity)
+        np.testing.assert_array_equal(missing[known], is_lost[known])
+
+
+def assert_minimised(cal, frames, variance, mask):
     total, residuals = squares_of(cal, frames, variance, mask)
     freedom = cal.weighted.fit.degrees_of_freedom
     # A prediction is rounded by eps of itself, M by eps of its dtype; each of N residuals r changes
@@ -105,7 +134,7 @@ def test_residuals_are_those_that_were_minimised(case, masked):
 
 def test_the_degrees_of_freedom_are_measurements_less_unknowns():
     """At whole shifts: M of each pixel, L of each cell seen, less one for the scale."""
-    cal, *_, mask = calibrated("whole", masked=True)
+    cal, *_, mask = calibrated("whole", masked="some")
     seen = np.zeros(cal.beam.shape, bool)
     for (row, col), masked in zip(CROSS.astype(int) + cal.beam_origin, mask, strict=True):
         seen[row : row + SHAPE[0], col : col + SHAPE[1]] |= ~masked

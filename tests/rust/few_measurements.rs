@@ -22,10 +22,15 @@ fn few(pixel: usize) -> usize {
     }
 }
 
+/// Whether one of so many exposures measures a pixel that is measured so often.
+const fn is_used(k: usize, pixel: usize, count: usize, times: usize) -> bool {
+    (k + pixel + pixel / SHAPE[1]) % count < times
+}
+
 /// An experiment whose mask leaves so many measurements of each pixel, in exposures that differ.
 fn with_few(experiment: Experiment, left: impl Fn(usize) -> usize) -> Experiment {
     let count = experiment.shifts.len();
-    let used = |k: usize, pixel: usize| (k + pixel) % count < left(pixel);
+    let used = |k: usize, pixel: usize| is_used(k, pixel, count, left(pixel));
     let mask = (0..count * PIXELS).map(|i| !used(i / PIXELS, i % PIXELS)).collect();
     Experiment { mask, ..experiment }
 }
@@ -77,28 +82,74 @@ fn the_answer_of_others_is_that_without_them() {
     }
 }
 
-/// The cells that a pixel sees: two on either side of its place, along both axes.
-fn cells(pixel: usize, [row, col]: [f64; 2]) -> impl Iterator<Item = [i64; 2]> {
-    let first = [(pixel / SHAPE[1]) as f64 + row, (pixel % SHAPE[1]) as f64 + col];
-    let [row, col] = first.map(|place| place.floor() as i64 - 1);
+/// The cells that a pixel sees, turned by nothing or by half: two on either side of its place, along both axes.
+fn cells(pixel: usize, shift: [f64; 2], degrees: i64) -> impl Iterator<Item = [i64; 2]> {
+    let own = [pixel / SHAPE[1], pixel % SHAPE[1]];
+    let [row, col] = [0, 1].map(|axis| {
+        let place = if degrees == 0 { own[axis] } else { SHAPE[axis] - 1 - own[axis] };
+        (place as f64 + shift[axis]).floor() as i64 - 1
+    });
     (0..16).map(move |i| [row + i / 4, col + i % 4])
+}
+
+/// Which measurements an experiment uses.
+type Used<'u> = &'u dyn Fn(usize, usize) -> bool;
+
+/// Whether a measurement is one of 2×2 of its exposure.
+fn is_in_block(used: Used<'_>, k: usize, pixel: usize) -> bool {
+    let [row, col] = [pixel / SHAPE[1], pixel % SHAPE[1]].map(|at| at as i64);
+    let is_used = |row: i64, col: i64| {
+        let is_inside = (0..SHAPE[0] as i64).contains(&row) && (0..SHAPE[1] as i64).contains(&col);
+        is_inside && used(k, row as usize * SHAPE[1] + col as usize)
+    };
+    let corners = [[-1, -1], [-1, 0], [0, -1], [0, 0]].map(|[r, c]| [row + r, col + c]);
+    corners.iter().any(|[r, c]| (0..4).all(|i| is_used(r + i / 2, c + i % 2)))
+}
+
+/// What is lost by the words of `lost.rs`, by exposure, of pixels that join no components.
+fn lost(used: Used<'_>, degrees: &[i64], margin: i64) -> Vec<Vec<usize>> {
+    let mut lost = vec![Vec::new(); BETWEEN.len()];
+    loop {
+        let is_left = |k: usize, pixel: usize| used(k, pixel) && !lost[k].contains(&pixel);
+        let stays = |pixel: usize| (0..BETWEEN.len()).filter(|&k| is_left(k, pixel)).count() > 2;
+        let every = || (0..BETWEEN.len()).flat_map(|k| (0..PIXELS).map(move |pixel| (k, pixel)));
+        let mut seen = std::collections::HashMap::new();
+        for (k, pixel) in every().filter(|&(k, pixel)| is_left(k, pixel) && stays(pixel)) {
+            let count = if is_in_block(used, k, pixel) { 16 } else { 1 };
+            for cell in cells(pixel, BETWEEN[k], degrees[k]) {
+                *seen.entry(cell).or_insert(0) += count;
+            }
+        }
+        let around = |[row, col]: [i64; 2]| {
+            (-margin..=margin)
+                .flat_map(move |r| (-margin..=margin).map(move |c| [row + r, col + c]))
+        };
+        let is_open = |cell: [i64; 2]| seen.get(&cell).copied().unwrap_or(0) < 16;
+        let is_lost = |k: usize, pixel: usize| {
+            used(k, pixel)
+                && !(is_in_block(used, k, pixel) && stays(pixel))
+                && cells(pixel, BETWEEN[k], degrees[k]).flat_map(around).any(is_open)
+        };
+        let found: Vec<Vec<usize>> = (0..BETWEEN.len())
+            .map(|k| (0..PIXELS).filter(|&pixel| is_lost(k, pixel)).collect())
+            .collect();
+        if found == lost {
+            return lost;
+        }
+        lost = found;
+    }
 }
 
 #[test]
 fn pixels_measured_once_are_lost_where_they_alone_see_cells() {
     // The last columns see cells behind those of the others.
     let times = |pixel: usize| if pixel % SHAPE[1] < 34 { 5 } else { 1 };
-    let used = |k: usize, pixel: usize| (k + pixel) % 5 < times(pixel);
-    let others = || (0..PIXELS).filter(|&pixel| times(pixel) == 5);
-    let places = || BETWEEN.iter().copied().enumerate();
-    let seen: std::collections::HashSet<_> =
-        places().flat_map(|(_, d)| others().flat_map(move |pixel| cells(pixel, d))).collect();
-    let is_lost = |pixel: usize| {
-        let mut own = places().filter(|(k, _)| times(pixel) == 1 && used(*k, pixel));
-        own.any(|(_, d)| cells(pixel, d).any(|cell| !seen.contains(&cell)))
-    };
-    assert!((0..PIXELS).any(is_lost) && (0..PIXELS).any(|p| times(p) == 1 && !is_lost(p)));
+    let used = |k: usize, pixel: usize| is_used(k, pixel, 5, times(pixel));
     for std in [None, Some(SHIFT_STD)] {
+        let gone = lost(&used, &[0; 5], i64::from(std.is_some())).concat();
+        let is_lost = |pixel: usize| gone.contains(&pixel);
+        assert!((0..PIXELS).any(is_lost) && (0..PIXELS).any(|p| times(p) == 1 && !is_lost(p)));
+        assert!(gone.iter().all(|&pixel| times(pixel) == 1));
         let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 8);
         let mut experiment = simulation.experiment().with_lamp(Lamp::Known);
         if let Some(std) = std {
@@ -120,63 +171,68 @@ fn pixels_measured_once_are_lost_where_they_alone_see_cells() {
     }
 }
 
-/// Whether a measurement is one of 2×2 of its exposure.
-fn is_firm(used: impl Fn(usize, usize) -> bool, k: usize, pixel: usize) -> bool {
-    let [row, col] = [pixel / SHAPE[1], pixel % SHAPE[1]].map(|at| at as i64);
-    let is_used = |row: i64, col: i64| {
-        let is_inside = (0..SHAPE[0] as i64).contains(&row) && (0..SHAPE[1] as i64).contains(&col);
-        is_inside && used(k, row as usize * SHAPE[1] + col as usize)
-    };
-    let corners = [[-1, -1], [-1, 0], [0, -1], [0, 0]].map(|[r, c]| [row + r, col + c]);
-    corners.iter().any(|[r, c]| (0..4).all(|i| is_used(r + i / 2, c + i % 2)))
+fn masked(simulation: &Simulation, used: Used<'_>) -> Experiment {
+    let mask = (0..BETWEEN.len() * PIXELS).map(|i| !used(i / PIXELS, i % PIXELS)).collect();
+    Experiment { mask, ..simulation.experiment() }
 }
 
 #[test]
-fn measurements_apart_are_lost_where_no_firm_one_sees_their_cells() {
+fn measurements_apart_are_lost_where_they_alone_see_cells() {
     // Of the last columns each exposure has one pixel in three, as along a ragged edge.
-    let used =
-        |k: usize, pixel: usize| pixel % SHAPE[1] < 34 || random(60 + k as u64, pixel) > 2.0 / 3.0;
-    let at = |i: usize| (i / PIXELS, i % PIXELS);
-    let all = || (0..5 * PIXELS).map(at).filter(|&(k, pixel)| used(k, pixel));
-    let seen: std::collections::HashSet<_> = all()
-        .filter(|&(k, pixel)| is_firm(used, k, pixel))
-        .flat_map(|(k, pixel)| cells(pixel, BETWEEN[k]))
-        .collect();
-    let is_lost = |(k, pixel): (usize, usize)| {
-        !is_firm(used, k, pixel) && cells(pixel, BETWEEN[k]).any(|cell| !seen.contains(&cell))
-    };
-    let lost = all().filter(|&at| is_lost(at)).count();
-    let kept = all().filter(|&(k, pixel)| !is_firm(used, k, pixel) && !is_lost((k, pixel))).count();
-    assert!(lost > 10 && kept > 10, "{lost} {kept}");
-    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 10);
-    let masked = |is_out: &dyn Fn((usize, usize)) -> bool| Experiment {
-        mask: (0..5 * PIXELS).map(at).map(is_out).collect(),
-        ..simulation.experiment()
-    };
-    let found = fit(&masked(&|at| !used(at.0, at.1)), Options::to(TOLERANCE)).unwrap();
-    let others =
-        fit(&masked(&|at| !used(at.0, at.1) || is_lost(at)), Options::to(TOLERANCE)).unwrap();
-    assert!(found.converged && others.converged);
-    assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
-    // Degrees of freedom count cells by the weights of whole exposures, those of lost measurements too.
-    assert!(found.degrees_of_freedom.abs_diff(others.degrees_of_freedom) <= 1);
-    assert_eq!(found.labels[0], others.labels[0]);
-    for (m, other) in found.sensitivity.iter().zip(&others.sensitivity) {
-        assert!(m.is_nan() == other.is_nan());
-        // Each is within its tolerance of the same minimum.
-        assert!(other.is_nan() || (m / other - 1.0).abs() < 10.0 * TOLERANCE);
+    let ragged =
+        |k: usize, pixel: usize| pixel % SHAPE[1] < 34 || random(70 + k as u64, pixel) > 2.0 / 3.0;
+    for (degrees, std) in [([0; 5], None), ([0; 5], Some(SHIFT_STD)), ([0, 180, 0, 180, 0], None)] {
+        let simulation =
+            Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 10).turned(&degrees);
+        let fitted = |experiment: Experiment| {
+            let experiment = match std {
+                Some(std) => experiment.measured_to(&std),
+                None => experiment,
+            };
+            fit(&experiment, Options::to(TOLERANCE)).unwrap()
+        };
+        let found = fitted(masked(&simulation, &ragged));
+        assert_eq!(found.lost, lost(&ragged, &degrees, i64::from(std.is_some())));
+        let count = found.lost.concat().len();
+        let apart = |k: usize| {
+            (0..PIXELS).filter(move |&pixel| ragged(k, pixel) && !is_in_block(&ragged, k, pixel))
+        };
+        assert!(0 < count && count < (0..5).flat_map(apart).count(), "{count}");
+        let others = fitted(masked(&simulation, &|k, pixel| {
+            ragged(k, pixel) && !found.lost[k].contains(&pixel)
+        }));
+        assert!(found.converged && others.converged);
+        assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
+        // Degrees of freedom count cells by the weights of whole exposures, those of lost measurements too.
+        assert!(found.degrees_of_freedom.abs_diff(others.degrees_of_freedom) <= 1);
+        assert_eq!(found.labels[0], others.labels[0]);
+        for (m, other) in found.sensitivity.iter().zip(&others.sensitivity) {
+            assert!(m.is_nan() == other.is_nan());
+            // Each is within its tolerance of the same minimum.
+            assert!(other.is_nan() || (m / other - 1.0).abs() < 10.0 * TOLERANCE);
+        }
     }
 }
 
 #[test]
-fn none_is_lost_where_most_stand_apart() {
-    // A mask like a chessboard.
+fn none_is_lost_where_many_stand_apart() {
     let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 11);
-    let is_black = |pixel: usize| (pixel / SHAPE[1] + pixel % SHAPE[1]).is_multiple_of(2);
-    let mask = (0..5 * PIXELS).map(|i| is_black(i % PIXELS)).collect();
-    let found = fit(&Experiment { mask, ..simulation.experiment() }, Options::to(1e-6)).unwrap();
-    assert!(found.converged);
-    assert!((0..PIXELS).all(|pixel| found.sensitivity[pixel].is_nan() == is_black(pixel)));
+    let at = |pixel: usize| (pixel / SHAPE[1], pixel % SHAPE[1]);
+    let is_black = |pixel: usize| (at(pixel).0 + at(pixel).1).is_multiple_of(2);
+    let masks: [&dyn Fn(usize) -> bool; 4] = [
+        // Chessboards, every second column, and all colours but one.
+        &is_black,
+        &|pixel| at(pixel).1 >= 16 && is_black(pixel),
+        &|pixel| at(pixel).1 >= 13 && at(pixel).1 % 2 == 1,
+        &|pixel| at(pixel).0 % 2 == 1 || at(pixel).1 % 2 == 1,
+    ];
+    for is_out in masks {
+        let experiment = masked(&simulation, &|_, pixel| !is_out(pixel));
+        let found = fit(&experiment, Options::to(1e-6)).unwrap();
+        assert!(found.converged);
+        assert!(found.lost.is_empty());
+        assert!((0..PIXELS).all(|pixel| found.sensitivity[pixel].is_nan() == is_out(pixel)));
+    }
 }
 
 #[test]

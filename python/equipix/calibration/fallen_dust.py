@@ -104,7 +104,7 @@ def _scaled(exposures: Exposures, fit: Fit, options: FitOptions) -> NDArray[np.f
     scaled, scale = np.empty(exposures.values.shape, np.float32), np.empty(len(exposures))
     for k, each in enumerate(scaled):
         residual = exposures.residual(fit, k, options.workers)
-        usable = exposures.usable(k)
+        usable = exposures.used(fit, k)
         np.divide(residual, exposures.deviation(k), out=residual, where=usable)
         residual[~usable] = np.nan
         scale[k] = ROBUST * nanmedian_abs(residual[None])[0]

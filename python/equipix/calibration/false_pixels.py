@@ -97,7 +97,9 @@ def _usual(weighted: Weighted, squares: Floats, options: Options) -> tuple[float
     exposures, fit = weighted.exposures, weighted.fit
     if fit.degrees_of_freedom < 1:
         return 0.0, np.inf
-    measured = np.count_nonzero(exposures.usable() & in_search(fit))
+    searched = in_search(fit)
+    used = (exposures.used(fit, k) & searched for k in range(len(exposures)))
+    measured = sum(np.count_nonzero(each) for each in used)
     noise = np.nanmedian(_of_pixels(squares)) * measured / fit.degrees_of_freedom
     # Without noise, only what the solver leaves would be compared.
     error = max(options.fit.tolerance, float(fit.error_estimate[-1]))

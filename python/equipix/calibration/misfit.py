@@ -169,7 +169,7 @@ def _share_of_good(weighted: Weighted, flags: Array, options: FitOptions) -> flo
     """Reduced χ² without pixels that are flagged, which may follow no model, over that with all."""
     exposures, fit = weighted.exposures, weighted.fit
     flagged = tested(fit) & ~usable(flags)
-    times = sum((exposures.usable(k) & flagged).astype(np.intp) for k in range(len(exposures)))
+    times = sum((exposures.used(fit, k) & flagged).astype(np.intp) for k in range(len(exposures)))
     freedom = float(np.maximum(np.subtract(times, 1), 0).sum())
     # Of many side by side the cells that only they see would be unknowns less, too.
     if not 0 < freedom < _FLAGGED * weighted.expected_misfit:

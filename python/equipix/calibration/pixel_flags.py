@@ -12,7 +12,6 @@ from equipix.flags import set_bits
 if TYPE_CHECKING:
     from equipix._types import Array, Bools, Floats
     from equipix.calibration.weights import Weighted
-    from equipix.exposures.exposures import Exposures
     from equipix.exposures.options import FitOptions
 
 
@@ -39,12 +38,13 @@ def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
     return dead | (sensitivity <= options.tolerance), hot
 
 
-def _weights(exposures: Exposures) -> Floats:
+def _weights(weighted: Weighted) -> Floats:
     """Sum of the weights of each pixel, one exposure at a time: large sensors must fit."""
+    exposures = weighted.exposures
     total = np.zeros(exposures.shape)
     for k in range(len(exposures)):
         variance = 1.0 if exposures.variance is None else exposures.variance[k]
-        used = exposures.usable(k)
+        used = exposures.used(weighted.fit, k)
         total += np.divide(1.0, variance, where=used, out=np.zeros(exposures.shape))
     return total
 
@@ -62,5 +62,5 @@ def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array
         without = np.asarray(1 / np.sqrt(information / variance))
         if exposures.dark_variance is None:
             return without, without
-        total = variance + exposures.dark_variance * _weights(exposures)
+        total = variance + exposures.dark_variance * _weights(weighted)
         return without, np.asarray(1 / np.sqrt(information / total))

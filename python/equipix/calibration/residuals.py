@@ -96,7 +96,7 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
     """Residuals of a fit, of at most about so many measurements."""
     exposures, fit = weighted.exposures, weighted.fit
     every, searched, testing = range(len(exposures)), in_search(fit), tested(fit)
-    used = sum(np.count_nonzero(exposures.usable(k) & testing, axis=1) for k in every)
+    used = sum(np.count_nonzero(exposures.used(fit, k) & testing, axis=1) for k in every)
     rows = bands(np.asarray(used), most // (len(exposures) * exposures.shape[1]))
     shape = (len(exposures), *rows.shape, exposures.shape[1])
     values, light, response = np.empty(shape), np.empty(shape), np.empty(shape)
@@ -113,14 +113,14 @@ def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None)
             if fit.offset is not None:
                 values[k, b] -= fit.offset[part]
     for k in every:
-        values[k, ~(exposures.usable(k) & testing)[rows]] = np.nan
+        values[k, ~(exposures.used(fit, k) & testing)[rows]] = np.nan
     variance = exposures.variance
     if variance is not None:
         deep = variance[:, rows] if variance.ndim == 3 else variance[:, None, None, None]
         root = np.sqrt(deep, dtype=np.float64)
         values /= root
         response /= root
-    measured = sum(np.count_nonzero(exposures.usable(k) & searched) for k in every)
+    measured = sum(np.count_nonzero(exposures.used(fit, k) & searched) for k in every)
     share = fit.degrees_of_freedom / max(measured, 1)
     error = float(fit.error_estimate[-1])
     return Residuals(values, light, response, rows, share, weighted.noise_variance, error)

@@ -146,7 +146,7 @@ def _seen(
 ) -> tuple[Floats, Floats]:
     """Light on each pixel in an exposure, and the weights of what may be used there."""
     light = np.nan_to_num(exposures.light(fit, exposure, workers), copy=False)
-    used = exposures.usable(exposure) & (light * response != 0)
+    used = exposures.used(fit, exposure) & (light * response != 0)
     return light, _weights(exposures.variance, exposure, used)
 
 

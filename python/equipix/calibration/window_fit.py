@@ -106,7 +106,7 @@ class WindowFit:
         squares = window.weighted_squares(np.square(window.values, dtype=np.float64))
         residuals = window.residuals(fit, options.workers)
         scaled = np.copysign(np.sqrt(window.weighted_squares(np.square(residuals))), residuals)
-        share = fit.degrees_of_freedom / max(int(np.count_nonzero(np.isfinite(squares))), 1)
+        share = fit.degrees_of_freedom / max(int(np.count_nonzero(np.isfinite(scaled))), 1)
         return cls(
             fit=fit,
             left=fit.misfit / max(fit.degrees_of_freedom, 1),

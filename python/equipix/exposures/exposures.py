@@ -115,6 +115,13 @@ class Exposures(ReadOnly):
             usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
         return usable
 
+    def used(self, fit: Fit, exposure: int) -> Bools:
+        """Return which measurements of an exposure a fit used: usable ones that it did not lose."""
+        used = self.usable(exposure)
+        if fit.lost:
+            used.flat[fit.lost[exposure]] = False
+        return used
+
     @property
     def knows_noise(self) -> bool:
         """Whether variances of the values are known, and not their ratios alone."""
@@ -240,12 +247,17 @@ class Exposures(ReadOnly):
         return residuals
 
     def residual(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
-        """Return y − c · L(u) · M(p) − O(p) of one exposure; NaN where nothing is predicted."""
+        """Return y − c · L(u) · M(p) − O(p) of one exposure.
+
+        NaN where nothing is predicted, and where the fit lost the measurement, as M is not its.
+        """
         residual = self.light(fit, exposure, workers)
         residual *= fit.sensitivity
         np.subtract(self.values[exposure], residual, out=residual)
         if fit.offset is not None:
             residual -= fit.offset
+        if fit.lost:
+            residual.flat[fit.lost[exposure]] = np.nan
         return residual
 
     def deviation(self, exposure: int) -> Floats:

@@ -80,6 +80,9 @@ pub struct Fit {
     /// Pixels that were left out of the search, since few measurements are theirs, if there are such: F does not
     /// contain their residuals.
     pub few: Option<Vec<bool>>,
+    /// By exposure, the pixels whose measurements there were left out, since they alone see cells that measurements do
+    /// not determine; empty if there are none. F does not contain them, and M does not follow them.
+    pub lost: Vec<Vec<usize>>,
     /// The weights of the prior M = mean(M) on pixels in weak light, row by row, if there are such.
     pub prior: Option<Arc<[f64]>>,
 }

@@ -140,6 +140,8 @@ pub(crate) struct PyFit {
     is_joint: bool,
     #[pyo3(get)]
     few: Option<Py<PyArray2<bool>>>,
+    #[pyo3(get)]
+    lost: Vec<Py<PyArray1<usize>>>,
     /// The weights of the prior of M on pixels in weak light.
     prior: Option<Arc<[f64]>>,
 }
@@ -241,6 +243,11 @@ impl PyFit {
             refinement: fit.refinement,
             is_joint,
             few: fit.few.map(|few| image(py, few, sensor)).transpose()?,
+            lost: fit
+                .lost
+                .into_iter()
+                .map(|pixels| read_only(py, pixels))
+                .collect::<PyResult<_>>()?,
             prior: fit.prior,
         })
     }

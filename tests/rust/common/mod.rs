@@ -118,6 +118,8 @@ pub(crate) struct Answer {
     pub(crate) degrees_of_freedom: i64,
     /// The pixels that left the search, since their measurements are few; empty if there are none.
     pub(crate) few: Vec<bool>,
+    /// By exposure, the pixels whose measurements were left out; empty if there are none.
+    pub(crate) lost: Vec<Vec<usize>>,
     /// The weights of the prior of M; empty without one.
     pub(crate) prior: Vec<f64>,
     pub(crate) history: Vec<Look>,
@@ -328,6 +330,7 @@ fn answer(fit: Fit) -> Answer {
         misfit: fit.misfit,
         degrees_of_freedom: fit.degrees_of_freedom,
         few: fit.few.unwrap_or_default(),
+        lost: fit.lost,
         prior: fit.prior.map(|prior| prior.to_vec()).unwrap_or_default(),
         converged: fit.history.ended == Ended::Converged,
         history: looks.map(look).collect(),

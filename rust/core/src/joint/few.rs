@@ -6,9 +6,9 @@
 //! closed form, as that of all pixels does, but the pulls of their measurements are 0, in products, in D and in draws
 //! of noise. Their variance follows too, since that of any pixel is D⁻¹ and what S leaves open of the beam.
 //!
-//! They stay in it where they join components, where most measurements of an exposure are of such pixels, and, at
-//! whole shifts alone, where cells are seen by them alone. Between pixels such cells form strips of a few pixels, in
-//! which a pattern of M and its inverse in L fit as well, so measurements there are lost (`lost.rs`). Lost is also the
+//! They stay in it where they join components, where most measurements of an exposure are of such pixels, and where
+//! cells are seen by them alone; between pixels only in wide parts of the sensor. Strips of a few pixels, in which a
+//! pattern of M and its inverse in L fit as well, have measurements that are lost there (`lost.rs`). Lost is also the
 //! measurement of a pixel that is measured once, where no other pixel sees its cells: its M follows any light. A pixel
 //! of which all measurements are lost has no M.
 
@@ -16,7 +16,7 @@ use std::ops::Range;
 
 use super::connected::connected;
 use super::layout::Grid;
-use super::lost::{Lost, Survey};
+use super::lost::{Lost, Survey, wide};
 use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::error::Result;
@@ -24,7 +24,7 @@ use crate::exposures::Exposures;
 use crate::frames::Real;
 
 /// Measurements that are few where there are more exposures.
-const FEW: u8 = 2;
+pub(super) const FEW: u8 = 2;
 
 /// The columns of such pixels, by row of the sensor, and lost measurements.
 #[derive(Debug, Default)]
@@ -55,10 +55,19 @@ impl Few {
             return Ok(Self::default());
         }
         let mut survey = Survey::new(exposures, grid, control)?;
+        let mut stay = Vec::new();
         loop {
             let times = survey.times()?;
-            let leaves = leaving(&times, &survey)?;
-            let lost = survey.undetermined(|pixel| !leaves[pixel] && times[pixel] > 1)?;
+            let mut leaves = leaving(&times, &survey)?;
+            let lost_of =
+                |leaves: &[bool]| survey.undetermined(|pixel| !leaves[pixel] && times[pixel] > 1);
+            if stay.is_empty() {
+                stay = wide(&lost_of(&leaves)?, &times, exposures.sensor(), control)?;
+            }
+            for (pixel, leaves) in leaves.iter_mut().enumerate() {
+                *leaves &= !(stay[pixel] && times[pixel] == FEW);
+            }
+            let lost = lost_of(&leaves)?;
             // Pixels that lose measurements may have few, whose cells are then seen by others.
             if lost.count() <= survey.lost.count() {
                 return Ok(Self::new(&times, &leaves, survey));
@@ -111,6 +120,12 @@ impl Few {
         let lost = self.lost.in_row(exposure, row).iter().map(|col| *col as usize);
         lost.filter(|col| cols.contains(col))
             .for_each(|col| values[col - cols.start] = T::default());
+    }
+
+    /// Whether the search uses a measurement, if there is one.
+    pub(crate) fn uses(&self, exposure: usize, row: usize, col: usize) -> bool {
+        let is_lost = self.lost.in_row(exposure, row).binary_search(&(col as u32)).is_ok();
+        !is_lost && self.in_row(row).binary_search(&col).is_err()
     }
 
     /// Their columns in a row.

@@ -6,11 +6,13 @@
 //! by [`ENOUGH`] others; of pixels that are measured more often than [`few`](super::few) says. A measurement that is
 //! neither in a block nor of such a pixel is lost where it sees a cell that is not determined.
 //!
-//! Where most measurements of an exposure are in no block, as behind a mask of every second pixel, all count as if they
-//! were.
+//! Wide parts of the sensor are no edges. Where most pixels of one are measured twice, and no others see their cells,
+//! they are an experiment of two exposures. And where many measurements are in no block, as behind a mask of every
+//! second pixel, they count as if they were.
 
 use std::ops::Range;
 
+use super::few::FEW;
 use super::layout::{Grid, MARGIN, Window};
 use crate::control::Control;
 use crate::error::Result;
@@ -20,6 +22,14 @@ use crate::geometry::{Rotation, TAPS};
 
 /// Measurements outside blocks that determine a cell: as many as one of them sees cells.
 const ENOUGH: u8 = (TAPS * TAPS) as u8;
+
+/// Side in pixels of a wide part of the sensor.
+const WIDE: usize = 32;
+/// Share of its pixels that are measured twice where it is an experiment of two exposures.
+const MOST: f64 = 0.5;
+/// Share of it that is measured outside of blocks where these count as blocks: less than of each fourth pixel, as of one
+/// colour, more than along a ragged edge.
+const MANY: f64 = 0.22;
 
 /// The columns of lost measurements, by exposure and row; empty if there are none.
 #[derive(Debug, Default)]
@@ -197,7 +207,22 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
     }
 }
 
-/// Whether each measurement is in a block; all are where a cell is its own value, and where most of an exposure are not.
+/// The pixels that lose measurements and have two, where they form wide parts of the sensor.
+pub(super) fn wide(
+    lost: &Lost,
+    times: &[u8],
+    sensor: Shape,
+    control: &Control,
+) -> Result<Vec<bool>> {
+    let mut image = vec![false; sensor.len()];
+    let lost = lost.pixels(sensor.cols);
+    lost.iter().flatten().for_each(|&pixel| image[pixel] = times[pixel] == FEW);
+    let mut wide = in_squares(&image, sensor, WIDE, MOST, control)?;
+    wide.iter_mut().zip(image).for_each(|(wide, is_one)| *wide &= is_one);
+    Ok(wide)
+}
+
+/// Whether each measurement is in a block, or counts as one; all do where a cell is its own value.
 fn blocks<T: Real>(
     exposures: &Exposures<'_, T>,
     is_spline: bool,
@@ -211,28 +236,49 @@ fn blocks<T: Real>(
     let is_masked = |k: &usize| is_spline && exposures.uniform_weight(*k).is_none();
     for k in (0..count).filter(is_masked) {
         let used = &mut used[k * sensor.len()..][..sensor.len()];
-        let opened = opened(used, sensor, control)?;
-        let count = |image: &[bool]| image.iter().filter(|pixel| **pixel).count();
-        if 2 * count(&opened) >= count(used) {
-            used.copy_from_slice(&opened);
+        let blocks = in_squares(used, sensor, 2, 1.0, control)?;
+        let apart: Vec<bool> =
+            used.iter().zip(&blocks).map(|(used, block)| used & !block).collect();
+        let many = in_squares(&apart, sensor, WIDE, MANY, control)?;
+        for (pixel, used) in used.iter_mut().enumerate() {
+            *used = blocks[pixel] | (apart[pixel] & many[pixel]);
         }
     }
     Ok(used)
 }
 
-/// The pixels that are one of 2×2 which are set, or of as many as there are along an axis.
-fn opened(image: &[bool], Shape { rows, cols }: Shape, control: &Control) -> Result<Vec<bool>> {
-    let (height, width) = (rows.min(2), cols.min(2));
-    let mut opened = vec![false; image.len()];
-    for row in 0..=rows - height {
+/// The pixels in squares of so many a side, or as many as there are along an axis, of which at least a share is set.
+fn in_squares(
+    image: &[bool],
+    Shape { rows, cols }: Shape,
+    side: usize,
+    share: f64,
+    control: &Control,
+) -> Result<Vec<bool>> {
+    let (height, width) = (rows.min(side), cols.min(side));
+    let least = (share * (height * width) as f64).ceil() as usize;
+    let mut found = vec![false; image.len()];
+    // How many are set of the last rows of each column.
+    let mut columns = vec![0; cols];
+    for row in 0..rows {
         control.check()?;
-        let lines = [row, row + height - 1].map(|row| row * cols);
-        for col in 0..=cols - width {
-            let corners = lines.map(|line| [line + col, line + col + width - 1]);
-            if corners.iter().flatten().all(|&pixel| image[pixel]) {
-                corners.iter().flatten().for_each(|&pixel| opened[pixel] = true);
+        for (col, count) in columns.iter_mut().enumerate() {
+            *count += usize::from(image[row * cols + col]);
+            *count -= usize::from(row >= height && image[(row - height) * cols + col]);
+        }
+        if row + 1 < height {
+            continue;
+        }
+        let mut count = 0;
+        for col in 0..cols {
+            count += columns[col];
+            count -= if col < width { 0 } else { columns[col - width] };
+            if col + 1 >= width && count >= least {
+                for row in row + 1 - height..=row {
+                    found[row * cols + col + 1 - width..=row * cols + col].fill(true);
+                }
             }
         }
     }
-    Ok(opened)
+    Ok(found)
 }

@@ -70,7 +70,7 @@ fn with_system(
     visit(&mut system);
 }
 
-/// N: the sum of w c² M² B_i B_j over the measurements of pixels that do not leave the search.
+/// N: the sum of w c² M² B_i B_j over the measurements that the search uses.
 fn dense(
     system: &System<'_, '_, f64>,
     flux: &[f64],
@@ -81,8 +81,12 @@ fn dense(
     let [sensitivity, _] = system.pixels();
     let mut normal = vec![vec![0.0; cells]; cells];
     let few = system.pass.few.image(SENSOR.cols).unwrap();
+    let lost = system.pass.few.lost.pixels(SENSOR.cols);
     for at in (0..mask.len()).filter(|&at| !mask[at] && !few[at % SENSOR.len()]) {
         let (k, pixel) = (at / SENSOR.len(), at % SENSOR.len());
+        if lost.get(k).is_some_and(|lost| lost.contains(&pixel)) {
+            continue;
+        }
         let gain = flux[k] * sensitivity[pixel];
         let seen = taps(system, k, pixel);
         for &(i, a) in &seen {

@@ -58,7 +58,8 @@ impl<T: Real> System<'_, '_, T> {
                     let at = |part: Option<&[f64]>| part.map_or(0.0, |part| part[col]);
                     let light = at(part(k));
                     let left = value.to_f64() - light * at(sensitivity) - at(offset);
-                    if weight > 0.0 && at(part(count + 1)) > 0.0 {
+                    let is_used = weight > 0.0 && self.pass.few.uses(k, row, col);
+                    if is_used && at(part(count + 1)) > 0.0 {
                         squares.push(weight * left * left);
                     }
                 }

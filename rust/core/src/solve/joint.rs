@@ -377,6 +377,7 @@ fn fit<T: Real>(
         variance_is_known: exposures.variance_is_known(),
         history,
         few: system.pass.few.image(exposures.sensor().cols),
+        lost: system.pass.few.lost.pixels(exposures.sensor().cols),
         prior: system.prior.as_ref().map(|prior| {
             prior.weights.iter().map(|weight| weight * prior.mean * prior.mean).collect()
         }),

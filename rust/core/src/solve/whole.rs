@@ -71,6 +71,7 @@ pub(super) fn minimise<T: Real>(
         flags: Vec::new(),
         degrees_of_freedom: degrees_of_freedom(exposures.used(), freed, &components),
         few: None,
+        lost: Vec::new(),
         prior: prior.map(|prior| prior.weights),
         components,
         misfit,
