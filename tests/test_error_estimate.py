@@ -60,6 +60,14 @@ def test_the_minimiser_that_errors_are_measured_from_is_that_of_dense_algebra():
         np.testing.assert_allclose(found.sensitivity, dense.sensitivity, rtol=0, atol=atol)
 
 
+def test_what_the_solver_leaves_is_no_flipped_exposure():
+    """Without noise, the fit of another order may end nearer to nothing."""
+    frames, shifts, mask = random_experiment(86)
+    found = minimiser(frames, shifts, mask)
+    assert not found.converged
+    assert "misfit" not in {verdict.kind for verdict in found.verdicts}
+
+
 @pytest.mark.study
 def test_it_is_honest_where_a_coarse_tolerance_ends_a_fit(draws, figure):
     """At most one of 162 errors is above twice the estimate, and none above three times."""

@@ -55,9 +55,12 @@ def misplaced(
         return None
     # In units of noise where that is known: an order explains what is above it.
     noise = 1.0 if exposures.knows_noise else 0.0
-    left = {words: WindowFit.of(each, options).left - noise for words, each in tried.items()}
-    best = min(left, key=lambda words: left[words])
-    return best if left[best] < _LEFT * (given.left - noise) else None
+    fits = {words: WindowFit.of(each, options) for words, each in tried.items()}
+    best = min(fits, key=lambda words: fits[words].left)
+    # Without noise all that is left may be what the solver leaves.
+    is_slight = given.cannot_be_far_above(fits[best])
+    explains = fits[best].left - noise < _LEFT * (given.left - noise)
+    return best if explains and not is_slight else None
 
 
 def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
