@@ -46,6 +46,26 @@ def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
     assert 0.5 < np.sqrt(np.mean(z**2)) < 1
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dark_that_is_finer_than_its_rounding_shows_no_pattern(seed):
+    """Read noise of 0.02 DN in a dark of 10 DN with a pattern of 0.3 DN: it is 9, 10 or 11 DN."""
+    rng = np.random.default_rng(seed)
+    truth = simulate.cosine_sensitivity(SHAPE, rng=seed)
+    cross = equipix.cross_pattern(5, 7)
+    electrons = 20_000 * simulate.exposures(
+        truth, simulate.wavy_beam(SHAPE, contrast=0.2, rng=seed), cross
+    )
+    offset = 10 + 0.3 * rng.standard_normal(SHAPE)
+
+    def stack(light):
+        shot = rng.poisson(light, (50, *SHAPE)) + 10 * rng.standard_normal((50, *SHAPE))
+        return np.rint(offset + 0.002 * shot).astype(np.uint8)
+
+    dark = equipix.average(stack(np.zeros(SHAPE)))
+    frames = [equipix.average(stack(light), dark=dark) for light in electrons]
+    assert equipix.calibrate(frames, cross).verdicts == ()
+
+
 def test_clipped_values_do_not_say_that_variances_are_too_large():
     cal, _ = calibrated(exposure_e=19500)
     assert "saturation" in {verdict.kind for verdict in cal.verdicts}

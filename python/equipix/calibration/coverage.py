@@ -49,7 +49,11 @@ def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> lis
 
 def _far(fit: Fit) -> str:
     """Return the words on a fit that ended far from its minimum."""
-    more = "allow more sweeps, or use larger shifts in a beam with more structure"
+    more = "use larger shifts in a beam with more structure"
+    if fit.lost:
+        more += ", or masks with smooth edges"
+    if fit.ended == "sweeps used":
+        more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
         f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): "

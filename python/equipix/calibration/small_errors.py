@@ -37,6 +37,10 @@ _CLEAR, _FAINTEST = 30.0, 0.05
 """Signal over noise that all but this share of values must have. Where the noise of M and L is
 larger, more than its square displaces the estimate."""
 
+_COARSE = 4.0
+"""Variance of the dark over the pixels, in that of its noise, from which its pattern is known: that
+of 0.3 DN, in whole numbers, is itself an error of rounding, which the residuals hold too."""
+
 _STEP = 0.005
 """Size of the error that is added, over the signal, rms: its effect is nearly linear. Of 0.05 the
 rest displaced crosstalk by four standard errors where the dark was that of one frame."""
@@ -256,8 +260,10 @@ def _causes(window: Exposures, signal: Floats) -> Iterator[Cause]:
         yield _CROSSTALK
     if not window.offset:
         yield _OFFSET
-    if window.dark is not None and np.ptp(window.dark) > 0:
-        yield _PATTERN
+    if window.dark is not None:
+        noise = 0.0 if window.dark_variance is None else float(np.mean(window.dark_variance))
+        if np.var(window.dark) > _COARSE * noise:
+            yield _PATTERN
 
 
 class _Fitted(NamedTuple):

@@ -291,8 +291,8 @@ def _on_components(fit: Fit) -> Verdict | None:
     return Verdict(
         "components",
         f"the shifts leave {fit.components} parts of the sensor unconnected: the sensitivity of "
-        f"{left} pixels outside the largest part is undetermined (NaN): choose other shifts, see "
-        "equipix.plan.identify",
+        f"{left} pixel{'s' * (left != 1)} outside the largest part is undetermined (NaN): choose "
+        "other shifts, see equipix.plan.identify",
     )
 
 
