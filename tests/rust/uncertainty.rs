@@ -38,7 +38,8 @@ impl Case {
             Noise::Unknown => answer.misfit / answer.degrees_of_freedom as f64,
             _ => 1.0,
         };
-        let covariance = Covariance::of(&experiment, &answer, unit).unwrap();
+        let used = experiment.clone().without(&answer.lost);
+        let covariance = Covariance::of(&used, &answer, unit).unwrap();
         Self { experiment, answer, covariance }
     }
 

@@ -163,6 +163,16 @@ impl Experiment {
         self
     }
 
+    /// The same without these measurements, by exposure.
+    pub(crate) fn without(mut self, lost: &[Vec<usize>]) -> Self {
+        let pixels = self.shape[0] * self.shape[1];
+        self.mask.resize(self.frames.len(), false);
+        for (k, own) in lost.iter().enumerate() {
+            own.iter().for_each(|pixel| self.mask[k * pixels + pixel] = true);
+        }
+        self
+    }
+
     /// Variances that differ threefold from measurement to measurement, and every twentieth masked, but
     /// for pixels of which that would leave so few that they leave the search.
     pub(crate) fn uneven(mut self) -> Self {
