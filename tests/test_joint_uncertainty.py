@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix import reference, simulate
 from equipix.errors import IdentifiabilityWarning
-from test_joint import CROSS, SMALL, SMALL_CROSS, TURNED, between, small
+from test_joint import CROSS, SMALL, SMALL_CROSS, TURNED, between, small, used
 from test_uncertainty import (
     DRAWS_EXACT_TO,
     MOST_DRAWS,
@@ -54,9 +54,8 @@ class TestAgainstDenseAlgebra:
     def test_the_map_and_functionals(self, name):
         shifts, options = CASES[name]
         frames, measured = small(1, shifts, rotation=options.get("rotation"))
-        options = options | measured
-        cal = equipix.calibrate(frames, shifts, uncertainty=True, **options)
-        dense = reference.joint(frames, shifts, **options)
+        cal = equipix.calibrate(frames, shifts, uncertainty=True, **options, **measured)
+        dense = reference.joint(frames, shifts, **options, **used(cal, measured))
         known = np.isfinite(cal.sensitivity)
         error = (cal.sensitivity_std / dense.std - 1)[known]
         made = cal.metadata["uncertainty"]

@@ -82,14 +82,15 @@ fn the_answer_of_others_is_that_without_them() {
     }
 }
 
-/// The cells that a pixel sees, turned by nothing or by half: two on either side of its place, along both axes.
+/// The cells that a pixel sees, turned by nothing or by half: those less than two from its place, along both axes.
 fn cells(pixel: usize, shift: [f64; 2], degrees: i64) -> impl Iterator<Item = [i64; 2]> {
     let own = [pixel / SHAPE[1], pixel % SHAPE[1]];
-    let [row, col] = [0, 1].map(|axis| {
+    let [rows, cols] = [0, 1].map(|axis| {
         let place = if degrees == 0 { own[axis] } else { SHAPE[axis] - 1 - own[axis] };
-        (place as f64 + shift[axis]).floor() as i64 - 1
+        let place = place as f64 + shift[axis];
+        place.floor() as i64 - 1..place.ceil() as i64 + 2
     });
-    (0..16).map(move |i| [row + i / 4, col + i % 4])
+    rows.flat_map(move |row| cols.clone().map(move |col| [row, col]))
 }
 
 /// Which measurements an experiment uses.

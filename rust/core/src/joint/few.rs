@@ -16,15 +16,12 @@ use std::ops::Range;
 
 use super::connected::connected;
 use super::layout::Grid;
-use super::lost::{Lost, Survey, wide};
+use super::lost::{FEW, Lost, Survey, wide};
 use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
-
-/// Measurements that are few where there are more exposures.
-pub(super) const FEW: u8 = 2;
 
 /// The columns of such pixels, by row of the sensor, and lost measurements.
 #[derive(Debug, Default)]

@@ -12,13 +12,15 @@
 
 use std::ops::Range;
 
-use super::few::FEW;
 use super::layout::{Grid, MARGIN, Window};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::{Rotation, TAPS};
+
+/// Measurements of a pixel that are few where there are more exposures.
+pub(super) const FEW: u8 = 2;
 
 /// Measurements outside blocks that determine a cell: as many as one of them sees cells.
 const ENOUGH: u8 = (TAPS * TAPS) as u8;
@@ -140,9 +142,20 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
     ) -> impl Iterator<Item = usize> {
         let window = &self.windows[exposure];
         let places = self.grid.geometry.views[window.view].cells;
-        let (row, col, side) =
-            (row + window.row - margin, col + window.col - margin, self.grid.width + 2 * margin);
-        (0..side * side).map(move |i| places.at(row + i / side, col + i % side))
+        let [rows, cols] = self.seen(window);
+        let (row, height) = (row + window.row + rows.start - margin, rows.len() + 2 * margin);
+        let (col, width) = (col + window.col + cols.start - margin, cols.len() + 2 * margin);
+        (0..height * width).map(move |i| places.at(row + i / width, col + i % width))
+    }
+
+    /// Which cells from the first one on the pixels see along both axes: at whole places one less than a spline has.
+    fn seen(&self, window: &Window) -> [Range<usize>; 2] {
+        [&window.along_rows, &window.along_cols].map(|taps| {
+            let factors = &taps.values[..self.grid.width];
+            let is_seen = |factor: &f64| *factor != 0.0;
+            let first = factors.iter().position(is_seen).unwrap_or(0);
+            first..factors.iter().rposition(is_seen).map_or(0, |last| last + 1)
+        })
     }
 
     /// The number of measurements of some pixels that see each cell; one in a block counts as enough.
@@ -174,15 +187,15 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
 
     /// Adds to the count of all cells that pixels side by side see.
     fn count(&self, exposure: usize, row: usize, cols: Range<usize>, add: u8, counts: &mut [u8]) {
-        let (window, width) = (&self.windows[exposure], self.grid.width);
-        let view = &self.grid.geometry.views[window.view];
+        let window = &self.windows[exposure];
+        let (view, [rows, across]) = (&self.grid.geometry.views[window.view], self.seen(window));
         let mut count = |cell: usize| counts[cell] = counts[cell].saturating_add(add);
         if view.rotation != Rotation::None {
             return cols.for_each(|col| self.cells(exposure, row, col, 0).for_each(&mut count));
         }
-        for i in 0..width {
-            let first = view.cells.at(row + window.row + i, cols.start + window.col);
-            (first..first + cols.len() + width - 1).for_each(&mut count);
+        for i in rows {
+            let first = view.cells.at(row + window.row + i, cols.start + window.col + across.start);
+            (first..first + cols.len() + across.len() - 1).for_each(&mut count);
         }
     }
 
