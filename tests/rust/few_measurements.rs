@@ -82,13 +82,20 @@ fn the_answer_of_others_is_that_without_them() {
     }
 }
 
-/// The cells that a pixel sees, turned by nothing or by half: those less than two from its place, along both axes.
-fn cells(pixel: usize, shift: [f64; 2], degrees: i64) -> impl Iterator<Item = [i64; 2]> {
+/// The cells that a pixel sees, turned by nothing or by half: those less than two from its place along both axes, and
+/// from a place a little further on where shifts are fitted.
+fn cells(
+    pixel: usize,
+    shift: [f64; 2],
+    degrees: i64,
+    fitted: bool,
+) -> impl Iterator<Item = [i64; 2]> {
     let own = [pixel / SHAPE[1], pixel % SHAPE[1]];
     let [rows, cols] = [0, 1].map(|axis| {
         let place = if degrees == 0 { own[axis] } else { SHAPE[axis] - 1 - own[axis] };
         let place = place as f64 + shift[axis];
-        place.floor() as i64 - 1..place.ceil() as i64 + 2
+        let last = if fitted { place.floor() + 1.0 } else { place.ceil() };
+        place.floor() as i64 - 1..last as i64 + 2
     });
     rows.flat_map(move |row| cols.clone().map(move |col| [row, col]))
 }
@@ -117,7 +124,7 @@ fn lost(used: Used<'_>, degrees: &[i64], margin: i64) -> Vec<Vec<usize>> {
         let mut seen = std::collections::HashMap::new();
         for (k, pixel) in every().filter(|&(k, pixel)| is_left(k, pixel) && stays(pixel)) {
             let count = if is_in_block(used, k, pixel) { 16 } else { 1 };
-            for cell in cells(pixel, BETWEEN[k], degrees[k]) {
+            for cell in cells(pixel, BETWEEN[k], degrees[k], margin > 0) {
                 *seen.entry(cell).or_insert(0) += count;
             }
         }
@@ -129,7 +136,7 @@ fn lost(used: Used<'_>, degrees: &[i64], margin: i64) -> Vec<Vec<usize>> {
         let is_lost = |k: usize, pixel: usize| {
             used(k, pixel)
                 && !(is_in_block(used, k, pixel) && stays(pixel))
-                && cells(pixel, BETWEEN[k], degrees[k]).flat_map(around).any(is_open)
+                && cells(pixel, BETWEEN[k], degrees[k], margin > 0).flat_map(around).any(is_open)
         };
         let found: Vec<Vec<usize>> = (0..BETWEEN.len())
             .map(|k| (0..PIXELS).filter(|&pixel| is_lost(k, pixel)).collect())

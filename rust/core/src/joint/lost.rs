@@ -148,11 +148,13 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
         (0..height * width).map(move |i| places.at(row + i / width, col + i % width))
     }
 
-    /// Which cells from the first one on the pixels see along both axes: at whole places one less than a spline has.
+    /// Which cells from the first one on the pixels see along both axes: one less than a spline has at places that are
+    /// whole and stay so.
     fn seen(&self, window: &Window) -> [Range<usize>; 2] {
+        let moves = self.exposures.positions().std.is_some();
         [&window.along_rows, &window.along_cols].map(|taps| {
             let factors = &taps.values[..self.grid.width];
-            let is_seen = |factor: &f64| *factor != 0.0;
+            let is_seen = |factor: &f64| moves || *factor != 0.0;
             let first = factors.iter().position(is_seen).unwrap_or(0);
             first..factors.iter().rposition(is_seen).map_or(0, |last| last + 1)
         })
