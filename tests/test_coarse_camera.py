@@ -56,6 +56,7 @@ def test_a_dark_that_is_finer_than_its_rounding_shows_no_pattern(seed):
         truth, simulate.wavy_beam(SHAPE, contrast=0.2, rng=seed), cross
     )
     offset = 10 + 0.3 * rng.standard_normal(SHAPE)
+    offset[50, 60] += 60
 
     def stack(light):
         shot = rng.poisson(light, (50, *SHAPE)) + 10 * rng.standard_normal((50, *SHAPE))

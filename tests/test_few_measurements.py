@@ -81,6 +81,112 @@ def test_experiments_of_two_exposures_keep_all_pixels():
     assert cal.weighted.fit.few is None
 
 
+SMALL = (24, 40)
+APART = np.array([[0, 0], [0.3, 5.2], [0.1, 14.6], [5.45, 0.1], [6.8, 0.35]])
+MIXED = np.array([[0, 0], [0, 5], [-5, 0], [3.4, -6.2], [3, -3]])
+
+
+def fitted(shifts, mask, *, rotation=None, std=None, missing="masked"):
+    """A small sensor in a beam with structure, with noise of 0.1 %."""
+    rng = np.random.default_rng(3)
+    truth = simulate.cosine_sensitivity(SMALL, rng=1)
+    beam = simulate.wavy_beam(SMALL, contrast=0.3, rng=1)
+    frames = simulate.exposures(truth, beam, shifts, rotation=rotation)
+    frames += 1e-3 * rng.standard_normal(frames.shape)
+    if missing == "NaN":
+        frames[mask], mask = np.nan, None
+    return equipix.calibrate(
+        frames, shifts, mask=mask, rotation=rotation, shift_std=std, variance=np.full(5, 1e-6)
+    )
+
+
+def frayed(seed=0):
+    """Half of the last eight columns, at random."""
+    missing = np.random.default_rng(seed).uniform(size=(5, *SMALL)) < 0.5
+    return (np.arange(SMALL[1]) >= SMALL[1] - 8) & missing
+
+
+def lost_by_the_rule(used, shifts, rotation, *, fitted):
+    """What is lost by the words of lost.rs, where no part of the sensor is wide or sparse."""
+    margin, (rows, cols) = int(fitted), SMALL
+    windows = np.lib.stride_tricks.sliding_window_view(used, (4, 4), (1, 2)).all(axis=(3, 4))
+    block = np.zeros_like(used)
+    for row, col in np.ndindex(4, 4):
+        block[:, row : row + rows - 3, col : col + cols - 3] |= windows
+
+    def cells(k, row, col):
+        turned = [(row, col), (col, rows - 1 - row), (rows - 1 - row, cols - 1 - col)]
+        place = [*turned, (cols - 1 - col, row)][rotation[k] // 90] + shifts[k]
+        last = np.floor(place) + 1 if fitted else np.ceil(place)
+        return [range(int(np.floor(p)) - 1, int(q) + 2) for p, q in zip(place, last, strict=True)]
+
+    lost = np.zeros_like(used)
+    while True:
+        left = used & ~lost
+        stays = left.sum(axis=0) > 2
+        seen = np.zeros((200, 200))
+        for k, row, col in np.argwhere(left & stays):
+            seen[np.ix_(*cells(k, row, col))] += 16 if block[k, row, col] else 1
+        found = lost.copy()
+        for k, row, col in np.argwhere(used & ~(block & stays)):
+            around = [range(r.start - margin, r.stop + margin) for r in cells(k, row, col)]
+            found[k, row, col] |= (seen[np.ix_(*around)] < 16).any()
+        if (found == lost).all():
+            return lost
+        lost = found
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+@pytest.mark.parametrize("shifts", [APART, MIXED], ids=["apart", "mixed"])
+@pytest.mark.parametrize("rotation", [[0] * 5, [0, 90, 180, 270, 0]], ids=["", "turned"])
+@pytest.mark.parametrize(("std", "missing"), [(None, "masked"), (None, "NaN"), (0.05, "masked")])
+def test_what_is_lost_is_lost_by_the_rule(shifts, rotation, std, missing):
+    mask = frayed()
+    cal = fitted(shifts, mask, rotation=rotation, std=std, missing=missing)
+    lost = np.zeros_like(mask)
+    for k, own in enumerate(cal.weighted.fit.lost):
+        lost[k].flat[own] = True
+    # Places from 0 to 200: all cells are behind them.
+    wanted = lost_by_the_rule(~mask, shifts + 60, rotation, fitted=std is not None)
+    assert wanted.sum() > 20
+    np.testing.assert_array_equal(lost, wanted)
+
+
+@pytest.mark.parametrize("std", [None, 0.05])
+def test_lost_measurements_tell_nothing_of_pixels(std):
+    """D, residuals and standard deviations are without them."""
+    cal = fitted(APART, frayed(), std=std)
+    exposures, fit = cal.weighted.exposures, cal.weighted.fit
+    squares = [exposures.light(fit, k, None) ** 2 / 1e-6 for k in range(5)]
+    used = [exposures.used(fit, k) for k in range(5)]
+    known = np.isfinite(cal.sensitivity)
+    total = np.sum(np.where(used, squares, 0), axis=0)
+    information = fit.information(workers=1)
+    np.testing.assert_allclose(information[known], total[known], rtol=1e-12)
+    assert not information[~np.any(used, axis=0)].any()
+    times = np.sum(used, axis=0)
+    np.testing.assert_array_equal(known, times > 0)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 3), (24, 3), (4, 4)])
+def test_islands_and_strips_in_the_dark_do_no_harm(size):
+    mask = np.zeros((5, *SMALL), bool)
+    mask[2, :, 30:] = True
+    row = max(0, 10 - size[0] // 2)
+    mask[2, row : row + size[0], 36 : 36 + size[1]] = False
+    cal = fitted(APART, mask)
+    assert cal.converged
+    assert cal.sweeps <= 100
+    assert cal.verdicts == ()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_ragged_edges_at_mostly_whole_shifts_converge(seed):
+    cal = fitted(MIXED, frayed(seed))
+    assert cal.converged
+    assert cal.sweeps <= 100
+
+
 def with_edge(edge, rng, clean, mask):
     """A circle, a threshold on noisy frames, or half of the measurements along the edge.
 
@@ -112,19 +218,12 @@ def test_large_discs_converge_and_raise_no_alarm(edge, draws, figure):
             frames, measured, mask=mask, variance=np.full(9, NOISE**2), flux="fit", shift_std=0.3
         )
         lost.append(sum(map(len, cal.weighted.fit.lost)) / np.count_nonzero(~mask))
-        if cal.converged:
-            passes.append(cal.sweeps)
-            # That free fluxes leave the tilt open is no alarm.
-            assert {verdict.kind for verdict in cal.verdicts} == {"tilt"}
-    of_discs = f"of discs of 512×512 pixels, edge of masks: {edge}"
-    figure(f"share that converges {of_discs}", len(passes) / len(lost), "1")
-    figure(f"most passes {of_discs}", max(passes), "at most 100")
-    figure(f"largest share of measurements lost {of_discs}", max(lost), "at most 0.01")
-    assert max(lost) <= 0.01
-    if edge == "circle":
-        assert len(passes) == len(lost)
-        assert max(passes) <= 100
-    else:
-        # Of ragged edges some leave cells that fit any value; the result says so.
-        assert len(passes) >= 0.75 * len(lost)
-        assert np.median(passes) <= 100
+        assert cal.converged
+        # That free fluxes leave the tilt open is no alarm.
+        assert {verdict.kind for verdict in cal.verdicts} == {"tilt"}
+        passes.append(cal.sweeps)
+    edge = f"of discs of 512×512 pixels, edge of masks: {edge}"
+    figure(f"most passes {edge}", max(passes), "at most 100")
+    figure(f"largest share of measurements lost {edge}", max(lost), "below 0.05")
+    assert max(passes) <= 100
+    assert max(lost) < 0.05

@@ -85,6 +85,24 @@ def test_one_array_that_is_flipped_is_named(bench, axes, words, variance):
     assert any(f"exposure 3 (from 0) fits better {words}" in each.message for each in found)
 
 
+def test_a_flip_that_leaves_less_than_half_a_percent_is_named():
+    """A pattern of 0.4 % in nearly even light: chi-square is above 100."""
+    rng = np.random.default_rng(0)
+    truth, beam = (
+        1 + 0.004 * rng.standard_normal((64, 72)),
+        simulate.wavy_beam((64, 72), contrast=5e-4, rng=1),
+    )
+    values = simulate.exposures(truth, beam, equipix.cross_pattern(5, 7))
+    values += 1e-4 * rng.standard_normal(values.shape)
+    values[2] = values[2][::-1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        found = equipix.calibrate(
+            values, equipix.cross_pattern(5, 7), variance=np.full(5, 1e-8)
+        ).verdicts
+    assert any("exposure 2 (from 0) fits better upside down" in each.message for each in found)
+
+
 @pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
 def test_some_exposures_that_are_flipped_are_a_misfit(bench, axis):
     frames = [np.flip(each, axis) if k in (1, 3) else each for k, each in enumerate(bench.frames)]

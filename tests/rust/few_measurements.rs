@@ -103,15 +103,15 @@ fn cells(
 /// Which measurements an experiment uses.
 type Used<'u> = &'u dyn Fn(usize, usize) -> bool;
 
-/// Whether a measurement is one of 2×2 of its exposure.
+/// Whether a measurement is one of 4×4 of its exposure.
 fn is_in_block(used: Used<'_>, k: usize, pixel: usize) -> bool {
     let [row, col] = [pixel / SHAPE[1], pixel % SHAPE[1]].map(|at| at as i64);
     let is_used = |row: i64, col: i64| {
         let is_inside = (0..SHAPE[0] as i64).contains(&row) && (0..SHAPE[1] as i64).contains(&col);
         is_inside && used(k, row as usize * SHAPE[1] + col as usize)
     };
-    let corners = [[-1, -1], [-1, 0], [0, -1], [0, 0]].map(|[r, c]| [row + r, col + c]);
-    corners.iter().any(|[r, c]| (0..4).all(|i| is_used(r + i / 2, c + i % 2)))
+    let mut corners = (row - 3..=row).flat_map(|r| (col - 3..=col).map(move |c| [r, c]));
+    corners.any(|[r, c]| (0..16).all(|i| is_used(r + i / 4, c + i % 4)))
 }
 
 /// What is lost by the words of `lost.rs`, by exposure, of pixels that join no components.
@@ -139,7 +139,10 @@ fn lost(used: Used<'_>, degrees: &[i64], margin: i64) -> Vec<Vec<usize>> {
                 && cells(pixel, BETWEEN[k], degrees[k], margin > 0).flat_map(around).any(is_open)
         };
         let found: Vec<Vec<usize>> = (0..BETWEEN.len())
-            .map(|k| (0..PIXELS).filter(|&pixel| is_lost(k, pixel)).collect())
+            .map(|k| {
+                let is_gone = |&pixel: &usize| lost[k].contains(&pixel) || is_lost(k, pixel);
+                (0..PIXELS).filter(is_gone).collect()
+            })
             .collect();
         if found == lost {
             return lost;

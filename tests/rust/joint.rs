@@ -8,7 +8,7 @@ use crate::simulation::{
     BETWEEN, CROSS, DRIFT, LONG, SHIFT_STD, SMALL, Simulation, TIMES, TURNED, cubic, even, rolling,
 };
 
-const TOLERANCE: f64 = 1e-8;
+const TOLERANCE: f64 = 1e-10;
 
 /// What every joint fit must do, with even weights, and with uneven ones and gaps.
 fn check(experiment: &Experiment) {
@@ -19,6 +19,7 @@ fn check(experiment: &Experiment) {
 fn check_one(experiment: &Experiment) {
     let answer = fit(experiment, Options::to(TOLERANCE)).unwrap();
     assert!(answer.is_joint() && answer.converged, "{:?}", answer.history.last());
+    assert!(answer.few.is_empty(), "F of dense algebra has all pixels");
     let used = experiment.clone().without(&answer.lost);
     let beside = Minimum::beside(&used, &answer, TOLERANCE).unwrap();
     let Minimum { step, slope, allowed, .. } = beside;

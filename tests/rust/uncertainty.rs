@@ -33,7 +33,7 @@ struct Case {
 impl Case {
     fn new(experiment: Experiment) -> Self {
         let answer = fit(&experiment, Options::to(TOLERANCE)).unwrap();
-        assert!(answer.converged);
+        assert!(answer.converged && answer.few.is_empty());
         let unit = match experiment.noise {
             Noise::Unknown => answer.misfit / answer.degrees_of_freedom as f64,
             _ => 1.0,

@@ -57,7 +57,7 @@ def _far(fit: Fit) -> str:
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
         f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) else more}"
+        f"{TOO_WEAK if fits_noise(fit) and not fit.lost else more}"
     )
 
 

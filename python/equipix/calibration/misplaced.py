@@ -57,8 +57,8 @@ def misplaced(
     noise = 1.0 if exposures.knows_noise else 0.0
     fits = {words: WindowFit.of(each, options) for words, each in tried.items()}
     best = min(fits, key=lambda words: fits[words].left)
-    # Without noise all that is left may be what the solver leaves.
-    is_slight = given.cannot_be_far_above(fits[best])
+    # Where noise is not known, and may be none, all that is left may be what the solver leaves.
+    is_slight = not exposures.knows_noise and given.cannot_be_far_above(fits[best])
     explains = fits[best].left - noise < _LEFT * (given.left - noise)
     return best if explains and not is_slight else None
 

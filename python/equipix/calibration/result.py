@@ -465,7 +465,8 @@ class Calibration(ReadOnly):
         -------
         ndarray, shape (n, rows, cols)
             Residuals in the units of the frames; where variances are known, in standard
-            deviations of a measurement. NaN where nothing is measured or predicted.
+            deviations of a measurement. NaN where nothing is measured or predicted. Measurements
+            that the fit left out, along ragged edges of masks, have residuals beyond their noise.
 
         Raises
         ------

@@ -99,8 +99,9 @@ def _explains_residuals(weighted: Weighted, workers: int | None) -> bool:
     if variance is None or variance.ndim != 3:
         return True
     along = square = 0.0
-    for k, values in enumerate(exposures.values):
-        residual = values - exposures.light(fit, k, workers) * fit.sensitivity
+    for k in range(len(exposures)):
+        residual = exposures.residual(fit, k, workers)
+        residual[~exposures.used(fit, k)] = np.nan
         of_residuals = np.diff(np.square(residual, dtype=np.float64), axis=1)
         of_variances = np.diff(variance[k].astype(np.float64), axis=1)
         known = np.isfinite(of_residuals) & np.isfinite(of_variances)

@@ -262,7 +262,9 @@ def _causes(window: Exposures, signal: Floats) -> Iterator[Cause]:
         yield _OFFSET
     if window.dark is not None:
         noise = 0.0 if window.dark_variance is None else float(np.mean(window.dark_variance))
-        if np.var(window.dark) > _COARSE * noise:
+        # Without hot pixels, which would make any dark one with a pattern.
+        clipped = np.clip(window.dark, *np.quantile(window.dark, [0.01, 0.99]))
+        if np.var(clipped) > _COARSE * noise:
             yield _PATTERN
 
 

@@ -354,10 +354,12 @@ def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
 def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
     if fit.ended == "converged":
         return None
-    if fits_noise(fit):
+    if fits_noise(fit) and not fit.lost:
         remedy = f": {TOO_WEAK}"
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"
+    elif fit.lost:
+        remedy = ", and no longer decreasing: use masks with smooth edges, or a larger 'tolerance'"
     else:
         remedy = (
             ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "

@@ -249,7 +249,8 @@ class Exposures(ReadOnly):
     def residual(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
         """Return y − c · L(u) · M(p) − O(p) of one exposure.
 
-        NaN where nothing is predicted, and where the fit lost the measurement, as M is not its.
+        NaN where nothing is predicted, and where the fit lost the measurement: M was fitted
+        without it.
         """
         residual = self.light(fit, exposure, workers)
         residual *= fit.sensitivity

@@ -80,8 +80,8 @@ pub struct Fit {
     /// Pixels that were left out of the search, since few measurements are theirs, if there are such: F does not
     /// contain their residuals.
     pub few: Option<Vec<bool>>,
-    /// By exposure, the pixels whose measurements there were left out, since they alone see cells that measurements do
-    /// not determine; empty if there are none. F does not contain them, and M does not follow them.
+    /// By exposure, the pixels whose measurements there were left out, because they see a cell that no others determine;
+    /// empty if there are none. F does not contain them, and M does not follow them.
     pub lost: Vec<Vec<usize>>,
     /// The weights of the prior M = mean(M) on pixels in weak light, row by row, if there are such.
     pub prior: Option<Arc<[f64]>>,
@@ -101,6 +101,7 @@ impl Fit {
             joint: self.is_joint(),
             unit: self.unit(),
             prior: self.prior.clone(),
+            lost: self.lost.iter().map(Vec::as_slice).collect(),
         }
     }
 
@@ -179,6 +180,8 @@ pub struct Solution<'s> {
     pub unit: f64,
     /// The weights of the prior of M.
     pub prior: Option<Arc<[f64]>>,
+    /// [`Fit::lost`].
+    pub lost: Vec<&'s [usize]>,
 }
 
 impl Solution<'_> {
@@ -213,7 +216,12 @@ impl Solution<'_> {
     ) -> Result<Vec<f64>> {
         self.check(exposures)?;
         let (sensor, rotations) = (exposures.sensor(), &exposures.positions().rotations);
-        let light = |k: usize| self.beam.light(self.shifts[k], rotations[k], sensor, workers);
+        let light = |k: usize| {
+            let mut light = self.beam.light(self.shifts[k], rotations[k], sensor, workers);
+            let lost = self.lost.get(k).copied().unwrap_or_default();
+            lost.iter().for_each(|&pixel| light[pixel] = f64::NAN);
+            light
+        };
         information::of_sensor(exposures, self.flux, light, workers, control)
     }
 }

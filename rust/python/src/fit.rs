@@ -15,7 +15,9 @@ use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
     Uncertainty, Workers,
 };
-use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{
+    PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
+};
 use pyo3::prelude::*;
 
 use crate::arrays::{either, image, read_only, rotation, shape_of};
@@ -260,6 +262,7 @@ impl PyFit {
             sensitivity: sensitivity.readonly(),
             flags: flags.readonly(),
             beam: self.beam.get().borrow(py),
+            lost: self.lost.iter().map(|pixels| pixels.bind(py).readonly()).collect(),
         }
     }
 }
@@ -270,6 +273,7 @@ pub(crate) struct BorrowedFit<'py> {
     sensitivity: PyReadonlyArray2<'py, f64>,
     flags: PyReadonlyArray2<'py, u32>,
     beam: BorrowedBeam<'py>,
+    lost: Vec<PyReadonlyArray1<'py, usize>>,
 }
 
 impl BorrowedFit<'_> {
@@ -284,6 +288,7 @@ impl BorrowedFit<'_> {
             joint: self.fit.is_joint,
             unit: self.fit.unit,
             prior: self.fit.prior.clone(),
+            lost: self.lost.iter().map(|pixels| Ok(pixels.as_slice()?)).collect::<PyResult<_>>()?,
         })
     }
 }

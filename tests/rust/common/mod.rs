@@ -295,6 +295,7 @@ fn ask<R>(
         joint: answer.is_joint(),
         unit: variance_of_weight_1(experiment, answer),
         prior: (!answer.prior.is_empty()).then(|| answer.prior.clone().into()),
+        lost: answer.lost.iter().map(Vec::as_slice).collect(),
     };
     with_exposures(experiment, &workers, |exposures| {
         let bars = Uncertainty::new(exposures, &solution, &workers, &control)?;

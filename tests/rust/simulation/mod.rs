@@ -173,8 +173,9 @@ impl Experiment {
         self
     }
 
-    /// Variances that differ threefold from measurement to measurement, and every twentieth masked, but
-    /// for pixels of which that would leave so few that they leave the search.
+    /// Variances that differ threefold from measurement to measurement, and one in sixty masked, but for pixels
+    /// of which that would leave so few that they leave the search. On sensors so small, more gaps would lose
+    /// so many others that pixels leave it for those.
     pub(crate) fn uneven(mut self) -> Self {
         let size = self.frames.len();
         if let Noise::Exposures(variance) = &self.noise {
@@ -182,7 +183,7 @@ impl Experiment {
             self.noise = Noise::Measurements(uneven.collect());
         }
         let (count, pixels) = (self.shifts.len(), self.shape[0] * self.shape[1]);
-        let masked = |i: usize| random(91, i) > 0.9;
+        let masked = |i: usize| random(91, i) > 0.97;
         let left = |p: usize| (0..count).filter(|k| !masked(k * pixels + p)).count();
         self.mask = (0..size).map(|i| masked(i) && left(i % pixels) > 2.min(count - 1)).collect();
         self

@@ -7,8 +7,8 @@
 //! of noise. Their variance follows too, since that of any pixel is D⁻¹ and what S leaves open of the beam.
 //!
 //! They stay in it where they join components, where most measurements of an exposure are of such pixels, and where
-//! cells are seen by them alone; between pixels only in wide parts of the sensor. Strips of a few pixels, in which a
-//! pattern of M and its inverse in L fit as well, have measurements that are lost there (`lost.rs`). Lost is also the
+//! cells are seen by them alone; between pixels only in wide parts of the sensor. In strips of a few pixels a pattern
+//! of M and its inverse in L fit as well, and measurements there are lost (`lost.rs`). Lost is also the
 //! measurement of a pixel that is measured once, where no other pixel sees its cells: its M follows any light. A pixel
 //! of which all measurements are lost has no M.
 
@@ -47,7 +47,7 @@ impl Few {
         control: &Control,
     ) -> Result<Self> {
         let count = exposures.count();
-        let is_whole = (0..count).all(|k| exposures.uniform_weight(k).is_some());
+        let is_whole = exposures.used() == count * exposures.sensor().len();
         if count <= usize::from(FEW) || is_whole || exposures.offset() {
             return Ok(Self::default());
         }
@@ -58,21 +58,18 @@ impl Few {
             let mut leaves = leaving(&times, &survey)?;
             let lost_of =
                 |leaves: &[bool]| survey.undetermined(|pixel| !leaves[pixel] && times[pixel] > 1);
+            let mut lost = lost_of(&leaves)?;
             if stay.is_empty() {
-                stay = wide(&lost_of(&leaves)?, &times, exposures.sensor(), control)?;
+                stay = wide(&lost, &times, exposures.sensor(), control)?;
             }
-            for (pixel, leaves) in leaves.iter_mut().enumerate() {
-                *leaves &= !(stay[pixel] && times[pixel] == FEW);
+            let stays = |pixel: usize| stay[pixel] && times[pixel] == FEW;
+            if (0..leaves.len()).any(|pixel| leaves[pixel] && stays(pixel)) {
+                leaves.iter_mut().enumerate().for_each(|(pixel, leaves)| *leaves &= !stays(pixel));
+                lost = lost_of(&leaves)?;
             }
-            let lost = lost_of(&leaves)?;
             // Pixels that lose measurements may have few, whose cells are then seen by others.
-            if lost.count() <= survey.lost.count() {
+            if !survey.lose(&lost) {
                 return Ok(Self::new(&times, &leaves, survey));
-            }
-            survey.lost = lost;
-            // No exposure may lose all its measurements.
-            if !has_all_exposures(&survey)? {
-                return Ok(Self::default());
             }
         }
     }
@@ -138,12 +135,6 @@ impl Few {
         }
         (self.pixels > 0).then_some(image)
     }
-}
-
-fn has_all_exposures<T: Real>(survey: &Survey<'_, '_, T>) -> Result<bool> {
-    let mut is_left = vec![false; survey.exposures.count()];
-    survey.for_each_stretch(|k, _, _| is_left[k] = true)?;
-    Ok(is_left.iter().all(|is_left| *is_left))
 }
 
 /// Which pixels with so many measurements leave the search.

@@ -2,13 +2,13 @@
 //!
 //! Along the edge of a mask some cells of a spline are seen by few measurements. These do not determine them, the
 //! penalty does not reach all of them, and coefficients of 1e8 fit as well, which the search follows for thousands of
-//! passes. So a cell counts as determined where it is seen by a measurement in a block, one of 2×2 of its exposure, or
-//! by [`ENOUGH`] others; of pixels that are measured more often than [`few`](super::few) says. A measurement that is
-//! neither in a block nor of such a pixel is lost where it sees a cell that is not determined.
+//! passes. So a cell counts as determined where a measurement in a block sees it, or [`ENOUGH`] others. A block is as
+//! many pixels of an exposure as one of them sees cells, side by side. Only pixels count that stay in the search and
+//! are measured at least twice. All other measurements are lost where they see a cell that is not determined.
 //!
 //! Wide parts of the sensor are no edges. Where most pixels of one are measured twice, and no others see their cells,
-//! they are an experiment of two exposures. And where many measurements are in no block, as behind a mask of every
-//! second pixel, they count as if they were.
+//! they are treated as an experiment of two exposures. And where most measurements of an exposure are in no block, or
+//! many in a part of it, as behind a mask like a chessboard, they count as if they were.
 
 use std::ops::Range;
 
@@ -22,16 +22,18 @@ use crate::geometry::{Rotation, TAPS};
 /// Measurements of a pixel that are few where there are more exposures.
 pub(super) const FEW: u8 = 2;
 
+/// Side of a block.
+const BLOCK: usize = TAPS;
+
 /// Measurements outside blocks that determine a cell: as many as one of them sees cells.
 const ENOUGH: u8 = (TAPS * TAPS) as u8;
 
-/// Side in pixels of a wide part of the sensor.
-const WIDE: usize = 32;
-/// Share of its pixels that are measured twice where it is an experiment of two exposures.
-const MOST: f64 = 0.5;
-/// Share of it that is measured outside of blocks where these count as blocks: less than of each fourth pixel, as of one
-/// colour, more than along a ragged edge.
-const MANY: f64 = 0.22;
+/// Side in pixels of a part of the sensor that may be an experiment of two exposures, and the share of its pixels that
+/// then are measured twice.
+const WIDE: (usize, f64) = (32, 0.5);
+/// Side in pixels of a part of an exposure where measurements outside of blocks count as blocks, and the share of its
+/// pixels that have one: more than along a ragged edge, less than of a chessboard.
+const SPARSE: (usize, f64) = (64, 0.3);
 
 /// The columns of lost measurements, by exposure and row; empty if there are none.
 #[derive(Debug, Default)]
@@ -95,6 +97,8 @@ pub(super) struct Survey<'e, 'a, T> {
     pub(super) control: &'e Control,
     pub(super) lost: Lost,
     windows: Vec<Window>,
+    /// How many measurements each exposure has.
+    used: Vec<usize>,
     /// Whether each measurement is in a block, by exposure and pixel.
     blocks: Vec<bool>,
 }
@@ -108,7 +112,32 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
         let positions = exposures.positions();
         let windows = grid.windows(&positions.on_grid(&positions.shifts));
         let blocks = blocks(exposures, grid.is_spline(), control)?;
-        Ok(Self { exposures, grid, control, lost: Lost::default(), windows, blocks })
+        let mut used = vec![0; exposures.count()];
+        exposures.for_each_stretch(control, |k, _, cols| used[k] += cols.len())?;
+        Ok(Self { exposures, grid, control, lost: Lost::default(), windows, used, blocks })
+    }
+
+    /// Loses these measurements too, but for exposures that would have none left; whether there were more.
+    pub(super) fn lose(&mut self, found: &Lost) -> bool {
+        if found.is_empty() {
+            return false;
+        }
+        let mut columns = std::mem::take(&mut self.lost.columns);
+        columns.resize(found.columns.len(), Vec::new());
+        let mut grows = false;
+        let of_exposures = columns.chunks_mut(found.rows).zip(found.columns.chunks(found.rows));
+        for ((own, found), used) in of_exposures.zip(&self.used) {
+            let joined: Vec<_> =
+                own.iter().zip(found).map(|(own, found)| union(own, found)).collect();
+            let count = |rows: &[Vec<u32>]| rows.iter().map(Vec::len).sum::<usize>();
+            if count(own) < count(&joined) && count(&joined) < *used {
+                own.clone_from_slice(&joined);
+                grows = true;
+            }
+        }
+        let is_empty = columns.iter().all(Vec::is_empty);
+        self.lost = if is_empty { Lost::default() } else { Lost { columns, rows: found.rows } };
+        grows
     }
 
     /// Calls `visit(exposure, row, columns)` for the measurements that stand side by side.
@@ -222,6 +251,13 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
     }
 }
 
+fn union(some: &[u32], others: &[u32]) -> Vec<u32> {
+    let mut union = [some, others].concat();
+    union.sort_unstable();
+    union.dedup();
+    union
+}
+
 /// The pixels that lose measurements and have two, where they form wide parts of the sensor.
 pub(super) fn wide(
     lost: &Lost,
@@ -232,7 +268,7 @@ pub(super) fn wide(
     let mut image = vec![false; sensor.len()];
     let lost = lost.pixels(sensor.cols);
     lost.iter().flatten().for_each(|&pixel| image[pixel] = times[pixel] == FEW);
-    let mut wide = in_squares(&image, sensor, WIDE, MOST, control)?;
+    let mut wide = in_squares(&image, sensor, WIDE, control)?;
     wide.iter_mut().zip(image).for_each(|(wide, is_one)| *wide &= is_one);
     Ok(wide)
 }
@@ -251,12 +287,15 @@ fn blocks<T: Real>(
     let is_masked = |k: &usize| is_spline && exposures.uniform_weight(*k).is_none();
     for k in (0..count).filter(is_masked) {
         let used = &mut used[k * sensor.len()..][..sensor.len()];
-        let blocks = in_squares(used, sensor, 2, 1.0, control)?;
+        let blocks = in_squares(used, sensor, (BLOCK, 1.0), control)?;
         let apart: Vec<bool> =
             used.iter().zip(&blocks).map(|(used, block)| used & !block).collect();
-        let many = in_squares(&apart, sensor, WIDE, MANY, control)?;
-        for (pixel, used) in used.iter_mut().enumerate() {
-            *used = blocks[pixel] | (apart[pixel] & many[pixel]);
+        let count = |image: &[bool]| image.iter().filter(|is_set| **is_set).count();
+        if 2 * count(&apart) < count(used) {
+            let sparse = in_squares(&apart, sensor, SPARSE, control)?;
+            for (pixel, used) in used.iter_mut().enumerate() {
+                *used = blocks[pixel] | (apart[pixel] & sparse[pixel]);
+            }
         }
     }
     Ok(used)
@@ -266,33 +305,37 @@ fn blocks<T: Real>(
 fn in_squares(
     image: &[bool],
     Shape { rows, cols }: Shape,
-    side: usize,
-    share: f64,
+    (side, share): (usize, f64),
     control: &Control,
 ) -> Result<Vec<bool>> {
     let (height, width) = (rows.min(side), cols.min(side));
     let least = (share * (height * width) as f64).ceil() as usize;
-    let mut found = vec![false; image.len()];
-    // How many are set of the last rows of each column.
-    let mut columns = vec![0; cols];
+    // The last pixel of each square, and how many are set of the last rows of each column.
+    let (mut found, mut columns) = (vec![false; image.len()], vec![0; cols]);
     for row in 0..rows {
         control.check()?;
-        for (col, count) in columns.iter_mut().enumerate() {
-            *count += usize::from(image[row * cols + col]);
-            *count -= usize::from(row >= height && image[(row - height) * cols + col]);
-        }
-        if row + 1 < height {
-            continue;
-        }
         let mut count = 0;
         for col in 0..cols {
+            columns[col] += usize::from(image[row * cols + col]);
+            columns[col] -= usize::from(row >= height && image[(row - height) * cols + col]);
             count += columns[col];
             count -= if col < width { 0 } else { columns[col - width] };
-            if col + 1 >= width && count >= least {
-                for row in row + 1 - height..=row {
-                    found[row * cols + col + 1 - width..=row * cols + col].fill(true);
-                }
+            found[row * cols + col] = row + 1 >= height && col + 1 >= width && count >= least;
+        }
+    }
+    // Each of the pixels before it, from the end: the nearest row below with a last pixel near to the right.
+    let mut below = vec![usize::MAX; cols];
+    for row in (0..rows).rev() {
+        control.check()?;
+        let mut right = usize::MAX;
+        for col in (0..cols).rev() {
+            if found[row * cols + col] {
+                right = col;
             }
+            if right - col < width {
+                below[col] = row;
+            }
+            found[row * cols + col] = below[col] - row < height;
         }
     }
     Ok(found)

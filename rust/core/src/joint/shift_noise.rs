@@ -47,7 +47,7 @@ impl<T: Real> System<'_, '_, T> {
         }
         let windows = self.pass.grid.windows(&self.state.shifts);
         let exposures = self.pass.exposures;
-        let pixels = exposures.used() as f64 / exposures.count() as f64;
+        let pixels = self.used() as f64 / exposures.count() as f64;
         self.shift_noise = curvature(&windows, &exposures.shares(), SMOOTHING);
         self.shift_noise.iter_mut().for_each(|noise| *noise *= self.unit * pixels);
     }
