@@ -155,9 +155,7 @@ def lost_by_the_rule(used, shifts, rotation, *, fitted):
 def test_what_is_lost_is_lost_by_the_rule(shifts, rotation, std, missing):
     mask = frayed()
     cal = fitted(shifts, mask, rotation=rotation, std=std, missing=missing)
-    lost = np.zeros_like(mask)
-    for k, own in enumerate(cal.weighted.fit.lost):
-        lost[k].flat[own] = True
+    lost = ~mask & ~counted(cal)
     # Places from 0 to 200: all cells are behind them.
     wanted = lost_by_the_rule(~mask, shifts + 60, rotation, fitted=std is not None)
     assert wanted.sum() > 20
@@ -237,9 +235,9 @@ def test_large_discs_converge_and_raise_no_alarm(edge, draws, figure):
         # That free fluxes leave the tilt open is no alarm.
         assert {verdict.kind for verdict in cal.verdicts} == {"tilt"}
         passes.append(cal.sweeps)
-    edge = f"of discs of 512×512 pixels, edge of masks: {edge}"
-    figure(f"most passes {edge}", max(passes), "at most 100")
-    figure(f"median of passes {edge}", float(np.median(passes)), "at most 100")
-    figure(f"largest share of measurements lost {edge}", max(lost), "as told by the fit")
+    of_discs = f"of discs of 512×512 pixels, edge of masks: {edge}"
+    figure(f"most passes {of_discs}", max(passes), "at most 100")
+    figure(f"median of passes {of_discs}", float(np.median(passes)), "at most 100")
+    figure(f"largest share of measurements lost {of_discs}", max(lost), "as told by the fit")
     # A ragged edge may take one more step of Gauss and Newton, from a start that is further away.
-    assert (max(passes) if edge.endswith("circle") else np.median(passes)) <= 100
+    assert (max(passes) if edge == "circle" else np.median(passes)) <= 100
