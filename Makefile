@@ -18,7 +18,7 @@ test: $(BIN)/.built-ci
 
 study: $(BIN)/.built-ci
 	$(BIN)/python -m pytest -m study -n 2 --dist worksteal --study-share 1 \
-		--study-record docs/studies.md
+		--study-record=docs/studies.md
 
 bench: $(BIN)/.built-release $(BIN)/.installed-bench
 	$(BIN)/python benches/run.py
