@@ -195,7 +195,6 @@ def _std(scale: float, variances: ArrayLike | None) -> Floats:
 def functional_std(
     weighted: Weighted,
     weights: Floats,
-    drift: Drift | None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -218,10 +217,7 @@ def functional_std(
         )
     if answer.incomplete:
         warn(incomplete_searches(answer.incomplete), ConvergenceWarning)
-    std = _std(scale, answer.variances)
-    if drift is not None and drift.is_added:
-        std = np.hypot(std, np.sqrt(drift.variance_of(weights, weighted.fit.sensitivity)))
-    return std
+    return _std(scale, answer.variances)
 
 
 def incomplete_searches(count: int) -> str:

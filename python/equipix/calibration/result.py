@@ -334,7 +334,9 @@ class Calibration(ReadOnly):
         check_progress(progress)
         check_unchanged(self.weighted.exposures, self.weighted.sampled)
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
-        std = functional_std(self.weighted, stack, self.drift, workers=workers, progress=progress)
+        std = functional_std(self.weighted, stack, workers=workers, progress=progress)
+        if self.drift is not None and self.drift.is_added:
+            std = np.hypot(std, np.sqrt(self.drift.variance_of(stack, self.weighted.fit.sensitivity)))
         return float(std[0]) if np.ndim(weights) == 2 else std
 
     def correct(
