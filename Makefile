@@ -46,6 +46,7 @@ lint: $(BIN)/.built-ci docs
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/mypy
 	$(BIN)/python -m mypy.stubtest equipix._native
 	find python/equipix -name '*.py' | xargs $(BIN)/numpydoc lint

@@ -12,8 +12,8 @@ import numpy as np
 import equipix
 from equipix import demo
 from equipix.experiment.aperture import measured_shifts
-from equipix.experiment.manifest import find_files
-from equipix.experiment.provenance import sha256_of
+from equipix.experiment.image_files import sha256_of
+from equipix.experiment.manifest import entry_files as find_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,14 +19,13 @@ import numpy as np
 
 import equipix
 from equipix import simulate
-from equipix.calibration.error_bars import functional_std
-from equipix.calibration.lamp_drift import lamp_drift
-from equipix.calibration.options import Options
-from equipix.calibration.residuals import sampled
-from equipix.calibration.weights import weighted_fit
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
-from equipix.maps import tilt, tilt_weights
+from equipix.diagnosis.lamp_drift import lamp_drift
+from equipix.exposures.exposures import exposures_of
+from equipix.exposures.fit import FitOptions
+from equipix.fitting.error_bars import functional_std
+from equipix.fitting.residuals import sampled
+from equipix.fitting.weighted import Options, weighted_fit
+from equipix.metrics.maps import tilt, tilt_weights
 
 SENSOR, NOISE, EXPERIMENTS = (64, 96), 1e-3, 200
 DRIFTS, COUNTS = (0.0, 1e-5, 1e-4, 1e-3), (5, 7, 9)
@@ -54,7 +53,9 @@ def experiment(count, drift, seed):
     # Positions at random may leave a corner unconnected.
     valid = np.isfinite(weighted.fit.sensitivity)
     error = tilt(weighted.fit.sensitivity, valid) - tilt(truth, valid)
-    return drift, error / functional_std(weighted, tilt_weights(valid), drift)
+    std = functional_std(weighted, tilt_weights(valid))
+    hidden = drift.variance_of(tilt_weights(valid), weighted.fit.sensitivity)
+    return drift, error / np.hypot(std, np.sqrt(hidden) if drift.is_added else 0)
 
 
 def law(x, freedom, ratio, steps=4001):

@@ -28,7 +28,7 @@ def main() -> None:
     best = plan.suggest(SENSOR, 5, 20, **CAUSES)[0]
     print("suggested:", best.budget)
     print("in this order (row, col):", best.shifts.tolist())
-    shares = plan.distinct_trend(cross), plan.distinct_trend(best.shifts)
+    shares = budget.distinct_trend, best.budget.distinct_trend
     print(f"of a linear drift {shares[0]:.1%} and {shares[1]:.1%} do not look like a tilt")
 
     # The experiment with all three errors, simulated with a known sensitivity.

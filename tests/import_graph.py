@@ -1,19 +1,16 @@
-"""Which file uses which, in Python and in Rust; what `test_imports.py` judges.
+"""Which file of a Rust crate uses which; what `test_imports.py` judges.
 
-A file is named by its place below the package or the crate: ``("simulate", "rig")``. A folder's
-own file (``__init__.py``; ``joint.rs`` beside ``joint/``) has the folder's name, ``("simulate",)``;
-that of the package or the crate has the empty name. A stub and its module are one file.
+A file is named by its place below the crate: ``("solve", "start")``. A folder's own file
+(``joint.rs`` beside ``joint/``) has the folder's name, ``("joint",)``; that of the crate has the
+empty name.
 
-A use is what a source names. In Python that is an import at any depth, under ``TYPE_CHECKING`` too,
-and a dotted name of the package in a string that is an expression, such as an annotation. In Rust
-it is a path, in a ``use`` line or anywhere else, unit tests left out. ``mod x;`` is no use. Calls
-of methods are not traced: where ``impl`` blocks of a type stand in several files, each counts by
-the paths in it.
+A use is a path, in a ``use`` line or anywhere else, unit tests left out. ``mod x;`` is no use.
+Calls of methods are not traced: where ``impl`` blocks of a type stand in several files, each counts
+by the paths in it.
 """
 
 from __future__ import annotations
 
-import ast
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
@@ -47,48 +44,6 @@ def circle(graph: Graph, depth: int | None = None) -> list[str]:
     except CycleError as error:
         return [name_of(place) for place in error.args[1]]
     return []
-
-
-def python_sources(package: Path) -> dict[Place, str]:
-    """The sources of a package, stubs included."""
-    sources: dict[Place, str] = {}
-    for path in sorted([*package.rglob("*.py"), *package.rglob("*.pyi")]):
-        place = path.relative_to(package).with_suffix("").parts
-        place = place[:-1] if place[-1] == "__init__" else place
-        sources[place] = sources.get(place, "") + path.read_text() + "\n"
-    return sources
-
-
-def python_names(source: str, package: str = "equipix") -> set[str]:
-    """Dotted names that a Python source imports, at any depth, or gives in a string."""
-    names = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            names |= names_in_text(node.value, package)
-    return names
-
-
-def names_in_text(text: str, package: str) -> set[str]:
-    """Dotted names of the package in a string that is an expression, such as an annotation."""
-    try:
-        tree = ast.parse(text.strip(), mode="eval")
-    except (SyntaxError, ValueError):
-        return set()
-    attributes = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
-    beginnings = {node.value for node in attributes}
-    names = (ast.unparse(node) for node in attributes if node not in beginnings)
-    return {name for name in names if re.fullmatch(rf"{package}(\.\w+)+", name)}
-
-
-def python_uses(place: Place, source: str, places: Iterable[Place]) -> set[Place]:
-    """The other files of the package that a source uses; () is the package itself."""
-    names = (name.split(".") for name in python_names(source))
-    return {home_of(rest, places) for top, *rest in names if top == "equipix"} - {place}
 
 
 def rust_sources(crate: Path) -> dict[Place, str]:
@@ -203,13 +158,6 @@ def rust_crates(place: Place, source: str, places: Iterable[Place]) -> set[str]:
     known = set(places)
     paths = [path for scope, path in rust_paths(place, source) if not absolute(scope, path, known)]
     return {path[1] if path[0] == "" else path[0] for path in paths}
-
-
-def python_graph(sources: Sources) -> Graph:
-    """Which file of a package uses which, its own ``__init__`` left out."""
-    return {
-        place: python_uses(place, source, sources) for place, source in sources.items() if place
-    }
 
 
 def rust_graph(sources: Sources, shared: Mapping[str, set[str]]) -> Graph:

@@ -9,13 +9,13 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.weights import Weighted
 from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
-from equipix.flags import Flag
-from equipix.shifts import Spot
+from equipix.exposures.exposures import exposures_of
+from equipix.exposures.fit import FitOptions
+from equipix.exposures.spots import Spot
+from equipix.findings import Flag
+from equipix.fitting.weighted import Weighted
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(3, 5)
 LARGEST = 0.008**2

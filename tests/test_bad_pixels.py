@@ -10,10 +10,9 @@ import pytest
 
 import equipix
 from equipix import Flag, errors, nuc, simulate
-from equipix.colour import Colours
-from equipix.defects import response_outliers
-from equipix.exposures.averaged import Averaged
-from equipix.exposures.blind import blind_pixels
+from equipix.measured.colour import Colours
+from equipix.measured.defects import blind_pixels, response_outliers
+from equipix.measured.means import Averaged
 from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)

@@ -9,12 +9,11 @@ import pytest
 
 import equipix
 from equipix import io
-from equipix._types import Method
-from equipix.calibration.saved import FORMAT
+from equipix._check import Method
+from equipix.calibration.result import FORMAT
 from equipix.errors import ConvergenceWarning, FileError, InputError, ShiftRoundingWarning
-from equipix.exposures.options import FitOptions
-from equipix.exposures.positions import Positions
-from equipix.shifts import Rounding
+from equipix.exposures.fit import FitOptions
+from equipix.exposures.positions import Positions, Rounding
 
 CROSS = equipix.cross_pattern(2, 3)
 

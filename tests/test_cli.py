@@ -16,8 +16,9 @@ import pytest
 
 import equipix
 from equipix import FrameStatistics, average, cli, simulate
-from equipix.frames import load_statistics
-from equipix.io import read_frames, write_frames
+from equipix.io.frames import read_frames
+from equipix.io.tiff import write_frames
+from equipix.measured.statistics import load_statistics
 
 SHAPE = (64, 80)
 

@@ -10,8 +10,8 @@ import pytest
 
 import equipix
 from equipix import Experiment, Flag, errors, simulate
-from equipix.exposures.averaged import Averaged
-from equipix.exposures.clipping import clipping, clipping_of
+from equipix.measured.means import Averaged
+from equipix.measured.saturation import clipping, clipping_of
 
 SHAPE, SHIFTS = (64, 80), equipix.cross_pattern(5, 7)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from equipix import cross_pattern, errors, plan, simulate
-from equipix.colour import Colours
+from equipix.measured.colour import Colours
 
 BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
 QUAD = "RRGG/RRGG/GGBB/GGBB"

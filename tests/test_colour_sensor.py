@@ -10,8 +10,8 @@ import pytest
 
 import equipix
 from equipix import cross_pattern, errors, io, metrics, nuc, plan, simulate
-from equipix.colour import Colours
-from equipix.mosaic import pattern_of
+from equipix.measured.colour import Colours
+from equipix.measured.filters import pattern_of
 
 SHAPE, CROSS, NOISE = (48, 56), cross_pattern(11, 19), 3.0
 X_TRANS = "GBGGRG/RGRBGB/GBGGRG/GRGGBG/BGBRGR/GRGGBG"

@@ -9,8 +9,8 @@ import pytest
 
 import equipix
 from equipix import Flag, simulate
-from equipix.calibration.sample_variances import sampled_frames
 from equipix.errors import EquipixWarning, MisfitWarning
+from equipix.fitting.stated_errors import sampled_frames
 
 SENSOR, CROSS = (64, 96), equipix.cross_pattern(11, 19)
 NOISE = 1e-3
@@ -50,8 +50,8 @@ class TestFluxPriors:
             cal, kinds, truth = self.experiment(seed, 1e-2)
             assert "prior" in kinds
             valid = np.ones(SENSOR, bool)
-            std = cal.std_of(equipix.maps.tilt_weights(valid))
-            z.append((cal.tilt - equipix.maps.tilt(truth, valid)) / std)
+            std = cal.std_of(equipix.metrics.mapsics.maps.tilt_weights(valid))
+            z.append((cal.tilt - equipix.metrics.mapsics.maps.tilt(truth, valid)) / std)
         # 12 values of Student's t with 7 degrees of freedom: 4.8 in one of 1000 such sets.
         assert np.abs(z).max() < 4.8
 

@@ -11,7 +11,7 @@ import pytest
 import equipix
 from equipix import Flag, io, loading, simulate
 from equipix.correction.apply import apply
-from equipix.correction.files import correct_files
+from equipix.correction.correct_files import correct_files
 from equipix.errors import FileError, InputError
 
 SHAPE = (30, 40)

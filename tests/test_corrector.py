@@ -13,7 +13,7 @@ import pytest
 
 import equipix
 from equipix import Corrector, Flag, errors, nuc, simulate
-from equipix.correction import kernel
+from equipix.correction import apply as kernel
 from equipix.correction.apply import replace_bad
 
 SHAPE = (37, 53)

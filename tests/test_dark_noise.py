@@ -8,7 +8,7 @@ import pytest
 import equipix
 from equipix import Flag, simulate
 from equipix.errors import IdentifiabilityWarning, InputError
-from equipix.io import write_frames
+from equipix.io.tiff import write_frames
 
 SHAPE = (80, 100)
 SHIFTS = equipix.cross_pattern(5, 7)
@@ -161,7 +161,7 @@ def test_functionals_of_a_noisy_dark():
 
 
 def tilt(image):
-    return equipix.maps.tilt(image, np.ones(image.shape, bool))
+    return equipix.metrics.mapsics.maps.tilt(image, np.ones(image.shape, bool))
 
 
 def test_the_dark_has_no_part_in_the_weights():

@@ -10,7 +10,7 @@ import pytest
 
 from equipix import cli, demo, errors, measure_shift
 from equipix.pictures.canvas import new_figure
-from equipix.pictures.demo import draw_demo
+from equipix.pictures.comparison import draw_demo
 
 pytest.importorskip("matplotlib")
 

@@ -11,7 +11,8 @@ import pytest
 
 import equipix
 from equipix import detector, errors, nuc
-from equipix.simulate import StaringArray, blackbody
+from equipix.detector import photons as blackbody
+from equipix.simulate import StaringArray
 
 MIDDLE = detector.HgCdTe(start_um=3.0, cutoff_um=5.1)
 LONG = detector.HgCdTe(start_um=8.0, cutoff_um=10.6)

@@ -23,9 +23,9 @@ from pydantic import BaseModel
 
 import equipix
 from equipix import simulate
-from equipix.calibration.verdicts import _CATEGORIES as CATEGORIES
 from equipix.cli.app import app
 from equipix.experiment.manifest import Manifest, Sensor
+from equipix.findings import _CATEGORIES as CATEGORIES
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -209,9 +209,10 @@ def test_docstrings_have_examples_to_run():
         for test in finder.find(importlib.import_module(module))
         if test.examples
     ]
-    assert {"equipix.calibration.calibrate.calibrate", "equipix.shifts.measure_shift"} <= set(
-        examples
-    )
+    assert {
+        "equipix.calibration.calibrate.calibrate",
+        "equipix.exposures.spots.measure_shift",
+    } <= set(examples)
 
 
 @pytest.mark.parametrize("name", [name for name in equipix.__all__ if not name.startswith("_")])

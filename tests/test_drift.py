@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import drift, plan, simulate, uncertainty
-from equipix.calibration import verdicts
-from equipix.exposures.front import exposures_of
+from equipix import plan, simulate
+from equipix.diagnosis import rules as verdicts
+from equipix.exposures.exposures import exposures_of
+from equipix.plan import drift
 
 CROSS = equipix.cross_pattern(11, 19).astype(float)
 CCD = (582, 782)
@@ -43,18 +44,18 @@ def test_equal_errors_have_the_formula_of_the_covariance():
     np.testing.assert_allclose(drift.slope_std(CROSS, 1e-4), wanted, rtol=100 * EPS)
     rho = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
     edge = 1e-4 * np.array(CCD) / np.sqrt(5 * np.diag(covariance) * (1 - rho**2))
-    np.testing.assert_allclose(drift.tilt_std(CCD, CROSS, 1e-4), edge, rtol=100 * EPS)
+    np.testing.assert_allclose(drift.tilt_of_fluxes(CCD, CROSS, 1e-4), edge, rtol=100 * EPS)
 
 
 def test_many_patterns_are_done_as_one_by_one():
     rng = np.random.default_rng(9)
     patterns = rng.integers(0, 40, (6, 3, 5, 2))
     errors = rng.uniform(0, 1e-3, 5)
-    together = drift.tilt_std(CCD, patterns, errors)
+    together = drift.tilt_of_fluxes(CCD, patterns, errors)
     assert together.shape == (6, 3, 2)
     for place in np.ndindex(6, 3):
         # Sums of five terms in another order.
-        alone = drift.tilt_std(CCD, patterns[place], errors)
+        alone = drift.tilt_of_fluxes(CCD, patterns[place], errors)
         np.testing.assert_allclose(together[place], alone, rtol=100 * EPS)
     rms = drift.tilt_rms(together)
     np.testing.assert_allclose(rms, np.sqrt(np.sum(together**2, axis=-1) / 12), rtol=10 * EPS)
@@ -78,19 +79,17 @@ def test_what_the_shifts_do_not_determine_is_infinite(shifts, wanted):
 def test_a_row_of_pixels_has_no_tilt_across_and_a_steady_lamp_leaves_none():
     line = np.array([(0, 0), (0, 2), (0, 5)])
     np.testing.assert_allclose(
-        drift.tilt_std((1, 40), line, 1e-3), (0, 0.04 / np.sqrt(3 * 38 / 9)), rtol=10 * EPS
+        drift.tilt_of_fluxes((1, 40), line, 1e-3), (0, 0.04 / np.sqrt(3 * 38 / 9)), rtol=10 * EPS
     )
-    np.testing.assert_array_equal(drift.tilt_std((30, 40), line, 0), (0, 0))
+    np.testing.assert_array_equal(drift.tilt_of_fluxes((30, 40), line, 0), (0, 0))
 
 
 def test_all_callers_agree():
-    wanted = drift.tilt_std((64, 80), CROSS, 1e-4)
+    wanted = drift.tilt_of_fluxes((64, 80), CROSS, 1e-4)
     budget = plan.error_budget((64, 80), CROSS, noise=1e-2, drift=1e-4)
     assert budget.tilt_by_cause["drift"] == tuple(wanted)
     assert budget.rms_by_cause["drift"] == drift.tilt_rms(wanted)
-    np.testing.assert_array_equal(
-        uncertainty.tilt_std(CROSS, (64, 80), flux_std=np.full(5, 1e-4)), wanted
-    )
+    np.testing.assert_array_equal(plan.tilt_std((64, 80), CROSS, flux_std=np.full(5, 1e-4)), wanted)
 
 
 class TestTrend:
@@ -123,8 +122,8 @@ class TestTrend:
         assert drift.distinct_trend(np.ones((5, 2)), np.arange(5)) == 1
 
     def test_the_plan_and_the_warning_agree(self):
-        told = drift.distinct_trend(CROSS, np.arange(5))
-        assert plan.distinct_trend(CROSS) == told
+        told = drift.distinct_trend(CROSS)
+        assert drift.distinct_trend(CROSS, np.arange(5)) == told
         frames = simulate.exposures(np.ones((24, 32)), simulate.gaussian_beam((24, 32)), CROSS)
         times = {"flux": "linear", "time": [0.0, 10.0, 20.0, 30.0, 40.0]}
         advised = verdicts.on_plan(exposures_of(frames, CROSS, **times))

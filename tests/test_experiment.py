@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
-from equipix.defects import dead_pixels, hot_pixels
-from equipix.experiment import run as experiment_run
-from equipix.exposures.averaged import Averaged
-from equipix.io import read_frames
-from equipix.noise import NoiseModel, photon_transfer, scatter_limit
+from equipix.experiment import experiment as experiment_run
+from equipix.io.frames import read_frames
+from equipix.measured.defects import dead_pixels, hot_pixels
+from equipix.measured.means import Averaged
+from equipix.measured.noise import NoiseModel, photon_transfer, scatter_limit
 
 SHAPE = (64, 80)
 SHIFTS = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
@@ -295,7 +295,7 @@ def test_a_mistake_of_all_exposures_is_said_once(manifest, tmp_path):
 
 
 def test_a_glob_is_in_natural_order_and_in_its_own_folder(tmp_path):
-    from equipix.experiment.manifest import find_files
+    from equipix.experiment.manifest import entry_files as find_files
 
     folder = tmp_path / "run[1]"
     folder.mkdir()

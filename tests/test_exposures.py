@@ -12,16 +12,14 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration import robust
-from equipix.calibration.weights import expected
 from equipix.errors import InputError
-from equipix.exposures.exposures import Exposures
+from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
-from equipix.exposures.orientation import Orientation
-from equipix.exposures.positions import Positions, in_beam, variance_in_beam
-from equipix.noise import NoiseModel
+from equipix.exposures.positions import Orientation, Positions, in_beam, variance_in_beam
+from equipix.fitting import outliers as robust
+from equipix.fitting.weighted import expected
+from equipix.measured.noise import NoiseModel
 
 SHAPE = (9, 14)
 TURNS = (0, 90, 180, 270)

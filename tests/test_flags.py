@@ -9,13 +9,12 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.options import Options
-from equipix.calibration.pixel_flags import pixel_flags
-from equipix.calibration.weights import Weighted, contradictory_found, weighted_fit
-from equipix.defects import Findings
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
-from equipix.flags import BITS, Flag
+from equipix.exposures.exposures import exposures_of
+from equipix.exposures.fit import FitOptions
+from equipix.findings import BITS, Flag
+from equipix.fitting.pixels import pixel_flags
+from equipix.fitting.weighted import Options, Weighted, contradictory_found, weighted_fit
+from equipix.measured.defects import Findings
 
 CROSS = equipix.cross_pattern(2, 3)
 FINDINGS = [field.name for field in dataclasses.fields(Findings)]

@@ -7,8 +7,7 @@ import pytest
 
 import equipix
 from equipix import _native, simulate
-from equipix.exposures.positions import Positions
-from equipix.shifts import whole_moves
+from equipix.exposures.positions import Positions, whole_moves
 
 SHAPE = (40, 52)
 CROSS = equipix.cross_pattern(5, 7).astype(float)

@@ -134,7 +134,7 @@ def test_averages_with_two_darks_are_refused():
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_saved_averages_keep_their_dark(tmp_path, suffix):
-    from equipix.frames import load_statistics, save_statistics
+    from equipix.measured.statistics import load_statistics, save_statistics
 
     each = statistics_of(virtual_experiment(6), 255)[0]
     save_statistics(tmp_path / f"mean{suffix}", each)
@@ -145,7 +145,7 @@ def test_saved_averages_keep_their_dark(tmp_path, suffix):
 
 def test_averages_saved_and_loaded_one_by_one_calibrate(tmp_path):
     """Each file holds the dark; equal darks are one."""
-    from equipix.frames import load_statistics, save_statistics
+    from equipix.measured.statistics import load_statistics, save_statistics
 
     found = statistics_of(virtual_experiment(7), 255)
     for k, each in enumerate(found):

@@ -13,7 +13,7 @@ import pytest
 
 import equipix
 from equipix import Flag, Polynomial, errors, hardware, nuc, reference
-from equipix.io import write_frames
+from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 
 SHAPE = (24, 32)

@@ -1,81 +1,28 @@
-"""Who may import whom, in both languages, and who alone may name a library.
+"""Who may use whom in the core, and who alone may name a crate.
 
-Every file is checked, stubs and annotations included; `import_graph.py` says what counts as a use.
-The rules name modules or folders: a folder's files all keep the folder's rule. Among the files of a
-folder every use is allowed that closes no circle, unless INNER gives them an order.
+Every file is checked; `import_graph.py` says what counts as a use. The rules name modules or
+folders: a folder's files all keep the folder's rule, and use each other where that closes no
+circle.
 
-A folder's own file, ``__init__.py`` or ``joint.rs``, uses the files in the folder. A file in there
-that uses an item of the folder's own file therefore closes a circle, which is never allowed in
-Python. In Rust SHARED names the items that files of a folder nevertheless take from the folder's
-own file; a use of any other item of it is a circle.
+A folder's own file, ``joint.rs``, uses the files in the folder. A file in there that uses an item
+of the folder's own file therefore closes a circle. SHARED names the items that files of a folder
+nevertheless take from the folder's own file; a use of any other item of it is a circle.
+
+The rules of the Python package stand in pyproject.toml, for import-linter.
 """
 
 from __future__ import annotations
 
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from import_graph import (
-    circle,
-    name_of,
-    python_graph,
-    python_names,
-    python_sources,
-    python_uses,
-    rust_crates,
-    rust_graph,
-    rust_items,
-    rust_sources,
-)
+from import_graph import circle, name_of, rust_crates, rust_graph, rust_items, rust_sources
 
 ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "python/equipix"
 CORE = ROOT / "rust/core/src"
 BINDING = ROOT / "rust/python/src"
-
-LAYERS = (
-    {"__main__"},
-    {"cli"},
-    {"pictures"},
-    {"demo"},
-    {"comparison", "experiment", "loading"},
-    {"calibration", "nuc", "scene"},
-    {"bolometer", "detector"},
-    {"exposures", "hardware", "plan", "simulate"},
-    {"correction", "defects", "lens", "metrics", "uncertainty"},
-    {"mosaic"},
-    {"light", "noise"},
-    {"frames", "shifts"},
-    {"batches", "colour", "drift", "flags", "maps", "mending", "rejection", "rounding"},
-    {"io"},
-    {"_check", "_readonly"},
-    {"_types"},
-    {"errors"},
-    {"_native"},
-)
-"""The Python package from the top down: a module imports from its own layer or from below."""
-
-INNER = {
-    "simulate": (
-        {"rig"},
-        {"accuracy", "camera", "moving", "staring", "store"},
-        {"blackbody", "signal"},
-    )
-}
-"""Folders whose files have an order of their own, from the top down like LAYERS."""
-
-LIBRARIES = {
-    "matplotlib": {"pictures"},
-    "pydantic": {"experiment.manifest"},
-    "pydantic_core": {"experiment.manifest"},
-    "rich": {"cli.terminal"},
-    "tifffile": {"io.tiff"},
-    "typer": {"cli"},
-}
-"""The modules, folders or files that alone may import a library; NumPy is free to all."""
 
 CHAIN = (
     {"solve", "uncertainty"},
@@ -125,9 +72,7 @@ CRATES = {
 }
 """The core modules that alone may name a crate."""
 
-PYTHON = python_sources(PACKAGE)
 RUST = rust_sources(CORE)
-FILES = sorted(name_of(place) for place in PYTHON if place)
 CORE_FILES = sorted(name_of(place) for place in RUST if place)
 
 
@@ -138,37 +83,6 @@ def place_of(name):
 def is_within(name, homes):
     """Whether a file is one of these files, or in one of these folders."""
     return any(f"{name}.".startswith(f"{home}.") for home in homes)
-
-
-def layer_of(module, layers=LAYERS):
-    found = [index for index, layer in enumerate(layers) if module in layer]
-    assert found, f"'{module}' stands in no layer: give it a place in LAYERS"
-    return found[0]
-
-
-def is_allowed(place, used):
-    """Whether a file of the package may use another."""
-    if used == ():
-        return False
-    if place[0] != used[0]:
-        apart = "reference" in (place[0], used[0])
-        return not apart and layer_of(place[0]) <= layer_of(used[0])
-    layers = INNER.get(place[0], ())
-    above, below = name_of(place[1:]), name_of(used[1:])
-    if not (layers and above and below):
-        return True
-    return layer_of(above, layers) <= layer_of(below, layers)
-
-
-def python_faults(name, source):
-    """What is wrong with the imports of a file of the package."""
-    place = place_of(name)
-    layer_of(place[0], (*LAYERS, {"reference"}))
-    used = python_uses(place, source, PYTHON)
-    wrong = {name_of(each) for each in used if not is_allowed(place, each)}
-    tops = {name.split(".")[0] for name in python_names(source)}
-    outer = tops - sys.stdlib_module_names - {"equipix", "numpy"}
-    return sorted(wrong | {top for top in outer if not is_within(name, LIBRARIES.get(top, ()))})
 
 
 def core_allows(module):
@@ -189,17 +103,6 @@ def rust_faults(name, source):
     return sorted(used - allowed | {each for each in crates if not is_within(name, CRATES[each])})
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_python_files_import_only_what_stands_below(name):
-    assert python_faults(name, PYTHON[place_of(name)]) == []
-
-
-def test_neither_python_files_nor_their_folders_import_in_a_circle():
-    graph = python_graph(PYTHON)
-    for depth in range(1, max(map(len, PYTHON)) + 1):
-        assert circle(graph, depth) == []
-
-
 @pytest.mark.parametrize("name", CORE_FILES)
 def test_core_files_use_only_what_stands_to_the_right(name):
     assert rust_faults(name, RUST[place_of(name)]) == []
@@ -216,14 +119,9 @@ def test_the_core_does_not_know_python():
 
 
 def test_every_rule_is_about_something_that_exists():
-    assert set.union(*LAYERS) | {"reference"} == {place[0] for place in PYTHON if place}
     assert set.union(*CHAIN) | set(BESIDE) == {place[0] for place in RUST if place}
-    for folder, layers in INNER.items():
-        inner = {name_of(place[1:]) for place in PYTHON if place[:1] == (folder,)}
-        assert set.union(*layers) == inner - {""}
-    for rules, files in ((LIBRARIES, FILES), (CRATES, CORE_FILES)):
-        homes = set().union(*rules.values())
-        assert [home for home in homes if not any(is_within(name, {home}) for name in files)] == []
+    homes = set().union(*CRATES.values())
+    assert [home for home in homes if not any(is_within(name, {home}) for name in CORE_FILES)] == []
 
 
 @pytest.mark.parametrize(
@@ -232,35 +130,6 @@ def test_every_rule_is_about_something_that_exists():
 def test_every_shared_item_is_still_needed(folder, item):
     fewer = SHARED | {folder: SHARED[folder] - {item}}
     assert circle(rust_graph(RUST, fewer)) != []
-
-
-@pytest.mark.parametrize(
-    ("name", "source", "fault"),
-    [
-        ("io", "from equipix.flags import Flag", "flags"),
-        ("io.names", "from equipix.flags import Flag", "flags"),
-        ("noise", "def f():\n    from equipix import calibration", "calibration"),
-        ("noise", "if TYPE_CHECKING:\n    from equipix.cli import app", "cli.app"),
-        ("noise", "def f(x: 'equipix.cli.app.App | None') -> None: ...", "cli.app"),
-        ("noise", "x: list['dict[str, equipix.cli.App]']", "cli"),
-        ("noise", "y = cast('equipix.simulate.camera.Camera', x)", "simulate.camera"),
-        ("noise", "Alias: TypeAlias = 'Callable[[equipix.cli.App], None]'", "cli"),
-        ("noise", "module = import_module('equipix.simulate.rig')", "simulate.rig"),
-        ("calibration", "import equipix.reference.descent", "reference.descent"),
-        ("demo", "from equipix import calibrate", ""),
-        ("simulate.store", "from equipix.simulate.rig import Truth", "simulate.rig"),
-        ("simulate.signal", "from equipix.simulate.store import Progress", "simulate.store"),
-        ("_native", "from equipix.uncertainty import Measurements", "uncertainty"),
-        ("_native", "from equipix.errors import InputError", "errors"),
-        ("frames", "import tifffile", "tifffile"),
-        ("io.names", "import tifffile", "tifffile"),
-        ("experiment", "from scipy.ndimage import label", "scipy"),
-        ("reference", "from equipix._check import as_array", "_check"),
-        ("reference.model", "import scipy", "scipy"),
-    ],
-)
-def test_the_checker_finds_forbidden_imports(name, source, fault):
-    assert python_faults(name, source) == [fault]
 
 
 @pytest.mark.parametrize(
@@ -295,17 +164,8 @@ def test_the_checker_passes_what_is_allowed():
     assert rust_faults("frames", f"use crate::error::Error; // crate::fit\n{tests}") == []
     assert rust_faults("io.tiff", "use super::{Depth, Format};\nuse tiff::Tag;") == []
     assert rust_faults("geometry", "pub(in crate::fit) struct S; /* crate::fit::M */") == []
-    assert python_faults("frames", "import numpy, os\nfrom equipix import io, _native") == []
-    assert (
-        python_faults("io", '"""See equipix.cli."""\nraise Error("give equipix.cli a name")') == []
-    )
-    assert python_faults("io.tiff", "import tifffile\nfrom equipix.io.names import as_path") == []
 
 
 def test_the_checker_finds_modules_without_a_place():
-    with pytest.raises(AssertionError, match="'extra' stands in no layer"):
-        python_faults("extra", "")
-    with pytest.raises(AssertionError, match="'extra' stands in no layer"):
-        python_faults("extra.part", "from equipix.extra import more")
     with pytest.raises(AssertionError, match="'extra' stands nowhere"):
         rust_faults("extra", "")

@@ -25,8 +25,8 @@ from PIL import Image
 import equipix
 from equipix import FrameStatistics, io, simulate
 from equipix.errors import FileError, InputError
-from equipix.frames import load_statistics, save_statistics
-from equipix.io.checksum import checksum
+from equipix.io.record import checksum
+from equipix.measured.statistics import load_statistics, save_statistics
 
 RNG = np.random.default_rng(20)
 WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)

@@ -9,16 +9,15 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.lamp_drift import lamp_drift
-from equipix.calibration.options import Options
-from equipix.calibration.residuals import sampled
-from equipix.calibration.significance import chi2_tail
-from equipix.calibration.weights import weighted_fit
-from equipix.drift import slope_covariance, slope_std
+from equipix.diagnosis.lamp_drift import lamp_drift
 from equipix.errors import DriftWarning
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
-from equipix.maps import tilt, tilt_weights
+from equipix.exposures.exposures import exposures_of
+from equipix.exposures.fit import FitOptions
+from equipix.fitting.residuals import sampled
+from equipix.fitting.weighted import Options, weighted_fit
+from equipix.measured.noise import chi2_tail
+from equipix.metrics.maps import tilt, tilt_weights
+from equipix.plan.drift import distinct_trend, slope_covariance, slope_std
 
 SENSOR, NOISE = (48, 64), 1e-3
 SEVEN = np.array([(0, 0), (3, 9), (9, 2), (-7, 8), (5, -9), (-3, -8), (-9, 1)], float)
@@ -158,7 +157,7 @@ def test_the_tilt_of_a_linear_drift_is_named():
     with pytest.warns(DriftWarning, match="if it is linear in the order of the exposures"):
         cal = equipix.calibrate(frames, shifts)
     # The rate is known to the standard error of what the trend leaves: 3.5 % of its variance.
-    visible = rate * np.sqrt(10 * equipix.plan.distinct_trend(shifts))
+    visible = rate * np.sqrt(10 * distinct_trend(shifts))
     error = 5 * cal.drift.flux_std / visible
     np.testing.assert_allclose(cal.drift.trend_tilt, np.abs(cal.tilt), rtol=error)
     assert (cal.drift.trend_tilt > 2 * cal.drift.tilt_std).all()

@@ -10,8 +10,7 @@ import pytest
 
 import equipix
 from equipix import Flag, LevelExperiment, errors, io, metrics, nuc
-from equipix.correction.files import correct_files
-from equipix.correction.tone import picture
+from equipix.correction.correct_files import correct_files, picture
 from equipix.simulate import StaringArray
 
 SHAPE = (24, 32)

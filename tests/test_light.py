@@ -8,10 +8,10 @@ import pytest
 import equipix
 from equipix import nuc, simulate
 from equipix.errors import DriftWarning
-from equipix.exposures.averaged import Averaged
-from equipix.io import write_frames
-from equipix.light import light_of
-from equipix.metrics.moments import moments
+from equipix.io.tiff import write_frames
+from equipix.measured.means import Averaged
+from equipix.measured.statistics import light_of
+from equipix.metrics.frame_noise import moments
 
 SHAPE = (60, 80)
 SHIFTS = equipix.cross_pattern(5, 7)

@@ -11,8 +11,8 @@ import tifffile
 
 import equipix
 from equipix import Experiment, Flag, cli, errors, simulate
-from equipix.frames import load_statistics
-from equipix.io import read_mask
+from equipix.io.frames import read_mask
+from equipix.measured.statistics import load_statistics
 
 SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
 

@@ -15,7 +15,7 @@ import pytest
 import equipix
 from equipix import cli
 from equipix.errors import EquipixError, InsufficientMemoryError
-from equipix.io import write_frames
+from equipix.io.tiff import write_frames
 
 CROSS = equipix.cross_pattern(2, 3)
 

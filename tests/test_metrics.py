@@ -11,7 +11,7 @@ import equipix
 from equipix import errors, io, metrics, nuc
 from equipix.metrics.correctability import _fisher_quantile
 from equipix.metrics.emva import high_passed, split_variances
-from equipix.metrics.moments import Moments, temporal_of
+from equipix.metrics.frame_noise import Moments, temporal_of
 from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)

@@ -9,11 +9,10 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.misfit import misfit
-from equipix.calibration.residual_tests import lag_one
-from equipix.calibration.residuals import bands, sampled
+from equipix.diagnosis.misfit import misfit
 from equipix.errors import EquipixWarning, MisfitWarning
-from equipix.exposures.options import FitOptions
+from equipix.exposures.fit import FitOptions
+from equipix.fitting.residuals import bands, lag_one, sampled
 
 SENSOR, CROSS = (64, 96), equipix.cross_pattern(11, 19)
 NOISE = 1e-3
@@ -225,7 +224,7 @@ def test_error_bars_in_speckle_of_three_pixels_are_refused():
     assert cal.sensitivity_std is None
     assert "finer than a spline" in cal.verdicts[-1].message
     with pytest.raises(equipix.errors.InputError, match="move by whole pixels"):
-        cal.std_of(equipix.maps.tilt_weights(np.ones(SENSOR, bool)))
+        cal.std_of(equipix.metrics.mapsics.maps.tilt_weights(np.ones(SENSOR, bool)))
 
 
 @pytest.mark.study

@@ -10,9 +10,8 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
-from equipix.calibration.brightness import on_brightness
-from equipix.calibration.input_verdicts import on_input
-from equipix.exposures.front import exposures_of
+from equipix.diagnosis.inputs import on_brightness, on_input
+from equipix.exposures.exposures import exposures_of
 
 SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
 

@@ -7,10 +7,10 @@ import pytest
 
 import equipix
 from equipix import nuc, simulate
-from equipix.defects import hot_pixels
-from equipix.exposures.averaged import Averaged
+from equipix.measured.defects import hot_pixels
+from equipix.measured.means import Averaged
+from equipix.measured.noise import largest_scatter, scatter, unaveraged
 from equipix.metrics import correctability
-from equipix.rounding import largest_scatter, scatter, unaveraged
 
 pytestmark = pytest.mark.study
 

@@ -9,7 +9,7 @@ import pytest
 
 import equipix
 from equipix import Flag, NoiseModel, errors, nuc, reference
-from equipix.exposures.averaged import Averaged
+from equipix.measured.means import Averaged
 from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)

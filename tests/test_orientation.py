@@ -9,10 +9,9 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.orientation import chosen_exposures
+from equipix.diagnosis.orientation import chosen_exposures
 from equipix.errors import EquipixWarning, ShiftSignWarning
-from equipix.exposures.orientation import Orientation
-from equipix.exposures.positions import Positions
+from equipix.exposures.positions import Orientation, Positions
 
 SENSOR, CROSS = (96, 120), equipix.cross_pattern(11, 19)
 EVERY = Orientation.every(quarter_turns=False)

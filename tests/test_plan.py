@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import equipix
 from equipix import plan, reference, simulate
-from equipix.drift import tilt_rms, tilt_std
 from equipix.errors import (
     DriftWarning,
     IdentifiabilityWarning,
@@ -19,7 +18,8 @@ from equipix.errors import (
     MisfitWarning,
     ShiftRoundingWarning,
 )
-from equipix.plan.noise import local_variance
+from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
+from equipix.plan.pattern_errors import local_variance
 
 WITHIN = 0.1
 """The claim: predictions agree with simulation within 10 %."""
@@ -242,7 +242,7 @@ class TestDrift:
     @pytest.mark.parametrize(("arms", "wanted"), [((11, 19), 2.0e-3), ((97, 160), 2.4e-4)])
     def test_of_the_cross(self, arms, wanted):
         # Measured at 782×582, in two figures.
-        tilt = tilt_std(CCD, equipix.cross_pattern(*arms).astype(float), 1e-4)
+        tilt = tilt_of_fluxes(CCD, equipix.cross_pattern(*arms).astype(float), 1e-4)
         assert tilt_rms(tilt) == pytest.approx(wanted, abs=0.05 * 10 ** np.floor(np.log10(wanted)))
 
     def test_is_loud_when_it_exceeds_the_noise(self):
@@ -314,16 +314,16 @@ class TestSpectrum:
 class TestOrder:
     def test_of_the_cross_hides_a_trend(self):
         # Section 5 of the design: 3.5 % of the variance.
-        assert plan.distinct_trend(CROSS) == pytest.approx(0.035, abs=5e-4)
+        assert distinct_trend(CROSS) == pytest.approx(0.035, abs=5e-4)
 
     @pytest.mark.parametrize("count", [4, 6, 11])
     def test_advised_hides_less(self, count):
         shifts = np.random.default_rng(count).integers(0, 40, (count, 2))
         order = plan.advise_order(shifts)
         assert sorted(order) == list(range(count))
-        told = plan.distinct_trend(shifts[order])
+        told = distinct_trend(shifts[order])
         rng = np.random.default_rng(0)
-        others = [plan.distinct_trend(rng.permutation(shifts)) for _ in range(500)]
+        others = [distinct_trend(rng.permutation(shifts)) for _ in range(500)]
         assert told >= max(others) - 1e-9
 
     def test_a_trend_in_the_advised_order_does_not_tilt(self):
@@ -333,13 +333,13 @@ class TestOrder:
             beam = simulate.gaussian_beam(shape)
             frames = simulate.exposures(np.ones(shape), beam, shifts, flux=1 + trend)
             tilts.append(np.linalg.norm(slopes(solved(frames, shifts, 1e-7))))
-        hidden = 1 - plan.distinct_trend(CROSS[plan.advise_order(CROSS)])
+        hidden = 1 - distinct_trend(CROSS[plan.advise_order(CROSS)])
         # The tilt goes with the root of what is hidden, in a metric as lopsided as cov(d): its
         # eigenvalues are 96 and 24.
         assert tilts[1] < 2 * np.sqrt(hidden / 0.965) * tilts[0]
 
     def test_three_exposures_hide_every_trend(self):
-        assert plan.distinct_trend([(0, 0), (0, 3), (5, 0)]) == pytest.approx(0, abs=1e-12)
+        assert distinct_trend([(0, 0), (0, 3), (5, 0)]) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -372,8 +372,8 @@ class TestSuggest:
         np.testing.assert_array_equal(first, second)
         assert (first.max(axis=0) <= (10, 20)).all()
         # In the order advised, which is one of its own.
-        told = plan.distinct_trend(first)
-        assert told == pytest.approx(plan.distinct_trend(first[plan.advise_order(first)]), abs=1e-9)
+        told = distinct_trend(first)
+        assert told == pytest.approx(distinct_trend(first[plan.advise_order(first)]), abs=1e-9)
 
     def test_five_unless_told(self):
         found = plan.suggest((40, 50), None, 12, drift=0)[0].shifts

@@ -11,9 +11,9 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.exposures.front import exposures_of
-from equipix.exposures.orientation import Orientation
-from equipix.frames import FrameStatistics, load_statistics, save_statistics
+from equipix.exposures.exposures import exposures_of
+from equipix.exposures.positions import Orientation
+from equipix.measured.statistics import FrameStatistics, load_statistics, save_statistics
 
 SHAPE, CROSS = (24, 32), equipix.cross_pattern(3, 5)
 

@@ -7,8 +7,8 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
+from equipix.diagnosis.inputs import repeated
 from equipix.exposures.positions import Positions
-from equipix.exposures.repeated import repeated
 
 CROSS = equipix.cross_pattern(3, 5)
 

@@ -12,8 +12,8 @@ import pytest
 
 import equipix
 from equipix import Flag, NoiseModel, errors, io, simulate
-from equipix.calibration import weights
-from equipix.calibration.robust import rejected
+from equipix.fitting import weighted as weights
+from equipix.fitting.outliers import rejected
 
 pytestmark = [
     # Frames with dust that is not left out, and variances that are wrong on purpose.

@@ -7,18 +7,18 @@ import pytest
 
 import equipix
 from equipix import nuc
-from equipix.defects import hot_pixels
-from equipix.exposures.averaged import Averaged
-from equipix.exposures.clipping import clipping_of
-from equipix.noise import photon_transfer
-from equipix.rounding import (
+from equipix.measured.defects import hot_pixels
+from equipix.measured.means import Averaged
+from equipix.measured.noise import (
     largest_scatter,
+    photon_transfer,
     scatter,
     scatter_slope,
     step_of,
     unaveraged,
     unaveraged_apart,
 )
+from equipix.measured.saturation import clipping_of
 
 SIGMAS = (0.01, 0.05, 0.1, 0.141, 0.142, 0.2, 0.3, 0.5, 1.0, 3.0)
 PHASES = (np.arange(1000) + 0.5) / 1000

@@ -75,7 +75,7 @@ def test_the_step_of_a_file_without_one_is_found(tmp_path, monkeypatch, step, da
         dark
     ]
     wanted = equipix.average(raw, dark=subtracted)
-    monkeypatch.setattr("equipix.frames._NUMBERS", ("saturation", "reject"))
+    monkeypatch.setattr("equipix.measured.statistics._NUMBERS", ("saturation", "reject"))
     wanted.save(tmp_path / "old.npz")
     found = equipix.FrameStatistics.load(tmp_path / "old.npz")
     assert found.step == (0 if dark == "array" else step)

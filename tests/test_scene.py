@@ -293,7 +293,7 @@ class TestEveryMethod:
             other.load(tmp_path / "state.npz")
         with pytest.raises(errors.FileError, match=r"equipix.scene.load reads it"):
             equipix.load(tmp_path / "state.npz")
-        monkeypatch.setattr("equipix.scene.saved.FORMAT", 5)
+        monkeypatch.setattr("equipix.scene.scene_correction.FORMAT", 5)
         method.save(tmp_path / "newer.npz")
         monkeypatch.undo()
         with pytest.raises(errors.FileError, match=r"newer.npz: has format 5"):

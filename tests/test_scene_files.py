@@ -10,7 +10,8 @@ import pytest
 
 import equipix
 from equipix import scene
-from equipix.io import read_frames, write_frames
+from equipix.io.frames import read_frames
+from equipix.io.tiff import write_frames
 from equipix.simulate import MovingScene
 
 SHAPE = (48, 64)

@@ -9,9 +9,9 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration.residuals import sampled
-from equipix.calibration.shift_errors import flux_variance, unrefined
 from equipix.errors import EquipixWarning
+from equipix.fitting.residuals import sampled
+from equipix.fitting.stated_errors import flux_variance, unrefined
 
 SENSOR, CROSS = (64, 96), equipix.cross_pattern(11, 19).astype(float)
 NOISE = 1e-3

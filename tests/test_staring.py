@@ -7,7 +7,8 @@ import pytest
 
 import equipix
 from equipix import errors, metrics, nuc
-from equipix.simulate import StaringArray, blackbody
+from equipix.detector import photons as blackbody
+from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
 LIGHT = (2e6, 5e6, 8e6, 11e6, 14e6)

@@ -47,7 +47,7 @@ cal = calibrate(np.ones((5, 40, 50)), shifts, workers=1)
 reveal_type(cal)
 reveal_type(equipix.average("a.tif"))
 reveal_type(equipix.plan.suggest((40, 50), 5, 9))
-reveal_type(equipix.uncertainty.tilt_std(shifts, (40, 50)))
+reveal_type(equipix.plan.tilt_std((40, 50), shifts))
 save(cal, "cal.tif")
 bad = (cal.flags & Flag.DO_NOT_USE) != 0
 if not isinstance(cal, Calibration):
@@ -56,7 +56,7 @@ if not isinstance(cal, Calibration):
 REVEALED = (
     "equipix.correction.protocol.Correction",
     ".Calibration",
-    "equipix.frames.FrameStatistics",
+    "equipix.measured.statistics.FrameStatistics",
     "list[equipix.plan.search.Suggestion]",
     "numpy.ndarray",
 )

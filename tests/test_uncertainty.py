@@ -12,7 +12,7 @@ import equipix
 from equipix import Flag, reference, simulate
 from equipix.cli import main
 from equipix.errors import IdentifiabilityWarning, InputError
-from equipix.uncertainty import tilt_std
+from equipix.plan import tilt_std
 
 CROSS = equipix.cross_pattern(2, 3)
 DRAWS_EXACT_TO = 0.02
@@ -278,29 +278,29 @@ class TestTilt:
         for _ in draws(200):
             flux = np.exp(drift * rng.standard_normal(5))
             tilts.append(equipix.calibrate(clean * flux[:, None, None], shifts).tilt)
-        std = tilt_std(shifts, shape, flux_std=drift)
+        std = tilt_std(shape, shifts, flux_std=drift)
         # Three standard errors of each rms of as many draws.
         error = 3 / np.sqrt(2 * len(tilts))
         assert np.std(tilts, axis=0) / std == pytest.approx(1, abs=error)
 
     def test_an_error_of_a_shift_in_a_slope_counts_as_one_of_flux(self):
         shifts = equipix.cross_pattern(11, 19)
-        by_flux = tilt_std(shifts, (582, 782), flux_std=1e-4)
+        by_flux = tilt_std((582, 782), shifts, flux_std=1e-4)
         slope = (1e-4 / 0.05, 0)
-        by_shift = tilt_std(shifts, (582, 782), shift_std=0.05, beam_slope=slope)
+        by_shift = tilt_std((582, 782), shifts, shift_std=0.05, beam_slope=slope)
         np.testing.assert_allclose(by_shift, by_flux, rtol=1e-12)
         both = tilt_std(
-            shifts, (582, 782), flux_std=np.full(5, 1e-4), shift_std=0.05, beam_slope=slope
+            (582, 782), shifts, flux_std=np.full(5, 1e-4), shift_std=0.05, beam_slope=slope
         )
         np.testing.assert_allclose(both, np.sqrt(2) * by_flux, rtol=1e-12)
 
     def test_drift_of_the_design(self):
         # DESIGN: at 782×582 with cross (11, 19) drift of 1e-4 makes 2.0e-3 rms.
-        tilt = tilt_std(equipix.cross_pattern(11, 19), (582, 782), flux_std=1e-4)
+        tilt = tilt_std((582, 782), equipix.cross_pattern(11, 19), flux_std=1e-4)
         assert np.hypot(*tilt) / np.sqrt(12) == pytest.approx(2.0e-3, rel=0.03)
 
     def test_shifts_along_one_line_leave_it_open(self):
-        assert np.isinf(tilt_std([(0, 0), (0, 2), (0, 3)], (9, 9), flux_std=1e-4)).all()
+        assert np.isinf(tilt_std((9, 9), [(0, 0), (0, 2), (0, 3)], flux_std=1e-4)).all()
 
 
 class TestWhatIsUndetermined:

@@ -7,7 +7,7 @@ import pytest
 
 import equipix
 from equipix import errors, plan, simulate
-from equipix.exposures.reach import micrometre_step
+from equipix.exposures.positions import micrometre_step
 
 CROSS = equipix.cross_pattern(11, 19)
 

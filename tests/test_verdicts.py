@@ -9,14 +9,13 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration import verdicts
-from equipix.calibration.options import Options
-from equipix.calibration.orientation import OrientationTest
-from equipix.calibration.weights import Weighted
-from equipix.calibration.window_fit import WindowFit
-from equipix.defects import Findings
+from equipix.diagnosis import rules as verdicts
+from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import ConvergenceWarning, MisfitWarning
-from equipix.exposures.options import FitOptions
+from equipix.exposures.fit import FitOptions
+from equipix.fitting.weighted import Options, Weighted
+from equipix.fitting.windows import WindowFit
+from equipix.measured.defects import Findings
 
 CROSS = equipix.cross_pattern(3, 5)
 GOOD = {

@@ -10,7 +10,7 @@ import pytest
 
 import equipix
 from equipix import Experiment, cli, errors, simulate
-from equipix.frames import load_statistics
+from equipix.measured.statistics import load_statistics
 
 SHAPE, CROSS = (48, 64), equipix.cross_pattern(5, 7)
 

@@ -11,8 +11,8 @@ import numpy as np
 
 import equipix
 from equipix import simulate
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
+from equipix.exposures.exposures import exposures_of
+from equipix.exposures.fit import FitOptions
 from peers import alternating, kuhn_lin_loranz, log_lsmr, over_relaxed
 from peers.race import Outcome
 

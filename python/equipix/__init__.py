@@ -24,46 +24,45 @@ if TYPE_CHECKING:
         plan,
         scene,
         simulate,
-        uncertainty,
     )
     from equipix._native import __version__
     from equipix.calibration.calibrate import calibrate
-    from equipix.calibration.history import History
-    from equipix.calibration.result import Calibration
+    from equipix.calibration.result import Calibration, History
     from equipix.comparison import Comparison, compare
     from equipix.correction.corrector import Corrector
     from equipix.correction.polynomial import Polynomial, combine
     from equipix.correction.protocol import Correction
-    from equipix.experiment.levels import LevelExperiment
-    from equipix.experiment.run import Experiment
-    from equipix.flags import Flag
-    from equipix.frames import FrameStatistics, average
+    from equipix.experiment.experiment import Experiment
+    from equipix.experiment.level_experiment import LevelExperiment
+    from equipix.exposures.spots import ShiftMeasurement, Spot, cross_pattern, measure_shift
+    from equipix.findings import Flag
     from equipix.loading import load
-    from equipix.noise import NoiseModel
-    from equipix.shifts import ShiftMeasurement, Spot, cross_pattern, measure_shift
+    from equipix.measured.average import average
+    from equipix.measured.noise import NoiseModel
+    from equipix.measured.statistics import FrameStatistics
 
 _HOMES = {
     "Calibration": "calibration.result",
     "Comparison": "comparison",
     "Correction": "correction.protocol",
     "Corrector": "correction.corrector",
-    "Experiment": "experiment.run",
-    "Flag": "flags",
-    "FrameStatistics": "frames",
-    "History": "calibration.history",
-    "LevelExperiment": "experiment.levels",
-    "NoiseModel": "noise",
+    "Experiment": "experiment.experiment",
+    "Flag": "findings",
+    "FrameStatistics": "measured.statistics",
+    "History": "calibration.result",
+    "LevelExperiment": "experiment.level_experiment",
+    "NoiseModel": "measured.noise",
     "Polynomial": "correction.polynomial",
-    "ShiftMeasurement": "shifts",
-    "Spot": "shifts",
+    "ShiftMeasurement": "exposures.spots",
+    "Spot": "exposures.spots",
     "__version__": "_native",
-    "average": "frames",
+    "average": "measured.average",
     "calibrate": "calibration.calibrate",
     "combine": "correction.polynomial",
     "compare": "comparison",
-    "cross_pattern": "shifts",
+    "cross_pattern": "exposures.spots",
     "load": "loading",
-    "measure_shift": "shifts",
+    "measure_shift": "exposures.spots",
 }
 """The module of each public name."""
 
@@ -78,7 +77,6 @@ _MODULES = (
     "plan",
     "scene",
     "simulate",
-    "uncertainty",
 )
 """Public modules."""
 
@@ -114,7 +112,6 @@ __all__ = [
     "plan",
     "scene",
     "simulate",
-    "uncertainty",
 ]
 
 

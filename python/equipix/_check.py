@@ -1,19 +1,81 @@
-"""Arrays of the caller, checked and converted for the compiled part."""
+"""Types of arguments, and their checks: arrays, masks, counts, shapes, words for messages."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+Array: TypeAlias = NDArray[Any]
 
-    from numpy.typing import ArrayLike, NDArray
+Floats: TypeAlias = NDArray[np.float64]
+
+Bools: TypeAlias = NDArray[np.bool_]
+
+Progress: TypeAlias = Callable[[int, int, str], object]
+"""Called as ``progress(done, total, stage)``; an exception in it stops the work."""
+
+Rng: TypeAlias = np.random.Generator | int
+"""A generator of random numbers, or its seed."""
+
+Method = Literal["multiscale", "coordinate-descent"]
+
+FluxModel = Literal["fit", "linear"]
+
+ShiftSign = Literal["confirmed", "contradicted", "undetermined"]
+
+Flagged = Literal["nan", "keep", "replace"]
+"""The values of pixels flagged ``DO_NOT_USE`` in corrected frames."""
+
+Display = Literal["linear", "histogram"]
+"""Tone laws of pictures."""
+
+OutputType = Literal["float32", "uint16", "uint8"]
+"""Types of corrected frames."""
+
+By = Literal["offset", "gain"]
+"""What a one-point correction changes."""
+
+Order = Literal[0, 1, 2, 3, "auto"]
+"""Order of response curves, or that which predicts a held-out level best."""
+
+
+class ReadOnly:
+    """Base of frozen dataclasses whose arrays are read-only.
+
+    They are views: nothing is copied, and an array that the caller made stays writeable.
+    """
+
+    def __post_init__(self) -> None:
+        """Replace each array by a read-only view of it."""
+        fields = vars(self)
+        fields |= {
+            name: read_only(value)
+            for name, value in fields.items()
+            if isinstance(value, np.ndarray)
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Unpickle: NumPy makes arrays writeable again."""
+        vars(self).update(state)
+        ReadOnly.__post_init__(self)
+
+
+def read_only(array: Array) -> Array:
+    """Return the array itself if it is read-only, else a read-only view of it."""
+    if not array.flags.writeable:
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
 
 _MOST_WORKERS = 1024
 
@@ -222,3 +284,35 @@ def check_count(name: str, got: int, count: int) -> None:
     """Refuse an argument that has not one entry for each exposure."""
     if got != count:
         raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")
+
+
+def union(*masks: Bools | None) -> Bools | None:
+    """Union of several masks, of one exposure or of all."""
+    given = [mask for mask in masks if mask is not None]
+    return functools.reduce(np.logical_or, given) if given else None
+
+
+def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
+    """Mask of one exposure or of all, of frames of that shape."""
+    array = as_array("mask", mask, ndim=(2, 3))
+    if array.dtype != np.bool_:
+        raise InputError(
+            f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+        )
+    if array.shape not in (shape[1:], shape):
+        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
+    return array
+
+
+class Words(NamedTuple):
+    """What messages call the argument of the measurements, and one of them."""
+
+    argument: str = "'frames'"
+    one: str = "exposure"
+
+    def place(self, number: int, name: str = "") -> str:
+        """Name one of the measurements."""
+        return f"{self.argument}: {self.one} {number}{f' ({name!r})' if name else ''}"
+
+
+EXPOSURES = Words()

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import as_array, check_count
+from equipix.calibration.result import Calibration
 from equipix.errors import InputError
-from equipix.flags import Flag, determined
-from equipix.maps import BLOCK, block_means, relative_error, rms
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix.calibration.result import Calibration
+from equipix.findings import Flag, determined
+from equipix.measured.filters import BLOCK
+from equipix.metrics.maps import block_means, relative_error, rms
 
 _MOST_BLOCKS = 16
 """Blocks whose uncertainty represents all: each takes about as long as a calibration."""

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from equipix import simulate
-from equipix._types import Progress
-from equipix.experiment.run import Experiment
-from equipix.frames import average
-from equipix.maps import rms_at_both_scales
-from equipix.shifts import cross_pattern
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from equipix.calibration.result import Calibration
-    from equipix.simulate import Camera, VirtualExperiment
-
+from equipix._check import Progress
+from equipix.calibration.result import Calibration
+from equipix.experiment.experiment import Experiment
+from equipix.exposures.spots import cross_pattern
+from equipix.measured.average import average
+from equipix.metrics.maps import relative_error, rms_at_both_scales
+from equipix.simulate.beams import cosine_sensitivity, gaussian_beam
+from equipix.simulate.camera import Camera
+from equipix.simulate.rig import VirtualExperiment, experiment
 
 RMS_LIMIT, BLOCK_RMS_LIMIT = 1.1, 1.5
 """Factors by which the errors may exceed the value that noise predicts."""
@@ -63,12 +59,12 @@ class Demo:
     @property
     def error(self) -> NDArray[Any]:
         """Relative error of the calibration, shape (rows, cols)."""
-        return simulate.relative_error(self.calibration.sensitivity, self.truth)
+        return relative_error(self.calibration.sensitivity, self.truth)
 
     @property
     def flat_field_error(self) -> NDArray[Any]:
         """Relative error of the flat field, shape (rows, cols)."""
-        return simulate.relative_error(self.flat_field, self.truth)
+        return relative_error(self.flat_field, self.truth)
 
     @property
     def passed(self) -> bool:
@@ -126,9 +122,9 @@ def virtual_experiment(
     """
     generator = np.random.default_rng(rng)
     arms = next(arms for size, arms in ARMS.items() if min(shape) >= size)
-    virtual = simulate.experiment(
-        simulate.cosine_sensitivity(shape, rng=generator),
-        simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782)),
+    virtual = experiment(
+        cosine_sensitivity(shape, rng=generator),
+        gaussian_beam(shape, width=1000 * max(1, shape[1] / 782)),
         cross_pattern(*arms),
         frames=frames,
         exposure_e=EXPOSURE_E,

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import as_array, check_shape, check_word, number
-from equipix._readonly import ReadOnly
-from equipix.colour import Colours
+from equipix._check import Array, Bools, Floats, ReadOnly, as_array, check_shape, check_word, number
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
-from equipix.flags import set_bits
-from equipix.maps import block_means
-from equipix.mosaic import responses
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Array, Bools, Floats
+from equipix.findings import set_bits
+from equipix.measured.colour import Colours
+from equipix.measured.filters import responses
+from equipix.metrics.maps import block_means
 
 Law = Literal["cos4", "radial"]
 

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from os import PathLike
+from typing import Any
 
+from equipix.calibration.result import Calibration
+from equipix.correction.protocol import Correction
 from equipix.errors import FileError
-from equipix.io import load_pages
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from os import PathLike
-
-    from equipix.calibration.result import Calibration
-    from equipix.correction.protocol import Correction
-    from equipix.nuc.response import Response
+from equipix.io.formats import load_pages
+from equipix.nuc.response import Response
 
 READERS = {
-    "calibration": ("equipix.calibration.reading", "read_calibration"),
+    "calibration": ("equipix.calibration.result", "read_calibration"),
     "dynamic correction": ("equipix.bolometer.dynamic", "read_dynamic"),
-    "frame statistics": ("equipix.frames", "read_statistics"),
+    "frame statistics": ("equipix.measured.average", "read_statistics"),
     "polynomial": ("equipix.correction.polynomial", "read_polynomial"),
-    "response": ("equipix.nuc.reading", "read_response"),
+    "response": ("equipix.nuc.response", "read_response"),
 }
 """By the kind in a file's metadata, the module, imported on first use, and the function that makes
 the content of ``(path, pages, metadata)``."""

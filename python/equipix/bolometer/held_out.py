@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from equipix.bolometer.solver import rank_of, solver_of
+from equipix._check import Bools, Floats
+from equipix.bolometer.states import Axes, Regressor, States, rank_of, solver_of
 from equipix.errors import InputError, MisfitWarning, warn
-
-if TYPE_CHECKING:
-    from equipix._types import Bools, Floats
-    from equipix.bolometer.states import Axes, Regressor, States
 
 HIGHEST = 8
 """Highest order in temperature."""

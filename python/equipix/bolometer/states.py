@@ -1,20 +1,16 @@
-"""States of operation, substrate temperature and bias, and the polynomials in them."""
+"""States of a bolometer, polynomials in them, and their least squares."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import as_array
-from equipix.bolometer.physics import ZERO_C
+from equipix._check import Bools, Floats, as_array
+from equipix.detector.photons import ZERO_C
 from equipix.errors import InputError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Bools, Floats
 
 _ALIKE = 0.01
 """Share of the range within which temperatures count as one: extrema of the highest polynomial, of
@@ -153,3 +149,40 @@ def _scaled(values: Floats, ends: Floats) -> Floats:
     """Values with the ends at −1 and 1; 0 where there is one end."""
     middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
     return np.asarray((values - middle) / half if half else np.zeros_like(values))
+
+
+_MOST_NOISE = 100.0
+"""Noise of a deviation between the references, over that of a reference."""
+
+
+def rank_of(axes: Axes, states: States) -> int:
+    """Number of coefficients that states determine."""
+    return int(np.linalg.matrix_rank(axes.basis(states.substrate_c, states.bias_v)))
+
+
+def solver_of(axes: Axes, states: States) -> Floats:
+    """Matrix that makes coefficients of values by least squares, shape (terms, n)."""
+    rank = rank_of(axes, states)
+    if rank < axes.terms:
+        raise InputError(
+            f"'order' {axes.order} and 'bias_order' {axes.bias_order} have {axes.terms} "
+            f"coefficients, but {len(states.substrate_c)} references at "
+            f"{len(states.temperatures)} temperatures and {len(states.biases)} biases determine "
+            f"{rank}: take more states, or lower orders"
+        )
+    return np.asarray(np.linalg.pinv(axes.basis(states.substrate_c, states.bias_v)))
+
+
+def check_spread(axes: Axes, states: States, solver: Floats) -> None:
+    """Refuse states between which the noise of a reference is multiplied by much."""
+    celsius = np.linspace(*axes.substrate_c, 33)
+    noise = [
+        np.linalg.norm(axes.basis(celsius, np.full(len(celsius), volts)) @ solver, axis=1).max()
+        for volts in states.biases
+    ]
+    if max(noise) > _MOST_NOISE:
+        raise InputError(
+            f"'substrate_c' and 'bias_v' determine order {axes.order} with {max(noise):.3g} times "
+            f"the noise of a reference (limit {_MOST_NOISE:g}): take states further apart, or "
+            "lower orders"
+        )

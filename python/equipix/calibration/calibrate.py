@@ -2,51 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix.calibration import verdicts
-from equipix.calibration.colours import contradiction
-from equipix.calibration.coverage import with_coverage
-from equipix.calibration.error_bars import (
+from equipix._check import FluxModel, Method, Progress
+from equipix._native import Fit
+from equipix.calibration.result import Calibration, with_hidden_tilt
+from equipix.diagnosis import rules
+from equipix.diagnosis.coverage import with_coverage
+from equipix.diagnosis.gauges import contradiction
+from equipix.diagnosis.inputs import on_input
+from equipix.diagnosis.lamp_drift import lamp_drift
+from equipix.diagnosis.misfit import misfit
+from equipix.diagnosis.orientation import orientation_test
+from equipix.diagnosis.small_errors import with_small_errors
+from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.fit import FitOptions
+from equipix.findings import say
+from equipix.fitting.error_bars import (
+    DarkStd,
+    ErrorBars,
     is_too_fine,
     standard_deviations,
     with_dark_misfit,
-    with_hidden_tilt,
 )
-from equipix.calibration.faint_pixels import without_faint_pixels
-from equipix.calibration.false_pixels import without_false_pixels
-from equipix.calibration.input_verdicts import on_input
-from equipix.calibration.lamp_drift import lamp_drift
-from equipix.calibration.misfit import misfit
-from equipix.calibration.options import Options, is_to_be_fitted
-from equipix.calibration.orientation import orientation_test
-from equipix.calibration.pixel_flags import pixel_flags
-from equipix.calibration.priors import widened
-from equipix.calibration.residuals import sampled
-from equipix.calibration.result import Calibration
-from equipix.calibration.sample_variances import steadied
-from equipix.calibration.small_errors import with_small_errors
-from equipix.calibration.unchanged import sampled_arrays
-from equipix.calibration.weights import weighted_fit
-from equipix.exposures.front import exposures_of
-from equipix.exposures.options import FitOptions
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
-    from equipix._native import Fit
-    from equipix._types import FluxModel, Method, Progress
-    from equipix.calibration.error_bars import DarkStd, ErrorBars
-    from equipix.calibration.weights import Weighted
-    from equipix.exposures.exposures import Exposures
-    from equipix.frames import FrameStatistics
-    from equipix.noise import NoiseModel
+from equipix.fitting.pixels import pixel_flags, without_faint_pixels, without_false_pixels
+from equipix.fitting.residuals import sampled
+from equipix.fitting.stated_errors import steadied, widened
+from equipix.fitting.weighted import (
+    Options,
+    Weighted,
+    is_to_be_fitted,
+    sampled_arrays,
+    weighted_fit,
+)
+from equipix.measured.noise import NoiseModel
+from equipix.measured.statistics import FrameStatistics
 
 
 def calibrate(
@@ -273,8 +269,8 @@ def calibrated(
     The fit starts from `start`; `provenance` is added to the metadata.
     """
     started = datetime.now(UTC)
-    advice = [*on_input(exposures), *verdicts.on_plan(exposures)]
-    verdicts.say(advice)
+    advice = [*on_input(exposures), *rules.on_plan(exposures)]
+    say(advice)
     weighted, frames = steadied(exposures, weighted_fit(exposures, options, start), options)
     weighted = without_false_pixels(weighted, options)
     weighted = without_faint_pixels(weighted, options.fit)
@@ -290,19 +286,19 @@ def calibrated(
     misfits = misfit(weighted, flags, residuals, options.fit)
     differ = contradiction(weighted, residuals, flags)
     weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
-    found = verdicts.on_fit(weighted, options, test, drift, misfits, widths, differ)
-    found = verdicts.unexplained(found, advice) + verdicts.on_noise(frames)
+    found = rules.on_fit(weighted, options, test, drift, misfits, widths, differ)
+    found = rules.unexplained(found, advice) + rules.on_noise(frames)
     found = with_small_errors(found, weighted, flags, residuals, options.fit)
     found = with_coverage(found, weighted, flags)
     # Before the error bars, which may be refused or interrupted.
-    verdicts.say(found)
-    has_none = verdicts.is_too_far(weighted.fit) or is_too_fine(weighted)
+    say(found)
+    has_none = rules.is_too_far(weighted.fit) or is_too_fine(weighted)
     wanted = options.uncertainty and not has_none
     bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
     if bars is not None and drift is not None:
         bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
-    last = verdicts.on_standard_deviations(weighted, options, bars, dark)
-    verdicts.say(last)
+    last = rules.on_standard_deviations(weighted, options, bars, dark)
+    say(last)
     metadata = _metadata(weighted, options, started, dark, bars)
     return Calibration.of(
         weighted,

@@ -1,45 +1,47 @@
-"""The result of a shift calibration."""
+"""The result of a calibration, and files of it."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from os import PathLike
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import check_count, check_progress
+from equipix._check import (
+    Array,
+    Bools,
+    Flagged,
+    Floats,
+    Progress,
+    ReadOnly,
+    ShiftSign,
+    as_array,
+    check_count,
+    check_progress,
+    per_exposure,
+)
 from equipix._native import Beam
-from equipix._readonly import ReadOnly
-from equipix.calibration.colours import gauge_of, scaled
-from equipix.calibration.error_bars import checked_weights, functional_std
-from equipix.calibration.history import History
-from equipix.calibration.prediction import places_of, signal_at, subtract_signals
-from equipix.calibration.saved import save_fields
-from equipix.calibration.unchanged import check_unchanged
 from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficients
-from equipix.correction.depth import depth_of
+from equipix.correction.protocol import depth_of
+from equipix.diagnosis.gauges import gauge_of, scaled
+from equipix.diagnosis.lamp_drift import Drift
+from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
-from equipix.exposures.front import measured_of
-from equipix.flags import determined
-from equipix.maps import slope_pixels, tilt
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from os import PathLike
-    from typing import Self
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Flagged, Progress, ShiftSign
-    from equipix.calibration.error_bars import ErrorBars
-    from equipix.calibration.lamp_drift import Drift
-    from equipix.calibration.orientation import OrientationTest
-    from equipix.calibration.verdicts import Verdict
-    from equipix.calibration.weights import Weighted
-    from equipix.colour import Colours
-    from equipix.frames import FrameStatistics
-    from equipix.noise import NoiseModel
+from equipix.exposures.positions import ROUNDING, Orientation, Positions
+from equipix.findings import Verdict, determined
+from equipix.fitting.error_bars import ErrorBars, functional_std
+from equipix.fitting.weighted import Weighted, check_unchanged
+from equipix.io.formats import save_pages
+from equipix.io.record import check_format, check_pages
+from equipix.measured.colour import Colours
+from equipix.measured.measured import Measured, measured_of
+from equipix.measured.noise import NoiseModel
+from equipix.measured.statistics import FrameStatistics
+from equipix.metrics.maps import slope_pixels, tilt
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -336,7 +338,9 @@ class Calibration(ReadOnly):
         stack = checked_weights(weights, determined(self.sensitivity, self.flags))
         std = functional_std(self.weighted, stack, workers=workers, progress=progress)
         if self.drift is not None and self.drift.is_added:
-            std = np.hypot(std, np.sqrt(self.drift.variance_of(stack, self.weighted.fit.sensitivity)))
+            std = np.hypot(
+                std, np.sqrt(self.drift.variance_of(stack, self.weighted.fit.sensitivity))
+            )
         return float(std[0]) if np.ndim(weights) == 2 else std
 
     def correct(
@@ -536,3 +540,321 @@ def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:
     """Return a place on the grid with whole numbers as int, as indices are."""
     row, col = (int(each) if each.is_integer() else each for each in place)
     return row, col
+
+
+@dataclass(frozen=True, eq=False)
+class History(ReadOnly):
+    """The course of a calibration: its state after some of its sweeps.
+
+    Attributes
+    ----------
+    sweep : ndarray, shape (looks,), uint64
+        How many sweeps had been made.
+    objective : ndarray, shape (looks,), float64
+        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
+        and while such a fit still finds their weights. In coordinate descent it is F after a sweep;
+        `Calibration.objective` is smaller by the one update of the beam that follows the last.
+    error_estimate : ndarray, shape (looks,), float64
+        The estimated largest relative error of the sensitivity.
+    """
+
+    sweep: NDArray[Any]
+    objective: NDArray[Any]
+    error_estimate: NDArray[Any]
+
+
+class Place(NamedTuple):
+    """Where the sensor is in the beam, and how bright the beam is."""
+
+    shift: tuple[float, float]
+    rotation: int
+    flux: float
+
+
+def places_of(shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None) -> list[Place]:
+    """Shift, rotation and flux of each exposure, checked."""
+    positions = Positions.of(shifts, rotation=rotation)
+    fluxes = per_exposure("flux", flux, len(positions), default=1)
+    rows = zip(positions.shifts, positions.rotation, fluxes, strict=True)
+    return [
+        Place((float(shift[0]), float(shift[1])), int(turn), float(c)) for shift, turn, c in rows
+    ]
+
+
+def signal_at(place: Place, beam: Beam, sensitivity: Array) -> Array:
+    """Frame c · L(u) · M(p) from a place, in the dtype of the sensitivity."""
+    rows, cols = sensitivity.shape
+    light = beam.light((rows, cols), place.shift, place.rotation, workers=None)
+    return np.asarray(place.flux * light * sensitivity, sensitivity.dtype)
+
+
+def subtract_signals(
+    measured: Measured, signals: Iterable[Array], dark: Array | None, out: Array
+) -> None:
+    """Write values less signals and dark, in standard deviations where variances are known.
+
+    Where nothing is measured `out` stays as it is.
+    """
+    for k, (values, signal) in enumerate(zip(measured.values, signals, strict=True)):
+        np.subtract(values, signal, out=out[k], where=np.isfinite(values))
+        if dark is not None:
+            out[k] -= dark
+        variance = measured.variance_of(k, signal)
+        if variance is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                out[k] /= np.sqrt(variance)
+
+
+KIND = "calibration"
+"""The kind in the metadata of the file."""
+
+FORMAT = 2
+"""Number of the file format; a file with a higher one is refused. Format 1 held no coefficients of
+the beam and no verdicts, rotations only among the options, and the images of ``rejected`` one below
+the other in one page."""
+
+_MAPS: dict[str, type] = {
+    "sensitivity": np.floating,
+    "flags": np.uint32,
+    "component_labels": np.integer,
+}
+
+_PLAIN = (
+    "objective",
+    "components",
+    "sweeps",
+    "converged",
+    "error_estimate",
+    "dark_is_fitted",
+)
+"""Fields that are JSON values as they are."""
+
+_MAYBE, _SPLINE = {"dark", "sensitivity_std"}, {"beam_coefficients"}
+
+_OPTIONAL = _MAYBE | _SPLINE
+
+
+def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
+    """Write the attributes of a `Calibration` to a file; see `Calibration.save`."""
+    content = {
+        "format": FORMAT,
+        "kind": KIND,
+        "calibration": _numbers(fields),
+        "metadata": fields["metadata"],
+    }
+    save_pages(path, _pages(fields), content, force=force)
+
+
+def read_fields(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> dict[str, Any]:
+    """Make the attributes of a `Calibration` of the arrays and metadata that `save_fields` wrote.
+
+    ``history`` holds the attributes of a `History`.
+
+    Raises
+    ------
+    FileError
+        If the format is newer than `FORMAT`, or a page is missing or does not fit.
+    KeyError, TypeError, ValueError
+        If a number is missing or is something else.
+    """
+    check_format(path, content, KIND, FORMAT)
+    check_pages(path, pages, _MAPS | dict.fromkeys(_MAYBE & pages.keys(), np.floating))
+    check_pages(path, pages, dict.fromkeys(["beam", *sorted(_SPLINE & pages.keys())], np.float64))
+    if content["format"] == 1 and "rejected" in pages:
+        images = pages["rejected"].reshape(-1, *pages["sensitivity"].shape)
+        pages = {**pages, "rejected": images}
+    stacks = dict.fromkeys({"rejected"} & pages.keys(), np.uint8)
+    check_pages(path, pages, {"sensitivity": np.floating}, stacks)
+    numbers = content["calibration"]
+    if content["format"] == 1:
+        options = content["metadata"]["options"]
+        former = {"rotation": options["rotation"], "dark_is_fitted": options["dark"] == "fit"}
+        numbers = {**numbers, **former, "verdicts": [], "beam_tilt": [0.0, 0.0]}
+    chi2, rejected = numbers["reduced_chi2"], pages.get("rejected")
+    _check_numbers(numbers, pages["beam"].shape)
+    row, col = numbers["beam_origin"]
+    return {
+        **{name: pages[name] for name in ("sensitivity", "beam", "flags", "component_labels")},
+        **{name: pages.get(name) for name in _OPTIONAL},
+        **{name: numbers[name] for name in _PLAIN},
+        **{name: _array(numbers[name]) for name in ("shifts", "flux", "beam_tilt")},
+        **{name: _array(numbers.get(name)) for name in ("tilt_std", "shift_std")},
+        "beam_origin": (row, col),
+        "rotation": np.array(numbers["rotation"], dtype=np.int64),
+        "verdicts": numbers["verdicts"],
+        "reduced_chi2": float("nan") if chi2 is None else chi2,
+        "shift_sign": numbers.get("shift_sign", "undetermined"),
+        "orientation": numbers.get("orientation"),
+        "drift": numbers.get("drift"),
+        "cfa": Colours.of(numbers.get("cfa")),
+        "colour_response": _responses(numbers.get("colour_response")),
+        "history": _history(numbers["history"]),
+        "rejected": None if rejected is None else rejected.astype(bool),
+        "metadata": content["metadata"],
+    }
+
+
+def _check_numbers(numbers: Mapping[str, Any], grid: tuple[int, ...]) -> None:
+    """Refuse numbers that cannot be those of a calibration."""
+    count = len(numbers["flux"])
+    if np.shape(numbers["shifts"]) != (count, 2) or len(numbers["rotation"]) != count:
+        raise ValueError(f"shifts and rotations, expected those of {count} exposures")
+    if not set(numbers["rotation"]) <= {0, 90, 180, 270}:
+        raise ValueError(f"rotation {numbers['rotation']}, expected 0, 90, 180 or 270 degrees")
+    origin = np.array(numbers["beam_origin"])
+    if origin.shape != (2,) or origin.dtype.kind not in "if" or not _is_inside(origin, grid):
+        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected a place on {grid}")
+    if not (_are_whole(origin) or _are_whole(origin + numbers["shifts"])):
+        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected exposures in cells")
+    if np.shape(numbers["beam_tilt"]) != (2,):
+        raise ValueError(f"beam_tilt {numbers['beam_tilt']}, expected two numbers")
+
+
+def _is_inside(place: NDArray[Any], grid: tuple[int, ...]) -> bool:
+    """Whether a place is in a cell of a grid, which reaches half of its side around it."""
+    return bool(np.all((place >= -0.5) & (place <= np.subtract(grid, 0.5))))
+
+
+def _are_whole(places: NDArray[Any]) -> bool:
+    """Whether places are whole numbers, but for rounding."""
+    return bool(np.all(np.abs(places - np.rint(places)) < ROUNDING))
+
+
+def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Collect the arrays of the size of the sensor, and the beam."""
+    names = ("beam", *_MAPS, *sorted(_OPTIONAL))
+    pages = {name: fields[name] for name in names if fields[name] is not None}
+    if fields["rejected"] is not None:
+        pages["rejected"] = fields["rejected"].astype(np.uint8)
+    return pages
+
+
+def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect the rest as JSON values, which have neither NaN nor infinity."""
+    chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
+    history, orientation, drift = (fields[name] for name in ("history", "orientation", "drift"))
+    if orientation is not None:
+        changes = {"best": vars(orientation.best)}
+        if orientation.hidden is not None:
+            changes["hidden"] = vars(orientation.hidden)
+        orientation = vars(orientation) | changes
+    return {
+        "beam_origin": list(fields["beam_origin"]),
+        "shifts": fields["shifts"].tolist(),
+        "flux": fields["flux"].tolist(),
+        **{name: fields[name] for name in _PLAIN},
+        "rotation": fields["rotation"].tolist(),
+        "beam_tilt": fields["beam_tilt"].tolist(),
+        "reduced_chi2": chi2 if np.isfinite(chi2) else None,
+        "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
+        "shift_sign": fields["shift_sign"],
+        "orientation": orientation,
+        "drift": None if drift is None else _lists(vars(drift)),
+        **_colours(fields),
+        "tilt_std": None
+        if tilt_std is None
+        else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],
+        "shift_std": None if shift_std is None else shift_std.tolist(),
+        "history": {
+            "sweep": history.sweep.tolist(),
+            "objective": history.objective.tolist(),
+            "error_estimate": history.error_estimate.tolist(),
+        },
+    }
+
+
+def _colours(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect the pattern of the filters and the responses of the colours, where there are any."""
+    if fields["cfa"] is None:
+        return {}
+    found = fields["colour_response"].items()
+    return {
+        "cfa": fields["cfa"].rows,
+        "colour_response": {label: value if value == value else None for label, value in found},
+    }
+
+
+def _responses(content: Mapping[str, float | None] | None) -> dict[str, float] | None:
+    if content is None:
+        return None
+    return {label: float("nan") if value is None else value for label, value in content.items()}
+
+
+def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace arrays by lists."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in fields.items()
+    }
+
+
+def _history(numbers: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    return {
+        "sweep": np.array(numbers["sweep"], dtype=np.uint64),
+        "objective": np.array(numbers["objective"]),
+        "error_estimate": np.array(numbers["error_estimate"]),
+    }
+
+
+def _array(values: Any) -> NDArray[np.float64] | None:
+    return None if values is None else np.array(values, dtype=np.float64)
+
+
+def read_calibration(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> Calibration:
+    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
+    fields = read_fields(path, pages, content)
+    verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
+    made = {
+        "history": History(**fields["history"]),
+        "orientation": _read_orientation(fields["orientation"]),
+        "drift": _read_drift(fields["drift"]),
+        "verdicts": verdicts,
+    }
+    return Calibration(**{**fields, **made})
+
+
+def _read_orientation(content: dict[str, Any] | None) -> OrientationTest | None:
+    if content is None:
+        return None
+    ways = {name: content.get(name) for name in ("best", "hidden")}
+    made = {name: Orientation(**way) for name, way in ways.items() if way is not None}
+    return OrientationTest(**{**content, **made})
+
+
+def _read_drift(content: dict[str, Any] | None) -> Drift | None:
+    if content is None:
+        return None
+    names = ("slope_covariance", "tilt_std", "trend_tilt")
+    arrays = {name: np.array(content[name]) for name in names}
+    return Drift(**{**content, **arrays})
+
+
+def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
+    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
+    if not drift.is_added:
+        return bars
+    hidden = response * np.sqrt(drift.variance_map(response))
+    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
+    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
+
+
+def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:
+    """Weights of functionals as (m, rows, cols), which must be 0 where ln M is undetermined."""
+    array = as_array("weights", weights, ndim=(2, 3)).astype(np.float64, copy=False)
+    if array.shape[-2:] != determined.shape:
+        raise InputError(f"'weights' has shape {array.shape}, the sensor {determined.shape}")
+    if not np.isfinite(array).all():
+        raise InputError("'weights' holds values that are not finite")
+    stack = array.reshape(-1, *determined.shape)
+    wrong = (stack != 0).any(axis=0) & ~determined
+    if wrong.any():
+        row, col = np.argwhere(wrong)[0].tolist()
+        raise InputError(
+            f"'weights' is not 0 in {np.count_nonzero(wrong)} pixels whose ln M is undetermined, "
+            f"the first at ({row}, {col}): set it to 0 there"
+        )
+    return stack

@@ -5,13 +5,15 @@ from __future__ import annotations
 import warnings
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from equipix._types import FluxModel, Method
-from equipix.cli.options import (
+from equipix._check import FluxModel, Method
+from equipix.calibration.result import Calibration
+from equipix.cli.summary import of_calibration, summary
+from equipix.cli.terminal import (
     Force,
     Json,
     Mask,
@@ -20,20 +22,21 @@ from equipix.cli.options import (
     Tolerance,
     Uncertainty,
     Workers,
+    check_output,
     naming_mask,
+    progress_bars,
+    show_result,
+    show_table,
 )
-from equipix.cli.summary import of_calibration, summary
-from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
-from equipix.experiment.run import Experiment
-from equipix.io import SUFFIXES, read_mask, refuse_inputs
+from equipix.experiment.experiment import Experiment
+from equipix.io.formats import SUFFIXES
+from equipix.io.frames import read_mask
+from equipix.io.paths import refuse_inputs
 from equipix.loading import load_any, load_calibration
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
-
-if TYPE_CHECKING:
-    from equipix.calibration.result import Calibration
 
 commands = typer.Typer()
 

@@ -7,19 +7,35 @@ from typing import Annotated, Any
 
 import typer
 
-from equipix._types import Display, Flagged, OutputType
-from equipix.cli.options import Force, Json, Mask, Saturation, Sensor, Workers, naming_mask
+from equipix._check import Display, Flagged, OutputType
 from equipix.cli.summary import of_statistics
-from equipix.cli.terminal import check_output, progress_bars, show_result
-from equipix.correction.files import Corrected, correct_files, is_folder
+from equipix.cli.terminal import (
+    Force,
+    Json,
+    Mask,
+    Saturation,
+    Sensor,
+    Workers,
+    check_output,
+    naming_mask,
+    progress_bars,
+    show_result,
+)
+from equipix.correction.correct_files import Corrected, correct_files, is_folder
 from equipix.errors import DriftWarning, InputError, warn
-from equipix.experiment.provenance import origin_of
-from equipix.experiment.repeats import refuse_repeated_files
-from equipix.frames import average as average_frames
-from equipix.frames import refuse_subtracted, saved_shape, warn_of_bright_dark
-from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
-from equipix.light import STRAY, light_of
+from equipix.experiment.image_files import origin_of, refuse_repeated_files
+from equipix.io.formats import SUFFIXES
+from equipix.io.frames import read_mask
+from equipix.io.paths import find_files, refuse_inputs
 from equipix.loading import load
+from equipix.measured.average import average as average_frames
+from equipix.measured.statistics import (
+    STRAY,
+    light_of,
+    refuse_subtracted,
+    saved_shape,
+    warn_of_bright_dark,
+)
 
 commands = typer.Typer()
 

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from equipix._check import naming_memory
-from equipix.cli.options import Force, Json, Sensor
-from equipix.cli.terminal import check_output, show_result
-from equipix.correction.protocol import check_sensor
-from equipix.flags import usable
-from equipix.hardware import Table, quality, smallest_widths
-from equipix.hardware.files import SUFFIXES
-from equipix.io import find_files, read_frames, refuse_inputs, refuse_saved
+from equipix.cli.terminal import Force, Json, Sensor, check_output, show_result
+from equipix.correction.protocol import Correction, check_sensor
+from equipix.findings import usable
+from equipix.hardware import quality
+from equipix.hardware.quality import smallest_widths
+from equipix.hardware.table import SUFFIXES, Table
+from equipix.io.formats import refuse_saved
+from equipix.io.frames import read_frames
+from equipix.io.paths import find_files, refuse_inputs
 from equipix.loading import load
-
-if TYPE_CHECKING:
-    from equipix.correction.protocol import Correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""

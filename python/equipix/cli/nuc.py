@@ -2,40 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from equipix._check import naming_memory
-from equipix._types import By
-from equipix.cli.options import Cfa, Force, Json, Mask, Sensor, Workers, naming_mask
+from equipix._check import Array, By, Flagged, naming_memory
 from equipix.cli.summary import flagged as flag_counts
 from equipix.cli.summary import summary
-from equipix.cli.terminal import check_output, progress_bars, show_result
-from equipix.correction.files import warn_of_corrected
-from equipix.correction.protocol import check_sensor, named_cfa
-from equipix.experiment.levels import LevelExperiment
-from equipix.experiment.provenance import origin_of
-from equipix.io import SUFFIXES, find_files, read_frames, read_mask, refuse_inputs, refuse_saved
+from equipix.cli.terminal import (
+    Cfa,
+    Force,
+    Json,
+    Mask,
+    Sensor,
+    Workers,
+    check_output,
+    naming_mask,
+    progress_bars,
+    show_result,
+)
+from equipix.correction.correct_files import warn_of_corrected
+from equipix.correction.protocol import Correction, check_sensor, named_cfa
+from equipix.experiment.image_files import origin_of
+from equipix.experiment.level_experiment import LevelExperiment
+from equipix.io.formats import SUFFIXES, refuse_saved
+from equipix.io.frames import read_frames, read_mask
+from equipix.io.paths import find_files, refuse_inputs
 from equipix.loading import load, load_response
-from equipix.metrics import correctability, planes, roughness, three_d_noise
+from equipix.measured.colour import Colours
+from equipix.measured.defects import DefectLimits
+from equipix.metrics.correctability import correctability
+from equipix.metrics.frame_noise import three_d_noise
+from equipix.metrics.maps import planes, roughness
 from equipix.nuc.bad_pixels import find_defects
-from equipix.nuc.limits import DefectLimits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from equipix._types import Array, Flagged
-    from equipix.colour import Colours
-    from equipix.correction.protocol import Correction
 
 commands = typer.Typer()
+
 nuc = typer.Typer(
     no_args_is_help=True,
     help="Uniform source: fit response curves, find bad pixels, measure quality.",
 )
+
 commands.add_typer(nuc, name="nuc")
 
 _ORDERS = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}

@@ -6,13 +6,25 @@ from typing import Annotated, Any
 
 import typer
 
-from equipix.cli.options import Cfa, Force, Json, Picture, Seed
-from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
+from equipix.cli.terminal import (
+    Cfa,
+    Force,
+    Json,
+    Picture,
+    Seed,
+    check_output,
+    progress_bars,
+    show_result,
+    show_table,
+)
 from equipix.errors import InputError, UnusedInputWarning, warn
+from equipix.exposures.positions import whole_moves
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
-from equipix.plan import ErrorBudget, advise_order, distinct_trend, error_budget, identify, suggest
-from equipix.shifts import whole_moves
+from equipix.plan.budget import ErrorBudget, error_budget
+from equipix.plan.components import identify
+from equipix.plan.drift import advise_order, distinct_trend
+from equipix.plan.search import suggest
 
 commands = typer.Typer()
 

@@ -9,14 +9,25 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from equipix.cli.options import Force, Json, Mask, Workers, naming_mask
-from equipix.cli.terminal import check_output, progress_bars, show_result
+from equipix.cli.terminal import (
+    Force,
+    Json,
+    Mask,
+    Workers,
+    check_output,
+    naming_mask,
+    progress_bars,
+    show_result,
+)
 from equipix.errors import InputError
-from equipix.io import SUFFIXES, find_files, read_mask, refuse_inputs
+from equipix.io.formats import SUFFIXES
+from equipix.io.frames import read_mask
+from equipix.io.paths import find_files, refuse_inputs
 from equipix.pictures.canvas import check_picture, save_figure
-from equipix.pictures.scene import draw_sequence
-from equipix.scene import METHODS, SceneCorrection, load
-from equipix.scene.sequence import Sequence, check_range, run_sequence, sequence_format
+from equipix.pictures.comparison import draw_sequence
+from equipix.scene.methods import METHODS, load
+from equipix.scene.scene_correction import SceneCorrection
+from equipix.scene.sequence import SequenceResult, check_range, run_sequence, sequence_format
 
 commands = typer.Typer()
 
@@ -161,7 +172,7 @@ def _method(
     return METHODS[name](shape, data_range or np.dtype(dtype), workers=workers, **options)
 
 
-def _summary(output: Path, method: SceneCorrection, done: Sequence) -> dict[str, Any]:
+def _summary(output: Path, method: SceneCorrection, done: SequenceResult) -> dict[str, Any]:
     """Frames, spreads of the coefficients, and quality over time."""
     every = max(1, -(-len(done.points) // _SHOWN))
     points = [*range(0, len(done.points) - 1, every), len(done.points) - 1]

@@ -8,13 +8,23 @@ from typing import Annotated, Any
 
 import typer
 
-from equipix.cli.options import Cfa, Force, Json, Seed, Shape, Workers
-from equipix.cli.terminal import check_output, progress_bars, show_result, show_table
+from equipix.cli.terminal import (
+    Cfa,
+    Force,
+    Json,
+    Seed,
+    Shape,
+    Workers,
+    check_output,
+    progress_bars,
+    show_result,
+    show_table,
+)
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError
-from equipix.io import refuse_inputs
+from equipix.io.paths import refuse_inputs
 from equipix.pictures.canvas import check_picture, save_figure
-from equipix.pictures.demo import draw_demo
+from equipix.pictures.comparison import draw_demo
 
 commands = typer.Typer()
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from equipix.bolometer import DynamicCorrection
+from equipix._check import Array
+from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
-from equipix.correction.protocol import sensor_of
-from equipix.flags import Flag, usable
-from equipix.frames import FrameStatistics
-from equipix.nuc.misfit import common_misfit
-from equipix.nuc.response import Response
-
-if TYPE_CHECKING:
-    from equipix._types import Array
-    from equipix.correction.protocol import Correction
+from equipix.correction.protocol import Correction, sensor_of
+from equipix.findings import Flag, usable
+from equipix.measured.statistics import FrameStatistics
+from equipix.nuc.response import Response, common_misfit
 
 
 def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[str, Any]:

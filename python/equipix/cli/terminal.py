@@ -1,22 +1,25 @@
-"""Common parts of all commands: bars, one-line messages, results, outputs."""
+"""Options, progress, messages and results at a terminal."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import os
+import re
 import sys
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
 
 from equipix.errors import FileError, InputError
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-    from pathlib import Path
-
-    Report = Callable[[int, int, str], None]
+Report = Callable[[int, int, str], None]
 
 CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
 """The command, or the group of commands, that was called."""
@@ -74,7 +77,7 @@ def say(kind: str, message: object) -> None:
     text, called = " ".join(str(message).split()), CALLED.get()
     if called is not None:
         # Imported where there is a message: `equipix --help` needs none.
-        from equipix.cli.wording import in_options
+        from equipix.cli.terminal import in_options
 
         text = in_options(text, called)
     print(f"equipix: {kind}: {text}", file=sys.stderr)  # noqa: T201
@@ -169,3 +172,119 @@ def _row(fields: dict[str, Any]) -> str:
     if any(isinstance(each, str) for each in fields.values()):
         return ": ".join(map(str, fields.values()))
     return _words(fields)
+
+
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
+
+Tolerance = Annotated[float, typer.Option(help="Largest relative error of the sensitivity.")]
+
+MaxSweeps = Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")]
+
+Uncertainty = Annotated[
+    bool, typer.Option("--uncertainty", help="Find the standard deviation of every pixel.")
+]
+
+Saturation = Annotated[
+    float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
+]
+
+Mask = Annotated[
+    Path | None,
+    typer.Option(help="An image or .npy: pixels that are not 0 in it are not used."),
+]
+
+Cfa = Annotated[
+    str | None,
+    typer.Option(
+        help="Colour filters of the pixels: RGGB, GRBG, GBRG or BGGR, or the rows of one period, "
+        "such as RRGG/RRGG/GGBB/GGBB, or RGBW/ of one row."
+    ),
+]
+
+Sensor = Annotated[
+    str | None,
+    typer.Option(
+        help="Name of the sensor that gave the frames: another than the file's is refused."
+    ),
+]
+
+
+@contextmanager
+def naming_mask(file: Path | None) -> Iterator[None]:
+    """Name the file in messages on the mask that was read from it."""
+    try:
+        yield
+    except InputError as error:
+        if file is None or not str(error).startswith("'mask'"):
+            raise
+        raise InputError(f"{file}: {error}") from error
+
+
+Picture = Annotated[
+    Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
+]
+
+Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
+
+Shape = Annotated[
+    tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
+]
+
+_VALUE = r"(?:'([^']*)'|(\w+(?:\.\w+)*))"
+
+
+def in_options(message: str, called: Any) -> str:
+    """Name the options of a command, or group, where a message names Python's keywords.
+
+    A keyword that is no option stays where it is a key of a manifest or an argument of the command;
+    of any other the message says that it is one of Python.
+    """
+    parameters = _parameters(called)
+    options = {
+        each.name: max(each.opts, key=len)
+        for each in parameters
+        if each.param_type_name == "option"
+    }
+    for name, option in options.items():
+        message = _with_values(message, name, option)
+    if ".toml: " in message:
+        return message  # its quoted words are keys of that file
+    for name, option in options.items():
+        message = re.sub(rf"(?<!key )'{name}'(?! (?:in|of) )", option, message)
+        if "_" in name:
+            message = re.sub(rf"(?<![\w'/.\\-]){name}(?![\w'=/\\]|\.\w)", option, message)
+    for name in _python_only() - {each.name for each in parameters}:
+        message = message.replace(f"'{name}'", f"'{name}' (in Python)")
+    return message
+
+
+def _with_values(message: str, name: str, option: str) -> str:
+    """Write ``name='value'`` and ``'name' (--name value)`` as ``--name value``."""
+    message = re.sub(rf"'{name}' \(({option}[^)]*)\)", r"\1", message)
+    message = re.sub(rf"\b{name}={_VALUE}", rf"{option} \1\2", message)
+    message = message.replace(f"{option} True", option)
+    return re.sub(rf"({option}(?: \w+)?)(?:, \1| \(\1\))", r"\1", message)
+
+
+def _parameters(called: Any) -> list[Any]:
+    """Parameters of a command, or of all commands of a group."""
+    inner = getattr(called, "commands", {}).values()
+    return [*called.params, *(each for command in inner for each in _parameters(command))]
+
+
+@cache
+def _python_only() -> frozenset[str]:
+    """Keywords of what commands call that are no keys of manifests."""
+    # Imported where there is a message: pydantic takes as long as the rest of `equipix --help`.
+    from equipix.calibration.calibrate import calibrate
+    from equipix.experiment.manifest import KEYS
+    from equipix.measured.average import average
+    from equipix.nuc.curve_fit import fit
+    from equipix.scene.methods import METHODS
+
+    called: list[Callable[..., object]] = [calibrate, average, fit, *METHODS.values()]
+    return frozenset(name for each in called for name in inspect.signature(each).parameters) - KEYS

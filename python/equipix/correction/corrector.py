@@ -4,34 +4,36 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
-from equipix._check import as_array, naming_memory, positive_workers
-from equipix.correction.apply import dark_frame, is_stored
-from equipix.correction.depth import depth_of
-from equipix.correction.kernel import (
+from equipix._check import Array, Flagged, as_array, naming_memory, positive_workers
+from equipix.correction.apply import (
     FAST,
     check_flagged,
+    dark_frame,
+    is_stored,
     largest_value,
     native,
     output_dtype,
     run,
     usual_treatment,
 )
-from equipix.correction.protocol import cfa_of, check_correction, check_sensor, takes_dark
+from equipix.correction.protocol import (
+    Correction,
+    cfa_of,
+    check_correction,
+    check_sensor,
+    depth_of,
+    takes_dark,
+)
 from equipix.errors import InputError
-from equipix.flags import usable
+from equipix.findings import usable
+from equipix.measured.statistics import FrameStatistics
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, DTypeLike
-
-    from equipix._types import Array, Flagged
-    from equipix.correction.protocol import Correction
-    from equipix.frames import FrameStatistics
-
-    Dark = Literal["stored"] | FrameStatistics | ArrayLike | None
+Dark = Literal["stored"] | FrameStatistics | ArrayLike | None
 
 
 class Corrector:

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from os import PathLike
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import check_type
-from equipix._readonly import ReadOnly
+from equipix._check import Array, Flagged, ReadOnly, check_type
 from equipix.correction.apply import apply_polynomial
-from equipix.correction.depth import depth_of
-from equipix.correction.protocol import cfa_of, check_correction
+from equipix.correction.protocol import Correction, cfa_of, check_correction, depth_of
 from equipix.errors import InputError
-from equipix.io import check_format, check_pages, save_pages
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from os import PathLike
-
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Array, Flagged
-    from equipix.correction.protocol import Correction
+from equipix.io.formats import save_pages
+from equipix.io.record import check_format, check_pages
 
 _KIND, _FORMAT = "polynomial", 1
+
 _MOST = 4
 """Most coefficients that the compiled part applies."""
 

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import number
-from equipix.errors import InputError
-from equipix.simulate.blackbody import (
+from equipix._check import Floats, number
+from equipix.detector.photons import (
     EV_UM,
     band_photons,
     hgcdte_composition,
     hgcdte_cutoff,
     hgcdte_gap,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Floats
+from equipix.errors import InputError
 
 _TAIL = 30.0
 """Widths below the band gap at which the absorption edge ends: e⁻³⁰ of the response."""

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
-from equipix._check import as_array, check_type, check_word, number
-from equipix._types import By
+from equipix._check import By, Floats, as_array, check_type, check_word, number
 from equipix.detector.material import HgCdTe
+from equipix.detector.photons import LARGEST_X, hgcdte_composition, hgcdte_cutoff
 from equipix.errors import InputError
-from equipix.simulate.blackbody import LARGEST_X, hgcdte_composition, hgcdte_cutoff
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from equipix._types import Floats
 
 _NODES = 16
 """Compositions of the Gauss-Legendre rule that stands for all pixels."""

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
+from equipix._check import Array, Bools, Floats
 from equipix.errors import InputError
-from equipix.experiment.manifest import find_files
+from equipix.experiment.manifest import Exposure, Manifest, entry_files
 from equipix.exposures.positions import in_beam, variance_in_beam
-from equipix.flags import usable
-from equipix.io import read_frames, refuse_saved
-from equipix.mending import hot_places, mended
-from equipix.shifts import measure_shift, saturation_level
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import Self
-
-    from equipix._types import Array, Bools, Floats
-    from equipix.calibration.weights import Weighted
-    from equipix.experiment.manifest import Exposure, Manifest
-    from equipix.frames import FrameStatistics
-    from equipix.mosaic import Filters
-    from equipix.shifts import ShiftMeasurement, Spot
+from equipix.exposures.spots import ShiftMeasurement, Spot, hot_places, measure_shift, mended
+from equipix.findings import usable
+from equipix.fitting.weighted import Weighted
+from equipix.io.formats import refuse_saved
+from equipix.io.frames import read_frames
+from equipix.measured.filters import Filters
+from equipix.measured.saturation import saturation_level
+from equipix.measured.statistics import FrameStatistics
 
 _AROUND = 8
 """Pixels to each side of a spot's middle that represent those under it."""
@@ -143,7 +138,7 @@ def _spots(
 ) -> tuple[ShiftMeasurement, tuple[int, int]]:
     """Find the spots of the move to `exposure`, and the shape of the sensor."""
     before, after = (
-        _images(find_files(path, entry))
+        _images(entry_files(path, entry))
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )

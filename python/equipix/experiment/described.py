@@ -1,23 +1,26 @@
-"""What experiments on disk have in common: a description, and the image files that it names."""
+"""What both kinds of manifest share: averages, masks, provenance."""
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, Self, TypeVar
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Generic, Self, TypeVar
 
+import numpy as np
+
+from equipix._check import Bools, Floats, Progress
 from equipix.errors import FileError
-from equipix.experiment.manifest import LevelManifest, Manifest, find_files
-from equipix.experiment.repeats import image_files, refuse_repeats
-from equipix.frames import average
-from equipix.io import as_path
-
-if TYPE_CHECKING:
-    from os import PathLike
-    from pathlib import Path
-
-    from equipix._types import Progress
-    from equipix.frames import FrameStatistics
+from equipix.experiment.image_files import image_files, refuse_repeats
+from equipix.experiment.manifest import LevelManifest, Manifest, Region, entry_files
+from equipix.io.frames import read_mask
+from equipix.io.paths import as_path
+from equipix.measured.average import average
+from equipix.measured.noise import NoiseModel
+from equipix.measured.statistics import FrameStatistics
 
 _Manifest = TypeVar("_Manifest", Manifest, LevelManifest)
 
@@ -66,7 +69,7 @@ class Described(ABC, Generic[_Manifest]):
     def files(self) -> list[Path]:
         """All image files, each once."""
         mask = self.manifest.sensor.mask
-        masks: list[Path] = [] if mask is None else find_files(self.path, mask)
+        masks: list[Path] = [] if mask is None else entry_files(self.path, mask)
         return list(dict.fromkeys([*self._images(), *masks]))
 
     @classmethod
@@ -92,7 +95,7 @@ class Described(ABC, Generic[_Manifest]):
             if progress is not None:
                 progress(done, total, f"averaging {name}")
 
-        sensor, files = self.manifest.sensor, find_files(self.path, entry)
+        sensor, files = self.manifest.sensor, entry_files(self.path, entry)
         level = sensor.saturation_level
         found = average(files, dark=dark, saturation=level, workers=workers, progress=report)
         if sensor.largest is not None and found.mean.max() > sensor.largest:
@@ -102,3 +105,102 @@ class Described(ABC, Generic[_Manifest]):
                 f"that 'bit_depth' = {sensor.bit_depth} holds: correct 'bit_depth' in [sensor]"
             )
         return found
+
+
+def excluded_pixels(
+    path: Path, manifest: Manifest | LevelManifest, shape: tuple[int, int]
+) -> Bools | None:
+    """Return the pixels that ``[sensor]`` excludes; None without a mask and regions.
+
+    Parameters
+    ----------
+    path : Path
+        The experiment.toml or levels.toml.
+    manifest : Manifest or LevelManifest
+        Its content.
+    shape : tuple of int
+        Rows and columns of the sensor.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols), or None
+        True = do not use.
+
+    Raises
+    ------
+    FileError
+        If the mask file is of another shape, a region reaches beyond the sensor, or nothing is
+        left.
+    """
+    sensor = manifest.sensor
+    if sensor.mask is None and sensor.region is None:
+        return None
+    excluded = np.zeros(shape, bool)
+    if sensor.mask is not None:
+        excluded |= _of_file(path, sensor.mask, shape)
+    for index, region in enumerate(sensor.region or [], start=1):
+        excluded |= _of_region(f"{path}: [[sensor.region]] {index}", region, shape)
+    if excluded.all():
+        raise FileError(f"{path}: 'mask' and 'region' in [sensor] leave no pixel to use")
+    return excluded
+
+
+def _of_file(path: Path, entry: str, shape: tuple[int, int]) -> Bools:
+    file = entry_files(path, entry)[0]
+    mask = read_mask(file)
+    if mask.shape != shape:
+        raise FileError(
+            f"{file}: is a mask of shape {mask.shape}, expected {shape} like the frames"
+        )
+    return mask
+
+
+def _of_region(place: str, region: Region, shape: tuple[int, int]) -> Bools:
+    shaped = _rectangle if region.centre is None else _disc
+    inside = shaped(place, region, shape)
+    return ~inside if region.outside else inside
+
+
+def _rectangle(place: str, region: Region, shape: tuple[int, int]) -> Bools:
+    inside = np.zeros(shape, bool)
+    spans = []
+    for name, span, size in zip(("rows", "cols"), (region.rows, region.cols), shape, strict=True):
+        first, end = span or (0, size)
+        if end > size:
+            raise FileError(f"{place}: '{name}' ends at {end}, expected at most {size}")
+        spans.append(slice(first, end))
+    inside[tuple(spans)] = True
+    return inside
+
+
+def _disc(place: str, region: Region, shape: tuple[int, int]) -> Bools:
+    row, col = region.centre or (0.0, 0.0)
+    rows, cols = np.ogrid[: shape[0], : shape[1]]
+    inside: Bools = np.hypot(rows - row, cols - col) <= (region.radius or 0.0)
+    if not inside.any():
+        raise FileError(
+            f"{place}: 'centre' {[row, col]} and 'radius' {region.radius:g} name no pixel of the "
+            f"sensor, which has {shape[0]} rows and {shape[1]} columns"
+        )
+    return inside
+
+
+def provenance(
+    path: Path,
+    manifest: Manifest,
+    hashes: Mapping[Path, str],
+    shifts: Floats,
+    std: Floats,
+    noise: NoiseModel | None,
+) -> dict[str, Any]:
+    """Names, measured shifts, noise and the hashes of the files, as JSON values."""
+    folder = path.parent
+    return {
+        "experiment": str(path),
+        "sensor": manifest.sensor.model_dump(),
+        "exposures": [exposure.name for exposure in manifest.exposure],
+        "measured_shifts": shifts.tolist(),
+        "measured_shift_std": std.tolist(),
+        "noise": None if noise is None else asdict(noise),
+        "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
+    }

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic_core import ErrorDetails, PydanticCustomError
 
-from equipix import io
-from equipix.colour import Colours
 from equipix.errors import EquipixError, FileError, InputError
-
-if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
+from equipix.io.paths import find_files
+from equipix.measured.colour import Colours
 
 _WANTED = {
     "format": "1: a newer format needs a newer equipix",
@@ -51,9 +48,13 @@ KEYS = frozenset(_WANTED)
 """All keys and tables of the manifests."""
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+
 Text = Annotated[str, Field(min_length=1)]
+
 Files = Text | Annotated[list[Text], Field(min_length=1)]
+
 Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+
 Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
 
@@ -268,10 +269,10 @@ def _read(path: Path, model: type[_Content]) -> _Content:
         raise FileError(f"{path}: {'; '.join(_problems(error.errors(), content))}") from None
 
 
-def find_files(manifest: Path, entry: str | list[str]) -> list[Path]:
+def entry_files(manifest: Path, entry: str | list[str]) -> list[Path]:
     """Find the files of an entry of `manifest` (a file, a glob or a list)."""
     try:
-        return io.find_files(entry, folder=manifest.parent)
+        return find_files(entry, folder=manifest.parent)
     except EquipixError as error:
         raise FileError(f"{manifest}: {error}") from error
 

@@ -1,33 +1,40 @@
-"""Mean frames of one beam at several positions, and all that is known of them."""
+"""Exposures of one beam, and the one function that makes them."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import naming_memory
-from equipix._readonly import ReadOnly
-from equipix.defects import Findings
-from equipix.shifts import nearest_whole
-
-if TYPE_CHECKING:
-    from typing import Self
-
-    from numpy.typing import NDArray
-
-    from equipix._native import Fit
-    from equipix._types import Array, Bools, Floats
-    from equipix.exposures.clipping import Clipping
-    from equipix.exposures.flux import Flux
-    from equipix.exposures.options import FitOptions
-    from equipix.exposures.orientation import Orientation
-    from equipix.exposures.positions import Positions
-    from equipix.mosaic import Filters
-    from equipix.noise import NoiseModel
+from equipix._check import (
+    Array,
+    Bools,
+    Floats,
+    FluxModel,
+    ReadOnly,
+    as_array,
+    as_mask,
+    naming_memory,
+    union,
+)
+from equipix._native import Fit
+from equipix.errors import InputError
+from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Orientation, Positions, check_reach, nearest_whole
+from equipix.measured.colour import Colours
+from equipix.measured.defects import Findings
+from equipix.measured.filters import Filters, mean_signal
+from equipix.measured.means import Averaged
+from equipix.measured.measured import Measured, measured_of
+from equipix.measured.noise import NoiseModel
+from equipix.measured.saturation import Clipping, _is_unsigned, clipping_advice
+from equipix.measured.statistics import FrameStatistics
 
 _BLOCK = 64
 """Rows of a block for medians."""
@@ -322,3 +329,109 @@ def _medians(values: Array) -> Array:
     middle = [np.maximum(index, 0)[None] for index in ((count - 1) // 2, count // 2)]
     medians: Array = np.mean([np.take_along_axis(values, i, axis=0)[0] for i in middle], axis=0)
     return medians
+
+
+def exposures_of(
+    frames: ArrayLike | Sequence[FrameStatistics] | Averaged,
+    shifts: ArrayLike,
+    *,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
+    mask: ArrayLike | None = None,
+    saturation: float | None = None,
+    flux: ArrayLike | FluxModel | None = None,
+    flux_std: ArrayLike | None = None,
+    time: ArrayLike | None = None,
+    rotation: ArrayLike | None = None,
+    shift_std: ArrayLike | None = None,
+    offset: bool = False,
+    dark_variance: ArrayLike | None = None,
+    cfa: ArrayLike | Colours | None = None,
+) -> Exposures:
+    """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
+    with naming_memory("calibrating"):
+        measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
+        count = len(measured.values)
+        given = None if mask is None else as_mask(mask, measured.values.shape)
+        positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
+        rows, cols = measured.values.shape[1:]
+        check_reach(shifts, positions, (rows, cols))
+        exposures = Exposures(
+            values=measured.values,
+            positions=positions,
+            flux=Flux.of(flux, flux_std, time, count),
+            mask=union(given, measured.mask),
+            variance=measured.variance,
+            noise=tuple(measured.models),
+            offset=offset,
+            findings=measured.findings,
+            dark=measured.dark,
+            dark_variance=_of_dark(dark_variance, measured, offset=offset),
+            clipped=measured.clipped,
+            raw=(measured.raw or _is_unsigned(frames)) and not offset,
+            unsteady=measured.unsteady,
+            names=measured.names,
+        )
+        refuse_nothing(exposures, given)
+        shown = mean_signal(exposures.values, exposures.mask)
+        return exposures.behind(Filters.of(measured.colours, *shown))
+
+
+def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
+    """Variance of the dark that was subtracted from all, given or that of the averages."""
+    if given is not None and offset:
+        raise InputError(
+            "'dark_variance' is that of a dark that was subtracted, but 'dark' is 'fit': give one "
+            "of the two"
+        )
+    if offset:
+        return None
+    if given is None:
+        return measured.dark_variance
+    shape = measured.values.shape[1:]
+    variance = as_array("dark_variance", given, ndim=(0, 2)).astype(np.float64)
+    if variance.shape not in ((1,), shape):  # as_array makes one number an array of one
+        raise InputError(
+            f"'dark_variance' has shape {variance.shape}, expected {shape} or one number"
+        )
+    wrong = variance[~(np.isfinite(variance) & (variance >= 0))]
+    if wrong.size:
+        raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")
+    return np.array(np.broadcast_to(variance, shape))
+
+
+_REASONS = {  # the first that most pixels share: dark frames scatter more than a wrong model too
+    "noisy": "scatters between frames by more than its noise model explains: correct the gain "
+    "('gain_dn_per_e' in [sensor], 'variance' of calibrate), or leave it out",
+    "hot": "is hot in the dark frames: give dark frames of the same camera and exposure time",
+    "dead": "does not respond to light: is the dark that of these frames?",
+}
+
+
+def refuse_nothing(exposures: Exposures, given: Bools | None) -> None:
+    """Refuse exposures that leave no value to use, if the mask `given` is not the reason.
+
+    Raises
+    ------
+    InputError
+        With what most pixels were left out for.
+    """
+    if any(part.any() for part in _parts(exposures, exposures.mask)):
+        return
+    if not np.isfinite(exposures.values).any():
+        raise InputError(
+            "'frames' holds no finite number: every value is NaN, infinite or saturated"
+        )
+    left = np.any([*_parts(exposures, given)], axis=0)
+    if exposures.clipped is not None and left.any():
+        raise InputError(f"'frames': {clipping_advice(exposures.clipped)}")
+    for name, reason in _REASONS.items():
+        found = getattr(exposures.findings, name)
+        if found is not None and 2 * np.count_nonzero(left & found) > np.count_nonzero(left):
+            raise InputError(f"'frames' leave no usable pixel: nearly each {reason}")
+
+
+def _parts(exposures: Exposures, mask: Bools | None) -> Iterator[Bools]:
+    """Pixels of each exposure with a finite value that a mask leaves."""
+    for k, values in enumerate(exposures.values):
+        masked = False if mask is None else mask[k] if mask.ndim == 3 else mask
+        yield np.isfinite(values) & ~np.asarray(masked)

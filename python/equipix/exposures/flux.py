@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, check_count, per_exposure
-from equipix._readonly import ReadOnly
+from equipix._check import Floats, FluxModel, ReadOnly, as_array, check_count, per_exposure
 from equipix.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Self
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Floats, FluxModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,19 @@
-"""Positions of the sensor in the beam."""
+"""Where the sensor stood: shifts, rotations, orientations, whole pixels."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import product
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import as_array, as_shifts, check_count, per_exposure
-from equipix._readonly import ReadOnly
+from equipix._check import Array, Floats, ReadOnly, as_array, as_shifts, check_count, per_exposure
 from equipix.errors import InputError
-from equipix.shifts import ROUNDING, nearest_whole, round_shifts
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Self
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Array, Floats
-    from equipix.exposures.orientation import Orientation
-    from equipix.shifts import Rounding
 
 _TURNS = {
     0: ((1, 0), (0, 1)),
@@ -171,3 +162,191 @@ def as_shift_std(shift_std: ArrayLike, count: int) -> Floats:
             "within a pixel of where they were measured: measure them more accurately"
         )
     return std
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """How given shifts and rotations are changed: signs first, then the order of the axes.
+
+    Attributes
+    ----------
+    rows, cols : bool
+        Whether the given values along rows, and along columns, change their sign.
+    exchanged : bool
+        Whether both values of each shift are exchanged, as for shifts given as (x, y).
+    turned : bool
+        Whether quarter turns go the other way, 90° for 270°.
+    """
+
+    rows: bool = False
+    cols: bool = False
+    exchanged: bool = False
+    turned: bool = False
+
+    @classmethod
+    def every(cls, *, quarter_turns: bool) -> list[Self]:
+        """Return all orientations, the one as given first."""
+        ways = (False, True) if quarter_turns else (False,)
+        found = [cls(*each) for each in product((False, True), (False, True), (False, True), ways)]
+        return sorted(found, key=lambda each: sum(vars(each).values()))
+
+    def shifts(self, given: Floats) -> Floats:
+        """Return shifts (n, 2) so changed."""
+        signs = np.where([self.rows, self.cols], -1.0, 1.0)
+        changed = given * signs + 0.0  # no negative zeros
+        return np.ascontiguousarray(changed[:, ::-1]) if self.exchanged else changed
+
+    def rotation(self, given: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return rotations (n,), in degrees, so changed."""
+        return -given % 360 if self.turned else given
+
+    @property
+    def words(self) -> str:
+        """What is to be changed, as a request."""
+        return "; then ".join(request for request, _ in self._changes()) or "change nothing"
+
+    @property
+    def changes(self) -> str:
+        """The same, as what has been changed."""
+        return " and ".join(change for _, change in self._changes()) or "nothing changed"
+
+    def _changes(self) -> list[tuple[str, str]]:
+        """Each change, as a request and as done."""
+        signs = {
+            (True, True): "of all shifts",
+            (True, False): "of the shifts along rows",
+            (False, True): "of the shifts along columns",
+        }
+        found = []
+        if which := signs.get((self.rows, self.cols)):
+            found.append((f"reverse the sign {which}", f"the sign {which} reversed"))
+        if self.exchanged:
+            request = "exchange the two values of each shift: (row, col), not (x, y)"
+            found.append((request, "the two values of each shift exchanged"))
+        if self.turned:
+            request = "give 270 for 90 degrees of rotation, and 90 for 270"
+            found.append((request, "rotations of 90 and 270 degrees exchanged"))
+        return found
+
+
+_DECIMALS = 1000
+"""Steps per pixel of shifts as people write them."""
+
+_LARGE, _LARGE_WHOLE = 0.1, 0.25
+"""Least share of the sensor's side of the largest shift, where steps are a fraction or whole."""
+
+_LEAST_STEP, _LEAST_WHOLE_STEP = 1.0, 3.0
+"""Least step, in pixels, of which all shifts are multiples; pixels are 1 to 25 micrometres wide."""
+
+
+def check_reach(shifts: ArrayLike, positions: Positions, shape: tuple[int, int]) -> None:
+    """Refuse a shift as large as the sensor, with its value as it was given.
+
+    Raises
+    ------
+    InputError
+        With the exposure and the remedy.
+    """
+    for k, (shift, turn) in enumerate(zip(as_shifts(shifts), positions.rotation, strict=True)):
+        window = shape if turn % 180 == 0 else shape[::-1]
+        for name, part, side in zip(("row", "column"), shift, window, strict=True):
+            if abs(part) >= side:
+                raise InputError(
+                    f"'shifts' of exposure {k} is ({shift[0]:.10g}, {shift[1]:.10g}): its {name} "
+                    f"part must be smaller than the sensor, which has {side} there; micrometres "
+                    "become pixels when divided by the pixel pitch"
+                )
+
+
+def micrometre_step(shifts: Floats, shape: tuple[int, int]) -> float | None:
+    """Return the step that large shifts are multiples of, as shifts in micrometres are; else None.
+
+    Shifts in pixels that are multiples of a step above 1 would leave the sensor in unconnected
+    parts, and measured shifts are multiples of no step.
+    """
+    moves = np.abs(shifts - shifts[0])
+    scaled = moves * _DECIMALS
+    whole = np.rint(scaled).astype(np.int64)
+    different = np.unique(whole[whole > 0])
+    if len(different) < 2 or np.abs(scaled - whole).max() > 1e-3:
+        return None
+    step = int(np.gcd.reduce(different)) / _DECIMALS
+    large = float((moves.max(axis=0) / shape).max())
+    least = (_LEAST_WHOLE_STEP, _LARGE_WHOLE) if step.is_integer() else (_LEAST_STEP, _LARGE)
+    return step if step >= least[0] and large > least[1] else None
+
+
+ROUNDING = 1e-6
+"""Largest fraction of a pixel that counts as rounding, as in the core."""
+
+_UNNOTICED = 0.02
+"""Fraction of a pixel that a shift may be rounded by without a warning."""
+
+
+class Rounding(NamedTuple):
+    """The shift (row, col) of an exposure, in pixels, before it was rounded to whole ones."""
+
+    exposure: int
+    shift: list[float]
+
+    @property
+    def words(self) -> str:
+        """What was rounded, and the limit."""
+        return (
+            f"shifts are rounded to whole pixels: that of exposure {self.exposure} (from 0) is "
+            f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole)"
+        )
+
+
+def nearest_whole(distance: Floats) -> Floats:
+    """Nearest whole numbers; of two that are equally near, but for rounding, the lower one.
+
+    As in the compiled part: a move of half a pixel is then the same from wherever it starts, and a
+    fraction that all shifts have in common is one half, not minus one half.
+    """
+    # What rounds to 0 from below is no −0.
+    return np.asarray(np.ceil(distance - (0.5 + ROUNDING)) + 0.0)
+
+
+def round_shifts(
+    shifts: Floats, std: ArrayLike | None = None
+) -> tuple[NDArray[np.int64], Rounding | None]:
+    """Shifts from the first one in whole pixels, and the largest rounding that is noticeable.
+
+    Parameters
+    ----------
+    shifts : ndarray, shape (n, 2)
+        Shifts (row, col) in pixels.
+    std : array_like, shape (n, 2), optional
+        Their standard errors, in pixels; 0 unless given.
+
+    Returns
+    -------
+    whole : ndarray, shape (n, 2), int64
+        The nearest whole moves from the first exposure; a tie goes to the lower one.
+    rounding : Rounding or None
+        Where a shift is more than 0.02 pixel and more than three standard errors from whole: it is
+        named as given.
+
+    Raises
+    ------
+    InputError
+        If a shift is not a finite number.
+    """
+    # A shift beyond any sensor, which the solver refuses, must still fit an integer.
+    exact = np.clip(as_shifts(shifts - shifts[0]), -_BEYOND, _BEYOND)
+    whole = nearest_whole(exact)
+    known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
+    change = np.abs(exact - whole)
+    change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
+    worst = int(change.max(axis=1).argmax())
+    rounding = Rounding(worst, shifts[worst].tolist()) if change[worst].any() else None
+    return whole.astype(np.int64), rounding
+
+
+def whole_moves(shifts: Floats) -> NDArray[np.int64]:
+    """Whole shifts that differ from the first one by the nearest whole numbers of pixels.
+
+    A part of a pixel that all shifts have in common moves the grid of the beam along.
+    """
+    return round_shifts(shifts)[0] + nearest_whole(shifts[0]).astype(np.int64)

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from equipix._check import Array
 from equipix.errors import FileError
-from equipix.hardware.content import DTYPES, Content, header, made, read_header
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from equipix._types import Array
-    from equipix.hardware.words import Format
+from equipix.hardware.table_files import DTYPES, Content, header, made, read_header
+from equipix.hardware.words import Format
 
 _FIRST = "/* equipix table: "
 
@@ -61,7 +57,7 @@ static inline uint16_t {lower}_apply(uint16_t x, uint32_t p)
 _ROUNDING = "sum = (sum + {half} - 1 + ((sum >> {bits}) & 1)) >> {bits}; /* half to even */"
 
 
-def encoded(content: Content, name: str) -> bytes:
+def to_c_header(content: Content, name: str) -> bytes:
     """Bytes of a file, whose C names begin with ``equipix_`` and its name."""
     lower = "equipix_" + re.sub(r"\W", "_", name, flags=re.ASCII).lower()
     upper = lower.upper()
@@ -116,7 +112,7 @@ def _last(upper: str, above: str) -> str:
     return f"#endif /* {upper}_H, {_DIGEST} {digest} */"
 
 
-def decoded(path: Path, data: bytes) -> Content:
+def from_c_header(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     text = data.decode().replace("\r\n", "\n").rstrip()
     first = text.split("\n", 1)[0].rstrip()

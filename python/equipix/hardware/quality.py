@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import as_array, naming_memory, number
+from equipix._check import Array, as_array, naming_memory, number
+from equipix.correction.protocol import Correction
 from equipix.errors import InputError
-from equipix.flags import usable
+from equipix.findings import usable
 from equipix.hardware.table import Table
 from equipix.hardware.words import check_width
-from equipix.metrics import Correctability, correctability
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Array
-    from equipix.correction.protocol import Correction
+from equipix.metrics import correctability
+from equipix.metrics.correctability import Correctability
 
 _WIDTHS = range(8, 17)
+
 _BOTH = 16
 """Width of the words that are not varied."""
 

@@ -1,31 +1,38 @@
-"""A correction as words for a camera's electronics."""
+"""A table of words: made, applied, written, read."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import as_array, positive_workers
-from equipix._readonly import ReadOnly
-from equipix.colour import Colours
+from equipix import _native
+from equipix._check import (
+    Array,
+    Bools,
+    Flagged,
+    Floats,
+    ReadOnly,
+    as_array,
+    naming_memory,
+    number,
+    positive_workers,
+)
 from equipix.correction.apply import apply
-from equipix.errors import InputError
-from equipix.flags import usable
-from equipix.hardware.content import Content, check_words
-from equipix.hardware.files import write
-from equipix.hardware.making import content_of
-from equipix.hardware.signal import Applied, applied, digitised
-from equipix.hardware.words import Format
-
-if TYPE_CHECKING:
-    from os import PathLike
-
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Array, Flagged, Floats
-    from equipix.correction.protocol import Correction
+from equipix.correction.protocol import Correction, cfa_of, check_correction
+from equipix.errors import FileError, InputError
+from equipix.findings import usable
+from equipix.hardware import c_header, table_files
+from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
+from equipix.hardware.table_files import Content, check_words
+from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
+from equipix.io.paths import as_path, write_whole
+from equipix.measured.colour import Colours
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -300,3 +307,167 @@ class Table(ReadOnly):
         if raw.shape[-2:] != self.shape:
             raise InputError(f"'frames' has shape {raw.shape}, the table {self.shape}")
         return raw
+
+
+_FORMATS = {".bin": table_files, ".hex": table_files, ".h": c_header}
+
+SUFFIXES = tuple(_FORMATS)
+"""Suffixes of files of tables."""
+
+
+def write(content: Content, path: str | PathLike[str], *, force: bool) -> None:
+    """Write a file, which appears whole or not at all."""
+    file = as_path("path", path)
+    data = _FORMATS[_suffix(file)].encoded(content, file.stem)
+    with write_whole(path, force=force) as temporary:
+        temporary.write_bytes(data)
+
+
+def read_content(path: str | PathLike[str]) -> Content:
+    """Read what `write` wrote.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, holds something else, or is incomplete or of another version.
+    """
+    file = as_path("path", path)
+    kind = _FORMATS[_suffix(file)]
+    try:
+        content: Content = kind.decoded(file, file.read_bytes())
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{file}: cannot be read: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise FileError(f"{file}: is damaged or incomplete: {error}") from error
+    return content
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        raise InputError(f"'{path}' ends in none of {', '.join(SUFFIXES)}, which name the format")
+    return suffix
+
+
+def content_of(
+    correction: Correction,
+    widths: Mapping[str, int],
+    steps: Mapping[str, float | None],
+    *,
+    adc_step: float,
+    lowest: float,
+    linearise: tuple[float, float] | None,
+) -> Content:
+    """Make the parts of a table, as `Table.of` describes them.
+
+    Raises
+    ------
+    InputError
+        As of `Table.of`.
+    """
+    check_correction("correction", correction)
+    bits = {name: check_width(name, width) for name, width in widths.items()}
+    if not np.isfinite(number("lowest", lowest)):
+        raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
+    exponents = _exponents(exponent_of("adc_step", adc_step), steps, bits)
+    with naming_memory("making a table"):
+        offset, gain, sag = line_of(correction, linearise)
+        found = encode((offset, gain), correction.flags, bits, exponents, float(lowest))
+        refuse_far_offsets(found, (offset, gain), bits, exponents, float(lowest))
+    colours = cfa_of(correction)
+    metadata = {
+        **origin(correction),
+        **({} if colours is None else {"cfa": colours.rows}),
+        "lowest": float(lowest),
+        "largest_error_dn": found.largest_error,
+    }
+    if linearise is not None:
+        metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
+    return Content(found.format, found.coarse, found.offset, found.gain, found.flags, metadata)
+
+
+def _exponents(adc: int, steps: Mapping[str, float | None], bits: Mapping[str, int]) -> Steps:
+    """Exponents of the steps; unless given, the output has the range of the ADC."""
+    out = chosen_exponent("out_step", steps["out_step"])
+    return Steps(
+        adc,
+        chosen_exponent("dac_step", steps["dac_step"]),
+        chosen_exponent("offset_step", steps["offset_step"]),
+        chosen_exponent("gain_step", steps["gain_step"]),
+        adc + bits["adc_bits"] - bits["out_bits"] if out is None else out,
+    )
+
+
+def read(path: str | PathLike[str]) -> Table:
+    """Read a table from the file that `Table.save` wrote, bit by bit.
+
+    Parameters
+    ----------
+    path : str or path
+        The file; its suffix, .bin, .hex or .h, names the format.
+
+    Returns
+    -------
+    Table
+        As it was saved.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, holds something else, or is of another size or version.
+    InputError
+        If the suffix is another.
+    """
+    content = read_content(path)
+    try:
+        return Table(*content)
+    except InputError as error:
+        raise FileError(f"{path}: is damaged: {error}") from error
+
+
+class Applied(NamedTuple):
+    """Corrected words, and how many outputs were limited to 0 and to the largest word."""
+
+    words: Array
+    below: int
+    above: int
+
+
+def digitised(raw: Array, coarse: Array, used: Bools, f: Format) -> Array:
+    """Words of the ADC behind the subtracting amplifier, as `Table.digitise` describes them."""
+    pedestal = np.ldexp(coarse.astype(np.float64), f.coarse)
+    words = np.empty(raw.shape, np.uint16)
+    for source, target in zip(_each(raw), _each(words), strict=True):
+        lost = int(np.count_nonzero(~np.isfinite(source) & used))
+        if lost:
+            raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
+        steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
+        target[...] = np.clip(steps, 0, f.largest_word)
+    return words
+
+
+def applied(raw: Array, gain: Array, offset: Array, f: Format, workers: int | None) -> Applied:
+    """Correct words of the ADC, and count the outputs that were limited."""
+    if raw.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
+            "table.digitise(frames) makes them of raw values"
+        )
+    words = np.ascontiguousarray(raw, np.uint16)
+    out = np.empty(words.shape, np.uint16)
+    stack = (-1, *gain.shape)
+    below, above = _native.apply_words(
+        words.reshape(stack),
+        np.ascontiguousarray(gain),
+        np.ascontiguousarray(offset),
+        out.reshape(stack),
+        f.arithmetic,
+        workers=workers,
+    )
+    return Applied(out, below, above)
+
+
+def _each(stack: Array) -> Array:
+    return stack[None] if stack.ndim == 2 else stack

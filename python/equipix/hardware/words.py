@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equipix._check import number
+from equipix._check import Floats, number
 from equipix.errors import InputError
-
-if TYPE_CHECKING:
-    from equipix._types import Floats
 
 _NARROWEST, WIDEST = 8, 16
 """Widths of words, in bits."""

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from equipix.io.reading import reading
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
+from equipix.io.paths import reading
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
 _LEVEL = 6  # of the compression
+
 _KEYWORD = b"Description\0"
+
 _LONGEST = 4096  # bytes of text that are read
 
 

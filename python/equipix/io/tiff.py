@@ -5,26 +5,28 @@ The only module that imports tifffile.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from equipix.errors import FileError
-from equipix.io.reading import reading
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from os import PathLike
-    from pathlib import Path
-
-    from numpy.typing import NDArray
+from equipix.io.paths import reading
 
 _PAGE_NAME = 285  # TIFF tag
+
 _PAGE_NUMBER = 297  # TIFF tag: number from 0, and how many there are
+
 _SUBFILE_TYPE = 255  # TIFF tag
+
 _PHOTOMETRIC = 262  # TIFF tag
+
 _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
+
 _TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that leave space for the directories
 
 

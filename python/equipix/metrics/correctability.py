@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import as_array, naming_memory, number
+from equipix._check import Bools, Floats, as_array, naming_memory, number
 from equipix.errors import InputError
-from equipix.metrics.moments import signed_root, stack_of, temporal_of, warn_of_drift
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Bools, Floats
+from equipix.metrics.frame_noise import signed_root, stack_of, temporal_of, warn_of_drift
 
 
 @dataclass(frozen=True)

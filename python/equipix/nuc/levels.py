@@ -1,34 +1,26 @@
-"""Levels of a uniform source: mean frames, the array's mean of each, and their noise."""
+"""Levels of a uniform source: references, noise, usable pixels."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._readonly import ReadOnly
-from equipix.colour import Colours
-from equipix.defects import SIGMAS, Findings, response_outliers
+from equipix._check import Array, Bools, Floats, ReadOnly, Words, as_mask, union
 from equipix.errors import BrightDarkWarning, DriftWarning, InputError, MisfitWarning, warn
-from equipix.exposures.averaged import Averaged, Words
-from equipix.exposures.front import as_mask, measured_of, union
-from equipix.frames import FrameStatistics
-from equipix.mosaic import Filters
-from equipix.noise import MEDIAN_SQUARE, NoiseModel
-from equipix.nuc.arguments import check_levels, check_variance
-from equipix.nuc.saturation import check_saturation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Self
-
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Array, Bools, Floats
-    from equipix.exposures.front import Measured
+from equipix.measured.colour import Colours
+from equipix.measured.defects import SIGMAS, Findings, response_outliers
+from equipix.measured.filters import Filters
+from equipix.measured.means import Averaged
+from equipix.measured.measured import Measured, check_levels, check_variance, measured_of
+from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
+from equipix.measured.statistics import FrameStatistics
+from equipix.nuc.level_rules import check_saturation
 
 _LEVELS = Words("'levels'", "level")
 
@@ -439,3 +431,32 @@ def _cause(values: Array, missing: Sequence[float], odd: float) -> str:
         f"the medians of the levels are {means} DN: give levels that differ by more than the "
         "noise, and the noise of these frames"
     )
+
+
+_FEW = 0.05
+"""Largest share of pixels that are left out because they deviate from the others."""
+
+
+def alike_pixels(squares: Floats) -> Bools:
+    """Find pixels that do not deviate from the others.
+
+    Parameters
+    ----------
+    squares : ndarray, shape (orders, pixels)
+        Mean square residual of each pixel at each order.
+
+    Returns
+    -------
+    ndarray of bool, shape (pixels,)
+        False where at some order it is above 36 times the variance of the normal variable whose
+        square has the median of the array; of more than one pixel in twenty, for those that deviate
+        most.
+    """
+    limits = SIGMAS**2 / MEDIAN_SQUARE * np.median(squares, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # the median of exact levels may be 0
+        excess = np.nan_to_num(squares / limits[:, None], posinf=0).max(axis=0)
+    most = int(_FEW * excess.size)
+    if not most:
+        return np.ones(excess.size, bool)
+    # Of more than `most`, those that deviate most are left out.
+    return np.asarray(excess <= max(1.0, float(np.partition(excess, -most - 1)[-most - 1])))

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
-from equipix._check import check_word, described
-from equipix._types import By, Order
+from equipix._check import Array, By, Floats, Order, check_word, described
 from equipix.errors import InputError
-from equipix.nuc.alike import alike_pixels
-from equipix.nuc.curve import response_at
-
-if TYPE_CHECKING:
-    from equipix._types import Array, Floats
-    from equipix.nuc.levels import Levels
+from equipix.nuc.curves import response_at
+from equipix.nuc.levels import Levels, alike_pixels
 
 FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
 """Name of the form of each order above 0, whose form is named by what is corrected."""

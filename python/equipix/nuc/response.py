@@ -1,33 +1,26 @@
-"""Response curves of pixels and the correction that inverts them: the result of `fit`."""
+"""Response curves as a correction, and files of them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from os import PathLike
+from typing import Any, Literal, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import as_array, naming_memory
-from equipix._readonly import ReadOnly
+from equipix._check import Array, Bools, Flagged, Floats, ReadOnly, as_array, naming_memory
 from equipix.correction.apply import apply, apply_polynomial, dark_frame, is_stored
-from equipix.correction.depth import depth_of
-from equipix.correction.protocol import cfa_of, named_cfa
+from equipix.correction.protocol import cfa_of, depth_of, named_cfa
 from equipix.errors import InputError
-from equipix.flags import usable
-from equipix.nuc.curve import counted_from, response_at
-from equipix.nuc.inverse import exact_inverse
-from equipix.nuc.saved import save_fields
-
-if TYPE_CHECKING:
-    from os import PathLike
-    from typing import Self
-
-    from numpy.typing import ArrayLike
-
-    from equipix._types import Array, Bools, Flagged, Floats
-    from equipix.colour import Colours
-    from equipix.frames import FrameStatistics
-
+from equipix.findings import usable
+from equipix.io.formats import save_pages
+from equipix.io.record import check_format, check_pages
+from equipix.measured.colour import Colours
+from equipix.measured.noise import median_of_noise
+from equipix.measured.statistics import FrameStatistics
+from equipix.nuc.curves import counted_from, exact_inverse, response_at
 
 _LARGEST = int(np.iinfo(np.uint32).max)
 """Largest number of the flags of a pixel."""
@@ -328,3 +321,97 @@ class Response(ReadOnly):
                 "fitted to levels from which no dark was subtracted"
             )
         return dark_frame(dark, self.shape)
+
+
+def common_misfit(response: Response) -> float:
+    """Median over usable pixels of reduced χ², over the median that noise alone has.
+
+    At most its mean: where rounding is above the noise residuals have few different values, and
+    their median may be any of them.
+    """
+    if response.metadata.get("options", {}).get("weights") != "variances":
+        return float("nan")
+    judged = usable(response.flags) & (response.freedom > 0)
+    if not judged.any():
+        return float("nan")
+    noise = median_of_noise(response.freedom[judged])
+    chi2 = response.reduced_chi2[judged]
+    return float(min(np.median(chi2 / noise), chi2.mean()))
+
+
+KIND = "response"
+"""The kind in the metadata of the file."""
+
+FORMAT = 1
+"""Number of the file format; a file with a higher one is refused."""
+
+_MAPS: dict[str, type] = {
+    "flags": np.uint32,
+    "inverse_error": np.float64,
+    "reduced_chi2": np.float64,
+    "used": np.uint32,
+}
+
+_STACKS: dict[str, type] = dict.fromkeys(
+    ("deviation", "variances", "inverse", "limits"), np.float64
+)
+
+
+def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
+    """Write the attributes of a `Response` to a file; see `Response.save`."""
+    pages = {name: fields[name] for name in (*_STACKS, *_MAPS)}
+    if fields["dark"] is not None:
+        pages["dark"] = fields["dark"]
+    content = {
+        "format": FORMAT,
+        "kind": KIND,
+        "levels": fields["levels"].tolist(),
+        "raw": fields["raw"],
+        "saturation": fields["saturation"],
+        "metadata": fields["metadata"],
+    }
+    if fields["cfa"] is not None:
+        content["cfa"] = fields["cfa"].rows
+        content["colour_response"] = fields["colour_response"]
+    save_pages(path, pages, content, force=force)
+
+
+def read_fields(
+    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
+) -> dict[str, Any]:
+    """Make the attributes of a `Response` of the arrays and metadata that `save_fields` wrote.
+
+    Raises
+    ------
+    FileError
+        If the format is newer than `FORMAT`, or a page is missing or does not fit.
+    KeyError, TypeError, ValueError
+        If a number is missing or is something else.
+    """
+    check_format(path, content, KIND, FORMAT)
+    maps = _MAPS | dict.fromkeys({"dark"} & pages.keys(), np.floating)
+    check_pages(path, pages, maps, _STACKS)
+    sizes = {name: len(pages[name]) for name in _STACKS}
+    orders = range(1, 5)
+    if sizes["deviation"] not in orders or sizes["variances"] != sizes["deviation"]:
+        raise ValueError(f"stacks of {sizes} images, expected a deviation of 1 to 4")
+    if sizes["inverse"] != (2 if sizes["deviation"] < 3 else 4) or sizes["limits"] != 2:
+        raise ValueError(f"stacks of {sizes} images, expected an inverse of 2 or 4 and 2 limits")
+    level = content["saturation"]
+    return {
+        **{name: pages[name] for name in (*_MAPS, *_STACKS)},
+        "dark": pages.get("dark"),
+        "levels": np.array(content["levels"], dtype=np.float64),
+        "raw": bool(content["raw"]),
+        "saturation": None if level is None else float(level),
+        "metadata": content["metadata"],
+        "cfa": Colours.of(content.get("cfa")),
+        "colour_response": content.get("colour_response"),
+    }
+
+
+def read_response(
+    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
+) -> Response:
+    """Make a response of the arrays and metadata of the file that `Response.save` wrote."""
+    return Response(**read_fields(path, pages, content))

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from equipix.errors import EquipixError, InputError
-from equipix.io import write_whole
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
+from equipix.io.paths import write_whole
 
 CALIBRATION, FLAT_FIELD, PREDICTION = "C0", "C1", "black"
 """Colours of what is drawn in several pictures."""

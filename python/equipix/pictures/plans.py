@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from equipix.pictures.canvas import CALIBRATION, draw_map, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from equipix.plan import ErrorBudget
+from equipix.plan.budget import ErrorBudget
 
 
 def draw_plans(budgets: list[ErrorBudget]) -> Figure:

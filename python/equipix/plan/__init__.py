@@ -1,10 +1,10 @@
 """Planning of an experiment: which pixels shifts compare, and which errors remain."""
 
 from equipix.plan.budget import ErrorBudget, error_budget
-from equipix.plan.identifiability import Identifiability, identify
-from equipix.plan.order import advise_order, distinct_trend
+from equipix.plan.components import Identifiability, identify
+from equipix.plan.drift import advise_order, tilt_std
+from equipix.plan.pattern_errors import Spectrum
 from equipix.plan.search import Suggestion, suggest
-from equipix.plan.spectrum import Spectrum
 
 __all__ = [
     "ErrorBudget",
@@ -12,8 +12,8 @@ __all__ = [
     "Spectrum",
     "Suggestion",
     "advise_order",
-    "distinct_trend",
     "error_budget",
     "identify",
     "suggest",
+    "tilt_std",
 ]

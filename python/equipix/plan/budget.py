@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_shifts, check_shape, number, per_exposure
-from equipix.drift import tilt_rms, tilt_std
+from equipix._check import Floats, as_shifts, check_shape, number, per_exposure
 from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError, warn
-from equipix.plan.identifiability import identify, is_connected
-from equipix.plan.noise import factor, local_variance
-from equipix.plan.order import distinct_trend
-from equipix.plan.shift_errors import shift_error_effect
-from equipix.plan.spectrum import Spectrum, smallest_near, spectrum
-from equipix.shifts import whole_moves
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Floats
+from equipix.exposures.positions import whole_moves
+from equipix.plan.components import identify, is_connected
+from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
+from equipix.plan.pattern_errors import (
+    Spectrum,
+    factor,
+    local_variance,
+    shift_error_effect,
+    smallest_near,
+    spectrum,
+)
 
 _WHOLE = 0.02
 """Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
@@ -195,7 +193,7 @@ def error_budget(
     components = _components(sizes, positions, _between_pixels(exact, waves))
     scale = noise**2 * factor(sizes, positions, powers)
     predicted = _Noise(sizes, positions, powers, beam_width, scale)
-    drift_tilt = tilt_std(sizes, exact, drift)
+    drift_tilt = tilt_of_fluxes(sizes, exact, drift)
     moved: tuple[float, tuple[float, float]] = (0.0, (0.0, 0.0))
     if beam_width is not None and shift_error:
         moved = shift_error_effect(sizes, exact, powers, beam_width, shift_error)

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, check_progress, check_shape, positive_count
-from equipix._types import Floats, Progress
-from equipix.colour import Colours
-from equipix.drift import tilt_rms, tilt_std
+from equipix._check import Floats, Progress, as_array, check_progress, check_shape, positive_count
 from equipix.errors import DriftWarning, InputError
+from equipix.measured.colour import Colours
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
-from equipix.plan.identifiability import is_connected
-from equipix.plan.order import advise_order
+from equipix.plan.components import is_connected
+from equipix.plan.drift import advise_order, tilt_of_fluxes, tilt_rms
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+Points = NDArray[np.int64]
 
-    Points = NDArray[np.int64]
-    Random = np.random.Generator
+Random = np.random.Generator
 
 _STARTS, _FINALISTS = 10, 6
 """Searches from different patterns, and how many of their ends get a full error budget."""
@@ -253,7 +250,7 @@ class _Score:
         if len(visible) > _WAVES:
             inverse *= 1 + _PERIODIC / visible[_WAVES:].min(axis=0)
         noise = self._noise**2 * inverse * (1 - 1 / count) * rest
-        drift = tilt_rms(tilt_std(self._shape, patterns, self._drift))
+        drift = tilt_rms(tilt_of_fluxes(self._shape, patterns, self._drift))
         return np.asarray(np.sqrt(noise + drift**2))
 
     def _cells(self, spans: Points, count: int) -> Floats:

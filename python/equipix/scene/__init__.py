@@ -1,10 +1,15 @@
 """Correction of non-uniformity from the scene, frame by frame, without a source."""
 
-from equipix.scene.adaptive import SceneCorrection
-from equipix.scene.descent import Gated, LocalMean
-from equipix.scene.loading import METHODS, load
-from equipix.scene.registered import Registered
-from equipix.scene.statistics import ConstantStatistics, Kalman
+from equipix.scene.methods import (
+    METHODS,
+    ConstantStatistics,
+    Gated,
+    Kalman,
+    LocalMean,
+    Registered,
+    load,
+)
+from equipix.scene.scene_correction import SceneCorrection
 
 __all__ = [
     "METHODS",

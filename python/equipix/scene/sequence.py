@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from equipix._check import check_progress
-from equipix.correction.files import warn_of_corrected
+from equipix._check import Array, Progress, check_progress
+from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
-from equipix.io import (
-    find_files,
-    frame_format,
-    refuse_inputs,
-    refuse_saved,
-    stream_frames,
-    write_frames,
-    write_whole,
-)
-from equipix.metrics import roughness
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from equipix._types import Array, Progress
-    from equipix.scene.adaptive import SceneCorrection
+from equipix.io.formats import refuse_saved
+from equipix.io.frames import frame_format, stream_frames
+from equipix.io.paths import find_files, refuse_inputs, write_whole
+from equipix.io.tiff import write_frames
+from equipix.metrics.maps import roughness
+from equipix.scene.scene_correction import SceneCorrection
 
 _POINTS = 50
 """Most frames of which the quality is found."""
@@ -36,7 +27,7 @@ _MARK = "corrected by equipix from the scene"
 
 
 @dataclass(frozen=True)
-class Sequence:
+class SequenceResult:
     """What a sequence went through.
 
     Attributes
@@ -95,7 +86,7 @@ def run_sequence(
     output: Path | None = None,
     force: bool = False,
     progress: Progress | None = None,
-) -> Sequence:
+) -> SequenceResult:
     """Take the frames of files in order, holding a few at a time.
 
     Parameters
@@ -169,7 +160,7 @@ class _Record:
         if finite and (self.done % self._every == 0 or self.done == 1):
             self._points.append((self.done, roughness(raw), roughness(corrected)))
 
-    def sequence(self) -> Sequence:
+    def sequence(self) -> SequenceResult:
         """What was recorded."""
         if self._last is None:
             raise FileError("no frame holds finite values that differ: nothing to learn from")
@@ -177,7 +168,7 @@ class _Record:
         if not self._points or self._points[-1][0] != number:
             self._points.append((number, roughness(last), roughness(after)))
         points, raw, corrected = zip(*self._points, strict=True)
-        return Sequence(self.done, points, raw, corrected, last.copy())
+        return SequenceResult(self.done, points, raw, corrected, last.copy())
 
 
 def _corrected(

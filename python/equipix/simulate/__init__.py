@@ -1,12 +1,8 @@
 """Virtual sensors, beams and cameras: experiments whose truth is known."""
 
-from equipix.maps import block_means, relative_error
-from equipix.simulate import blackbody
+from equipix.metrics.maps import block_means, relative_error
 from equipix.simulate.accuracy import noise_prediction
-from equipix.simulate.camera import Camera
-from equipix.simulate.moving import Frame, MovingScene
-from equipix.simulate.rig import Truth, VirtualExperiment, experiment
-from equipix.simulate.signal import (
+from equipix.simulate.beams import (
     Beam,
     cosine_sensitivity,
     exposures,
@@ -17,6 +13,9 @@ from equipix.simulate.signal import (
     tilted_beam,
     wavy_beam,
 )
+from equipix.simulate.camera import Camera
+from equipix.simulate.moving import Frame, MovingScene
+from equipix.simulate.rig import Truth, VirtualExperiment, experiment
 from equipix.simulate.staring import StaringArray
 
 __all__ = [
@@ -27,7 +26,6 @@ __all__ = [
     "StaringArray",
     "Truth",
     "VirtualExperiment",
-    "blackbody",
     "block_means",
     "cosine_sensitivity",
     "experiment",

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, as_shifts
+from equipix._check import Floats, Rng, as_array, as_shifts
 from equipix.errors import InputError
-from equipix.maps import rms_at_both_scales
-from equipix.shifts import whole_moves
-from equipix.simulate.signal import exposures
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix.simulate.signal import Beam
-from equipix._types import Floats, Rng
+from equipix.exposures.positions import whole_moves
+from equipix.metrics.maps import rms_at_both_scales
+from equipix.simulate.beams import Beam, exposures
 
 
 def noise_prediction(

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, check_bit_depth
+from equipix._check import Floats, Rng, as_array, check_bit_depth
 from equipix.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Floats, Rng
 
 Pixels: TypeAlias = "NDArray[np.int64]"
 

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, as_shifts
-from equipix.colour import Colours
+from equipix._check import Floats, Progress, Rng, as_array, as_shifts
 from equipix.errors import InputError
-from equipix.io import as_path
-from equipix.rounding import UNIFORM, scatter, unaveraged
+from equipix.io.paths import as_path
+from equipix.measured.colour import Colours
+from equipix.measured.noise import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
-from equipix.simulate.camera import Camera
-from equipix.simulate.signal import Beam, filtered, window
-from equipix.simulate.store import Recording, Stream, write_experiment
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Floats, Progress, Rng
-    from equipix.simulate.camera import Pixels
+from equipix.simulate.beams import Beam, filtered, window
+from equipix.simulate.camera import Camera, Pixels
+from equipix.simulate.recording import Recording, Stream, write_experiment
 
 FULL_SCALE_E = 20_000.0
 """Electrons that fill the range of the ADC where no gain is given."""
@@ -142,7 +136,7 @@ class VirtualExperiment:
     def variance_of_mean(self) -> Floats:
         """Variance of the dark-subtracted mean of each exposure, (n, rows, cols), in DN².
 
-        What frames do not average out of the rounding is included: see `equipix.rounding`.
+        What frames do not average out of the rounding is included: see `equipix.measured.noise`.
         """
         shape = self.camera.shape
         dark = self._of_mean(np.zeros(shape), self.dark_count)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, check_bit_depth, check_shape
+from equipix._check import Floats, Rng, as_array, check_bit_depth, check_shape
+from equipix.detector.photons import band_photons
 from equipix.errors import InputError
-from equipix.simulate.blackbody import band_photons
-from equipix.simulate.signal import filtered
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from equipix._types import Floats, Rng
+from equipix.simulate.beams import filtered
 
 _REFERENCE_K = 300.0
 """Temperature of a black body at which the mean light is given."""

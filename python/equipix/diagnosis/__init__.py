@@ -1,0 +1,1 @@
+"""What a fit and its residuals say about a calibration."""

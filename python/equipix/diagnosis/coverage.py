@@ -1,0 +1,120 @@
+"""How much of the sensor a fit determines, and why it is not more."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from equipix import _native
+from equipix._check import Array, Bools
+from equipix._native import Fit
+from equipix.diagnosis.rules import TOO_WEAK, fits_noise
+from equipix.exposures.exposures import Exposures
+from equipix.exposures.positions import whole_moves
+from equipix.findings import Flag, Verdict, usable
+from equipix.fitting.weighted import Weighted
+
+_LEAST = 0.5
+"""Least share of the pixels not masked by the caller that a calibration must determine."""
+
+_LARGEST_ERROR = 1.0
+"""Largest estimated relative error of M: above it, M is not determined to its first digit."""
+
+_FEWEST = 3
+"""Fewest exposures that compare pixels along both axes."""
+
+
+def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> list[Verdict]:
+    """Add the verdict on a fit that determines less than half of the pixels that are not masked.
+
+    It stands in the place of that on components, which it contains. A fit that ended far from its
+    minimum determines none.
+    """
+    if not float(weighted.fit.error_estimate[-1]) <= _LARGEST_ERROR:
+        return [Verdict("partial", _far(weighted.fit)), *found]
+    wanted = _wanted(weighted.exposures)
+    determined = usable(flags) & wanted
+    count, total = int(determined.sum()), int(wanted.sum())
+    if count >= _LEAST * total:
+        return found
+    text = (
+        f"the exposures determine only {count} of {total} unmasked pixels (limit {_LEAST:.0%}): "
+        f"{_cause(weighted, wanted & ~determined, flags)}"
+    )
+    return [Verdict("partial", text), *(each for each in found if each.kind != "components")]
+
+
+def _far(fit: Fit) -> str:
+    """Return the words on a fit that ended far from its minimum."""
+    more = "use larger shifts in a beam with more structure"
+    if fit.lost:
+        more += ", or masks with smooth edges"
+    if fit.ended == "sweeps used":
+        more = f"allow more sweeps, or {more}"
+    return (
+        "the fit ended far from its minimum, and determines no pixel (estimated relative error "
+        f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): "
+        f"{TOO_WEAK if fits_noise(fit) and not fit.lost else more}"
+    )
+
+
+def _wanted(exposures: Exposures) -> Bools:
+    """Pixels that the caller has not masked: with a usable value, or found bad or saturated."""
+    wanted = np.zeros(exposures.shape, bool)
+    for k in range(len(exposures)):
+        wanted |= exposures.usable(k)
+    for found in vars(exposures.findings).values():
+        if found is not None:
+            wanted |= found
+    return wanted
+
+
+def _cause(weighted: Weighted, missing: Bools, flags: Array) -> str:
+    """Return what most of the missing pixels have in common, and the remedy."""
+    exposures, fit = weighted.exposures, weighted.fit
+    if _most(missing, exposures.findings.saturated):
+        return (
+            "most of the others reach the saturation level: expose less, or correct the level "
+            "('saturation', 'bit_depth')"
+        )
+    if _most(missing, (flags & (Flag.DEAD | Flag.HOT)) != 0):
+        return (
+            "most of the others count as dead, hot or noisy: check the dark frames, and the gain "
+            "if it is given"
+        )
+    if _most(missing, (flags & Flag.UNRELIABLE_FLAT) != 0):
+        return "most of the others receive almost no light: mask them, or use more light"
+    return _cause_in_shifts(exposures, fit.components)
+
+
+def _most(missing: Bools, found: Bools | None) -> bool:
+    """Whether a finding is of most of the missing pixels."""
+    return found is not None and 2 * int((missing & found).sum()) > int(missing.sum())
+
+
+def _cause_in_shifts(exposures: Exposures, components: int) -> str:
+    """Return why the shifts leave pixels unconnected."""
+    shifts, count = exposures.positions.shifts, len(exposures)
+    away = shifts - shifts[0]
+    turned = len(set(exposures.positions.rotation.tolist())) > 1
+    result = f"the shifts leave {components} parts of the sensor unconnected"
+    if not away.any() and not turned:
+        return f"{result}, since they are all alike: move the sensor between exposures"
+    if count < _FEWEST:
+        return (
+            f"{result}, since {count} exposures compare pixels along one direction only: take at "
+            f"least {_FEWEST}, at positions that do not lie on one line"
+        )
+    if not turned and np.linalg.matrix_rank(away) < 2 <= min(exposures.shape):
+        return f"{result}, since they lie on one line: move the sensor along the other axis too"
+    if _mask_separates(exposures):
+        return f"{result}, since pixels between them are masked or missing: use shorter shifts"
+    return f"{result}: choose other shifts, see equipix.plan.identify"
+
+
+def _mask_separates(exposures: Exposures) -> bool:
+    """Whether the same shifts connect most of a sensor without masked pixels."""
+    rotation = exposures.positions.rotation.tolist()
+    whole = whole_moves(exposures.positions.shifts)
+    _, counts, _ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
+    rows, cols = exposures.shape
+    return max(counts) >= _LEAST * rows * cols

@@ -1,0 +1,206 @@
+"""Verdicts on what was given, before any fit."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from equipix._check import Array, Bools
+from equipix.exposures.exposures import Exposures
+from equipix.exposures.positions import Positions, micrometre_step, nearest_whole
+from equipix.findings import Verdict
+from equipix.fitting.residuals import on_sensor
+from equipix.measured.saturation import clipping_advice
+
+_LEAST_MOVE = 0.5
+"""Least distance, in pixels, between shifts that are in pixels."""
+
+
+def on_input(exposures: Exposures) -> list[Verdict]:
+    """Verdicts on exposures that the values given contradict."""
+    found = [
+        _on_clipping(exposures),
+        _on_raw(exposures),
+        Verdict("light", exposures.unsteady) if exposures.unsteady else None,
+        _on_units(exposures),
+        _on_brightness(exposures),
+        _on_repeats(exposures),
+        _on_filters(exposures),
+    ]
+    return [verdict for verdict in found if verdict is not None]
+
+
+def _on_clipping(exposures: Exposures) -> Verdict | None:
+    """Verdict on a saturation level that is missing or too high."""
+    if exposures.clipped is None:
+        return None
+    return Verdict("saturation", clipping_advice(exposures.clipped))
+
+
+def _on_raw(exposures: Exposures) -> Verdict | None:
+    """Verdict on averages, or arrays as cameras write them, without a dark."""
+    if not exposures.raw:
+        return None
+    return Verdict(
+        "raw",
+        "no dark was subtracted from frames of whole numbers, so that an offset of the camera "
+        "counts as light: give 'dark' to equipix.average (--dark), or subtract it before",
+    )
+
+
+def _on_units(exposures: Exposures) -> Verdict | None:
+    """Verdict on shifts that look like millimetres, or like micrometres."""
+    shifts = exposures.positions.shifts
+    most = float(np.ptp(shifts, axis=0).max())
+    if 0 < most < _LEAST_MOVE:
+        return Verdict(
+            "unit",
+            f"the shifts differ by {most:.2g} pixel at most (limit {_LEAST_MOVE:g}), from which "
+            "next to nothing follows. Expected are pixels: divide millimetres by the pixel pitch, "
+            "see 'From micrometres to pixels' in README",
+        )
+    step = micrometre_step(shifts, exposures.shape)
+    if step is None:
+        return None
+    return Verdict(
+        "unit",
+        f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
+        f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
+        "pitch, see 'From micrometres to pixels' in README",
+    )
+
+
+def _on_brightness(exposures: Exposures) -> Verdict | None:
+    """Verdict on one exposure with far more or less light than its flux says."""
+    words = on_brightness(exposures)
+    return None if words is None else Verdict("flux", words)
+
+
+def _on_filters(exposures: Exposures) -> Verdict | None:
+    """Verdict on a pattern of colour filters, or of the read-out, that is not the one named."""
+    filters = exposures.filters
+    return Verdict("cfa", filters.words) if filters is not None and filters.words else None
+
+
+def _on_repeats(exposures: Exposures) -> Verdict | None:
+    """Verdict on one exposure that is given for two positions."""
+    pair = repeated(exposures.values, exposures.positions)
+    if pair is None:
+        return None
+    first, second = pair
+    return Verdict(
+        "repeated",
+        f"exposures {first} and {second} are equal, value for value, which noise prevents: give "
+        "each position its own frames, and see whether the sensor moved",
+    )
+
+
+_FAR, _BLACK = 1.5, 20.0
+"""Factors from which light contradicts a flux that is known, and one that is fitted. The latter is
+of an exposure without light, or of the others."""
+
+_FALL = 4.0
+"""Factor by which a sensitivity may fall from edge to edge, which compares as light does."""
+
+_STDS = 5.0
+"""Standard deviations of a prior that a flux does not reach."""
+
+_ROWS, _FEWEST = 256, 100
+"""Rows that are compared, and fewest pixels of two exposures in the same cells of the beam."""
+
+_CLEAR = 10.0
+"""Standard deviations of noise that the light of an exposure, over these pixels, must be."""
+
+
+def on_brightness(exposures: Exposures) -> str | None:
+    """Say which exposure has far more or less light than its flux says; None if not just one.
+
+    Wrong shifts in a steep beam make several exposures look so.
+    """
+    # Values with an offset are not proportional to light.
+    if exposures.offset or exposures.raw or len(set(exposures.positions.rotation.tolist())) > 1:
+        return None
+    shifts = on_sensor(exposures.positions)
+    away = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)
+    # The first may itself be black.
+    for middle in np.argsort(away, kind="stable")[:2].tolist():
+        moves = nearest_whole(shifts - shifts[middle]).astype(int)
+        found = _relative_light(exposures, middle, moves)
+        if np.isfinite(found).sum() >= 3 and np.nanmedian(found) > 0:
+            break
+    else:
+        return None
+    found /= np.nanmedian(found)
+    flux = exposures.flux
+    is_free = flux.kind in ("fit", "linear")
+    limit = np.maximum(_FAR, _FALL ** np.sum(np.abs(moves) / exposures.shape, axis=1))
+    limit = np.maximum(limit, _BLACK) if is_free else limit
+    if flux.std is not None:
+        limit = np.maximum(limit, np.exp(_STDS * flux.std))
+    (far,) = np.nonzero((found > limit) | (found < 1 / limit))
+    if len(far) != 1:
+        return None
+    (worst,) = far
+    given = "" if is_free else f", for its flux of {flux.values[worst]:g}"
+    return (
+        f"{exposures.name_of(int(worst))} has {max(found[worst], 0.0):.2g} times the light of the "
+        f"others in the same cells of the beam{given} (expected 1, limit {limit[worst]:.3g} or its "
+        "inverse): check its frames and its flux, or leave it out"
+    )
+
+
+def _relative_light(exposures: Exposures, middle: int, moves: Array) -> Array:
+    """Light of each exposure over that of the middle one, in cells that both see, for equal fluxes.
+
+    NaN of exposures that have too few of them in common.
+    """
+    step = max(1, exposures.shape[0] // _ROWS)
+    result = np.full(len(exposures), np.nan)
+    usable = exposures.usable(middle)
+    for k, move in enumerate(moves.tolist()):
+        here, there = (_common(each, exposures.shape, step) for each in (move, [-d for d in move]))
+        both = exposures.usable(k)[here] & usable[there]
+        if np.count_nonzero(both) < _FEWEST:
+            continue
+        own, other = exposures.values[k][here], exposures.values[middle][there]
+        light, usual = (float(np.sum(each, where=both, dtype=np.float64)) for each in (own, other))
+        ratio = exposures.flux.values[k] / exposures.flux.values[middle]
+        if usual * ratio > _CLEAR * max(_noise(own, both), ratio * _noise(other, both)):
+            result[k] = light / (usual * ratio)
+    return result
+
+
+def _noise(values: Array, used: Bools) -> float:
+    """Standard deviation of a sum of values, at most: of neighbours, which light changes too."""
+    both = used[:, 1:] & used[:, :-1]
+    steps = np.subtract(values[:, 1:], values[:, :-1], where=both, out=np.zeros(both.shape))
+    return float(np.sqrt(np.sum(steps**2) / 2))
+
+
+def _common(move: list[int], shape: tuple[int, int], step: int) -> tuple[slice, slice]:
+    """Rows, every `step`-th, and columns of a moved sensor that see what it saw before."""
+    (first, left), (end, right) = np.maximum(0, (np.negative(move), shape - np.maximum(move, 0)))
+    return slice(first, end, step), slice(left, right)
+
+
+_SAMPLED = 4096
+"""Values of an exposure that are compared before all are."""
+
+
+def repeated(values: Array, positions: Positions) -> tuple[int, int] | None:
+    """Indices of the first two exposures that are equal though the sensor moved, or None.
+
+    Equal exposures of a constant value are possible in a simulation without noise.
+    """
+    step = max(1, values[0].size // _SAMPLED)
+    samples = [each.ravel()[::step] for each in values]
+    for first, second in combinations(range(len(values)), 2):
+        has_moved = np.any(positions.shifts[first] != positions.shifts[second])
+        if not has_moved or not np.array_equal(samples[first], samples[second], equal_nan=True):
+            continue
+        known = samples[first][np.isfinite(samples[first])]
+        is_constant = known.size == 0 or np.ptp(known) == 0
+        if not is_constant and np.array_equal(values[first], values[second], equal_nan=True):
+            return first, second
+    return None

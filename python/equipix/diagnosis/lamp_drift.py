@@ -1,0 +1,223 @@
+"""What the data say of given fluxes: the drift of the lamp, and the tilt that it hides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from equipix._check import Array, Bools, Floats, ReadOnly
+from equipix.fitting.residuals import EXACT, FEWEST, Residuals, on_sensor, testable
+from equipix.fitting.stated_errors import flux_variance
+from equipix.fitting.weighted import Weighted
+from equipix.measured.noise import ROBUST, chi2_tail
+from equipix.plan.drift import affine_columns, slope_covariance, unit_times
+
+_WARNED = 1e-3
+"""Probability of a scatter of fluxes without drift below which `calibrate` warns."""
+
+_VISIBLE = 1e-6
+"""Share of the variance of a trend below which what it leaves is rounding."""
+
+_BLOCK, _FAR = 16, 5.0
+"""Columns of a block, and how many standard deviations off it is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drift(ReadOnly):
+    """Drift of the lamp against the fluxes that were given.
+
+    Attributes
+    ----------
+    size : float
+        Standard deviation ε of ln c of an exposure about what was given, that of noise subtracted;
+        0 where the fluxes scatter no more than noise lets them.
+    flux_std : float
+        Standard error of the flux of an exposure, by noise and by shifts that were not refined.
+    degrees_of_freedom : int
+        Number of combinations of fluxes that leave a residual, n − 3 (n − 4 for a linear trend).
+        Errors of the tilt over its standard deviation are at most as far out as those of Student's
+        t with so many: as t where the drift is above five standard errors, and between that and
+        the normal law where it is smaller.
+    probability : float
+        That fluxes scatter so much without drift.
+    slope_covariance : ndarray, shape (2, 2)
+        Covariance of the slope of ln M, per pixel, that such a drift hides.
+    tilt_std : ndarray, shape (2,)
+        Standard deviation of the hidden tilt, edge to edge (row, col), of independent errors.
+    trend_tilt : ndarray, shape (2,)
+        Size of the hidden tilt, edge to edge, if the lamp drifted linearly in the order of the
+        exposures and left this residual; 0 where the trend was fitted or leaves none.
+    """
+
+    size: float
+    flux_std: float
+    degrees_of_freedom: int
+    probability: float
+    slope_covariance: Floats
+    tilt_std: Floats
+    trend_tilt: Floats
+
+    @property
+    def is_added(self) -> bool:
+        """Whether error bars contain it: without a threshold, below which they were too small."""
+        return self.size > 0
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the data contradict the fluxes: `calibrate` warns."""
+        return self.probability < _WARNED
+
+    @property
+    def words(self) -> str:
+        """What is wrong, the value, the limit and the remedy."""
+        rows, cols = self.tilt_std
+        return (
+            f"the data contradict the fluxes: they differ from those given by {self.size:.1e}, rms "
+            f"(standard error {self.flux_std:.1e}, {self.degrees_of_freedom} degrees of freedom). "
+            "First check the shifts: in a smooth beam wrong ones look the same. A drift of the "
+            "lamp hides a tilt of the sensitivity, edge to edge, of probably "
+            f"{rows:.1e} along rows and {cols:.1e} along columns{self._words_of_trend}: give "
+            "fluxes of a monitor, or turn one exposure by 90 or 180 degrees and use flux='fit'"
+        )
+
+    @property
+    def _words_of_trend(self) -> str:
+        rows, cols = self.trend_tilt
+        if not np.any(self.trend_tilt > self.tilt_std):
+            return ""
+        return (
+            f" ({rows:.1e} and {cols:.1e} if it is linear in the order of the exposures: then give "
+            "'time' and flux='linear')"
+        )
+
+    def variance_of(self, weights: Floats, response: Floats) -> Floats:
+        """Variance of Σ weights · ln M by the hidden tilt, for each of a stack (m, rows, cols)."""
+        places = _places(response)
+        along = np.einsum("mrc,arc->ma", weights, places)
+        return np.asarray(np.einsum("ma,ab,mb->m", along, self.slope_covariance, along))
+
+    def variance_map(self, response: Floats) -> Floats:
+        """Variance of ln M in each pixel by the hidden tilt, in the gauge mean(M) = 1."""
+        places = _places(response)
+        return np.asarray(np.einsum("arc,ab,brc->rc", places, self.slope_covariance, places))
+
+
+def _places(response: Floats) -> Floats:
+    """Coordinates (2, rows, cols) from where a tilt leaves M as it is: its centre of gravity."""
+    places = np.indices(response.shape, dtype=np.float64)
+    known = np.isfinite(response)
+    weights = np.where(known, response, 0)
+    total = weights.sum()
+    return np.asarray(places - (np.sum(places * weights, axis=(1, 2)) / total)[:, None, None])
+
+
+def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
+    """Estimate the drift of the lamp from the residuals of a fit with given fluxes.
+
+    Parameters
+    ----------
+    weighted : Weighted
+        Exposures and their fit.
+    residuals : Residuals
+        Their residuals, or those of a sample.
+
+    Returns
+    -------
+    Drift or None
+        None where the fluxes were fitted freely or with a prior, where exposures are turned against
+        each other, with a fitted dark, where no combination of fluxes leaves a residual, and where
+        the fit is too far from its minimum.
+
+    Notes
+    -----
+    One linearised step with free fluxes. The slope of F gives b_k = Σ w m (y − m), m = c L M being
+    the expected signal, and the step is v = b/S, S_k = Σ w m² t. The share t of a measurement that
+    the beam does not take is (1 − 1/j)/(1 − 1/n), with j exposures that see its cell. Errors of
+    ln c that are affine in the shifts leave no residual: with P the projector on the other f
+    combinations, ε² = |P v|²/f less the variance of v. Without drift the sum of squares of P v over
+    their variances follows χ² of f degrees of freedom. The variance of v is that of noise and that
+    of shifts which have a prior and were not refined: the square of the mean slope of ln L times
+    the variance of the shift. Sums are over blocks of pixels; one whose own flux is far from the
+    median of its exposure is left out, so that dust looks like no drift.
+    """
+    exposures, fit = weighted.exposures, weighted.fit
+    turns = set(exposures.positions.rotation.tolist())
+    if exposures.offset or len(turns) > 1 or exposures.flux.kind not in ("known", "linear"):
+        return None
+    if fit.degrees_of_freedom < FEWEST or not residuals.inexactness <= EXACT:
+        return None
+    shifts = on_sensor(exposures.positions)
+    columns = affine_columns(shifts, exposures.flux.time)
+    freedom = len(shifts) - columns.shape[1]
+    if freedom < 1 or np.linalg.matrix_rank(columns) < columns.shape[1]:
+        return None
+    fluxes, variances = _free_fluxes(residuals, shifts, exposures.shape)
+    if not np.isfinite(variances).all():
+        return None
+    variances *= max(residuals.scale, weighted.reduced_chi2)
+    variances += _solver_error(fit.error_estimate[-1], shifts, exposures.shape) ** 2
+    variances += flux_variance(weighted, residuals)
+    roots = np.sqrt(variances)
+    scatter = _rest(columns / roots[:, None], fluxes / roots)
+    flux_std = float(np.sqrt(variances.mean()))
+    rest = _rest(columns, fluxes)
+    size = max(0.0, float(rest @ rest) / freedom - flux_std**2) ** 0.5
+    covariance = slope_covariance(shifts, size, exposures.flux.time)
+    tilt = np.sqrt(np.diag(covariance)) * exposures.shape
+    probability = chi2_tail(float(scatter @ scatter), freedom)
+    trend = np.abs(_slope_of_trend(columns, rest, exposures.flux.time)) * exposures.shape
+    return Drift(size, flux_std, freedom, probability, covariance, tilt, trend)
+
+
+def _free_fluxes(
+    residuals: Residuals, shifts: Floats, shape: tuple[int, int]
+) -> tuple[Floats, Floats]:
+    """Errors of ln c as given, and their variances where a value of weight 1 has variance 1."""
+    known = np.isfinite(residuals.values)
+    signal = np.where(known, residuals.signal, 0)
+    share = testable(residuals.rows, shifts, shape)
+    places = np.arange(0, shape[1], _BLOCK)
+    strengths, slopes = (
+        np.add.reduceat(each.sum(axis=2), places, axis=2)
+        for each in (signal**2 * share, np.where(known, residuals.values, 0) * signal)
+    )
+    agree = _agreeing(strengths, slopes)
+    strength, slope = (np.sum(each, axis=(1, 2), where=agree) for each in (strengths, slopes))
+    none = np.full(len(shifts), np.inf)
+    variances = np.divide(1.0, strength, where=strength > 0, out=none)
+    return np.asarray(np.divide(slope, strength, where=strength > 0, out=0 * slope)), variances
+
+
+def _agreeing(strengths: Floats, slopes: Floats) -> Bools:
+    """Blocks whose flux is near the median of their exposure: dust and reflections are no drift."""
+    known = strengths > 0
+    fluxes = np.divide(slopes, strengths, where=known, out=np.zeros_like(slopes))
+    centres = [
+        np.median(each[use]) if use.any() else 0 for each, use in zip(fluxes, known, strict=True)
+    ]
+    distances = np.abs(fluxes - np.reshape(centres, (-1, 1, 1))) * np.sqrt(np.maximum(strengths, 0))
+    scale = ROBUST * np.median(distances[known]) if known.any() else 0.0
+    return np.asarray(known & (distances <= _FAR * scale))
+
+
+def _slope_of_trend(columns: Floats, rest: Floats, time: Array | None) -> Floats:
+    """Slope of ln M (row, col) that a trend in the order of exposures hides if it leaves `rest`."""
+    order = unit_times(np.arange(len(columns)))
+    visible = _rest(columns, order)
+    if time is not None or not visible @ visible > _VISIBLE:
+        return np.zeros(2)
+    hidden = np.linalg.lstsq(columns, order, rcond=None)[0][1:3]
+    return np.asarray(hidden * (visible @ rest) / (visible @ visible))
+
+
+def _solver_error(error: float, shifts: Floats, shape: tuple[int, int]) -> float:
+    """Flux that an error of M of the sensor's own size leaves: its second difference."""
+    reach = np.ptp(shifts, axis=0) / np.maximum(shape, 1)
+    return float(error * np.sum((np.pi * reach) ** 2) / 2)
+
+
+def _rest(columns: Array, values: Array) -> Floats:
+    """What least squares along columns leaves."""
+    found = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return np.asarray(values - columns @ found)

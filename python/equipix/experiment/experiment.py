@@ -1,0 +1,301 @@
+"""A calibration experiment on disk, as experiment.toml describes it, and its evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from equipix._check import Bools, Floats, FluxModel, Method, Progress, as_mask, naming_memory, union
+from equipix.calibration.calibrate import calibrated
+from equipix.calibration.result import Calibration
+from equipix.errors import FileError, InputError, UnusedInputWarning, warn
+from equipix.experiment.aperture import Equalisation, measured_shifts
+from equipix.experiment.described import Described, excluded_pixels, provenance
+from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
+from equipix.experiment.manifest import Manifest, entry_files, read_manifest
+from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.fit import FitOptions
+from equipix.fitting.pixels import pixel_flags
+from equipix.fitting.weighted import Options, weighted_fit
+from equipix.measured.colour import Colours
+from equipix.measured.defects import hot_pixels
+from equipix.measured.means import Averaged
+from equipix.measured.statistics import FrameStatistics, refuse_subtracted
+
+_ROUGH = 1e-4
+"""Tolerance of the fit that the aperture's images are corrected by: 3e-5 pixel."""
+
+
+@dataclass(frozen=True)
+class Experiment(Described[Manifest]):
+    """Exposures of one steady beam at several sensor positions, as files on disk.
+
+    Attributes
+    ----------
+    path : Path
+        The experiment.toml.
+    manifest : Manifest
+        Its checked content.
+
+    See Also
+    --------
+    equipix.calibrate : The same for arrays in memory.
+
+    Notes
+    -----
+    Frames, dark frames and aperture images are named relative to the file: one file (a
+    multi-page TIFF holds many frames; a saved average stands for the frames that it was made of), a
+    glob or a list. ``[sensor]`` may exclude pixels by a mask
+    file and by regions. The position of an exposure is either
+    ``shift = [row, col]`` in pixels, or computed from the position before it and from images of
+    a small aperture in the beam, taken before and after the move.
+    """
+
+    @classmethod
+    def _read(cls, path: Path) -> Manifest:
+        return read_manifest(path)
+
+    def check_formats(self) -> None:
+        """Read the files' headers: all images must be of one shape and depth.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read or differs from the first dark frames.
+        """
+        check_formats(self._images())
+
+    def measure_shifts(
+        self, calibration: Calibration | None = None
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Shift of each exposure and its standard error.
+
+        Parameters
+        ----------
+        calibration : Calibration, optional
+            A first calibration from this experiment, which the images of the aperture are then
+            corrected by; its flagged pixels stay as they are.
+
+        Returns
+        -------
+        shifts : ndarray, shape (n, 2)
+            Absolute shifts (row, col) in pixels.
+        std : ndarray, shape (n, 2)
+            Standard errors; for shifts that the file gives those that it gives, or 0. Those of
+            successive moves add in quadrature, and so does the error of a centroid by the unequal
+            pixels under the spot: 0.008 pixel, or s/(2√π) where a calibration leaves them unequal
+            by s.
+
+        Raises
+        ------
+        FileError
+            If an aperture image cannot be read.
+        InputError
+            If one shows no usable spot; if the calibration was read from a file, holds no dark, or
+            is of another sensor.
+
+        Notes
+        -----
+        The aperture is fixed in the beam, at the coordinate u = A p + t + d: with
+        its image at p_before and p_after, d_new = d_old + (A_old p_before + t_old) −
+        (A_new p_after + t_new).
+        """
+        equalisation = None
+        if calibration is not None:
+            if calibration.weighted is None:
+                raise InputError(
+                    "'calibration' was read from a file, which does not hold the measurements: "
+                    "give the result of Experiment.run"
+                )
+            equalisation = Equalisation.of(calibration.weighted, calibration.flags)
+        options = FitOptions()
+        hot = self._hot(options) if self._is_moved() else None
+        if calibration is None and self.manifest.sensor.cfa is not None and self._is_moved():
+            dark = self._dark(options)
+            equalisation = Equalisation.of_colours(self._average(dark, options).filters, dark)
+        return measured_shifts(self.path, self.manifest, equalisation, hot=hot)
+
+    def _is_moved(self) -> bool:
+        """Whether a move is measured from images of the aperture."""
+        return any(exposure.shift is None for exposure in self.manifest.exposure[1:])
+
+    def _hot(self, options: FitOptions) -> Bools:
+        """Pixels that the dark frames show to be hot."""
+        return hot_pixels(self._dark(options), None)
+
+    def _dark(self, options: FitOptions) -> FrameStatistics:
+        frames = self.manifest.dark.frames
+        dark = self._statistics("dark", frames, None, options.workers, options.progress)
+        files = ", ".join(map(str, entry_files(self.path, frames)))
+        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
+        return dark
+
+    def run(
+        self,
+        *,
+        flux: FluxModel | None = None,
+        mask: ArrayLike | None = None,
+        robust: bool = False,
+        method: Method = "multiscale",
+        tolerance: float = 1e-6,
+        max_sweeps: int | None = None,
+        uncertainty: bool = False,
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> Calibration:
+        """Calibrate the sensor from the files.
+
+        Parameters
+        ----------
+        flux : {"fit", "linear"}, optional
+            Fluxes to find: one for each exposure, or linear in the file's ``time``. Unless given
+            they are those of the file, as known or, with ``flux_std``, as a prior.
+        mask : array_like of bool, shape (rows, cols) or (n, rows, cols), optional
+            True = do not use, besides the pixels that the file excludes.
+        robust : bool
+            Whether to leave out measurements that disagree with the others.
+        method : {"multiscale", "coordinate-descent"}
+            How to minimise the objective.
+        tolerance : float
+            Largest relative error of the sensitivity at which the solver stops.
+        max_sweeps : int, optional
+            Upper limit on passes over the data.
+        uncertainty : bool
+            Whether to find the standard deviation of every pixel and of the tilt.
+        workers : int, optional
+            Number of threads; by default one for each processor.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` repeatedly.
+
+        Returns
+        -------
+        Calibration
+            With the dark frame, the flags of dead, hot and saturated pixels, and in `metadata`
+            the names, the options, the hashes of the files and the times.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read, the images differ in size or depth, or two files have the same
+            content.
+        InputError
+            If an option is out of range, or the exposures do not make a calibration.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
+
+        Warns
+        -----
+        UnusedInputWarning
+            If the file has ``flux`` or ``time`` that `flux` leaves without use.
+
+        Notes
+        -----
+        Shifts with a standard error are refined, with it as their prior: see `calibrate`. Those
+        measured from images of an aperture are measured twice, the second time on images corrected
+        by a first calibration.
+        """
+        fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
+        options = Options(fit_options, robust=robust, uncertainty=uncertainty)
+        self._warn_of_unused(flux)
+        if flux == "linear" and self._column("time") is None:
+            raise InputError(
+                f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
+                "[[exposure]]"
+            )
+        self.check_formats()
+        excluded = self._excluded(mask)
+        hashes = sha256_of([self.path, *self.files()])
+        refuse_repeats(self.path, self.manifest, hashes)
+        dark = self._dark(fit_options)
+        hot = hot_pixels(dark, None)
+        averaged = self._average(dark, fit_options)
+        colours = Equalisation.of_colours(averaged.filters, dark)
+        shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
+        exposures = self._exposures(averaged, shifts, std, flux, excluded, fit_options)
+        start = None
+        if self._is_moved() and not fit_options.whole_shifts:
+            rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
+            first = weighted_fit(exposures, replace(options, fit=rough))
+            equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
+            shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
+            exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
+            start = first.fit
+        origin = provenance(self.path, self.manifest, hashes, shifts, std, averaged.noise)
+        return calibrated(exposures, options, start=start, provenance=origin)
+
+    def _warn_of_unused(self, flux: FluxModel | None) -> None:
+        """Warn of values in the file that the fluxes to find leave without use."""
+        if flux is not None and self._column("flux") is not None:
+            warn(
+                f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
+                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
+                UnusedInputWarning,
+            )
+        if flux != "linear" and self._column("time") is not None:
+            warn(
+                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
+                UnusedInputWarning,
+            )
+
+    def _excluded(self, mask: ArrayLike | None) -> Bools | None:
+        """Pixels that the file or the caller excludes."""
+        shape = check_formats(self._images()[:1])
+        given = None
+        if mask is not None:
+            given = as_mask(mask, (len(self.manifest.exposure), *shape))
+        return union(given, excluded_pixels(self.path, self.manifest, shape))
+
+    def _exposures(
+        self,
+        averaged: Averaged,
+        shifts: Floats,
+        std: Floats,
+        flux: FluxModel | None,
+        mask: Bools | None,
+        options: FitOptions,
+    ) -> Exposures:
+        """The exposures from averaged frames and the file."""
+        refined = std.any() and not options.whole_shifts
+        exposures = exposures_of(
+            averaged,
+            shifts,
+            mask=mask,
+            shift_std=std if refined else None,
+            flux=self._column("flux") if flux is None else flux,
+            flux_std=self._column("flux_std") if flux is None else None,
+            time=self._column("time") if flux == "linear" else None,
+            rotation=[exposure.rotation for exposure in self.manifest.exposure],
+        )
+        return exposures.whole(std) if options.whole_shifts else exposures
+
+    def _average(self, dark: FrameStatistics, options: FitOptions) -> Averaged:
+        """Mean signal of every exposure; the frames' other statistics are reduced at once."""
+        exposures = self.manifest.exposure
+        with naming_memory("averaging"):
+            sensor = self.manifest.sensor
+            averaged = Averaged(
+                len(exposures),
+                dtype=np.float32,
+                gain=sensor.gain_dn_per_e,
+                saturation=sensor.saturation_level,
+                saturation_key=sensor.saturation_key,
+                colours=Colours.of(sensor.cfa),
+            )
+            for each in exposures:
+                statistics = self._statistics(
+                    each.name, each.frames, dark, options.workers, options.progress
+                )
+                try:
+                    averaged.add(statistics, each.name)
+                except InputError as error:
+                    raise FileError(f"{self.path}: {error}") from error
+        return averaged
+
+    def _column(self, key: str) -> list[float] | None:
+        """The values of a key that all exposures have, or none."""
+        values = [getattr(exposure, key) for exposure in self.manifest.exposure]
+        return [value for value in values if value is not None] or None

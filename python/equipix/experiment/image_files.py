@@ -1,0 +1,166 @@
+"""Formats, repeats and hashes of image files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from equipix.errors import FileError
+from equipix.experiment.manifest import LevelManifest, Manifest, entry_files
+from equipix.io.frames import frame_format
+from equipix.measured.statistics import saved_shape
+
+
+def check_formats(files: Sequence[Path]) -> tuple[int, int]:
+    """Return the shape (rows, cols) that all files have.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or differs from the first in shape or depth.
+    """
+    first, *others = files
+    wanted, wanted_dtype = _format(first)
+    for file in others:
+        shape, dtype = _format(file)
+        wanted_dtype = wanted_dtype or dtype
+        if shape != wanted or dtype not in (None, wanted_dtype):
+            raise FileError(
+                f"{file}: holds {dtype or 'averaged'} frames of shape {shape}, expected "
+                f"{wanted_dtype or 'averaged'} of shape {wanted} as in {first}"
+            )
+    return wanted
+
+
+def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
+    """Rows, columns and dtype of the frames of a file; no dtype of frames averaged before."""
+    saved = saved_shape(file)
+    if saved is not None:
+        return saved, None
+    (_, rows, cols), dtype = frame_format(file)
+    return (rows, cols), dtype
+
+
+class Entry(NamedTuple):
+    """The files of one key of experiment.toml."""
+
+    key: str
+    exposure: str
+    files: list[Path]
+    kind: str = "exposure"
+
+    def __str__(self) -> str:
+        """Return the words for a message."""
+        return f"'{self.key}' of {self.kind} '{self.exposure}'" if self.exposure else "[dark]"
+
+
+def refuse_repeats(
+    path: Path, manifest: Manifest | LevelManifest, hashes: Mapping[Path, str] | None = None
+) -> None:
+    """Refuse a file that stands for two measurements, by its name or, with `hashes`, its content.
+
+    One image of the aperture may serve for two moves: it is after the one and before the other.
+    Dark frames may be equal, as those of a camera that shows 0 in the dark.
+
+    Raises
+    ------
+    FileError
+        With the file and where it stands.
+    """
+    entries = [*_entries(path, manifest)]
+    for entry in entries:
+        if hashes is None or entry.key != "dark":
+            for one, other in _alike(entry.files, entry.files, hashes, within=True):
+                raise FileError(f"{path}: {_words(one, other)} twice in {entry}")
+    for first, second in combinations(entries, 2):
+        images = "aperture" in first.key and "aperture" in second.key
+        if images and first.exposure != second.exposure:
+            continue
+        for one, other in _alike(first.files, second.files, hashes):
+            raise FileError(
+                f"{path}: {_words(one, other)} in {first} and in {second}: give each its own frames"
+            )
+
+
+def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
+    """Refuse a file that is averaged twice, by its name or its content, or as its own dark.
+
+    Raises
+    ------
+    FileError
+        With the file and where it stands.
+    """
+    for hashes in (None, sha256_of(dict.fromkeys([*frames, *dark]))):
+        for one, other in _alike(frames, frames, hashes, within=True):
+            raise FileError(f"{_words(one, other)} twice in the frames: give each once")
+        for one, other in _alike(frames, dark, hashes):
+            raise FileError(
+                f"{_words(one, other)} in the frames and in 'dark': give each its own frames"
+            )
+
+
+def image_files(path: Path, manifest: Manifest | LevelManifest) -> list[Path]:
+    """List the files of all measurements, each once."""
+    return list(dict.fromkeys(file for entry in _entries(path, manifest) for file in entry.files))
+
+
+def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
+    """Give the keys that name files of measurements, with the files."""
+    if manifest.dark is not None:
+        yield Entry("dark", "", entry_files(path, manifest.dark.frames))
+    if isinstance(manifest, LevelManifest):
+        for name, level in zip(manifest.names, manifest.level, strict=True):
+            yield Entry("frames", name, entry_files(path, level.frames), "level")
+        return
+    for exposure in manifest.exposure:
+        for key in ("frames", "aperture_before", "aperture_after"):
+            entry = getattr(exposure, key)
+            if entry is not None:
+                yield Entry(key, exposure.name, entry_files(path, entry))
+
+
+def _alike(
+    first: list[Path],
+    second: list[Path],
+    hashes: Mapping[Path, str] | None,
+    *,
+    within: bool = False,
+) -> Iterator[tuple[Path, Path]]:
+    """Give the pairs of the same file, or of the same content."""
+    seen: dict[object, Path] = {}
+    for file in first:
+        mark = file.resolve() if hashes is None else hashes[file]
+        if within and mark in seen:
+            yield seen[mark], file
+        seen.setdefault(mark, file)
+    if not within:
+        for file in second:
+            mark = file.resolve() if hashes is None else hashes[file]
+            if mark in seen:
+                yield seen[mark], file
+
+
+def _words(one: Path, other: Path) -> str:
+    if one == other:
+        return f"'{one.name}' stands"
+    return f"'{one.name}' and '{other.name}' are the same images, and stand"
+
+
+def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
+    """Hashes of the content of files."""
+    return {file: _sha256(file) for file in files}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def origin_of(correction: Path) -> str:
+    """Name a correction by the hash of its file, as corrected frames do."""
+    return f"correction sha256 {sha256_of([correction])[correction]}"

@@ -1,0 +1,1 @@
+"""Fits of exposures until the weights are final, and their error bars."""

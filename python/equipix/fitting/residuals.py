@@ -1,0 +1,247 @@
+"""A sample of residuals, and tests of it.
+
+Residuals of a right model are white. Tests take residuals (..., rows, cols), NaN where there are
+none: images of neighbouring pixels in their last two axes. None needs a variance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from equipix._check import Array, Bools, Floats
+from equipix._native import Fit
+from equipix.exposures.positions import Positions, in_beam, nearest_whole
+from equipix.fitting.weighted import Weighted
+from equipix.measured.noise import ROBUST, nanmedian_abs
+
+FEWEST = 1000
+"""Least degrees of freedom of a fit whose residuals say anything."""
+
+EXACT = 0.3
+"""Largest `Residuals.inexactness` at which F is as good as at its minimum."""
+
+SAMPLED = 2**18
+"""Measurements of a sample: a correlation of 1.2 % is then five standard errors."""
+
+_BAND = 32
+"""Rows of a band: several blocks of neighbours, and more than most shifts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals in bands of whole rows, spread evenly over the sensor.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, bands, rows of a band, cols)
+        (y − c L M)/σ; in the units of the frames where no variance is known. NaN where nothing is
+        measured or predicted.
+    light : ndarray of the same shape
+        c L.
+    response : ndarray of the same shape
+        M/σ.
+    rows : ndarray, shape (bands, rows of a band), int
+        The row of the sensor of each row.
+    share : float
+        Degrees of freedom of the fit over its measurements: the mean square of residuals where
+        variances are right.
+    scale : float
+        The variance of a value of weight 1, so the mean square of an error of measurement.
+    error : float
+        Estimated error of M.
+    """
+
+    values: Floats
+    light: Floats
+    response: Floats
+    rows: Array
+    share: float
+    scale: float
+    error: float
+
+    @property
+    def inexactness(self) -> float:
+        """Estimated error of M over the relative noise that the fit leaves.
+
+        F may still decrease by the order of its square. Infinite where there is no noise.
+        """
+        power, square = (np.nansum(np.square(each)) for each in (self.signal, self.values))
+        if not (self.share > 0 and square > 0):
+            return float("inf")
+        return float(self.error * (self.share * power / square) ** 0.5)
+
+    @property
+    def signal(self) -> Floats:
+        """The expected signal c L M/σ."""
+        return self.light * self.response
+
+    @property
+    def slopes(self) -> Floats:
+        """Slopes M/σ · ∂(c L) along rows and columns, (2, n, ...): what errors of shifts leave."""
+        return np.stack([_slope(self.light, axis) * self.response for axis in (-2, -1)])
+
+
+def _slope(light: Floats, axis: int) -> Floats:
+    """Mean of the steps to both neighbours, or to the one that is predicted; 0 without any."""
+    ends = [(0, 0)] * light.ndim
+    ends[axis] = (1, 1)
+    steps = np.pad(np.diff(light, axis=axis), ends, constant_values=np.nan)
+    both = np.stack([np.delete(steps, end, axis) for end in (0, -1)])
+    return np.asarray(np.nansum(both, axis=0) / np.maximum(np.isfinite(both).sum(axis=0), 1))
+
+
+def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None) -> Residuals:
+    """Residuals of a fit, of at most about so many measurements."""
+    exposures, fit = weighted.exposures, weighted.fit
+    every, searched, testing = range(len(exposures)), in_search(fit), tested(fit)
+    used = sum(np.count_nonzero(exposures.used(fit, k) & testing, axis=1) for k in every)
+    rows = bands(np.asarray(used), most // (len(exposures) * exposures.shape[1]))
+    shape = (len(exposures), *rows.shape, exposures.shape[1])
+    values, light, response = np.empty(shape), np.empty(shape), np.empty(shape)
+    size = (rows.shape[1], exposures.shape[1])
+    for b, first in enumerate(rows[:, 0].tolist()):
+        part = slice(first, first + size[0])
+        corners = exposures.positions.corners((first, 0), size, exposures.shape)
+        for k, (row, col) in enumerate(np.array(fit.shifts) + corners):
+            turn = int(exposures.positions.rotation[k])
+            seen = fit.beam.light(size, (row, col), turn, workers=workers)
+            np.multiply(fit.flux[k], seen, out=light[k, b])
+            response[k, b] = fit.sensitivity[part]
+            values[k, b] = exposures.values[k, part] - light[k, b] * response[k, b]
+            if fit.offset is not None:
+                values[k, b] -= fit.offset[part]
+    for k in every:
+        values[k, ~(exposures.used(fit, k) & testing)[rows]] = np.nan
+    variance = exposures.variance
+    if variance is not None:
+        deep = variance[:, rows] if variance.ndim == 3 else variance[:, None, None, None]
+        root = np.sqrt(deep, dtype=np.float64)
+        values /= root
+        response /= root
+    measured = sum(np.count_nonzero(exposures.used(fit, k) & searched) for k in every)
+    share = fit.degrees_of_freedom / max(measured, 1)
+    error = float(fit.error_estimate[-1])
+    return Residuals(values, light, response, rows, share, weighted.noise_variance, error)
+
+
+def in_search(fit: Fit) -> Bools:
+    """Pixels whose measurements F contains."""
+    # Without a component, measurements are not used.
+    known = fit.component_labels >= 0
+    return known if fit.few is None else known & ~fit.few
+
+
+def tested(fit: Fit) -> Bools:
+    """Pixels whose residuals test the model: of which M does not follow its prior."""
+    return in_search(fit) if fit.prior is None else in_search(fit) & (fit.prior == 0)
+
+
+def bands(measured: Array, most: int) -> Array:
+    """Rows (bands, rows of a band): all, as one band, or bands of some, spread evenly.
+
+    `measured` is the number of measurements of each row. Bands lie where these are at least half as
+    many as in the fullest band: masks, as of discs, may leave nothing in most rows.
+    """
+    count, number = len(measured), most // _BAND
+    if number * _BAND >= count or count <= _BAND:
+        return np.arange(count)[None]
+    inside = np.convolve(measured, np.ones(_BAND), "valid")
+    full = np.flatnonzero(inside >= inside.max() / 2)
+    first = [-_BAND]
+    for row in full[np.linspace(0, len(full) - 1, max(number, 2)).round().astype(int)].tolist():
+        if row >= first[-1] + _BAND:
+            first.append(row)
+    return np.array(first[1:])[:, None] + np.arange(_BAND)
+
+
+def on_sensor(positions: Positions) -> Floats:
+    """Shifts (n, 2) along the axes of the sensor, where all exposures are turned alike."""
+    turn = int(positions.rotation[0])
+    axes = [in_beam(unit, turn, (1, 1)) - in_beam((0, 0), turn, (1, 1)) for unit in np.eye(2)]
+    return np.asarray(positions.shifts @ np.array(axes).T)
+
+
+def testable(rows: Array, shifts: Floats, shape: tuple[int, int]) -> Floats:
+    """Share of each measurement (n, bands, rows, cols) that the beam does not take."""
+    count = len(shifts)
+    moves = nearest_whole(shifts[:, None] - shifts)
+    seen = []
+    for axis, places in enumerate((rows.ravel(), np.arange(shape[1]))):
+        at = places + moves[..., axis, None]
+        seen.append(((at >= 0) & (at < shape[axis])).astype(np.float64))
+    # Each exposure sees its own cells.
+    seers = np.einsum("kjr,kjc->krc", *seen).reshape(count, *rows.shape, shape[1])
+    return np.asarray((1 - 1 / seers) / (1 - 1 / count))
+
+
+_CLIPPED = 4.0
+"""Standard deviations at which residuals are cut off, so that a few false values do not decide."""
+
+
+class Correlation(NamedTuple):
+    """Correlation of the residuals of neighbouring pixels, along one axis.
+
+    `size` is the mean product over the mean square, `z` the same in standard errors, `product` the
+    mean product in the units of the squared residuals.
+    """
+
+    size: float
+    z: float
+    product: float
+
+
+def lag_one(residuals: NDArray[np.floating], share: float) -> tuple[Correlation, Correlation]:
+    """Correlation of residuals one row and one column apart.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (..., rows, cols)
+        Residuals of a fit; NaN where there are none.
+    share : float
+        Degrees of freedom over measurements: the fit makes residuals dependent on each other.
+
+    Returns
+    -------
+    rows, cols : Correlation
+        Of neighbours in one column, and of neighbours in one row.
+
+    Notes
+    -----
+    With r = Q e, e white of variance σ² and Q a projection of rank f that is nearly invariant to
+    translations, the sum of all products r r' has the variance σ⁴f. The sum of their squares
+    expects σ⁴f²/N: products of pairs that share a pixel or a cell of the beam are dependent.
+    """
+    cut = clipped(residuals)
+    pairs = ((cut[..., 1:, :], cut[..., :-1, :]), (cut[..., 1:], cut[..., :-1]))
+    square = float(np.nanmean(np.square(cut))) if np.isfinite(cut).any() else math.nan
+    rows, cols = (_correlation(a * b, square, share) for a, b in pairs)
+    return rows, cols
+
+
+def _correlation(products: Floats, square: float, share: float) -> Correlation:
+    known = products[np.isfinite(products)]
+    spread = math.sqrt(float(known @ known) / share) if share > 0 else 0.0
+    if not (known.size and spread > 0):
+        return Correlation(0.0, 0.0, 0.0)
+    mean = float(known.mean())
+    return Correlation(mean / square, float(known.sum()) / spread, mean)
+
+
+def clipped(residuals: NDArray[np.floating]) -> Floats:
+    """Residuals cut off at four standard deviations of their exposure, the first axis."""
+    axes = tuple(range(1, residuals.ndim))
+    scale = ROBUST * nanmedian_abs(residuals)
+    limits = _CLIPPED * scale.reshape((-1, *(1 for _ in axes)))
+    return np.asarray(np.clip(residuals, -limits, limits), np.float64)
+
+
+def in_blocks(image: Array, side: int) -> Array:
+    """Sums over blocks of `side` pixels square in the last two axes, smaller ones at the end."""
+    for axis, size in ((-2, image.shape[-2]), (-1, image.shape[-1])):
+        image = np.add.reduceat(image, np.arange(0, size, side), axis=axis)
+    return image

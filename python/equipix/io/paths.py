@@ -1,0 +1,230 @@
+"""Names and globs to files, outputs whole or not at all, a reader's failure as an error."""
+
+from __future__ import annotations
+
+import glob
+import logging
+import os
+import re
+import shutil
+import threading
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+from equipix.errors import EquipixError, FileError, InputError
+
+
+def find_files(
+    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, folder: Path = Path()
+) -> list[Path]:
+    """Files that a path, a glob or a list of these names; a glob's in natural order.
+
+    Parameters
+    ----------
+    source : path, or iterable of paths
+        A name with ``*``, ``?`` or ``[`` is a glob, unless a file has just that name.
+    folder : Path, optional
+        Where relative names start.
+
+    Returns
+    -------
+    list of Path
+        At least one file; a list keeps its order, and ``f2`` precedes ``f10`` in a glob.
+
+    Raises
+    ------
+    FileError
+        If a file does not exist or a glob matches nothing.
+    InputError
+        If there is no name, or something else than a name.
+    """
+    names = [source] if isinstance(source, str | bytes | os.PathLike) else source
+    found = [path for name in names for path in _matches(name, folder)]
+    if not found:
+        raise InputError("'source' names no file")
+    return found
+
+
+def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
+    pattern = str(as_path("source", name))
+    path = folder / pattern
+    if path.is_dir():
+        raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
+    if path.exists():
+        return [path]
+    if not glob.has_magic(pattern):
+        raise FileError(f"{path}: does not exist")
+    # Unlike Path.glob, this leaves out hidden files, as a shell does.
+    found = glob.glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
+    if not found:
+        raise FileError(f"{path}: no file matches")
+    return sorted((folder / match for match in found), key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"([0-9]+)", str(path))
+    return [(int(part), part) if part[:1].isdecimal() else (-1, part) for part in parts]
+
+
+def as_path(name: str, value: object) -> Path:
+    """Check that an argument is the name of a file or a folder.
+
+    Raises
+    ------
+    InputError
+        If it is no name, or none that a file can have.
+    """
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or "\0" in text:
+        raise InputError(f"'{name}' holds {value!r}, expected a path")
+    return Path(text)
+
+
+def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Refuse an output that is also an input, or another output.
+
+    Raises
+    ------
+    FileError
+        If an output is one of the inputs or one of the other outputs, by whatever name.
+    """
+    taken = {path.resolve() for path in inputs}
+    named: set[Path] = set()
+    for path in outputs:
+        if path.resolve() in taken:
+            raise FileError(f"{path}: is one of the inputs: name another output")
+        if path.resolve() in named:
+            raise FileError(f"{path}: is named for two outputs: name another for one of them")
+        named.add(path.resolve())
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn whatever a reader raises or logs about a broken file into an error that names it."""
+    complaints = _Complaints()
+    logger = logging.getLogger("tifffile")
+    logger.addHandler(complaints)
+    try:
+        yield
+    except EquipixError:
+        raise
+    except Exception as error:
+        hint = "; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
+        raise FileError(f"{path}: cannot be read: {error}{hint}") from error
+    finally:
+        logger.removeHandler(complaints)
+    if complaints.messages:
+        raise FileError(f"{path}: is broken: {complaints.messages[0]}")
+
+
+class _Complaints(logging.Handler):
+    """What tifffile logs instead of raising, such as a last page that it leaves out."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.thread = threading.get_ident()
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the message."""
+        if record.thread == self.thread:
+            self.messages.append(record.getMessage())
+
+
+@contextmanager
+def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[Path]:
+    """Replace a file in one step, when all of its new version is written.
+
+    Parameters
+    ----------
+    path : path
+        Where the file is to be.
+    force : bool, optional
+        Replace a file that is there.
+
+    Yields
+    ------
+    Path
+        Where to write it; moved to `path` at the end, removed after an exception.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    InputError
+        If `path` is not the name of a file.
+    """
+    target = as_path("path", path)
+    temporary = _beside(target)
+    try:
+        if target.is_dir():
+            raise FileError(f"{target}: is a folder, expected the name of a file")
+        if not target.parent.exists():
+            raise FileError(f"{target}: there is no folder '{target.parent}': make it first")
+        if target.exists() and not force:
+            raise FileError(f"{target}: exists already; force=True (--force) replaces it")
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    except EquipixError:
+        raise
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_beside(target: Path) -> Iterator[Path]:
+    """Make a folder whose content the caller moves to `target` when all of it is written.
+
+    Parameters
+    ----------
+    target : path
+        Where the content is to be; its parent folders are made.
+
+    Yields
+    ------
+    Path
+        The folder; what is in it at the end, or after an exception, is removed.
+
+    Raises
+    ------
+    FileError
+        If something cannot be written.
+    """
+    temporary = _beside(target.resolve())
+    try:
+        temporary.mkdir(parents=True)
+        yield temporary
+    except EquipixError:
+        raise
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def replace_folder(target: Path, new: Path) -> None:
+    """Replace a folder, if there is one, by another; the old one is removed last."""
+    target = target.resolve()
+    if not target.exists():
+        new.rename(target)
+        return
+    old = _beside(target)
+    target.rename(old)
+    try:
+        new.rename(target)
+    except OSError:
+        old.rename(target)
+        raise
+    shutil.rmtree(old)
+
+
+def _beside(target: Path) -> Path:
+    """Return an unused hidden name in the folder of `target`, of the same suffix."""
+    return target.parent / f".{uuid.uuid4().hex}{target.suffix}"

@@ -1,0 +1,253 @@
+"""Averaging of repeated frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from equipix import _native
+from equipix._check import Progress, as_array, as_floats, as_level, naming_memory, positive_workers
+from equipix.errors import FileError, InputError, UnsupportedFileError
+from equipix.io.frames import frame_format, stream_frames
+from equipix.io.paths import find_files
+from equipix.measured.statistics import (
+    FrameStatistics,
+    _check_mask,
+    _masked,
+    _step,
+    _subtract,
+    load_statistics,
+    saved_shape,
+)
+from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
+
+
+def average(
+    source: ArrayLike | Iterable[ArrayLike] | str | PathLike[str] | Iterable[str | PathLike[str]],
+    *,
+    dark: FrameStatistics | ArrayLike | None = None,
+    saturation: float | None = None,
+    mask: ArrayLike | None = None,
+    reject: float | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> FrameStatistics:
+    r"""Mean and variance of each pixel over any number of repeated frames.
+
+    Parameters
+    ----------
+    source : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
+        The frames, in DN. Of files, every page counts: grey TIFF, PNG, PGM and BMP, all of one
+        shape and depth; the file of a saved average gives that average. An iterable is taken one
+        frame at a time and never collected, and files are read in small batches, so memory does not
+        grow with the number of frames. Masked samples of `numpy.ma` arrays do not count.
+    dark : FrameStatistics or array of shape (rows, cols), optional
+        Dark mean, subtracted from the mean, in DN; the variance of a `FrameStatistics` dark mean
+        is added to that of the mean.
+    saturation : float, optional
+        Samples at or above this level are counted as saturated, in DN. By default the largest
+        value of an integer dtype (give 4095 for 12 bits in a 16-bit file); floating-point frames
+        are not tested then.
+    mask : array_like of bool, shape (rows, cols), optional
+        True = do not use: mean and variances of the pixel become NaN, its counts 0.
+    reject : float, optional
+        Leave out samples that deviate by more than so many standard deviations from the others of
+        their pixel, such as cosmic rays: 5 is usual. They count nowhere, not even as saturated. It
+        takes nine frames of one steady scene or more, and holds the first nine of them.
+    workers : int, optional
+        Number of threads; by default one for each processor. It changes no bit of the result.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` repeatedly, in frames; `total` is an
+        estimate until all files have been opened.
+
+    Returns
+    -------
+    FrameStatistics
+        Mean, unbiased variance of one frame, variance of the mean, and counts.
+
+    Raises
+    ------
+    InputError
+        If an argument has a wrong shape or value.
+    FileError
+        If a file is missing, broken, in colour, or differs from the first in shape or depth.
+    InsufficientMemoryError
+        If there is not enough memory; on Linux this is checked before the work starts.
+
+    Notes
+    -----
+    For n samples x of a pixel
+
+    .. math:: \bar x = \frac{1}{n} \sum x, \qquad s^2 = \frac{1}{n-1} \sum (x - \bar x)^2 .
+
+    Samples of 8 and 16 bits are summed exactly. Others are summed as float64 in batches that are
+    merged by Chan's formula [1]_, with a relative error of some ``n/16 + 16`` roundings at most.
+    Samples that are not finite do not count; saturated ones do, and are counted apart.
+
+    With `reject` a sample is compared with the mean of those before, and with a noise that pixels
+    of similar signal have in common, or with its pixel's own where that is larger:
+    `equipix.measured.stream.Rejection`, which states the bias that is left. The variance is divided
+    by that of a normal distribution cut at so many standard deviations.
+
+    References
+    ----------
+    .. [1] T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms for computing the sample variance",
+       The American Statistician 37 (1983) 242-247.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> frames = np.array([[[1, 2]], [[3, 2]]], dtype=np.uint8)
+    >>> result = equipix.average(frames)
+    >>> result.mean, result.variance
+    (array([[2., 2.]]), array([[2., 0.]]))
+    """
+    workers = positive_workers(workers)
+    level, rejection = as_level(saturation), None if reject is None else Rejection(reject)
+    offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
+    frames = _paths_or_frames(source)
+    out = None if mask is None else as_array("mask", mask, ndim=2)
+    with naming_memory("averaging"):
+        if isinstance(frames, list):
+            statistics = _average_files(frames, level, out, workers, progress, rejection)
+        else:
+            given = batches(frames)
+            statistics = _average_batches(
+                given, level, out, workers, progress, _length(source), rejection
+            )
+        if reject is not None:
+            statistics = dataclasses.replace(statistics, reject=float(reject))
+        return _masked(_subtract(statistics, offset), out)
+
+
+def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
+    """Paths as a list, an array as it is, other iterables as an iterator."""
+    if isinstance(source, np.ndarray):
+        return source if np.ma.is_masked(source) else np.asarray(source)
+    if isinstance(source, str | os.PathLike):
+        return [source]
+    try:
+        items = iter(source)
+    except TypeError as error:
+        raise InputError(
+            f"'source' is a {type(source).__name__}, expected frames or the names of files"
+        ) from error
+    for first in items:
+        everything = itertools.chain([first], items)
+        return list(everything) if isinstance(first, str | os.PathLike) else everything
+    raise InputError("'source' holds no frames")
+
+
+def _length(source: Any) -> int:
+    return len(source) if hasattr(source, "__len__") else 0
+
+
+def _average_files(
+    names: list[Any],
+    level: float | None,
+    mask: NDArray[Any] | None,
+    workers: int | None,
+    progress: Progress | None,
+    rejection: Rejection | None,
+) -> FrameStatistics:
+    paths = find_files(names)
+    if any(path.suffix.lower() == ".npz" for path in paths):
+        return _saved(paths, level, mask, rejection)
+    if rejection is None:
+        with suppress(UnsupportedFileError):
+            if mask is not None:
+                _check_mask(mask, frame_format(paths[0])[0][1:])
+            maps = _native.average_files(paths, level, mask, workers, progress)
+            return _statistics(maps, frame_format(paths[0])[1], level)
+    if any(saved_shape(path) for path in paths):
+        return _saved(paths, level, mask, rejection)
+    stream = stream_frames(paths, workers=workers)
+    given = batches(frame for _, frames in stream for frame in frames)
+    return _average_batches(given, level, mask, workers, progress, len(paths), rejection)
+
+
+def _saved(
+    paths: list[Path],
+    level: float | None,
+    mask: NDArray[Any] | None,
+    rejection: Rejection | None,
+) -> FrameStatistics:
+    """Read the one average that is given in the place of frames."""
+    path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
+    if others:
+        raise FileError(
+            f"{path}: holds averaged frames, which cannot be averaged with other files: name one "
+            "saved average alone, or the frames of all"
+        )
+    if rejection is not None:
+        raise InputError(f"{path}: holds averaged frames, from which 'reject' cannot leave out any")
+    statistics = load_statistics(path)
+    if level is not None and statistics.saturation not in (None, level):
+        raise FileError(
+            f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
+            f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
+        )
+    _check_mask(mask, statistics.mean.shape)
+    return statistics if mask is None else dataclasses.replace(statistics, light_variance=None)
+
+
+def _statistics(
+    maps: tuple[Any, ...], dtype: np.dtype[Any], level: float | None
+) -> FrameStatistics:
+    mean, variance, count, saturated, light_variance = maps
+    return FrameStatistics(
+        mean,
+        variance,
+        variance / count,
+        count,
+        saturated,
+        saturation=_level_of(dtype, level),
+        raw=dtype.kind in "iu",
+        step=_step(mean, variance, count),
+        light_variance=None if np.isnan(light_variance) else light_variance,
+    )
+
+
+def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
+    """Saturation level of samples of a dtype: the largest whole number, unless given."""
+    if level is None and dtype.kind in "iu":
+        return float(np.iinfo(dtype).max)
+    return level
+
+
+def _average_batches(
+    given: Iterator[NDArray[Any]],
+    level: float | None,
+    mask: NDArray[Any] | None,
+    workers: int | None,
+    progress: Progress | None,
+    total: int,
+    rejection: Rejection | None,
+) -> FrameStatistics:
+    first = next(given)
+    dtype, level = sum_dtype(first), _level_of(first.dtype, level)
+    everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
+    if rejection is not None:
+        dtype, everything = np.dtype(np.float64), rejection.cleaned(everything)
+    _check_mask(mask, first.shape[1:])
+    sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, workers)
+    done = 0
+    for batch in everything:
+        sums.add(np.ascontiguousarray(unmasked(batch, dtype), dtype=dtype))
+        done += len(batch)
+        if progress is not None:
+            progress(done, max(done, total), "average")
+    maps = sums.finish()
+    if rejection is not None:
+        maps = (maps[0], maps[1] / rejection.variance_kept, *maps[2:])
+    return _statistics(maps, first.dtype, level)

@@ -1,0 +1,534 @@
+"""Which pixels must not be used: dead, hot, noisy, blind, unlike their neighbours."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from equipix._check import Array, Bools, Floats, ReadOnly, number
+from equipix.errors import InputError
+from equipix.measured.noise import NoiseModel, scatter_limit
+from equipix.measured.statistics import FrameStatistics, light_of
+
+SIGMAS = 6.0
+"""Standard deviations that noise does not reach on a sensor of some million pixels."""
+
+HOT_SIGMAS = 10.0
+"""Limit of a hot dark level in standard deviations of the others: dark levels have long tails."""
+
+DEAD_RESPONSE = 0.5
+"""Response relative to the neighbours below which a pixel is dead."""
+
+_CHANCE = 1e-7
+"""Probability below which a number of samples left out is no chance."""
+
+_ROUNDS = 3
+"""Rounds in which the share of samples left out is found without the pixels found before."""
+
+_BLOCK = 16
+"""Side of the blocks of pixels whose median is what is usual there."""
+
+_STEP = 1.1
+"""Response of a block over that of the one beside it from which a step may lie between them."""
+
+_LARGEST_STEP = 10.0
+"""Response of a block over that of the one beside it up to which both may be good."""
+
+_REACH = 5
+"""Pixels on each side of a pixel in its row and column that it is compared with beside a step."""
+
+_OWN = 3
+"""Rank of their values that counts: the middle of one side, which two bad pixels do not move."""
+
+_AROUND = 5
+"""Side of the square of blocks that a block is compared with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings(ReadOnly):
+    """Bad pixels found before the last fit: maps (rows, cols) of bool, or None.
+
+    Attributes
+    ----------
+    saturated : ndarray of bool or None
+        A sample reaches the saturation level in some exposure.
+    dead : ndarray of bool or None
+        No response to light: see `dead_pixels` and `equipix.measured.defects`.
+    hot : ndarray of bool or None
+        A high dark level or much dark noise: see `hot_pixels`.
+    noisy : ndarray of bool or None
+        More scatter between frames than the noise explains: see `noisy_pixels`.
+    contradictory : ndarray of bool or None
+        Another response before than after some moment, as under dust that fell; or most of the
+        measurements left out by a robust calibration, or all but one. The fit flags them, and their
+        sensitivity counts neither for its mean nor for its slope.
+    faint : ndarray of bool or None
+        Light so weak that the noise of the dark leaves M less known than in bright pixels; treated
+        likewise.
+    """
+
+    saturated: Bools | None = None
+    dead: Bools | None = None
+    hot: Bools | None = None
+    noisy: Bools | None = None
+    contradictory: Bools | None = None
+    faint: Bools | None = None
+
+    @property
+    def unreliable(self) -> Bools | None:
+        """Pixels whose sensitivity counts neither for its mean nor for its slope."""
+        if self.contradictory is None or self.faint is None:
+            return self.faint if self.contradictory is None else self.contradictory
+        return self.contradictory | self.faint
+
+
+def dead_pixels(
+    signals: NDArray[Any],
+    models: Sequence[NoiseModel] | None,
+    usual: NDArray[Any] | float = 1.0,
+) -> NDArray[Any]:
+    """Find pixels whose response to light is below half of that of their neighbours.
+
+    Parameters
+    ----------
+    signals : ndarray, shape (n, rows, cols)
+        Dark-subtracted means of the exposures, in DN.
+    models : sequence of NoiseModel, optional
+        Those of `signals`, one an exposure: a pixel must be below by more than noise explains.
+    usual : ndarray of shape (rows, cols), optional
+        Response of good pixels, such as those of the colours of their filters.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where this holds in every exposure with a measurement, and where none has one; the
+        neighbours' response is the median of a block of 16×16 pixels.
+    """
+    dead = np.ones(signals.shape[1:], dtype=bool)
+    for k, signal in enumerate(signals):
+        margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
+        # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
+        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * _block_medians(signal / usual))
+    return dead
+
+
+def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
+    """Find pixels whose dark level or dark noise is far above that of the others.
+
+    Parameters
+    ----------
+    dark : FrameStatistics
+        The averaged dark frames.
+    noise : NoiseModel, optional
+        The noise of the good pixels; without it only the level counts.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where the level is more than 10 standard deviations above the median (estimated by
+        1.4826 times the median absolute deviation, and at least one DN or one step between values),
+        or the variance beyond what noise and rounding explain.
+    """
+    excess = dark.mean - np.nanmedian(dark.mean)
+    spread = max(1.0, dark.step, 1.4826 * float(np.nanmedian(np.abs(excess))))
+    hot: NDArray[Any] = excess > HOT_SIGMAS * spread
+    frames = int(dark.count.max())
+    if noise is not None and frames > 1:
+        limit = scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
+        hot |= dark.variance > _with_light(limit, light_of(dark).variance(dark.mean))
+    return hot
+
+
+def noisy_pixels(
+    means: Array,
+    variances: Array,
+    frames: Sequence[int],
+    noise: NoiseModel,
+    *,
+    times: float = 1.0,
+    light: Iterable[Array] | None = None,
+) -> Bools:
+    """Find pixels that scatter between frames by more than the noise explains.
+
+    Parameters
+    ----------
+    means, variances : ndarray, shape (n, rows, cols)
+        Dark-subtracted mean and sample variance of each exposure, in DN and DN².
+    frames : sequence of int
+        Number of frames of each exposure.
+    noise : NoiseModel
+        That of one frame of a good pixel.
+    times : float
+        Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
+        is beyond chance.
+    light : iterable of ndarray, shape (rows, cols), optional
+        What the variances of each exposure have of light that varied between its frames, in DN².
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where this holds in every exposure that shows a scatter.
+    """
+    noisy = np.ones(means.shape[1:], dtype=bool)
+    seen = np.zeros_like(noisy)
+    common = itertools.repeat(np.zeros(()), len(frames)) if light is None else light
+    for mean, variance, count, shared in zip(means, variances, frames, common, strict=True):
+        if count < 2:
+            continue
+        of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(mean)
+        limit = np.maximum(of_chance, times**2 * noise.scatter(mean))
+        known = np.isfinite(variance) & np.isfinite(mean)
+        noisy &= ~known | (variance > _with_light(limit, shared))
+        seen |= known
+    return noisy & seen
+
+
+def often_rejected(missing: Array, samples: int) -> Bools:
+    """Find pixels of which samples were left out more often than chance explains.
+
+    A pixel that jumps between levels loses the samples of the rarer one: those that are left show
+    little noise, and their mean is that of one level.
+
+    Parameters
+    ----------
+    missing : ndarray, shape (rows, cols), of whole numbers
+        Samples that were left out.
+    samples : int
+        All samples of a pixel.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where the binomial distribution of so many samples, each left out with the share of
+        the other pixels, gives a probability below 1e-7.
+    """
+    found = np.zeros(missing.shape, bool)
+    for _ in range(_ROUNDS if missing.any() else 0):
+        others = missing[~found]
+        # One more than there are: of none the share would be 0.
+        share = (float(others.sum()) + 1) / (samples * others.size + 1)
+        found = np.asarray(missing >= _binomial_limit(samples, share))
+    return found
+
+
+def _binomial_limit(samples: int, share: float) -> int:
+    """Return the smallest number that is reached with a probability below 1e-7."""
+    if share >= 1:
+        return samples + 1
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, samples + 1)))])
+    hits = np.arange(samples + 1)
+    terms = logs[-1] - logs - logs[::-1] + hits * np.log(share)
+    terms += (samples - hits) * np.log1p(-share)
+    above = np.cumsum(np.exp(terms)[::-1])[::-1]
+    return int(np.count_nonzero(above >= _CHANCE))
+
+
+def _with_light(limit: Array | float, light: Array) -> Array:
+    """Largest variance by noise of variance up to `limit` and light: their deviations add up."""
+    return np.asarray((np.sqrt(limit) + np.sqrt(light)) ** 2)
+
+
+def response_outliers(
+    sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]], *, least: float = DEAD_RESPONSE
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.
+
+    Parameters
+    ----------
+    sensitivity : ndarray, shape (rows, cols)
+        Sensitivity M; NaN where undetermined.
+    std : callable
+        Gives the standard deviations of M, which is asked only if there are suspects: M must be
+        beyond the limit by more than chance explains.
+    least : float
+        Sensitivity below which a pixel is dead, over that of its neighbours.
+
+    Returns
+    -------
+    dead, hot : ndarray of bool, shape (rows, cols)
+        Of the two kinds; the neighbours' sensitivity is the median of a block of 16×16 pixels, or
+        of the 5×5 blocks around where that is below half or above twice theirs: of a region of
+        bad pixels that fills most of a block. Beside a step of the response it is that of the
+        pixel's own side.
+
+    Notes
+    -----
+    The medians of adjacent blocks differ by more than a tenth beside a step. A pixel there is
+    compared with the five pixels on each side of it in its row, and in its column. Beside a
+    straight step one of these sides at least is the pixel's own. So the third lowest of the ten is
+    no higher than usual for a pixel of the weak side. In a line along the step all are of the
+    pixel's own side, and the third lowest is usual there even if two are bad. Hence for a dead
+    pixel the higher of these values of its row and its column counts, for a hot one the lower of
+    the third highest. A pair, a block of 2×2 and three in a line along a step are found. The value
+    is limited to the range of the medians. For a dead pixel those below a tenth of the largest are
+    left out: dead regions.
+
+    Four or more in a line along a step may as well be a bend of it: beside 0.15 a column of 0.1 is
+    not told from the other side. They are found only if they are dead, or hot, beside that as well.
+    The same holds for a pixel beside a step at an angle to rows and columns, or of the outermost
+    row or column where a step meets it.
+    """
+    dead, hot = np.zeros(sensitivity.shape, bool), np.zeros(sensitivity.shape, bool)
+    with np.errstate(invalid="ignore"):
+        # Where no pixel is twice as sensitive as another, none is twice its neighbours' median.
+        lowest, highest = (f.reduce(sensitivity, axis=None) for f in (np.fmin, np.fmax))
+        if not lowest < max(least, DEAD_RESPONSE) * highest:
+            return dead, hot
+    # The noise of a dead region may make its median negative.
+    usual, deviation = np.maximum(_usual(sensitivity), 0), std()
+    lowest, highest = _range_around(usual)
+    alive, _ = _range_around(usual, 1 / _LARGEST_STEP)
+    stepped = highest > _STEP * lowest
+    for found, sign, limit, extreme, floor in (
+        (dead, -1, least, highest, alive),
+        (hot, 1, 1 / DEAD_RESPONSE, lowest, lowest),
+    ):
+        beyond = sign * (sensitivity - limit * _of_pixels(extreme, sensitivity.shape))
+        suspects = np.nonzero(beyond > 0)
+        blocks = suspects[0] // _BLOCK, suspects[1] // _BLOCK
+        beside = np.clip(_on_its_side(sensitivity, suspects, sign), floor[blocks], highest[blocks])
+        around = np.where(stepped[blocks], beside, usual[blocks])
+        beyond = sign * (sensitivity[suspects] - limit * around)
+        found[suspects] = beyond > SIGMAS * deviation[suspects]
+    return dead, hot
+
+
+def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
+    """Take for each pixel the median of the 16×16 block that it lies in."""
+    return _of_pixels(_medians(image), image.shape)
+
+
+def _usual(image: NDArray[Any]) -> NDArray[Any]:
+    """Medians of blocks, but of an odd block the median of the 5×5 blocks around.
+
+    A block is odd where its median is below half or above twice that of the blocks around, and most
+    of these are within that of their median: most of its pixels are bad. Where half of a sensor
+    responds weakly no block is odd. In steep light every block may be so, hence this is for
+    responses alone.
+    """
+    medians, reach = _medians(image), _AROUND // 2
+    padded = np.pad(medians, reach, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (_AROUND, _AROUND))
+    around = _nanmedian(windows, axis=(2, 3))
+    usual = _are_alike(windows, around[..., None, None]).sum(axis=(2, 3))
+    most = 2 * usual > np.isfinite(windows).sum(axis=(2, 3))
+    odd = most & ~_are_alike(medians, around)
+    return np.where(odd, around, medians)
+
+
+def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Lowest and highest response of each block and those beside it.
+
+    Blocks below `least` times the highest do not count.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(usual, 1, mode="edge"), (3, 3))
+    highest = np.fmax.reduce(windows, axis=(2, 3))
+    counted = np.where(windows >= least * highest[..., None, None], windows, np.nan)
+    return np.fmin.reduce(counted, axis=(2, 3)), highest
+
+
+def _on_its_side(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int) -> NDArray[Any]:
+    """Usual response on each pixel's side of a step, to find dead (`sign` -1) or hot pixels."""
+    rows, cols = pixels
+    # The differences go on beyond the border, so that a step at an angle does not turn back there.
+    padded = np.pad(image, _REACH, mode="reflect", reflect_type="odd")
+    steps = np.delete(np.arange(2 * _REACH + 1), _REACH)[:, None]
+    lines = padded[rows + steps, cols + _REACH], padded[rows + _REACH, cols + steps]
+    # A missing value may be of the pixel's own side.
+    known = [np.where(np.isnan(line), -np.inf, -sign * line) for line in lines]
+    ranked = [np.sort(line, axis=0)[_OWN - 1] for line in known]
+    return np.asarray(-sign * np.maximum(*ranked))
+
+
+def _are_alike(values: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
+    """Which responses are between half and twice the usual one."""
+    return (values >= DEAD_RESPONSE * usual) & (values * DEAD_RESPONSE <= usual)
+
+
+def _medians(image: NDArray[Any]) -> NDArray[Any]:
+    """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
+    rows, cols = image.shape
+    padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
+    return _nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
+
+
+def _of_pixels(blocks: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Spread values of blocks over their pixels."""
+    return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[: shape[0], : shape[1]]
+
+
+def _nanmedian(values: NDArray[Any], axis: tuple[int, ...]) -> NDArray[Any]:
+    """Median of the values that are numbers; NaN where there is none."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
+
+
+_WELL_ABOVE = 10.0
+"""Signal of the pixels around, over the limit of noise, from which they see light beyond doubt:
+light that fades passes the limit of noise slowly, a dead region ends within a pixel."""
+
+
+def blind_pixels(signals: Array, models: Sequence[NoiseModel], usual: Array | float = 1.0) -> Bools:
+    """Find pixels that are at the dark in every exposure, however many lie side by side.
+
+    Parameters
+    ----------
+    signals : ndarray, shape (n, rows, cols)
+        Dark-subtracted means of the exposures, in DN.
+    models : sequence of NoiseModel, one an exposure
+        Those of `signals`.
+    usual : ndarray of shape (rows, cols), optional
+        Response of good pixels, such as those of the colours of their filters.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True where no exposure has a signal above six standard deviations of the dark, and where
+        along rows or columns the nearest other pixels on both sides see so much light in every
+        exposure that a good pixel here would be ten times above that; and where along rows and
+        columns these are such pixels themselves. One side may be the edge of the sensor.
+
+    Notes
+    -----
+    A region without light in the beam lies elsewhere in each exposure, so that the pixels beside
+    what is dark in all of them are dark in some. That does not hold where all shifts run along the
+    region, as along the shadow of a wire: its pixels are found as well, though they may be good.
+    They have no light in any exposure, so nothing determines their sensitivity either way.
+    """
+    limits = [SIGMAS * float(np.sqrt(model.variance(np.zeros(())))) for model in models]
+    dark = np.ones(signals.shape[1:], dtype=bool)
+    light = np.full(signals.shape[1:], np.inf)
+    for signal, limit in zip(signals, limits, strict=True):
+        # A comparison with NaN is false: a missing measurement neither is light nor excludes it.
+        dark &= ~(signal > limit)
+        light = np.minimum(light, signal / limit)
+    if not dark.any():
+        return dark
+    light /= usual
+    wanted = np.broadcast_to(_WELL_ABOVE / usual, dark.shape)
+    found = dark & (_between_lit(dark, light, wanted) | _between_lit(dark.T, light.T, wanted.T).T)
+    # What such pixels enclose along rows and columns is where dead rows cross dead columns, as in
+    # the corners of a frame of them.
+    dark &= ~found
+    edges, half = found.astype(np.float64), np.full(dark.shape, 0.5)
+    enclosed = _between_lit(dark, edges, half) & _between_lit(dark.T, edges.T, half.T).T
+    return found | (dark & enclosed)
+
+
+def _between_lit(dark: Bools, light: Array, wanted: Array) -> Bools:
+    """Which dark pixels have lit ones as the nearest others of their column, on both sides."""
+    before, after = _nearest(dark, light), _nearest(dark[::-1], light[::-1])[::-1]
+    lit = (before > wanted) & (after > wanted)
+    return np.asarray(lit & (np.minimum(before, after) < np.inf))
+
+
+def _nearest(dark: Bools, light: Array) -> Array:
+    """Light of the last pixel of the column that is not dark; infinite at the sensor's edge."""
+    rows = np.arange(len(dark))[:, None]
+    last = np.maximum.accumulate(np.where(dark, -1, rows), axis=0)
+    return np.where(last < 0, np.inf, np.take_along_axis(light, np.maximum(last, 0), axis=0))
+
+
+_WIDTH, _EVERY = 11, 2
+"""Rows and columns of the square with whose median a pixel is compared, and every how many of them
+count: clusters of 5×5 pixels are less than half of it."""
+
+_LEAST_FRAMES = 51
+"""Frames from which deviations are compared: of n frames that do not depend on each other a
+deviation errs by 1/√(2(n − 1)), of which the limit 1/2 is then five times."""
+
+
+def unresponsive(gain: Array, deviation: Array, frames: int) -> Array:
+    """Pixels of less than half the response of their neighbours.
+
+    Parameters
+    ----------
+    gain : ndarray, shape (rows, cols)
+        Gain of each pixel, the inverse of its response.
+    deviation : ndarray, shape (rows, cols)
+        Standard deviation of each pixel over the frames.
+    frames : int
+        Number of frames.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        Pixels whose gain, or whose deviation from 51 frames on, has that response.
+    """
+    limit = DefectLimits.response
+    weak: Array = ~((gain > 0) & (gain <= 1 / limit))
+    if frames >= _LEAST_FRAMES:
+        weak |= deviation < limit * _median(deviation)
+    return weak
+
+
+def _median(values: Array) -> Array:
+    """Median over the square around each pixel, reflected about the edge pixels."""
+    padded = np.pad(values, _WIDTH // 2, mode="reflect")
+    squares = np.lib.stride_tricks.sliding_window_view(padded, (_WIDTH, _WIDTH))
+    median: Array = np.median(squares[:, :, ::_EVERY, ::_EVERY], axis=(2, 3))
+    return median
+
+
+def relative_response(rise: Floats, good: Bools) -> Floats:
+    """Response of each pixel over the array's, at each state."""
+    mean = rise[:, good].mean(axis=1)
+    scatter = rise[:, good].std(axis=1)
+    weak = np.flatnonzero(~(np.abs(mean) > scatter))
+    if weak.size:
+        k = int(weak[0])
+        raise InputError(
+            f"'black_bodies' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
+            f"{scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels see: "
+            "take black bodies further apart"
+        )
+    return np.asarray(rise / mean[:, None, None])
+
+
+@dataclass(frozen=True)
+class DefectLimits:
+    """Limits of `find_defects`, each adjustable.
+
+    Attributes
+    ----------
+    response : float
+        Response below which a pixel is dead, over that of its neighbours: 1/2 in GB/T 17444-2013
+        [1]_, over the mean response, of which an uneven source would make dead corners.
+    gain : float
+        1/(1 + K) above which a pixel does not respond: K → −1 has no bound.
+    noise : float
+        Noise above which a pixel is noisy (overheated), over that which pixels of its signal have
+        in common: 2 in GB/T 17444-2013, over the mean noise.
+    correlation : float
+        Standard deviations by which von Neumann's ratio of a noisy pixel must lie below that of
+        white noise for flicker.
+    range : float
+        Share of the array's range of levels in which a pixel must have values.
+    misfit : float
+        Standard deviations beyond which the misfit of a curve is not that of the others: of noise,
+        and of what the order lacks in all pixels.
+
+    References
+    ----------
+    .. [1] GB/T 17444-2013, "Measuring methods for parameters of infrared focal plane arrays".
+    """
+
+    response: float = 0.5
+    gain: float = 10.0
+    noise: float = 2.0
+    correlation: float = 5.0
+    range: float = 0.5
+    misfit: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Refuse limits that are not above 0."""
+        for name, value in vars(self).items():
+            if not number(name, value) > 0:
+                raise InputError(f"'{name}' is {value!r}, expected a number above 0")

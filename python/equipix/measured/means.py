@@ -1,0 +1,363 @@
+"""Averages of exposures or levels, reduced one by one."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from equipix._check import EXPOSURES, Array, Bools, Floats, Words
+from equipix.errors import InputError
+from equipix.measured.colour import Colours, planes_of
+from equipix.measured.defects import (
+    Findings,
+    blind_pixels,
+    dead_pixels,
+    hot_pixels,
+    noisy_pixels,
+    often_rejected,
+)
+from equipix.measured.filters import Filters, mean_signal, pattern_of
+from equipix.measured.noise import NoiseModel, photon_transfer
+from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
+from equipix.measured.statistics import (
+    NAMED,
+    STRAY,
+    FrameStatistics,
+    Light,
+    light_of,
+    same_statistics,
+)
+
+
+class Averaged:
+    """The part of the `FrameStatistics` of each exposure that a calibration needs.
+
+    Parameters
+    ----------
+    count : int
+        Number of exposures.
+    dtype : dtype
+        Of the mean frames that are kept.
+    gain : float, optional
+        Gain of the camera where it is known, in DN per electron.
+    saturation : float, optional
+        Level that was averaged with, in DN, where it is known; for messages.
+    saturation_key : str
+        What messages call that level.
+    words : Words
+        What messages call the frames.
+    colours : Colours, optional
+        Colour filters of the pixels; unless given those that stand out of the first frames.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, rows, cols)
+        Mean frames, the dark subtracted; NaN where a sample saturates, which is left out of that
+        exposure alone.
+    raw : bool
+        Whether no dark was subtracted from averages of whole numbers.
+    dark : FrameStatistics or None
+        The dark frames that were subtracted.
+    step : float
+        Largest step between the values of frames, in DN; 0 if they are not whole.
+    light : list of Light
+        What the variances of each exposure have of light that varied between its frames.
+    pedestal : float
+        Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        dtype: DTypeLike = np.float64,
+        gain: float | None = None,
+        saturation: float | None = None,
+        saturation_key: str = "saturation",
+        words: Words = EXPOSURES,
+        colours: Colours | None = None,
+    ) -> None:
+        self._words, self.colours = words, colours
+        self._period = (1, 1)
+        self.count, self.gain, self.saturation = count, gain, saturation
+        self._saturation_key = saturation_key
+        self.dark: FrameStatistics | None = None
+        self.pedestal, self._is_counted = 0.0, False
+        self._dtype = np.dtype(dtype)
+        self._frames: list[int] = []
+        self._names: list[str] = []
+        self._of_dark: list[float] = []
+        self._points: list[Array] = []
+        self._clipped: list[Clipping | None] = []
+        self._screened = 0  # samples of a pixel that were compared with the others
+        self.raw = True
+        self.step = 0.0
+        self.light: list[Light] = []
+
+    @classmethod
+    def of(
+        cls,
+        frames: Sequence[FrameStatistics],
+        *,
+        words: Words = EXPOSURES,
+        colours: Colours | None = None,
+    ) -> Self:
+        """Reduce the statistics of all exposures."""
+        averaged = cls(len(frames), words=words, colours=colours)
+        for each in frames:
+            averaged.add(each)
+        return averaged
+
+    def add(self, frames: FrameStatistics, name: str = "") -> None:
+        """Add the next exposure, which may have a name.
+
+        Raises
+        ------
+        InputError
+            If it has another shape than the first, another dark, or no finite value that does not
+            saturate; with the first exposure, if its dark has none.
+        """
+        exposure, shape = len(self._frames), frames.mean.shape
+        if exposure == 0:
+            if frames.dark is not None:
+                self._refuse_saturated("'dark'", frames.dark)
+            self.values = np.empty((self.count, *shape), self._dtype)
+            self.variances = np.empty((self.count, *shape), np.float32)
+            self.saturated = np.zeros(shape, bool)
+            self.dark = frames.dark
+            shown = pattern_of(frames.mean) if self.colours is None else self.colours
+            self._period = (1, 1) if shown is None else shown.period
+            self.step = 0.0 if frames.dark is None else frames.dark.step
+            if self.dark is not None:
+                self._screen(self.dark)
+        if shape != self.saturated.shape:
+            raise InputError(
+                f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
+                "expected one"
+            )
+        if not same_statistics(frames.dark, self.dark):
+            raise InputError(
+                f"{self._words.place(exposure)} has another dark than the first: average all with "
+                "one 'dark'"
+            )
+        saturates = frames.saturated > 0
+        which = self._words.place(exposure, name)
+        _refuse_no_variance(which, frames)
+        self._refuse_saturated(which, frames)
+        clipped = clipping_of(frames)
+        self._clipped.append(clipped)
+        self.raw &= frames.raw
+        self.values[exposure] = np.where(saturates, np.nan, frames.mean)
+        self.variances[exposure] = frames.variance
+        self.saturated |= saturates
+        count = int(frames.count.max())
+        self._frames.append(count)
+        self._names.append(name)
+        self._screen(frames)
+        if self.dark is None:
+            self._of_dark.append(_added_by_dark(frames, count))
+        # Clipped samples scatter less: their bins would have most of the weight in the noise model.
+        free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
+        self.step = max(self.step, frames.step)
+        light = light_of(frames)
+        self.light.append(light)
+        common = light.variance(frames.mean)
+        self._points.append(
+            photon_transfer(
+                frames.mean, frames.variance, free, count, frames.step, common, self._period
+            )
+        )
+
+    def _screen(self, frames: FrameStatistics) -> None:
+        """Count the samples that were left out as those of cosmic rays."""
+        if frames.reject is None:
+            return
+        if not self._screened:
+            self._missing = np.zeros(frames.count.shape, np.uint32)
+        self._missing += np.where(frames.count > 0, frames.count.max() - frames.count, np.uint32(0))
+        self._screened += int(frames.count.max())
+
+    def counted_from_lowest(self) -> Self:
+        """Return a copy whose noise models count the signal from the lowest of several exposures.
+
+        Raw values contain the level without light, which adds no photon noise.
+        """
+        counted = copy.copy(self)
+        for known in ("noise", "filters"):
+            vars(counted).pop(known, None)
+        counted._is_counted = True
+        lowest = counted._lowest
+        counted.pedestal = float(np.nanmin(lowest))
+        return counted
+
+    @cached_property
+    def filters(self) -> Filters | None:
+        """Colour filters of the pixels, where they are given or stand out of the values."""
+        if not self._is_counted:
+            return Filters.of(self.colours, *mean_signal(self.values))
+        medians = [float(np.nanmedian(each)) for each in self.values]
+        rise = self.values[int(np.argmax(medians))] - self.values[int(np.argmin(medians))]
+        return Filters.of(self.colours, rise)
+
+    @property
+    def _lowest(self) -> Floats:
+        """Median of the lowest level in the colour of each pixel."""
+        shape = self.saturated.shape
+        lowest = np.empty(shape)
+        for plane in planes_of(None if self.filters is None else self.filters.colours, shape):
+            lowest[plane] = min(float(np.nanmedian(each[plane])) for each in self.values)
+        return lowest
+
+    @cached_property
+    def noise(self) -> NoiseModel | None:
+        """Noise model of one frame, fitted over all pixels of all frames.
+
+        None without scatter: of single frames, and of equal ones that are not rounded.
+        """
+        points = [each - (self.pedestal, 0, 0) for each in self._points]
+        known = any(map(len, points))
+        if self.dark is not None:
+            points.append(_dark_points(self.dark))
+            known |= self.gain is not None and len(points[-1]) > 0
+        every = np.concatenate(points)
+        if not known or (self.step == 0 and not every[:, 1].any()):
+            return None
+        return NoiseModel.fit(every, gain=self.gain, step=self.step)
+
+    def rounded(self, noise: NoiseModel) -> NoiseModel:
+        """Noise model of one frame that counts the rounding of these frames."""
+        return noise if noise.step > 0 else dataclasses.replace(noise, step=self.step)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Number of frames of each exposure."""
+        return tuple(self._frames)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each exposure; empty where it has none."""
+        return tuple(self._names)
+
+    @property
+    def unsteady(self) -> str:
+        """The exposure whose light varied most between its frames, or the dark; or nothing."""
+        if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
+            return f"'dark': {stray.words} (limit {STRAY:g}). See that all its frames are dark"
+        worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
+        if not self.light[worst].is_large:
+            return ""
+        which = self._words.place(worst, self._names[worst])
+        return (
+            f"{which}: {self.light[worst].words} (limit {NAMED:g}). It was "
+            f"taken out of the noise model. See that all frames are of one {self._words.one}, let "
+            "the source settle, or average more frames"
+        )
+
+    @property
+    def clipped(self) -> Clipping | None:
+        """A saturation level that was not given, if the values show one."""
+        return highest(self._clipped)
+
+    def models(self, noise: NoiseModel) -> list[NoiseModel]:
+        """Noise model of each mean frame without that of the dark, from that of one frame."""
+        return [noise.of_mean(frames) for frames in self._frames]
+
+    def dark_variance(self, noise: NoiseModel) -> Floats | None:
+        """Variance of the dark that was subtracted from all, from the noise of one frame.
+
+        Of a dark that is not kept it is what the averages state; None without any. One frame shows
+        no noise, and what exposures in bright light say of that of the dark may be far off: its
+        scatter between neighbours, which holds its pattern too, stands for it.
+        """
+        if self.dark is not None:
+            is_one = self.dark.count.max() <= 1
+            of_frame = _between_neighbours(self.dark.mean) if is_one else noise.scatter(0.0)
+            scatter = of_frame / np.maximum(self.dark.count, 1)
+            of_mean = noise.of_mean(int(self.dark.count.max()))
+            return np.asarray(scatter + of_mean.rounding_apart(0.0, self.dark.mean))
+        stated = float(np.mean(self._of_dark))
+        return np.full(self.saturated.shape, stated) if stated > 0 else None
+
+    def findings(self, noise: NoiseModel | None) -> Findings:
+        """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
+        noisy = None
+        if noise is not None:
+            pairs = zip(self.light, self.values, strict=True)
+            light = (of_light.variance(values) for of_light, values in pairs)
+            noisy = noisy_pixels(self._signals, self.variances, self._frames, noise, light=light)
+            if self._screened:
+                noisy |= often_rejected(self._missing, self._screened)
+        hot = np.zeros(self.saturated.shape, bool)
+        if self.dark is not None:
+            hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
+        dead = None
+        if noise is not None or self.dark is not None:
+            dead = self._dead(noise) & ~hot
+        return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
+
+    def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
+        saturates = frames.saturated > 0
+        refuse_saturated(which, frames.mean, saturates, self.saturation, self._saturation_key)
+
+    def _dead(self, noise: NoiseModel | None) -> Bools:
+        """Pixels that are dead in every exposure in which they do not saturate."""
+        models = None if noise is None else self._models_with_dark(noise)
+        measured = np.isfinite(self.values).any(axis=0)
+        usual = 1.0 if self.filters is None else self.filters.map_of(self.saturated.shape)
+        dead: Bools = dead_pixels(self._signals, models, usual)
+        if models is not None:
+            dead |= blind_pixels(self._signals, models, usual)
+        return dead & measured
+
+    @property
+    def _signals(self) -> Array:
+        """Values above the level without light, as far as it is known."""
+        return self.values - self._lowest if self._is_counted else self.values
+
+    def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
+        """Noise model of each mean frame less the dark, for one exposure by itself."""
+        of_dark = self.dark_variance(noise)
+        variance = 0.0 if of_dark is None else float(np.median(of_dark))
+        return [noise.of_mean(frames, dark_variance=variance) for frames in self._frames]
+
+
+def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:
+    """Refuse averages of several samples without a finite variance that is not negative."""
+    several = (frames.count > 1) & np.isfinite(frames.mean)
+    wrong = several & ~(np.isfinite(frames.variance) & (frames.variance >= 0))
+    if wrong.any():
+        raise InputError(
+            f"{which}: 'variance' holds {frames.variance[wrong][0]:g}, expected finite numbers not "
+            "below 0 where 'count' is above 1"
+        )
+
+
+def _added_by_dark(frames: FrameStatistics, count: int) -> float:
+    """Variance that a dark adds to the mean, as `variance_of_mean` has it: its median."""
+    if count < 2:
+        return 0.0
+    return max(0.0, float(np.nanmedian(frames.variance_of_mean - frames.variance / count)))
+
+
+def _between_neighbours(frame: Array) -> float:
+    """Variance of pixels about their neighbours, in DN²: half that of differences.
+
+    Of normal differences 68.27 % lie within one standard deviation; bad pixels do not count.
+    """
+    steps = np.abs(np.diff(frame.ravel().astype(np.float64)))
+    return float(np.nanpercentile(steps, 68.27) ** 2 / 2)
+
+
+def _dark_points(dark: FrameStatistics) -> Array:
+    """Points of the photon-transfer curve at signal 0."""
+    usable: Bools = np.asarray(dark.saturated == 0)
+    frames = int(dark.count.max())
+    common = light_of(dark).variance(dark.mean)
+    signal = np.zeros(dark.mean.shape)
+    return photon_transfer(signal, dark.variance, usable, frames, dark.step, common)

@@ -1,0 +1,389 @@
+r"""Averaged frames, their dark, their light between frames, and files of them.
+
+Frames of light 1 + δ make a pixel of signal μ scatter by μ² var(δ) besides its noise. The means of
+the frames show it. Where a share f of a pixel's samples is missing, frames are means over different
+pixels, so samples count there as differences to the first value of their pixel. With N = Σ (1 − f)
+samples in the average frame the means have the variance
+
+.. math:: V = \bar\mu^2 \operatorname{var}(\delta) + \sum (1 - f) \sigma^2 / N^2 , \qquad
+    \bar\mu = \sum_\text{follow} (1 - f) \mu / N ,
+
+with the signals of the pixels that follow the light.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from equipix._check import Array, Floats, ReadOnly, check_maps
+from equipix.errors import BrightDarkWarning, FileError, InputError, warn
+from equipix.io.formats import load_pages, refuse_saved, save_pages, saved_kind
+from equipix.io.record import check_format, check_pages
+from equipix.measured.noise import scatter_limit, step_of
+
+_FORMAT = 1  # of saved statistics; files with a larger number are refused
+
+_KIND = "frame statistics"
+
+_PAGES = {
+    "mean": np.float64,
+    "variance": np.float64,
+    "variance_of_mean": np.float64,
+    "count": np.uint32,
+    "saturated": np.uint32,
+}
+
+_COUNTS = ("count", "saturated")
+
+_NUMBERS = ("saturation", "reject", "step", "light_variance")
+
+_SAMPLED = 4096  # pixels that show the step between values
+
+_DARK = "dark_"  # before the names of the dark's pages
+
+DARKER = 0.25
+"""Share of the dark by which frames are not darker than it: a dark drifts by less."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStatistics(ReadOnly):
+    """Mean and scatter of repeated frames of one scene, as read-only arrays.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (rows, cols), float64
+        Mean of the frames, the dark mean subtracted if there was one, in DN.
+    variance : ndarray, shape (rows, cols), float64
+        Unbiased sample variance of one frame, in DN²; NaN where fewer than two samples count.
+    variance_of_mean : ndarray, shape (rows, cols), float64
+        Variance of `mean`, in DN²: ``variance / count``, plus that of the dark mean.
+    count : ndarray, shape (rows, cols), uint32
+        Number of samples that went into the mean.
+    saturated : ndarray, shape (rows, cols), uint32
+        Number of samples at or above the saturation level.
+    dark : FrameStatistics or None
+        The dark frames whose mean was subtracted, where they were given as statistics. They show
+        which pixels are hot, and how noisy a frame without light is.
+    saturation : float or None
+        The level that samples were compared with, in DN; None if there was none.
+    raw : bool
+        Whether no dark was subtracted from whole numbers, as cameras write them.
+    reject : float or None
+        The deviation, in standard deviations, beyond which samples were left out; None where all
+        count.
+    step : float
+        Step between the values of the frames, in DN: 1 of whole numbers, 16 of 12 bits that were
+        shifted to 16; 0 of values that are not whole. Of files that hold no
+        step it is found from the sums over frames; it is 0 where they are not whole, since the dark
+        that was subtracted is not kept.
+    light_variance : float or None
+        Unbiased variance of the means of the frames over the pixels that are not masked, in DN²:
+        that of the light, and of the noise over the number of pixels. Where samples are missing it
+        is that of their differences to the first values of their pixels. None of one frame, or
+        where it is not known: a saved average does not show it without the pixels of another mask.
+    """
+
+    mean: NDArray[Any]
+    variance: NDArray[Any]
+    variance_of_mean: NDArray[Any]
+    count: NDArray[Any]
+    saturated: NDArray[Any]
+    dark: FrameStatistics | None = None
+    saturation: float | None = None
+    raw: bool = False
+    reject: float | None = None
+    step: float = 0.0
+    light_variance: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse maps of different shapes."""
+        ReadOnly.__post_init__(self)
+        dark = {} if self.dark is None else {"dark": self.dark.mean}
+        check_maps("FrameStatistics", self.maps | dark)
+
+    @property
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """The five maps by their names."""
+        return {name: getattr(self, name) for name in _PAGES}
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `FrameStatistics.load` reads.
+
+        `equipix.average`, experiment.toml and the command line take the file in the place of the
+        frames.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        save_statistics(path, self, force=force)
+
+    @staticmethod
+    def load(path: str | PathLike[str]) -> FrameStatistics:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : str or path
+            A .tif or .npz file.
+
+        Returns
+        -------
+        FrameStatistics
+            The averaged frames.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, holds something else, or was written in a newer format.
+        """
+        return load_statistics(path)
+
+
+def save_statistics(
+    path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
+) -> None:
+    """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
+    pages, dark = dict(statistics.maps), statistics.dark
+    content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
+    content |= {name: getattr(statistics, name) for name in ("raw", *_NUMBERS)}
+    if dark is not None:
+        pages |= {_DARK + name: values for name, values in dark.maps.items()}
+        content |= {_DARK + name: getattr(dark, name) for name in _NUMBERS}
+    save_pages(path, pages, content, force=force)
+
+
+def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
+    """Read averaged frames; the parameter and errors are those of `FrameStatistics.load`."""
+    return read_statistics(path, *load_pages(path))
+
+
+def read_statistics(
+    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
+) -> FrameStatistics:
+    """Make averages of the arrays and metadata of the file that `save_statistics` wrote."""
+    check_format(path, content, _KIND, _FORMAT)
+    check_pages(path, pages, _PAGES)
+    dark = None
+    if _DARK + "mean" in pages:
+        check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
+        dark = _of_pages(path, pages, content, _DARK)
+    raw = content.get("raw", False)
+    statistics = dataclasses.replace(_of_pages(path, pages, content), dark=dark, raw=raw)
+    return statistics if "step" in content else _with_steps(statistics)
+
+
+def _with_steps(statistics: FrameStatistics) -> FrameStatistics:
+    """Find the steps of averages that were saved without: sums over frames still show them."""
+    dark, mean = statistics.dark, statistics.mean
+    if dark is not None:
+        dark, mean = _with_steps(dark), mean + dark.mean
+    step = _step(mean, statistics.variance, statistics.count)
+    return dataclasses.replace(statistics, dark=dark, step=step)
+
+
+def _of_pages(
+    path: str | PathLike[str],
+    pages: Mapping[str, NDArray[Any]],
+    content: dict[str, Any],
+    before: str = "",
+) -> FrameStatistics:
+    mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
+    numbers = {name: content[before + name] for name in _NUMBERS if before + name in content}
+    for name, value in numbers.items():
+        if type(value) not in (int, float) and (name == "step" or value is not None):
+            raise FileError(
+                f"{path}: is damaged: its '{before}{name}' is {value!r}, expected a number"
+            )
+    return FrameStatistics(mean, variance, of_mean, count, saturated, **numbers)
+
+
+def saved_shape(path: Path) -> tuple[int, int] | None:
+    """Rows and columns of the averages in a file; None of frames. A calibration is an error."""
+    if (kind := saved_kind(path)) is None:
+        return None
+    if kind != _KIND:
+        refuse_saved(path)
+    rows, cols = load_statistics(path).mean.shape
+    return rows, cols
+
+
+def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> float:
+    """Step between the values of frames, of a sample of the pixels.
+
+    Sums over frames are multiples of it. Those of a pixel whose frames are equal are multiples of
+    their number as well, so there the mean counts.
+    """
+    sample = np.linspace(0, mean.size - 1, min(mean.size, _SAMPLED)).astype(np.intp)
+    means, variances, counts = (each.ravel()[sample] for each in (mean, variance, count))
+    return step_of(means * np.where(variances > 0, counts, 1))
+
+
+def _check_mask(mask: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
+    """Refuse a mask of frames of that shape that is none, or leaves no pixel."""
+    if mask is None:
+        return
+    if mask.dtype != np.bool_ or mask.shape != shape:
+        raise InputError(
+            f"'mask' is {mask.dtype} of shape {mask.shape}, expected bool of shape {shape}, True "
+            f"= do not use{': give mask != 0' if mask.shape == shape else ''}"
+        )
+    if mask.all():
+        raise InputError("'mask' is True in every pixel, expected some pixels to use")
+
+
+def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStatistics:
+    """Return averages without the pixels of a mask."""
+    if mask is None:
+        return statistics
+    maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
+    for name, values in maps.items():
+        values[mask] = 0 if name in _COUNTS else np.nan
+    return dataclasses.replace(statistics, **maps)
+
+
+def _subtract(
+    statistics: FrameStatistics, dark: FrameStatistics | NDArray[Any] | None
+) -> FrameStatistics:
+    if dark is None:
+        return statistics
+    if statistics.dark is not None:
+        if isinstance(dark, FrameStatistics) and same_statistics(statistics.dark, dark):
+            return statistics
+        raise InputError(
+            "'source' is an average from which another dark than 'dark' is subtracted already: "
+            "give the frames, or the dark that was subtracted"
+        )
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
+    mean = dark.mean if isinstance(dark, FrameStatistics) else dark
+    if mean.shape != statistics.mean.shape:
+        raise InputError(
+            f"'dark' has shape {mean.shape}, expected {statistics.mean.shape} like the frames"
+        )
+    if not np.isfinite(mean).any():
+        raise InputError("'dark' holds no finite number: give the mean of dark frames")
+    variance = dark.variance_of_mean if isinstance(dark, FrameStatistics) else 0.0
+    return dataclasses.replace(
+        statistics,
+        mean=statistics.mean - mean,
+        variance_of_mean=statistics.variance_of_mean + variance,
+        dark=dark if isinstance(dark, FrameStatistics) else None,
+        raw=False,
+    )
+
+
+def warn_of_bright_dark(statistics: FrameStatistics) -> None:
+    """Warn of a dark that is not that of the frames, or was subtracted from them before."""
+    if statistics.dark is None or not np.isfinite(statistics.mean).any():
+        return
+    level, below = np.nanmedian(statistics.dark.mean), -np.nanmedian(statistics.mean)
+    if level > 0 and below > DARKER * level:
+        warn(
+            f"the frames are darker than 'dark' by {below:.4g} of {level:.4g} DN in the median "
+            f"(limit {DARKER:.0%}): see that frames and dark are not exchanged, and give frames "
+            "from which no dark was subtracted",
+            BrightDarkWarning,
+        )
+
+
+def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:
+    """Refuse as a dark an average that holds no dark level; `place` is for the message."""
+    if dark.dark is not None:
+        raise InputError(
+            f"{place}: its dark was already subtracted; 'dark' needs frames or an average without "
+            "a dark"
+        )
+
+
+def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) -> bool:
+    """Whether two averages are the same measurement: one object, or equal to the last bit."""
+    if one is None or other is None or one is other:
+        return one is other
+    pairs = zip(one.maps.values(), other.maps.values(), strict=True)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+_LARGEST = 0.5
+"""Relative variation up to which frames are those of one light; above, offsets vary."""
+
+NAMED = 0.1
+"""Variance by the light over that of noise, above which it is worth a word."""
+
+
+STRAY = 10.0
+"""Variance in common over that of noise, which only frames of different things have."""
+
+
+class Light(NamedTuple):
+    """Variance that all pixels of some frames have in common."""
+
+    relative: float = 0.0
+    """Of the light, over its squared mean."""
+    offset: float = 0.0
+    """Of all values alike, in DN², where the frames have no light."""
+    over_noise: float = 0.0
+    """Mean over the pixels, over the variance that is left: noise."""
+
+    def variance(self, signal: Array) -> Floats:
+        """Variance that it adds to one frame of a pixel of this signal, in DN²."""
+        return np.asarray(self.relative * np.square(signal, dtype=np.float64) + self.offset)
+
+    @property
+    def is_large(self) -> bool:
+        """Whether noise would be larger by a tenth or more with it."""
+        return self.over_noise > NAMED
+
+    @property
+    def words(self) -> str:
+        """What varies, by how much, and over the noise."""
+        what = (
+            f"light varies by {self.relative**0.5:.2%}"
+            if self.relative
+            else (f"offset varies by {self.offset**0.5:.3g} DN")
+        )
+        return (
+            f"the {what} rms between the frames, which adds {self.over_noise:.3g} times the noise"
+        )
+
+
+def light_of(frames: FrameStatistics) -> Light:
+    """What the means of frames show beyond noise, which passes six standard deviations nowhere.
+
+    Saturated pixels do not follow the light. Of frames from which no dark was subtracted the signal
+    holds the dark level.
+    """
+    count = int(frames.count.max())
+    known = np.isfinite(frames.mean) & np.isfinite(frames.variance)
+    if frames.light_variance is None or count < 2 or not known.any():
+        return Light()
+    share = np.where(known, frames.count / count, 0)
+    samples = float(share.sum())
+    scatter = float((share[known] * frames.variance[known]).sum()) / samples
+    variance = frames.light_variance
+    if variance <= scatter_limit(count) * scatter / samples:
+        return Light()
+    follows = known & (frames.saturated == 0)
+    mean = float((share[follows] * frames.mean[follows]).sum()) / samples
+    light = Light(offset=variance)
+    if variance < (_LARGEST * mean) ** 2:
+        light = Light(relative=variance / mean**2)
+    common = float(light.variance(frames.mean[follows]).mean()) if follows.any() else 0.0
+    own = max(float(frames.variance[follows].mean()) - common, 1e-3 * common)
+    return light._replace(over_noise=common / own)

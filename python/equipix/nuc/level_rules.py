@@ -1,0 +1,350 @@
+"""What levels or the curves fitted to them leave to say: saturation, inverse, misfit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from equipix._check import Array, Bools
+from equipix.errors import InputError, InverseWarning, MisfitWarning, SaturationWarning, warn
+from equipix.findings import usable
+from equipix.measured.defects import SIGMAS
+from equipix.measured.means import Averaged
+from equipix.measured.measured import Measured
+from equipix.measured.noise import inliers, scatter_limit
+from equipix.measured.saturation import Clipping, clipping_advice, is_of_bits
+from equipix.nuc.response import Response
+
+_MOST_AT_HIGHEST = 0.5
+"""Share of its pixels at the highest value of all levels above which a level saturates."""
+
+_WHOLE = 0.99
+"""The same, above which only pixels that do not respond are below: nothing is left to fit."""
+
+_FEWEST_JUDGED = 16
+"""Fewest pixels of an array whose spread is judged."""
+
+_ROUNDING = 1e-9
+"""Relative rounding of means from which a dark was subtracted, and added again."""
+
+
+def check_saturation(
+    measured: Measured, averaged: Averaged | None = None, mask: Bools | None = None
+) -> None:
+    """Warn of levels that probably saturate, and refuse those that do so as a whole.
+
+    Raises
+    ------
+    InputError
+        If a level is at the highest value of all levels in nearly all pixels.
+
+    Notes
+    -----
+    A level with most of its pixels at exactly the highest value saturates, if the pixels of another
+    level differ, or the value is the largest number of some bits. If all levels are even without
+    it, they are no frames of a camera. Where no such value is found, the noise of averages shows
+    levels that a full well limits.
+    """
+    top, shares = _at_highest(measured)
+    crowded = [level for level, share in enumerate(shares) if share > _MOST_AT_HIGHEST]
+    found = measured.clipped
+    if crowded and (is_of_bits(top) or _others_differ(measured, crowded)):
+        _refuse_whole(top, shares, crowded)
+        values = round(sum(shares) * measured.values[0].size)
+        found = found or Clipping(top, values)
+    if found is None:
+        if averaged is not None:
+            warn_of_full_wells(averaged, mask)
+        return
+    where = [level for level, share in enumerate(shares) if share > 0] if found.level == top else []
+    named = f"{_named(shares, where)} of 'levels': " if where else ""
+    warn(named + clipping_advice(found, "levels.toml", "nuc.fit"), SaturationWarning)
+
+
+def _at_highest(measured: Measured) -> tuple[float, list[float]]:
+    """Highest finite raw value of all levels, and the share of each level's pixels there."""
+    tops = [_highest(_raw_level(measured, level)) for level in range(len(measured.values))]
+    top = max(tops)
+    if not np.isfinite(top) or top <= 0 or measured.values[0].size < _FEWEST_JUDGED:
+        return top, [0.0] * len(tops)
+    least = top * (1 - _ROUNDING)
+    return _whole(top), [
+        _share(_raw_level(measured, level), least) if each >= least else 0.0
+        for level, each in enumerate(tops)
+    ]
+
+
+def _highest(raw: Array) -> float:
+    """Largest finite value, or minus infinity."""
+    return float(np.max(raw, initial=-np.inf, where=np.isfinite(raw)))
+
+
+def _share(raw: Array, least: float) -> float:
+    """Share of the finite values that are `least` or more."""
+    known = np.isfinite(raw)
+    count = int(np.count_nonzero(known))
+    return int(np.count_nonzero(known & (raw >= least))) / max(1, count)
+
+
+def _whole(top: float) -> float:
+    """The whole number that a mean is but for rounding, or the mean."""
+    return float(np.rint(top)) if abs(top - np.rint(top)) <= _ROUNDING * top else top
+
+
+def _others_differ(measured: Measured, crowded: Sequence[int]) -> bool:
+    """Whether another level has most of its pixels below its highest value."""
+    for level in set(range(len(measured.values))) - set(crowded):
+        raw = _raw_level(measured, level)
+        top = _highest(raw)
+        if np.isfinite(top) and _share(raw, top - _ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
+            return True
+    return False
+
+
+def _refuse_whole(top: float, shares: Sequence[float], crowded: Sequence[int]) -> None:
+    """Refuse levels that saturate in nearly all pixels."""
+    whole = [level for level in crowded if shares[level] >= _WHOLE]
+    if whole:
+        raise InputError(
+            f"'levels': {_named(shares, whole)} are exactly {top:.10g}, the highest value, so they "
+            "saturate: leave such levels out, or expose less"
+        )
+
+
+def _named(shares: Sequence[float], levels: Sequence[int]) -> str:
+    """Name levels with their shares."""
+    return " and ".join(f"{shares[each]:.1%} of the values of level {each}" for each in levels)
+
+
+def _raw_level(measured: Measured, level: int) -> Array:
+    """Values of a level before the dark was subtracted; NaN where they are known to saturate."""
+    values: Array = measured.values[level]
+    if measured.mask is not None and measured.mask.ndim == 3:
+        values = np.where(measured.mask[level], np.nan, values)
+    return values if measured.dark is None else values + measured.dark
+
+
+_SHARE = 0.5
+"""Variance of a level that saturates over that of a darker one."""
+
+_ROUNDED_VARIANCE = 0.25
+"""Most by which rounding to whole DN changes a variance, in DN²."""
+
+_TAIL = 0.01
+"""Share of the pixels beyond the ends of a level's values."""
+
+
+class _Scatter(NamedTuple):
+    """Mean value of a level, and the temporal variance of one frame."""
+
+    level: int
+    mean: float
+    variance: float
+    least: float
+    """Lower bound of that of the pixels' own noise: a drift of the light is no part of it."""
+
+
+def warn_of_full_wells(averaged: Averaged, mask: Bools | None) -> None:
+    """Warn of levels that scatter less than a darker one, and say what to do.
+
+    Notes
+    -----
+    Saturation is where the temporal variance has its maximum [1]_: a full well loses what exceeds
+    it. A drift of the light in the frames of the darker level would look the same, so what all of
+    its pixels may have in common does not count.
+
+    References
+    ----------
+    .. [1] European Machine Vision Association, "EMVA Standard 1288", release 4.0 linear, 2021.
+    """
+    used = _used(averaged, mask)
+    if np.count_nonzero(used) < _FEWEST_JUDGED:
+        return
+    lowest = averaged.values[int(np.argmin([each[used].mean() for each in averaged.values]))][used]
+    scatters = [
+        _scatter(averaged, level, used, lowest)
+        for level, frames in enumerate(averaged.frames)
+        if frames > 1
+    ]
+    full = [each for each in scatters if _noisier(each, scatters)]
+    if full:
+        first = min(full, key=lambda each: each.mean)
+        darker = max(_noisier(first, scatters), key=lambda each: each.variance)
+        warn(_words(full, first, darker) + _advice(averaged, used, full), SaturationWarning)
+
+
+def _noisier(bright: _Scatter, scatters: list[_Scatter]) -> list[_Scatter]:
+    """Darker levels with a noise that saturation alone explains."""
+    return [
+        each
+        for each in scatters
+        if each.mean < bright.mean
+        and bright.variance < min(each.least, _SHARE * each.variance) - _ROUNDED_VARIANCE
+    ]
+
+
+def _used(averaged: Averaged, mask: Bools | None) -> Bools:
+    """Pixels with a value and a variance at every level, so that gains are the same at all."""
+    known = np.isfinite(averaged.values) & np.isfinite(averaged.variances)
+    used = np.asarray(known.all(axis=0))
+    return used if mask is None else used & ~mask.reshape(-1, *used.shape).any(axis=0)
+
+
+def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Scatter:
+    """Noise of a level, with its bound."""
+    frames = averaged.frames[level]
+    variances = averaged.variances[level][used].astype(np.float64)
+    rise = averaged.values[level][used].astype(np.float64) - lowest
+    kept = inliers(variances, scatter_limit(frames))
+    common = _common(variances[kept], rise[kept], frames - 1)
+    mean, variance = (
+        float(_raw_average(averaged, level)[used].mean()),
+        float(variances[kept].mean()),
+    )
+    return _Scatter(level, mean, variance, variance - common)
+
+
+def _common(variances: Array, rise: Array, freedom: int) -> float:
+    """Largest variance that pixels may have in common, as a drift of the light gives it.
+
+    Notes
+    -----
+    Sample variances of a variance σ² of their own and C in common have the mean σ² + C, and scatter
+    by σ⁴ + 2σ²C, times 2 over the degrees of freedom f: C² is the square of the mean less that.
+    Both parts rise with the gain of a pixel, so the scatter is that about their line over the
+    `rise` from the lowest level. The scatter of N variances has a relative standard error of
+    √((2 + 12/f)/N), with the kurtosis of χ².
+    """
+    square = float(variances.mean()) ** 2
+    error = SIGMAS * float(np.sqrt((2 + 12 / freedom) / variances.size))
+    scatter = float(variances.var()) - _by_rise(variances, rise)
+    return float(np.sqrt(max(0.0, square * (1 + error) - freedom / 2 * scatter)))
+
+
+def _by_rise(variances: Array, rise: Array) -> float:
+    """Part of the scatter of variances that their line over the rise explains."""
+    steepness = float(rise.var())
+    if steepness == 0:  # the lowest level itself
+        return 0.0
+    covariance = float(np.mean((rise - rise.mean()) * (variances - variances.mean())))
+    return covariance**2 / steepness
+
+
+def _raw_average(averaged: Averaged, level: int) -> Array:
+    """Mean values of a level before the dark was subtracted."""
+    values: Array = averaged.values[level]
+    return values if averaged.dark is None else values + averaged.dark.mean
+
+
+def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
+    """Say which levels saturate, with the numbers of the darkest of them."""
+    named = " and ".join(f"level {each.level}" for each in full)
+    verbs = ("saturates", "counts") if len(full) == 1 else ("saturate", "count")
+    least, most = (
+        f"{each.variance:.3g} DN² at {each.mean:.6g} DN (level {each.level})"
+        for each in (first, darker)
+    )
+    return (
+        f"{named} of 'levels' probably {verbs[0]} below the top of the ADC, by a full well, and "
+        f"{verbs[1]} as valid: the variance of a frame is {least}, but {most}. Leave out what "
+        "saturates"
+    )
+
+
+def _advice(averaged: Averaged, used: Bools, full: list[_Scatter]) -> str:
+    """Name the saturation level, where it is above the values of all other levels."""
+    if averaged.dark is None and not averaged.raw:
+        return ""  # less a dark that was not kept
+    saturate = [each.level for each in full]
+    free = [level for level in range(averaged.count) if level not in saturate]
+    low = min(float(np.quantile(_raw_average(averaged, level)[used], _TAIL)) for level in saturate)
+    highest = max(
+        float(np.quantile(_raw_average(averaged, level)[used], 1 - _TAIL)) for level in free
+    )
+    if np.floor(low) <= highest:
+        return ""
+    level = f"{np.floor(low):.10g}"
+    return (
+        f", and write saturation = {level} in [sensor] of levels.toml, or give it as 'saturation' "
+        "to equipix.average"
+    )
+
+
+_MOST = 2.0
+"""Misfit of the array above which more of it comes from the order than from noise."""
+
+_LEAST = 0.5
+"""Mean of reduced χ² below which the noise is less than stated."""
+
+
+def warn_of_misfit(response: Response, misfit: float) -> None:
+    """Warn of a misfit that noise does not explain, or of less than noise, and say what to do."""
+    if misfit < _LEAST:
+        _warn_of_large_noise(response)
+    if not misfit > _MOST:
+        return
+    order, levels = response.order, len(response.levels)
+    higher = ""
+    if response.metadata["options"]["order"] == "auto":
+        higher = "no other order predicts levels that are left out better, so "
+    elif order < 3:
+        more = "fit with" if order < levels - 2 else "give more levels and fit with"
+        higher = f"{more} order={order + 1} or order='auto', "
+    warn(
+        f"curves of order {order} leave half of the pixels a misfit of {misfit:.3g} or more times "
+        f"that of noise: {higher}check that the source was steady and that the noise was as "
+        "stated. find_defects flags pixels that deviate from the others, not what all have in "
+        "common",
+        MisfitWarning,
+    )
+
+
+def _warn_of_large_noise(response: Response) -> None:
+    """Warn of residuals that are smaller than the noise, of which not all pixels have few."""
+    judged = usable(response.flags) & (response.freedom > 0)
+    chi2 = float(response.reduced_chi2[judged].mean())
+    if chi2 < _LEAST:
+        warn(
+            f"the residuals of the curves are smaller than the noise predicts (reduced "
+            f"chi-square {chi2:.3g}, expected 1, limit {_LEAST:g}): standard deviations are too "
+            "large, and bad pixels may be missed. Check that the light was steady while the "
+            "frames of a level were taken, and that the noise was as stated",
+            MisfitWarning,
+        )
+
+
+_LARGEST_DIFFERENCE = 0.3
+"""Largest difference, over the noise of a frame, that passes: it adds 4 % to the noise."""
+
+_MOST_BEYOND = 1e-3
+"""Largest share of the usable pixels that may differ by more, without a warning."""
+
+
+def inverse_verdict(difference: Array, noise: float | None) -> dict[str, float | int | None]:
+    """Compare the error of the cubic with the noise of a frame, and warn where it is large.
+
+    Parameters
+    ----------
+    difference : ndarray, shape (pixels,)
+        Largest difference to the exact inverse of usable pixels, in DN.
+    noise : float, optional
+        Noise of a frame, in DN, where it is known.
+
+    Returns
+    -------
+    dict
+        The largest difference, the noise, and the number of pixels beyond the limit, for metadata.
+    """
+    largest = float(np.max(difference, initial=0.0))
+    beyond = 0 if noise is None else int(np.count_nonzero(difference > _LARGEST_DIFFERENCE * noise))
+    if beyond > _MOST_BEYOND * difference.size:
+        warn(
+            f"the cubic that inverts the curves differs from their inverse by up to {largest:.2g} "
+            f"DN, and in {beyond} of {difference.size} pixels by more than {_LARGEST_DIFFERENCE:g} "
+            f"of the noise of a frame, {noise:.2g} DN: correct(exact=True), or fit a lower order "
+            "or a smaller range of levels",
+            InverseWarning,
+        )
+    return {"largest_error_dn": largest, "noise_dn": noise, "pixels_beyond": beyond}

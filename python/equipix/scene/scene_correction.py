@@ -1,0 +1,541 @@
+"""What all corrections from the scene share: update, state, files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
+
+from equipix._check import Array, as_array, as_level, check_shape, number, positive_workers
+from equipix._native import SceneCorrection as Native
+from equipix.correction.polynomial import Polynomial
+from equipix.errors import FileError, InputError, UnusedInputWarning, warn
+from equipix.findings import set_bits
+from equipix.io.formats import load_pages, save_pages
+from equipix.io.record import check_format
+from equipix.measured.defects import unresponsive
+
+DataRange = tuple[float, float]
+"""Lowest and highest raw value in DN."""
+
+_FEW = 0.1
+"""Share of the frames that counted below which `result` warns."""
+
+_STILL = 0.25
+"""Share of the field above which `result` warns that it never moved."""
+
+_USED = 0.3
+"""Share of the range below which `result` warns that the frames do not use it."""
+
+_SPREAD = 0.3
+"""Standard deviation of the gains above which `result` warns."""
+
+_FIRST_MASK = 64
+"""Frames after which pixels that do not respond are masked for the first time."""
+
+_TAKEN = (np.uint8, np.uint16, np.float32, np.float64)
+"""Types that the compiled part takes as they are."""
+
+
+class SceneCorrection:
+    """Base of the corrections from the scene: gain and offset that each frame changes.
+
+    Raw values v become y = (v − low) / (high − low) with the ends of `data_range`. The corrected
+    frame is X = gain · y + offset, in DN low + (high − low) · X. After every frame the mean of the
+    gains is 1 and that of the offsets 0. Coefficients are of single precision.
+
+    Frames with a value that is not finite, and frames of which half of the rows or more hold one
+    value each, such as frames that were lost or cut, are corrected but change no state. A value
+    more than one span outside of the range is refused.
+
+    Values from `saturation` on, by default the largest whole number of the frames' dtype, do not
+    change their pixels, nor the pixels with more than an eighth of such values around them.
+
+    Pixels of `mask` do not learn, and others do not learn from them; from 64 frames on those that
+    vary by less than half of what the pixels around them do are masked too. A frame that differs
+    from the one before and from the last usable one by more than three times the usual change, as
+    one of a shutter, is corrected and changes nothing (`Registered` compares pairs instead).
+    """
+
+    method: ClassVar[str] = ""
+    """Name of the method, as the command line takes it."""
+
+    _UNLEARNED: ClassVar[str] = "take frames first"
+    """What to do where no frame counted."""
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        data_range: DTypeLike | DataRange,
+        saturation: float | None,
+        workers: int | None,
+        options: dict[str, Any],
+        mask: ArrayLike | None,
+    ) -> None:
+        """Check what all methods take; `options` holds the keywords of the method."""
+        self._shape = check_shape(shape)
+        self._range = _range_of(data_range)
+        self._saturation = as_level(saturation)
+        self._workers = positive_workers(workers)
+        self._options = options
+        self._native = self._made()
+        self._mask, self._masked_at = _mask_of(mask, self._shape), 0
+        self._peak: float | None = None
+        if self._mask.any():
+            self._native.mask(self._mask)
+
+    def _made(self) -> Native:
+        """Make the compiled correction of the options."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Short form: method, sizes and frames."""
+        rows, cols = self._shape
+        return f"<{type(self).__name__} of {rows} x {cols} pixels, {self.frames} frames>"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        return self._shape
+
+    @property
+    def data_range(self) -> DataRange:
+        """Lowest and highest raw value in DN, which become 0 and 1."""
+        return self._range
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keywords of the method, as JSON values."""
+        return dict(self._options)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that counted: of methods that need motion, those that moved."""
+        return self._native.frames()
+
+    @property
+    def frames_taken(self) -> int:
+        """Number of usable frames that were given, whether they counted or not."""
+        return self._native.taken()
+
+    @property
+    def frames_foreign(self) -> int:
+        """Number of frames that were refused since they differ from the ones before and after."""
+        return self._native.foreign()
+
+    @property
+    def floor(self) -> float | None:
+        """Upper limit in DN of the rms pattern that the method leaves, measured by itself.
+
+        It follows from how much the pattern still changes, of `Kalman` from its variances, at the
+        mean of the frames: None before 32 frames that counted. It is up to 1.5 times what is left,
+        and includes nothing that stands still in all frames. While a pattern is still being
+        learned, it is larger.
+        """
+        found = self._native.floor(self._workers)
+        return None if found is None else found * (self._range[1] - self._range[0])
+
+    @property
+    def saturation(self) -> float | None:
+        """Saturation level in DN that was given."""
+        return self._saturation
+
+    @property
+    def gain(self) -> Array:
+        """Gain of each pixel, mean 1, shape (rows, cols), float32, read-only."""
+        return self._native.coefficients()[0]
+
+    @property
+    def offset(self) -> Array:
+        """Offset of each pixel in DN, mean 0, shape (rows, cols), float32.
+
+        It is that of the formula corrected = low + gain · (raw − low) + offset.
+        """
+        low, high = self._range
+        return self._native.coefficients()[1] * np.float32(high - low)
+
+    def update(self, frame: ArrayLike) -> Array:
+        """Correct a frame by the coefficients so far, then learn from it.
+
+        Parameters
+        ----------
+        frame : array_like, shape (rows, cols)
+            Raw frame in DN.
+
+        Returns
+        -------
+        ndarray, shape (rows, cols), float32
+            The corrected frame in DN.
+
+        Raises
+        ------
+        InputError
+            If the frame has another shape, or a finite value more than one span outside of the
+            range; then nothing has changed.
+        """
+        raw = as_array("frame", frame, ndim=2)
+        if raw.shape != self._shape or raw.dtype == np.bool_:
+            raise InputError(
+                f"'frame' is {raw.dtype} of shape {raw.shape}, expected numbers of {self._shape}"
+            )
+        taken = raw if raw.dtype in _TAKEN else raw.astype(np.float64)
+        corrected = np.empty(self._shape, np.float32)
+        level = self._saturation
+        if level is None and raw.dtype.kind in "iu":
+            level = float(np.iinfo(raw.dtype).max)
+        self._native.update(taken, corrected, saturation=level, workers=self._workers)
+        if np.isfinite(top := float(raw.max())):
+            self._peak = top if self._peak is None else max(self._peak, top)
+        self._mask_unresponsive()
+        return corrected
+
+    def _mask_unresponsive(self) -> None:
+        """Mask pixels that do not respond, after 64 frames and each time that they doubled."""
+        taken = self.frames_taken
+        if taken < _FIRST_MASK or taken & (taken - 1) or taken == self._masked_at:
+            return
+        self._masked_at = taken
+        weak = unresponsive(np.ones(self._shape), self._native.deviation(), taken)
+        if not (self._mask | weak).all():
+            self._native.mask(self._mask | weak)
+
+    def _learned(self) -> bool:
+        """Whether the coefficients have changed."""
+        return self.frames > 0
+
+    def check_learned(self) -> None:
+        """Refuse to give a result where no frame counted.
+
+        Raises
+        ------
+        InputError
+            If no frame counted: the scene never moved, or too few frames were taken.
+        """
+        if not self._learned():
+            raise InputError(
+                f"{type(self).__name__} has learned nothing, from {self.frames} frames that "
+                f"counted: {self._UNLEARNED}"
+            )
+
+    def result(self) -> Polynomial:
+        """Correction by the coefficients so far.
+
+        Returns
+        -------
+        Polynomial
+            Corrected frame c_0 + c_1 · raw in DN, with c_1 the gain and c_0 the offset for raw
+            values in DN. A pixel that varies over the frames by less than half of what its
+            neighbours do is flagged ``DEAD``, from 51 frames on, and one of a gain above 2.
+
+        Raises
+        ------
+        InputError
+            If no frame counted: the scene never moved, or too few frames were taken.
+
+        Warns
+        -----
+        UnusedInputWarning
+            If less than a tenth of the usable frames counted.
+        """
+        self.check_learned()
+        self._warn_of_few()
+        self._warn_of_still()
+        self._warn_of_range()
+        gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
+        low, high = self._range
+        flags = np.zeros(self._shape, np.uint32)
+        set_bits(flags, "out_of_range", self._mask)
+        set_bits(flags, "dead", unresponsive(gain, self._native.deviation(), self.frames_taken))
+        metadata = {
+            "scene": {
+                "method": self.method,
+                "options": self.options,
+                "data_range": list(self._range),
+                "saturation": self._saturation,
+                "frames": self.frames,
+                "frames_taken": self.frames_taken,
+                "frames_foreign": self.frames_foreign,
+                "floor_dn": self.floor,
+            }
+        }
+        _warn_of_spread(gain[flags == 0])
+        coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
+        return Polynomial(coefficients, flags, metadata)
+
+    def _warn_of_few(self) -> None:
+        """Warn where so few frames counted that the scene moved hardly, or was not seen to."""
+        if self.frames < _FEW * self.frames_taken:
+            warn(
+                f"{self.frames} of {self.frames_taken} frames counted: the scene moved hardly, or "
+                "its contrast is too low for its motion to be seen beside the pattern",
+                UnusedInputWarning,
+            )
+
+    def _warn_of_still(self) -> None:
+        """Warn where much of the field never moved: its scene became part of the pattern."""
+        still = self._native.still()
+        if still is not None and still > _STILL:
+            warn(
+                f"in {still:.0%} of the field (limit {_STILL:.0%}) nothing moves from frame to "
+                "frame: a scene that stands still there, or frames that do not follow one another, "
+                "became part of the pattern; take a scene that moves over the whole field",
+                UnusedInputWarning,
+            )
+
+    def _warn_of_range(self) -> None:
+        """Warn where the range is far wider than the frames: thresholds are shares of it."""
+        low, high = self._range
+        if self._peak is not None and self._peak < low + _USED * (high - low):
+            bits = max(int(np.ceil(np.log2(max(self._peak, 1) + 1))), 1)
+            warn(
+                f"the largest value is {self._peak:g} DN, less than {_USED:.0%} of the range "
+                f"({low:g}, {high:g}): thresholds are shares of it. Give data_range=(0, "
+                f"{2**bits - 1}), on the command line --bit-depth {bits}",
+                UnusedInputWarning,
+            )
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write the state to a file, from which `load` goes on with the same bytes.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        """
+        maps, counts = self._native.state()
+        content: dict[str, Any] = {
+            "method": self.method,
+            "shape": list(self._shape),
+            "data_range": list(self._range),
+            "saturation": self._saturation,
+            "options": self._options,
+            "counts": dict(counts),
+            "peak": self._peak,
+        }
+        mask = {"mask": self._mask.astype(np.float32)}
+        write_state(path, dict(maps) | mask, content, force=force)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | PathLike[str],
+        *,
+        shape: tuple[int, int] | None = None,
+        workers: int | None = None,
+    ) -> Self:
+        """Read a state that `save` wrote.
+
+        Parameters
+        ----------
+        path : str or path
+            The file.
+        shape : tuple of int, optional
+            Sizes of the sensor; a state of another size is refused.
+        workers : int, optional
+            Number of threads; by default one for each processor.
+
+        Returns
+        -------
+        SceneCorrection
+            In the state in which it was saved.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged, or holds the state of another method, size or of
+            a newer format.
+        """
+        maps, content = read_state(path, cls.method, shape)
+        return cls.resumed(path, maps, content, workers)
+
+    @classmethod
+    def resumed(
+        cls,
+        path: str | PathLike[str],
+        maps: Mapping[str, Array],
+        content: Mapping[str, Any],
+        workers: int | None,
+    ) -> Self:
+        """Make a correction of the parts of its file; the errors are those of `load`."""
+        positive_workers(workers)
+        try:
+            low, high = content["data_range"]
+            made = cls(
+                tuple(content["shape"]),
+                (float(low), float(high)),
+                saturation=content["saturation"],
+                workers=workers,
+                mask=maps.get("mask"),
+                **content["options"],
+            )
+            counts = [
+                (str(name), whole_number(name, count)) for name, count in content["counts"].items()
+            ]
+            made._native.restore(list(maps.items()), counts)
+            made._masked_at = made.frames_taken
+            peak = content["peak"]
+            made._peak = None if peak is None else number("peak", peak)
+            check_digest(maps, content)
+        except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
+            raise FileError(f"{path}: is damaged: {error}") from error
+        return made
+
+
+def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
+    """Pixels that are not used, where the mask is not 0."""
+    if mask is None:
+        return np.zeros(shape, bool)
+    masked: Array = as_array("mask", mask, ndim=2) != 0
+    if masked.shape != shape:
+        raise InputError(f"'mask' has shape {masked.shape}, expected {shape}")
+    return masked
+
+
+def _warn_of_spread(gain: Array) -> None:
+    """Warn where gains spread further than those of cameras."""
+    if gain.size and not np.std(gain) <= _SPREAD:
+        warn(
+            f"the gains spread by {np.std(gain):.2g} (limit {_SPREAD:g}), from {gain.min():.2g} to "
+            f"{gain.max():.2g}: the scene does not determine them; take a scene of more contrast, "
+            "or less noise",
+            UnusedInputWarning,
+        )
+
+
+def whole_number(name: str, value: int) -> int:
+    """A whole number from 0, checked."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise InputError(f"'{name}' is {value!r}, expected a whole number")
+    return int(value)
+
+
+def _range_of(data_range: DTypeLike | DataRange) -> DataRange:
+    """Lowest and highest raw value: given, or those of whole numbers."""
+    if isinstance(data_range, tuple | list) and len(data_range) == 2:
+        low, high = (number("data_range", value) for value in data_range)
+        if not -np.inf < low < high < np.inf:
+            raise InputError(
+                f"'data_range' is {data_range!r}, expected (low, high), finite, rising"
+            )
+        return low, high
+    try:
+        limits = np.iinfo(np.dtype(data_range))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"'data_range' is {data_range!r}, expected (low, high) in DN, or whole numbers such as "
+            "'uint16'"
+        ) from error
+    return float(limits.min), float(limits.max)
+
+
+KIND = "state of a correction from the scene"
+"""The kind in the metadata of the file."""
+
+FORMAT = 4
+"""Number of the file format; a file with another one is refused."""
+
+_CONTENT = frozenset({"method", "shape", "data_range", "saturation", "options", "counts", "peak"})
+"""What is remembered beside the maps."""
+
+
+def write_state(
+    path: str | PathLike[str], maps: Mapping[str, Array], content: Mapping[str, Any], *, force: bool
+) -> None:
+    """Write a state; see `SceneCorrection.save`."""
+    digest = {"digest": _digest(maps, content)}
+    save_pages(path, maps, {"format": FORMAT, "kind": KIND, **content, **digest}, force=force)
+
+
+def check_digest(maps: Mapping[str, Array], content: Mapping[str, Any]) -> None:
+    """Refuse a state of which any byte is not the one that was saved.
+
+    Raises
+    ------
+    InputError
+        If the digest is that of another state.
+    """
+    held = {key: content[key] for key in sorted(_CONTENT)}
+    if content.get("digest") != _digest(maps, held):
+        raise InputError("'digest' is that of another state: maps or numbers were changed")
+
+
+def _digest(maps: Mapping[str, Array], content: Mapping[str, Any]) -> str:
+    """SHA-256 of all maps and of the content."""
+    found = hashlib.sha256(json.dumps(dict(content), sort_keys=True).encode())
+    for name, values in sorted(maps.items()):
+        found.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    return found.hexdigest()
+
+
+def read_state(
+    path: str | PathLike[str], method: str | None, shape: tuple[int, int] | None
+) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Read the maps and the rest of a state.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    method : str, optional
+        The method that it must be of.
+    shape : tuple of int, optional
+        The sizes of the sensor that it must be of.
+
+    Returns
+    -------
+    maps : dict of str to ndarray
+        Maps by name, float32.
+    content : dict
+        Method, shape, range, options, counts and the largest raw value.
+
+    Raises
+    ------
+    FileError
+        If it is not such a state, or is damaged.
+    """
+    maps, content = load_pages(path)
+    check_format(path, content, KIND, FORMAT)
+    if content["format"] < FORMAT:
+        raise FileError(
+            f"{path}: has format {content['format']}, of an earlier version whose states lack the "
+            f"noise, the largest value or the pattern (format {FORMAT}): learn again"
+        )
+    if missing := _CONTENT - content.keys():
+        raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")
+    if method is not None and content["method"] != method:
+        raise FileError(f"{path}: holds a state of '{content['method']}', expected '{method}'")
+    held = _sizes(path, content["shape"])
+    if not isinstance(content["method"], str):
+        raise FileError(f"{path}: is damaged: 'method' is {content['method']!r}")
+    if shape is not None and held != tuple(shape):
+        raise FileError(f"{path}: holds a state of a sensor {held}, expected {tuple(shape)}")
+    for name, values in maps.items():
+        if values.dtype != np.float32 or values.ndim != 2:
+            raise FileError(
+                f"{path}: is damaged: page '{name}' is {values.dtype} of shape {values.shape}, "
+                "expected float32 in two dimensions"
+            )
+    return maps, content
+
+
+def _sizes(path: str | PathLike[str], shape: Any) -> tuple[int, int]:
+    """Rows and columns of the sensor, from the file."""
+    if (
+        isinstance(shape, list)
+        and len(shape) == 2
+        and all(isinstance(size, int) and not isinstance(size, bool) for size in shape)
+    ):
+        return shape[0], shape[1]
+    raise FileError(f"{path}: is damaged: 'shape' is {shape!r}, expected two whole numbers")
