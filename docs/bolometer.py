@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 import equipix
-from equipix import bolometer
+from equipix import bolometer, metrics, simulate
 
 SHAPE = (48, 64)
 LOW, HIGH = -20.0, 60.0
@@ -37,7 +37,7 @@ def states(count: int, changes: tuple[float, ...] = (-0.05, 0.05)) -> np.ndarray
     return np.array([(celsius, volts(each)) for celsius in nodes(count) for each in changes])
 
 
-def means(array: bolometer.BolometerArray, at: np.ndarray, **scene: float) -> np.ndarray:
+def means(array: simulate.BolometerArray, at: np.ndarray, **scene: float) -> np.ndarray:
     """Noise-free frames at some states."""
     return np.stack([array.mean(celsius, bias_v=bias, **scene) for celsius, bias in at])
 
@@ -45,7 +45,7 @@ def means(array: bolometer.BolometerArray, at: np.ndarray, **scene: float) -> np
 class Tested:
     """Frames at the states that no fit used, and the range of the output."""
 
-    def __init__(self, array: bolometer.BolometerArray) -> None:
+    def __init__(self, array: simulate.BolometerArray) -> None:
         """Make all frames, noise free."""
         self.array = array
         self.at = np.array([(celsius, volts(c)) for celsius in TESTED for c in (-0.05, 0.0, 0.05)])
@@ -70,7 +70,7 @@ class Tested:
             at(celsius + error_k, bias).correct(frame)
             for (celsius, bias), frame in zip(self.at, raw, strict=True)
         ]
-        return bolometer.non_uniformity(np.stack(frames), self.span)
+        return metrics.non_uniformity(np.stack(frames), self.span)
 
 
 def offsets(tested: Tested) -> None:
@@ -145,7 +145,7 @@ def noisy(tested: Tested) -> None:
 
 
 def taken(
-    array: bolometer.BolometerArray, at: np.ndarray, count: int, scene_c: float | None
+    array: simulate.BolometerArray, at: np.ndarray, count: int, scene_c: float | None
 ) -> list[equipix.FrameStatistics]:
     """Averages of frames with noise at some states."""
     seed = 0 if scene_c is None else int(100 + scene_c)
@@ -169,7 +169,7 @@ def excess(
     for (celsius, bias), frame in zip(tested.at, raw, strict=True):
         if nominal and bias != NOMINAL:
             continue
-        left = correction.at(celsius, bias).correct(frame)
+        left = correction.correction(celsius, bias).correct(frame)
         shares.append(np.std(left) / np.sqrt(np.mean(array.temporal_noise(celsius) ** 2)))
     return float(np.mean(shares))
 
@@ -178,7 +178,7 @@ def others() -> None:
     """Print the non-uniformity of arrays of other pixels."""
     found = []
     for seed in range(2, 7):
-        tested = Tested(bolometer.BolometerArray.of(SHAPE, rng=seed))
+        tested = Tested(simulate.BolometerArray.of(SHAPE, rng=seed))
         at = states(6)
         found.append(tested.left(bolometer.fit(means(tested.array, at), *at.T)))
     print(f"five other arrays: {min(found):.2e} to {max(found):.2e}")
@@ -186,7 +186,7 @@ def others() -> None:
 
 def main() -> None:
     """Print all tables."""
-    tested = Tested(bolometer.BolometerArray.of(SHAPE, rng=1))
+    tested = Tested(simulate.BolometerArray.of(SHAPE, rng=1))
     offsets(tested)
     others()
     gains(tested)

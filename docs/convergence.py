@@ -15,7 +15,7 @@ from figures import AFTER, BEFORE, FOLDER, INK, LIGHT, SAVED
 from matplotlib.figure import Figure
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -70,7 +70,7 @@ def follow(truth: NDArray, frames: NDArray, method: str, limits: Iterable[int]) 
     curve = Curve([], [], [])
     for limit in limits:
         found = stopped(frames, equipix.cross_pattern(*ARMS), method, limit)
-        error = simulate.relative_error(found.sensitivity, truth)
+        error = metrics.relative_error(found.sensitivity, truth)
         curve.sweeps.append(found.sweeps)
         curve.error.append(float(np.abs(error).max()))
         curve.estimate.append(found.error_estimate)

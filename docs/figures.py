@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, FancyArrowPatch, Polygon, Rectangle
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,7 +161,7 @@ def main() -> None:
     pictures = {
         "scheme": draw_scheme(),
         "figure1": draw_maps(frames[0], result, ROW),
-        "figure2": draw_figure_2(simulate.relative_error(result.sensitivity, truth)),
+        "figure2": draw_figure_2(metrics.relative_error(result.sensitivity, truth)),
     }
     for name, figure in pictures.items():
         figure.savefig(FOLDER / f"{name}.png", **SAVED)

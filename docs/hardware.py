@@ -182,9 +182,9 @@ def in_floats(words: list[Any], step: float) -> tuple[Loop, float]:
 
 
 def in_words(words: list[Any], bits: int, step: float) -> tuple[Any, Any]:
-    """Gain and offset of the loop with integer memories; `hardware.Adaptive` has 8 bits or more."""
+    """Gain and offset of the loop with integer memories; `AdaptiveLoop` has 8 bits or more."""
     if bits >= min(WIDTHS):
-        loop = hardware.Adaptive(
+        loop = hardware.AdaptiveLoop(
             SCENE, adc_bits=ADC_BITS, gain_bits=bits, offset_bits=bits, step=step
         )
         loop.update(np.stack(words), workers=1)

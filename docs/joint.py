@@ -16,7 +16,7 @@ from figures import FOLDER, SAVED
 from matplotlib.figure import Figure
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 from equipix.errors import MisfitWarning
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def main() -> None:
         )
     for axes, fault in zip(grid, faults, strict=True):
         errors = [
-            100 * simulate.relative_error(run.sensitivity, fault.truth)[fault.part]
+            100 * metrics.relative_error(run.sensitivity, fault.truth)[fault.part]
             for run in fault.runs.values()
         ]
         limit = float(np.percentile(np.abs(errors[0]), 99.5))

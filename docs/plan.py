@@ -16,7 +16,7 @@ from figures import FOLDER, SAVED
 
 import equipix
 from equipix import plan
-from equipix.errors import DriftWarning
+from equipix.errors import MisfitWarning
 from equipix.pictures.plans import draw_plans
 
 SENSOR, TRAVEL = (582, 782), 80
@@ -58,5 +58,5 @@ def main() -> None:
 
 if __name__ == "__main__":
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DriftWarning)
+        warnings.simplefilter("ignore", MisfitWarning)
         main()

@@ -22,7 +22,7 @@ from figures import AFTER, BEFORE, FOLDER, INK, LIGHT, SAVED, draw_maps
 from matplotlib.figure import Figure
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,10 +79,10 @@ class Claim:
         return all(value <= self.limit for value in self.values)
 
     def __str__(self) -> str:
-        """Verdict, values and limit on one line."""
+        """Finding, values and limit on one line."""
         values = "  ".join(f"{value:8.2e}" for value in self.values)
-        verdict = "holds" if self.holds else "FAILS"
-        return f"{verdict}  {self.text:<52}  {values}  at most {self.limit:.2e}"
+        finding = "holds" if self.holds else "FAILS"
+        return f"{finding}  {self.text:<52}  {values}  at most {self.limit:.2e}"
 
 
 def prepare(rng: int) -> tuple[NDArray, list[simulate.VirtualExperiment]]:
@@ -150,9 +150,9 @@ def calibrate_all(experiments: list[simulate.VirtualExperiment]) -> list[Found]:
 def check(truth: NDArray, found: list[Found]) -> list[Claim]:
     """Compare the maps with each other and with the truth."""
     pairs = list(combinations(found, 2))
-    errors = [simulate.relative_error(one.calibration.sensitivity, truth) for one in found]
+    errors = [metrics.relative_error(one.calibration.sensitivity, truth) for one in found]
     ratios = [rms(error) / one.predicted for error, one in zip(errors, found, strict=True)]
-    blocks = [rms(simulate.block_means(error)) for error in errors]
+    blocks = [rms(metrics.block_means(error)) for error in errors]
     largest = [float(abs(_row(one) - _row(other)).max()) for one, other in pairs]
     surplus = [_surplus(one, other) for one, other in pairs]
     return [
@@ -177,7 +177,7 @@ def _surplus(first: Found, second: Found) -> float:
     """How far the difference of two maps is from what noise predicts, as a share of that."""
     maps = (one.calibration.sensitivity for one in (first, second))
     predicted = np.hypot(first.predicted, second.predicted)
-    return float(abs(rms(simulate.relative_error(*maps)) / predicted - 1))
+    return float(abs(rms(metrics.relative_error(*maps)) / predicted - 1))
 
 
 def draw_figure_5(found: list[Found]) -> Figure:

@@ -17,7 +17,7 @@ from figures import AFTER, BEFORE, FOLDER, INK, LIGHT, SAVED
 from matplotlib.figure import Figure
 
 import equipix
-from equipix import reference, simulate
+from equipix import metrics, reference, simulate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -97,7 +97,7 @@ def draw_profiles(axes: Axes, truth: NDArray, frames: NDArray) -> None:
         if sweeps:
             shifts = equipix.cross_pattern(*ARMS)
             found = stopped(frames, shifts, "coordinate-descent", sweeps).sensitivity
-        error = simulate.relative_error(found, truth)[row]
+        error = metrics.relative_error(found, truth)[row]
         axes.plot(error, color=colour, lw=1.5 if sweeps else 0.7, label=f"{sweeps} sweeps")
     axes.set(xlabel="column", ylabel="relative error of M", xlim=(0, truth.shape[1] - 1))
     axes.set_title(f"row {row} of 782×582")

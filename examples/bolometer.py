@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 import equipix
-from equipix import bolometer
+from equipix import bolometer, simulate
 
 SHAPE, FRAMES = (96, 128), 64
 CELSIUS = (-20.0, -12.0, 8.0, 32.0, 52.0, 60.0)
@@ -20,7 +20,7 @@ NOW = (21.7, 2.02)
 
 def main() -> None:
     """Take references, fit, and correct frames of an even scene."""
-    array = bolometer.BolometerArray.of(SHAPE, rng=1)
+    array = simulate.BolometerArray.of(SHAPE, rng=1)
     states = [(celsius, volts) for celsius in CELSIUS for volts in VOLTS]
 
     def averages(scene_c: float | None) -> list[equipix.FrameStatistics]:
@@ -36,7 +36,7 @@ def main() -> None:
     print(correction)
 
     # In operation: the thermometer and the bias give the maps, the maps correct frames.
-    now = correction.at(*NOW)
+    now = correction.correction(*NOW)
     corrector = equipix.Corrector(now, "float32")
     raw = np.stack(list(array.frames(NOW[0], 64, rng=9, scene_c=35.0, bias_v=NOW[1])))
     corrected = np.stack([corrector.apply(frame) for frame in raw])

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 
 import equipix
-from equipix import Flag, simulate
+from equipix import Flag, metrics, simulate
 
 
 def main(output: str = "cal.tif") -> None:
@@ -44,7 +44,7 @@ def main(output: str = "cal.tif") -> None:
     bad = (cal.flags & Flag.DO_NOT_USE) != 0
     print(f"{bad.sum()} bad pixels; a frame of mean {raw.mean():.0f} DN becomes {equal.mean():.0f}")
 
-    error = simulate.relative_error(cal.sensitivity, np.where(bad, np.nan, truth))
+    error = metrics.relative_error(cal.sensitivity, np.where(bad, np.nan, truth))
     predicted, _ = camera.noise_prediction(rng=3)
     print(f"rms error {np.nanstd(error):.2e}, predicted from noise {predicted:.2e}")
 

@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 
 import equipix
-from equipix import simulate
-from equipix.errors import DriftWarning
+from equipix import metrics, simulate
+from equipix.errors import MisfitWarning
 
 SENSOR = (96, 128)
 NOISE, DRIFT, MONITOR = 1e-3, 1e-2, 2e-4
@@ -27,12 +27,12 @@ def main() -> None:
     known = {"variance": np.full(5, NOISE**2)}
     with warnings.catch_warnings():
         # calibrate warns that the fluxes are not equal, and of the tilt that this probably hides.
-        warnings.simplefilter("ignore", DriftWarning)
+        warnings.simplefilter("ignore", MisfitWarning)
         steady = equipix.calibrate(frames, shifts, **known)
     monitor = equipix.calibrate(frames, shifts, flux=readings, flux_std=MONITOR, **known)
     runs = {"steady lamp": steady, "monitor": monitor}
     for name, cal in runs.items():
-        error = simulate.relative_error(cal.sensitivity, truth)
+        error = metrics.relative_error(cal.sensitivity, truth)
         tilt = cal.tilt - np.array(slope(truth))
         print(f"{name:12} rms error {np.std(error):.1e}, tilt error {np.abs(tilt).max():.1e}")
     # The remaining error of the tilt is that of the monitor. equipix.plan.error_budget predicts it.

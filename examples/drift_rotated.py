@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 from equipix.errors import IdentifiabilityWarning
 
 SENSOR = (96, 128)
@@ -32,7 +32,7 @@ def main() -> None:
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         alike = equipix.calibrate(frames[:5], shifts[:5], flux="fit")
     for name, cal in {"one turned": turned, "all alike": alike}.items():
-        error = np.std(simulate.relative_error(cal.sensitivity, truth))
+        error = np.std(metrics.relative_error(cal.sensitivity, truth))
         print(f"{name:11} rms error {error:.1e}, tilt along columns {cal.tilt[1]:+.4f}")
     found = turned.flux / turned.flux.mean() / (flux / flux.mean()) - 1
     print(f"largest error of a flux {np.abs(found).max():.1e}")

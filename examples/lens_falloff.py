@@ -19,13 +19,13 @@ def main() -> None:
     corner = 2 * 27.0**2
     print("focal length, mm: illumination of the corner, gain")
     for focal in SIZES_MM:
-        light = float(lens.cos4(corner, focal))
+        light = (1 + corner / focal**2) ** -2  # cos^4 of the angle to the axis
         print(f"{focal:4d}: {light:.3f}  {1 / light:.3f}")
     sensitivity = simulate.paper_sensitivity(SHAPE, rng=1)
     rows, cols = np.ogrid[: SHAPE[0], : SHAPE[1]]
     squared = (rows - 1040.0) ** 2 + (cols - 1010.0) ** 2
-    flat = 8000 * lens.cos4(squared, 100 / PITCH_MM) * sensitivity
-    found = lens.fit_falloff(flat)
+    flat = 8000 * (1 + squared * (PITCH_MM / 100) ** 2) ** -2 * sensitivity
+    found = lens.fit(flat)
     std = found.std["focal_length"] * PITCH_MM
     print(f"fitted: focal length {found.focal_length * PITCH_MM:.3f} mm, std {std:.3f} mm")
     corrected = found.correction().correct(flat / sensitivity)

@@ -10,8 +10,8 @@ import warnings
 import numpy as np
 
 import equipix
-from equipix import plan, simulate
-from equipix.errors import DriftWarning
+from equipix import metrics, plan, simulate
+from equipix.errors import MisfitWarning
 
 SENSOR = (96, 128)
 CAUSES = {"noise": 1e-3, "drift": 2e-5, "shift_error": 0.02, "beam_width": 200}
@@ -40,11 +40,11 @@ def main() -> None:
     frames = simulate.exposures(truth, beam, reached, flux=flux)
     frames += CAUSES["noise"] * rng.standard_normal(frames.shape)
     cal = equipix.calibrate(frames, best.shifts)
-    rms = np.std(simulate.relative_error(cal.sensitivity, truth))
+    rms = np.std(metrics.relative_error(cal.sensitivity, truth))
     print(f"rms error {rms:.2e}, predicted by the plan {best.budget.rms:.2e}")
 
 
 if __name__ == "__main__":
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DriftWarning)
+        warnings.simplefilter("ignore", MisfitWarning)
         main()

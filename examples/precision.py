@@ -11,8 +11,8 @@ import warnings
 import numpy as np
 
 import equipix
-from equipix import plan, simulate
-from equipix.errors import DriftWarning
+from equipix import metrics, plan, simulate
+from equipix.errors import MisfitWarning
 
 SENSOR = (582, 782)
 SIGNAL, READ_NOISE = 16_000, 10
@@ -45,7 +45,7 @@ def main() -> None:
     frames = simulate.exposures(truth, even_beam, PATTERNS[5])
     frames += noise * rng.standard_normal(frames.shape)
     cal = equipix.calibrate(frames, PATTERNS[5])
-    rms = np.std(simulate.relative_error(cal.sensitivity, truth))
+    rms = np.std(metrics.relative_error(cal.sensitivity, truth))
     print(f"simulated, 10 frames, 5 exposures: {rms:.2e}")
     print(f"predicted: {budget(5, noise).rms:.2e}")
 
@@ -58,7 +58,7 @@ def even_beam(rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
 def budget(exposures: int, noise: float, drift: float = 0.0) -> plan.ErrorBudget:
     """Error budget of the pattern with so many exposures."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DriftWarning)
+        warnings.simplefilter("ignore", MisfitWarning)
         return plan.error_budget(SENSOR, PATTERNS[exposures], noise=noise, drift=drift)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 SENSOR = (96, 128)
 NOISE = 6e-4
@@ -31,7 +31,7 @@ def main() -> None:
         "true shifts": equipix.calibrate(frames, shifts, **known),
     }
     for name, cal in runs.items():
-        rms = np.std(simulate.relative_error(cal.sensitivity, truth))
+        rms = np.std(metrics.relative_error(cal.sensitivity, truth))
         print(f"{name:12} rms error {rms:.1e}, reduced chi2 {cal.reduced_chi2:.2f}")
     refined = runs["refined"].shifts - shifts
     # A displacement common to all exposures moves the beam only; no measurement determines it.

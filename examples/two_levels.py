@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 SENSOR = (96, 128)
 LEVELS = (1.0, 0.4)
@@ -23,7 +23,7 @@ def main() -> None:
     frames += NOISE * rng.standard_normal(frames.shape)
 
     cal = equipix.calibrate(frames, shifts, flux=flux, dark="fit")
-    error = np.std(simulate.relative_error(cal.sensitivity, truth))
+    error = np.std(metrics.relative_error(cal.sensitivity, truth))
     print(f"sensitivity: rms error {error:.1e}; dark: {np.std(cal.dark - dark):.1e}")
     # The dark is part of the calibration, so raw frames are corrected without another dark.
     equal = cal.correct(frames[0])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import bolometer, detector, errors, lens, metrics, nuc
+from equipix import bolometer, detector, errors, lens, metrics, nuc, simulate
+from equipix.lens import cos4
 
 SHAPE = (24, 32)
 
@@ -23,9 +24,9 @@ STACKS = [frames(each, k) for k, each in enumerate(LIGHT)]
 LEVELS = [equipix.average(each) for each in STACKS]
 RESPONSE = nuc.fit(LEVELS)
 ROWS, COLS = np.mgrid[: SHAPE[0], : SHAPE[1]]
-FLAT = 1000 * lens.cos4((ROWS - 12.0) ** 2 + (COLS - 15.0) ** 2, 60.0)
-GAIN = lens.fit_falloff(FLAT).correction()
-ARRAY = bolometer.BolometerArray.of(SHAPE, rng=1)
+FLAT = 1000 * cos4((ROWS - 12.0) ** 2 + (COLS - 15.0) ** 2, 60.0)
+GAIN = lens.fit(FLAT).correction()
+ARRAY = simulate.BolometerArray.of(SHAPE, rng=1)
 CELSIUS = [-20.0, 0.0, 20.0, 40.0, 60.0]
 SHUTTER = np.stack([ARRAY.mean(each) for each in CELSIUS])
 
@@ -48,11 +49,10 @@ CALLS = {
     metrics.validity_interval: {"times": [0.0, 1.0], "ratios": [0.1, 0.2]},
     metrics.emva_spatial: {"dark": frames(50, 9), "bright": STACKS[1], "gain_dn_per_e": None},
     metrics.emva_transfer: {"dark": [frames(50, 9)], "bright": STACKS, "light": list(LIGHT)},
-    metrics.netd: {"cold": STACKS[0], "hot": STACKS[1], "delta_t": 5.0},
+    metrics.netd: {"cold": STACKS[0], "hot": STACKS[1], "delta_k": 5.0},
     metrics.roughness: {"frame": FLAT},
     metrics.three_d_noise: {"frames": STACKS[1]},
-    lens.fit_falloff: {"flat": FLAT, "law": "cos4", "sensitivity": None, "mask": None},
-    lens.cos4: {"squared_distance": 1.0, "focal_length": 3.0},
+    lens.fit: {"frame": FLAT, "law": "cos4", "sensitivity": None, "mask": None},
     equipix.Corrector: {
         "correction": RESPONSE,
         "dtype": "uint16",
@@ -75,7 +75,7 @@ CALLS = {
         "regressor": "temperature",
         "mask": None,
     },
-    bolometer.non_uniformity: {"frames": SHUTTER, "span": 1e4},
+    metrics.non_uniformity: {"frames": SHUTTER, "span": 1e4},
     detector.composition_tolerance: {
         "material": detector.HgCdTe(start_um=3.0, cutoff_um=5.1),
         "references_k": (290.0, 310.0),
@@ -127,11 +127,10 @@ def test_is_refused_by_the_name_of_the_argument(function, wrong):
         (lambda: nuc.find_defects("r1.tif"), "'response' is 'r1.tif', .*equipix.load"),
         (lambda: nuc.find_defects(GAIN), "'response' is of type Polynomial, expected a Response"),
         (lambda: nuc.find_defects(RESPONSE, limits={}), "'limits' is of type dict, .*DefectLimits"),
-        (lambda: metrics.emva_transfer("d.tif", STACKS, LIGHT), "'dark' is 'd.tif', .* a list of"),
-        (lambda: metrics.emva_transfer([STACKS[0]], LEVELS[0], LIGHT), "'bright' is of type Frame"),
-        (lambda: metrics.netd(*STACKS[:2], "5 K"), "'delta_t' is '5 K', expected a number"),
+        (lambda: metrics.emva_transfer(STACKS, "d.tif", LIGHT), "'dark' is 'd.tif', .* a list of"),
+        (lambda: metrics.emva_transfer(LEVELS[0], [STACKS[0]], LIGHT), "'bright' is of type Frame"),
+        (lambda: metrics.netd(*STACKS[:2], "5 K"), "'delta_k' is '5 K', expected a number"),
         (lambda: metrics.correctability(STACKS[0], confidence="high"), "'confidence' is 'high'"),
-        (lambda: lens.cos4(1.0, 0), "'focal_length' is 0, expected a number above 0"),
         (lambda: equipix.Polynomial([[1.0]], GAIN.flags), "'coefficients' is of type list"),
         (lambda: RESPONSE.with_flags(-1), r"'flags' has shape \(\), expected 2 dimensions"),
         (lambda: RESPONSE.with_flags(np.full(SHAPE, -1)), "'flags' holds -1, expected bits"),

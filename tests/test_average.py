@@ -197,12 +197,12 @@ FRAMES = np.zeros((3, 4, 5), np.uint8)
 @pytest.mark.parametrize(
     ("source", "options", "message"),
     [
-        (np.zeros((4, 5)), {}, r"'source' has shape \(4, 5\), expected \(frames, rows, cols\)"),
-        (np.zeros((0, 4, 5)), {}, "'source' has shape"),
-        (np.zeros((2, 0, 5)), {}, "'source' has shape"),
-        (np.zeros((2, 4, 5), complex), {}, "'source' has dtype complex128"),
-        ([], {}, "'source' holds no frames"),
-        (7, {}, "'source' is a int"),
+        (np.zeros((4, 5)), {}, r"'frames' has shape \(4, 5\), expected \(frames, rows, cols\)"),
+        (np.zeros((0, 4, 5)), {}, "'frames' has shape"),
+        (np.zeros((2, 0, 5)), {}, "'frames' has shape"),
+        (np.zeros((2, 4, 5), complex), {}, "'frames' has dtype complex128"),
+        ([], {}, "'frames' holds no frames"),
+        (7, {}, "'frames' is a int"),
         ([FRAMES[0], FRAMES[0, 1:]], {}, r"'source\[1\]' is uint8 of shape \(3, 5\)"),
         ([FRAMES[0], FRAMES[0].astype(float)], {}, r"'source\[1\]' is float64"),
         ([FRAMES], {}, r"'source\[0\]' has shape \(3, 4, 5\)"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, errors, nuc, simulate
+from equipix import Flag, errors, metrics, nuc, simulate
 from equipix.measured.colour import Colours
 from equipix.measured.defects import blind_pixels, response_outliers
 from equipix.measured.means import Averaged
@@ -253,7 +253,7 @@ def test_frames_of_another_level_in_an_average_are_told(foreign):
     ]
     mixed = np.concatenate([stacks[0], stacks[-1][:foreign]])
     levels = [equipix.average(each) for each in (mixed, *stacks[1:])]
-    with pytest.warns(errors.DriftWarning, match=r"level 0: .* all frames are of one level"):
+    with pytest.warns(errors.MisfitWarning, match=r"level 0: .* all frames are of one level"):
         nuc.fit(levels, order=1)
 
 
@@ -417,7 +417,7 @@ class TestRegions:
         assert cal.converged
         assert cal.sweeps <= 40
         np.testing.assert_array_equal((cal.flags & Flag.DEAD) > 0, dead)
-        error = simulate.relative_error(np.where(dead, np.nan, cal.sensitivity), truth)
+        error = metrics.relative_error(np.where(dead, np.nan, cal.sensitivity), truth)
         assert np.nanstd(error) < 2e-3
 
     @pytest.mark.parametrize("edge", [1e-3, 15.0], ids=["sharp", "fading"])
@@ -443,7 +443,7 @@ class TestRegions:
         beam = simulate.gaussian_beam(shape, amplitude=120, width=400)
         frames = self.averages(np.where(dead, 0, truth), beam, shifts)
         averaged = Averaged.of(frames, colours=Colours.of("RGGB") if given else None)
-        found = averaged.findings(averaged.noise).dead
+        found = averaged.bad_pixels(averaged.noise).dead
         # Blue pixels are no brighter than noise: only what dead ones enclose sets them apart.
         blue = Colours.of("RGGB").numbers(shape) == 2
         assert not (found & ~dead).any()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, bolometer, errors, io
+from equipix import Flag, bolometer, errors, io, metrics, simulate
 from equipix.bolometer import BolometerArray, DynamicCorrection
 
 EPS = np.finfo(np.float64).eps
@@ -50,10 +50,10 @@ class Simulated:
     def left(self, correction, raw=None):
         frames = self.raw if raw is None else raw
         corrected = [
-            correction.at(t, v, extrapolate=True).correct(frame)
+            correction.correction(t, v, extrapolate=True).correct(frame)
             for (t, v), frame in zip(self.tested, frames, strict=True)
         ]
-        return bolometer.non_uniformity(np.stack(corrected), self.span)
+        return metrics.non_uniformity(np.stack(corrected), self.span)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ class TestClaimsOfTheSource:
         correction = bolometer.fit(averages, *at.T)
         shares = []
         for celsius in TESTED:
-            left = correction.at(celsius).correct(array.mean(celsius)).std()
+            left = correction.correction(celsius).correct(array.mean(celsius)).std()
             shares.append(left / np.sqrt(np.mean(array.temporal_noise(celsius) ** 2)))
         # Orders of 4 or 5 from 8 x 64 frames leave the noise of √(6/8/64) = 0.11 of a frame.
         assert np.mean(shares) < 0.2
@@ -146,7 +146,7 @@ class TestKnownTruth:
         assert (found.axes.order, found.gain_axes.order) == (order, order)
         for state in ((3.3, 1.97), (-11.0, 2.03)):
             raw, level = frames([state], 500.0)
-            corrected = found.at(*state).correct(raw)
+            corrected = found.correction(*state).correct(raw)
             # Values of 1e4, some ten operations and 16 terms; the black bodies differ by 700.
             np.testing.assert_allclose(corrected, level.item() + 500, rtol=0, atol=1e3 * EPS * 1e4)
 
@@ -192,7 +192,7 @@ class TestBadPixels:
         assert (found.flags[2, 3], found.flags[7, 8]) == (unknown, unknown)
         assert found.flags[5, 6] == dead
         assert np.count_nonzero(found.flags) == 3
-        corrected = found.at(10.0).correct(simulated.array.mean(10.0))
+        corrected = found.correction(10.0).correct(simulated.array.mean(10.0))
         assert np.isnan(corrected).sum() == 3
         assert np.nanstd(corrected) < LIMIT * simulated.span
 
@@ -203,7 +203,7 @@ class TestBadPixels:
 
 class TestCorrectionAtAState:
     def test_it_is_a_correction_of_frames(self, simulated, both, tmp_path):
-        now = both.at(12.5, 1.98)
+        now = both.correction(12.5, 1.98)
         assert isinstance(now, equipix.Correction)
         assert now.metadata["state"] == {"substrate_c": 12.5, "bias_v": 1.98}
         frame = next(simulated.array.frames(12.5, 1, rng=3, scene_c=30.0, bias_v=1.98))
@@ -228,14 +228,14 @@ class TestCorrectionAtAState:
         assert after < np.hypot(1, 0.2) * temporal
 
     def test_a_gain_after_it_is_refused_since_frames_hold_the_level(self, both):
-        now, gain = both.at(12.5), np.stack([np.zeros(SHAPE), np.full(SHAPE, 1.1)])
+        now, gain = both.correction(12.5), np.stack([np.zeros(SHAPE), np.full(SHAPE, 1.1)])
         then = equipix.Polynomial(gain, np.zeros(SHAPE, np.uint32))
         with pytest.raises(errors.InputError, match="the gain of 'then' would multiply it"):
             equipix.combine(now, then)
 
     def test_without_a_bias_it_is_that_in_the_middle_of_the_squares(self, both):
-        middle = both.at(12.5)
-        np.testing.assert_array_equal(middle.coefficients, both.at(12.5, 2.0).coefficients)
+        middle = both.correction(12.5)
+        np.testing.assert_array_equal(middle.coefficients, both.correction(12.5, 2.0).coefficients)
 
     @pytest.mark.parametrize(
         ("state", "message"),
@@ -247,12 +247,12 @@ class TestCorrectionAtAState:
     )
     def test_states_outside_of_the_references_are_refused(self, both, state, message):
         with pytest.raises(errors.InputError, match=message):
-            both.at(*state)
+            both.correction(*state)
 
     def test_extrapolation_must_be_asked_for(self, both):
-        assert np.isfinite(both.at(61.0, 2.2, extrapolate=True).coefficients).all()
+        assert np.isfinite(both.correction(61.0, 2.2, extrapolate=True).coefficients).all()
         with pytest.raises(errors.InputError, match="'substrate_c' is inf"):
-            both.at(np.inf, extrapolate=True)
+            both.correction(np.inf, extrapolate=True)
 
 
 class TestFiles:
@@ -268,7 +268,7 @@ class TestFiles:
             kept.metadata,
         )
         for state in ((1.0, 2.0), (44.0, 1.95)):
-            one, other = (each.at(*state).coefficients for each in (kept, read))
+            one, other = (each.correction(*state).coefficients for each in (kept, read))
             assert one.tobytes() == other.tobytes()
         assert repr(read) == repr(kept)
 
@@ -347,13 +347,13 @@ class TestRefusals:
 
     def test_measures_of_nothing_are_refused(self):
         with pytest.raises(errors.InputError, match="'span' is 0"):
-            bolometer.non_uniformity(self.FRAMES, 0)
+            metrics.non_uniformity(self.FRAMES, 0)
         with pytest.raises(errors.InputError, match="no finite value in frame 1"):
-            bolometer.non_uniformity([[[1.0]], [[np.nan]]], 1.0)
+            metrics.non_uniformity([[[1.0]], [[np.nan]]], 1.0)
 
 
 def test_states_that_determine_almost_nothing_are_refused():
-    array = bolometer.BolometerArray.of(SHAPE, rng=1)
+    array = simulate.BolometerArray.of(SHAPE, rng=1)
     celsius = [20.0, 20.001, 60.0]
     shutter = [array.mean(each) for each in celsius]
     with pytest.raises(errors.InputError, match="times the noise of a reference"):
@@ -363,7 +363,7 @@ def test_states_that_determine_almost_nothing_are_refused():
 
 def test_auto_takes_no_order_that_states_without_one_do_not_determine():
     """Nine temperatures, each at one of two biases."""
-    array = bolometer.BolometerArray.of(SHAPE, rng=1)
+    array = simulate.BolometerArray.of(SHAPE, rng=1)
     celsius = np.linspace(-20, 60, 9)
     volts = np.where(np.arange(9) % 2, 2.05, 1.95)
     shutter = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
@@ -376,13 +376,13 @@ class TestOrderOfFewTemperatures:
 
     @pytest.fixture
     def array(self):
-        return bolometer.BolometerArray.of(SHAPE, rng=7)
+        return simulate.BolometerArray.of(SHAPE, rng=7)
 
     @staticmethod
     def left(array, correction, celsius):
         """Spatial noise over the temperatures of the references, in DN."""
         at = np.linspace(min(celsius), max(celsius), 9)
-        return np.mean([correction.at(each).correct(array.mean(each)).std() for each in at])
+        return np.mean([correction.correction(each).correct(array.mean(each)).std() for each in at])
 
     @pytest.mark.parametrize(
         "celsius", [(0, 20, 40), (-20, 20, 60), (40, 0, 20), (0, 15, 40), (0, 19.99, 40)]
@@ -466,7 +466,7 @@ def test_a_response_that_crosses_0_is_flagged_where_it_does():
     bodies = (level - 500 * response, level + 500 * response)
     found = bolometer.fit(level + 0 * response, celsius, 2.0, black_bodies=bodies, order=1)
     for state, flagged in ((-20.0, True), (0.0, True), (20.0, False), (60.0, False)):
-        here = found.at(state)
+        here = found.correction(state)
         expected = Flag.DEAD | Flag.DO_NOT_USE if flagged else 0
         assert here.flags[1, 2] == expected, state
         assert not np.delete(here.flags.ravel(), 6).any()
@@ -492,7 +492,7 @@ class TestSaturatedReferences:
         wanted = np.zeros(SHAPE, np.uint32)
         wanted[2, 3] = wanted[5, 6] = wanted[7, 8] = self.SATURATED
         np.testing.assert_array_equal(found.flags, wanted)
-        assert np.isnan(found.at(20.0).correct(shutter[2].astype(float))).sum() == 3
+        assert np.isnan(found.correction(20.0).correct(shutter[2].astype(float))).sum() == 3
 
     def test_one_saturated_sample_of_an_average_flags_the_pixel(self):
         stacks = np.repeat(self.frames()[:, None], 3, axis=1)
@@ -505,7 +505,7 @@ class TestSaturatedReferences:
     def test_many_values_at_the_highest_one_are_told(self):
         shutter = self.frames().astype(float)
         shutter[3, :4] = 65535.0
-        with pytest.warns(errors.SaturationWarning, match="128 values of 'shutter' at state 3 are"):
+        with pytest.warns(errors.InputWarning, match="128 values of 'shutter' at state 3 are"):
             bolometer.fit(shutter, [0, 10, 20, 30, 40], 2.0, order=1)
 
     def test_nothing_else_than_saturated_pixels_is_refused(self):
@@ -514,19 +514,19 @@ class TestSaturatedReferences:
 
 
 def test_the_mask_of_clipped_values_ends_the_warning():
-    array = bolometer.BolometerArray.of((24, 32), rng=1)
+    array = simulate.BolometerArray.of((24, 32), rng=1)
     frames = [array.mean(each) for each in (-20, 0, 20, 40, 60)]
     level = np.quantile(frames[4], 0.9)
     clipped = frames[4] >= level
     frames[4] = np.minimum(frames[4], level)
-    with pytest.warns(errors.SaturationWarning, match="exclude their pixels by 'mask'"):
+    with pytest.warns(errors.InputWarning, match="exclude their pixels by 'mask'"):
         bolometer.fit(frames, [-20, 0, 20, 40, 60], NOMINAL, order=3)
     correction = bolometer.fit(frames, [-20, 0, 20, 40, 60], NOMINAL, order=3, mask=clipped)
     np.testing.assert_array_equal((correction.flags & Flag.DO_NOT_USE) == 0, ~clipped)
 
 
 def test_averages_beside_whole_numbers_leave_saturation_in_sight():
-    array = bolometer.BolometerArray.of((24, 32), rng=1)
+    array = simulate.BolometerArray.of((24, 32), rng=1)
     frames = [np.rint(array.mean(each)).astype(np.uint16) for each in (-20, 0, 20, 40, 60)]
     frames[4][3, 5] = 65535
     mixed = [equipix.average(np.stack([frames[0]] * 2)), *frames[1:]]
@@ -535,7 +535,7 @@ def test_averages_beside_whole_numbers_leave_saturation_in_sight():
 
 
 def test_states_that_determine_one_order_alone_say_so():
-    array = bolometer.BolometerArray.of((24, 32), rng=1)
+    array = simulate.BolometerArray.of((24, 32), rng=1)
     celsius, volts = [0, 20, 40, 0, 40], [2.0, 2.0, 2.0, 2.05, 2.05]
     frames = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
     with pytest.warns(errors.MisfitWarning, match="determine no order above 0"):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import equipix
-from equipix import Flag, errors, reference, simulate
+from equipix import Flag, errors, metrics, reference, simulate
 from equipix.reference import descent as reference_descent
 from equipix.reference import model as reference_model
 
@@ -277,7 +277,7 @@ class TestErrorEstimate:
         cal = equipix.calibrate(
             frames, CROSS, mask=mask, method=method, tolerance=1e-5, max_sweeps=10**5
         )
-        true = simulate.relative_error(cal.sensitivity, truth)
+        true = metrics.relative_error(cal.sensitivity, truth)
         assert cal.converged
         assert np.nanmax(np.abs(true)) < 10 * 1e-5
 
@@ -329,7 +329,7 @@ class TestComponents:
         cal = equipix.calibrate(frames, CROSS, mask=mask, tolerance=1e-10)
         assert (cal.component_labels[mask] == -1).all()
         assert np.isnan(cal.sensitivity[mask]).all()
-        error = simulate.relative_error(cal.sensitivity, np.where(mask, np.nan, truth))
+        error = metrics.relative_error(cal.sensitivity, np.where(mask, np.nan, truth))
         assert np.nanmax(np.abs(error)) < 1e-9
         assert np.isnan(cal.beam).any()
 
@@ -368,8 +368,8 @@ class TestFrameStatistics:
         weighted = equipix.calibrate(
             np.stack([a.mean for a in averages]), CROSS, variance=gain * means / count
         )
-        scatter = np.std(simulate.relative_error(weighted.sensitivity, truth))
-        difference = np.std(simulate.relative_error(cal.sensitivity, weighted.sensitivity))
+        scatter = np.std(metrics.relative_error(weighted.sensitivity, truth))
+        difference = np.std(metrics.relative_error(cal.sensitivity, weighted.sensitivity))
         # Weights off by a fraction move M by that fraction of its scatter: here by what the noise
         # of the means and four standard deviations of the fitted variance make of them.
         off = np.sqrt(gain / count / means.min()) + 4 * np.sqrt(2 / ((count - 1) * 5 * 4800))

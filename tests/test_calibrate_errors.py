@@ -11,7 +11,7 @@ import equipix
 from equipix import io
 from equipix._check import Method
 from equipix.calibration.result import FORMAT
-from equipix.errors import ConvergenceWarning, FileError, InputError, ShiftRoundingWarning
+from equipix.errors import ConvergenceWarning, FileError, InputError, InputWarning
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.positions import Positions, Rounding
 
@@ -136,14 +136,14 @@ def test_an_unmet_tolerance_says_what_would_meet_it():
 
 
 def test_a_rounded_shift_is_named_with_what_to_do():
-    with pytest.warns(ShiftRoundingWarning, match=r"exposure 2 \(from 0\) is .*0\.3.* move the"):
+    with pytest.warns(InputWarning, match=r"exposure 2 \(from 0\) is .*0\.3.* move the"):
         cal = equipix.calibrate(
             frames(),
             with_value(CROSS, (2, 0), 0.3),
             method="coordinate-descent",
             tolerance=1e-3,
         )
-    assert [verdict.kind for verdict in cal.verdicts] == ["rounding"]
+    assert [finding.kind for finding in cal.findings] == ["rounding"]
     np.testing.assert_array_equal(cal.shifts, with_value(CROSS, (2, 0), 0))
 
 
@@ -311,7 +311,7 @@ class TestFiles:
             {"beam_origin": [0, 0, 0]},
             {"beam_origin": [0, 99]},
             {"shifts": [1, 2]},
-            {"verdicts": [{"kind": "unheard", "message": "of"}]},
+            {"findings": [{"kind": "unheard", "message": "of"}]},
             {"history": {"sweep": [-1], "objective": [1.0], "error_estimate": [1.0]}},
         ],
         ids=str,

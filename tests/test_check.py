@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, NoiseModel, errors, simulate
+from equipix import Flag, NoiseModel, errors, metrics, simulate
 
 CROSS = equipix.cross_pattern(5, 7)
 WIDE = equipix.cross_pattern(11, 19)
@@ -216,7 +216,7 @@ class TestReducedChi2:
         # that adds 0.0009/√5 in quadrature to four standard deviations of 0.0014 and is left out.
         self.chi2(run)
 
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_noise_models_on_plain_arrays(self):
         """Variances at the noisy values bias the signals, which looks like a drift of the lamp."""
         model = NoiseModel(read_noise=5.0, gain=1.0)
@@ -253,7 +253,7 @@ class TestNoiseModel:
             frames += 3 * rng.standard_normal(frames.shape)
             for index, variance in enumerate((model, model.variance(frames))):
                 cal = equipix.calibrate(frames, WIDE, variance=variance)
-                squares[index] += np.mean(simulate.relative_error(cal.sensitivity, truth) ** 2)
+                squares[index] += np.mean(metrics.relative_error(cal.sensitivity, truth) ** 2)
         assert squares[0] < squares[1]
 
     def test_one_for_each_exposure(self):

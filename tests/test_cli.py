@@ -105,24 +105,24 @@ def test_warnings_are_one_line_each(run, experiment, tmp_path):
     assert re.fullmatch(r"equipix: warning: not converged after \d sweeps[^\n]*\n", err)
 
 
-def test_verdicts_and_rejected_values_are_reported(run, experiment, tmp_path):
+def test_findings_and_rejected_values_are_reported(run, experiment, tmp_path):
     output = tmp_path / "cal.tif"
     command = ("calibrate", experiment, "-o", output, "--max-sweeps", "2", "--robust")
     status, out, err = run(*command)
     assert status == 0
-    assert re.search(r"\nverdicts +convergence\n", out)
+    assert re.search(r"\nfindings +convergence\n", out)
     saved = equipix.load(output)
-    (verdict,) = saved.verdicts
-    assert verdict.message in err
+    (finding,) = saved.findings
+    assert finding.message in err
     inspected = json.loads(run("inspect", output, "--json")[1])
     calibrated = json.loads(run(*command, "--force", "--json")[1])
     for told in (inspected, calibrated):
-        assert told["verdicts"] == [{"kind": "convergence", "message": verdict.message}]
+        assert told["findings"] == [{"kind": "convergence", "message": finding.message}]
         assert told["is_partial"] is False
         assert list(told["rejected_values"]) == ["p0", "p1", "p2", "p3", "p4"]
         assert list(told["rejected_values"].values()) == saved.metadata["rejected"]
     out = run("inspect", output)[1]
-    assert re.search(rf"\nverdicts +convergence: {re.escape(verdict.message)}\n", out)
+    assert re.search(rf"\nfindings +convergence: {re.escape(finding.message)}\n", out)
     assert re.search(r"\nrejected values +p0 \d+, p1 ", out)
 
 

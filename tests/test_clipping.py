@@ -51,8 +51,8 @@ def test_a_missing_level_is_named(bit_depth, frames):
     read_noise = np.hypot(gain * virtual.camera.read_noise_e, np.sqrt(1 / 12))
     options = {"variance": equipix.NoiseModel(read_noise, gain)}
     cal, said = calibrated(found, **options)
-    assert re.search(f"exactly {level}, .*saturation = {level} ", said["SaturationWarning"])
-    assert "saturation" in {verdict.kind for verdict in cal.verdicts}
+    assert re.search(f"exactly {level}, .*saturation = {level} ", said["InputWarning"])
+    assert "saturation" in {finding.kind for finding in cal.findings}
     # With the level that it names all is well but for pixels that saturate around others.
     again, said = calibrated(averages(virtual, level), **options)
     assert set(said) <= {"IdentifiabilityWarning"}
@@ -123,9 +123,9 @@ def test_a_level_that_is_too_high_in_a_manifest_is_named(tmp_path):
     path = camera(2, exposure_e=20_000.0).write(tmp_path / "experiment")
     path.write_text(path.read_text().replace("bit_depth = 12", "saturation = 4096"))
     cal, said = recorded(lambda: Experiment.load(path).run(tolerance=1e-3))
-    assert "saturation = 4095 in " in said["SaturationWarning"]
-    assert "no usable pixel" not in said["SaturationWarning"]
-    assert "saturation" in {verdict.kind for verdict in cal.verdicts}
+    assert "saturation = 4095 in " in said["InputWarning"]
+    assert "no usable pixel" not in said["InputWarning"]
+    assert "saturation" in {finding.kind for finding in cal.findings}
 
 
 @pytest.mark.parametrize(
@@ -141,9 +141,9 @@ def test_clipped_samples_are_not_in_the_noise_model(exposure_e, width):
     # pixels over half of the range is the difference of two means, and has twice their error.
     error = 2 * np.sqrt(2 / 5 / (5 * np.prod(SHAPE) / 2))
     assert noise.gain == pytest.approx(virtual.camera.gain_dn_per_e, rel=4 * error)
-    findings = Averaged.of(found).findings(noise)
+    bad_pixels = Averaged.of(found).bad_pixels(noise)
     # The camera's own hot pixels are all that there are.
-    assert np.count_nonzero(findings.hot | findings.noisy) < 0.01 * np.prod(SHAPE)
+    assert np.count_nonzero(bad_pixels.hot | bad_pixels.noisy) < 0.01 * np.prod(SHAPE)
 
 
 def test_whole_numbers_saturate_at_the_largest_of_their_type():
@@ -156,7 +156,7 @@ def test_whole_numbers_saturate_at_the_largest_of_their_type():
     clipped = np.clip(np.rint(frames), 0, 65_535).astype(np.uint16)
     variance = np.full(5, 400.0)
     for given in (clipped, list(clipped)):
-        with pytest.warns(errors.MissingDarkWarning, match="frames of whole numbers"):
+        with pytest.warns(errors.InputWarning, match="frames of whole numbers"):
             cal = equipix.calibrate(given, SHIFTS, variance=variance, uncertainty=True)
         reached = (clipped == 65_535).any(axis=0)
         np.testing.assert_array_equal((cal.flags & Flag.SATURATED) != 0, reached)
@@ -165,7 +165,7 @@ def test_whole_numbers_saturate_at_the_largest_of_their_type():
         # 5120 values: their rms has a standard error of 1 %, that of the map of 2 % is added.
         assert np.sqrt(np.nanmean(z**2)) == pytest.approx(1, abs=4 * np.hypot(0.01, 0.02))
     _, said = calibrated(clipped.astype(float), variance=variance)
-    assert "saturation = 65535" in said["SaturationWarning"]
+    assert "saturation = 65535" in said["InputWarning"]
 
 
 @pytest.mark.parametrize("level", [4095, 16_383])
@@ -178,6 +178,6 @@ def test_a_level_spread_by_one_dn_is_named(level):
     spread = np.minimum(frames, level - 1) + rng.integers(-1, 2, frames.shape)
     _, said = calibrated(np.rint(spread), variance=np.full(5, 26.0))
     words = f"values are between {level - 2} and {level}, .*saturation = {level - 2} "
-    assert re.search(words, said["SaturationWarning"])
+    assert re.search(words, said["InputWarning"])
     _, said = calibrated(np.rint(0.9 * frames), variance=np.full(5, 26.0))
-    assert "SaturationWarning" not in said
+    assert "InputWarning" not in said

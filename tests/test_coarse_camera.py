@@ -33,7 +33,7 @@ def calibrated(*, binning=1, **camera):
 def test_rounding_that_all_exposures_share_is_no_misfit(gain, frames, bits):
     """M follows it: reduced chi-square is 0.53 and 0.84, and error bars are right or too large."""
     cal, z = calibrated(gain_dn_per_e=gain, frames=frames, bit_depth=bits)
-    assert cal.verdicts == ()
+    assert cal.findings == ()
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.03
 
 
@@ -41,7 +41,7 @@ def test_rounding_that_all_exposures_share_is_no_misfit(gain, frames, bits):
 def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
     """Its noise was that of a line through bright light, up to five times too large, or none."""
     cal, z = calibrated(frames=frames, dark_frames=1)
-    assert cal.verdicts == ()
+    assert cal.findings == ()
     # The dark's own pattern, of 2 to 3 DN beside a read noise of 2 DN, counts as noise.
     assert 0.5 < np.sqrt(np.mean(z**2)) < 1
 
@@ -64,25 +64,25 @@ def test_a_dark_that_is_finer_than_its_rounding_shows_no_pattern(seed):
 
     dark = equipix.average(stack(np.zeros(SHAPE)))
     frames = [equipix.average(stack(light), dark=dark) for light in electrons]
-    assert equipix.calibrate(frames, cross).verdicts == ()
+    assert equipix.calibrate(frames, cross).findings == ()
 
 
 def test_clipped_values_do_not_say_that_variances_are_too_large():
     cal, _ = calibrated(exposure_e=19500)
-    assert "saturation" in {verdict.kind for verdict in cal.verdicts}
-    assert not any("variances are too large" in verdict.message for verdict in cal.verdicts)
+    assert "saturation" in {finding.kind for finding in cal.findings}
+    assert not any("variances are too large" in finding.message for finding in cal.findings)
 
 
 def test_shifts_of_binned_pixels_are_no_matter_of_noise():
     cal, _ = calibrated(binning=2, frames=4)
-    assert not any("variances are too small" in verdict.message for verdict in cal.verdicts)
+    assert not any("variances are too small" in finding.message for finding in cal.findings)
 
 
 def test_an_estimate_below_the_tolerance_is_not_said_to_be_above_it():
     """Almost all pixels saturate."""
     with np.errstate(invalid="ignore"):
         cal, _ = calibrated(gain_dn_per_e=0.2, bit_depth=8)
-    (words,) = [verdict.message for verdict in cal.verdicts if verdict.kind == "convergence"]
+    (words,) = [finding.message for finding in cal.findings if finding.kind == "convergence"]
     assert "too few to estimate the error" in words
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from equipix import cross_pattern, errors, plan, simulate
+from equipix import cross_pattern, errors, metrics, plan, simulate
 from equipix.measured.colour import Colours
 
 BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
@@ -96,5 +96,5 @@ def test_a_filtered_sensitivity_has_the_responses_of_its_colours():
 def test_a_relative_error_takes_the_mean_of_each_colour():
     truth = simulate.filtered(np.ones((6, 6)), "RGGB")
     measured = simulate.filtered(np.ones((6, 6)), "RGGB", response={"R": 3, "G": 2, "B": 1})
-    assert np.abs(simulate.relative_error(measured, truth, cfa="RGGB")).max() < 1e-15
-    assert np.abs(simulate.relative_error(measured, truth)).max() > 1
+    assert np.abs(metrics.relative_error(measured, truth, cfa="RGGB")).max() < 1e-15
+    assert np.abs(metrics.relative_error(measured, truth)).max() > 1

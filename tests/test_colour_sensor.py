@@ -10,6 +10,7 @@ import pytest
 
 import equipix
 from equipix import cross_pattern, errors, io, metrics, nuc, plan, simulate
+from equipix.lens import cos4
 from equipix.measured.colour import Colours
 from equipix.measured.filters import pattern_of
 
@@ -66,13 +67,13 @@ class TestCalibrate:
         truth, good = sensor("GBRG")
         cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2))
         np.testing.assert_array_equal(cal.flags == 0, good)
-        (verdict,) = cal.verdicts
-        assert verdict.kind == "cfa"
-        assert "every 2 rows and 2 columns" in verdict.message
-        assert "cfa='GRBG' or cfa='GBRG'" in verdict.message
+        (finding,) = cal.findings
+        assert finding.kind == "cfa"
+        assert "every 2 rows and 2 columns" in finding.message
+        assert "cfa='GRBG' or cfa='GBRG'" in finding.message
         assert cal.cfa is None
         assert cal.colour_response is None
-        assert np.abs(simulate.relative_error(cal.sensitivity, truth))[good].max() < 0.02
+        assert np.abs(metrics.relative_error(cal.sensitivity, truth))[good].max() < 0.02
 
     @pytest.mark.filterwarnings(NAMED)
     @pytest.mark.parametrize(("pattern", "words"), [("AB/AB", "2 columns"), ("A/A/B", "3 rows")])
@@ -81,10 +82,10 @@ class TestCalibrate:
         truth = simulate.filtered(truth, pattern, response={"A": 0.4, "B": 1.0})
         cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2))
         np.testing.assert_array_equal(cal.flags == 0, good)
-        (verdict,) = cal.verdicts
-        assert words in verdict.message
-        assert "read-out" in verdict.message
-        assert "cfa=" not in verdict.message
+        (finding,) = cal.findings
+        assert words in finding.message
+        assert "read-out" in finding.message
+        assert "cfa=" not in finding.message
 
     @pytest.mark.parametrize("shape", [(12, 40), (8, 512), (15, 15)])
     def test_a_gradient_on_a_narrow_sensor_is_no_pattern(self, shape):
@@ -105,7 +106,7 @@ class TestCalibrate:
         truth, _ = sensor("RGGB")
         frames, variance = exposures(truth), np.full(5, NOISE**2)
         if not write:
-            assert equipix.calibrate(frames, CROSS, variance=variance, cfa=given).verdicts == ()
+            assert equipix.calibrate(frames, CROSS, variance=variance, cfa=given).findings == ()
             return
         with pytest.warns(errors.MisfitWarning, match=f"pixels of one colour .* write {write}"):
             equipix.calibrate(frames, CROSS, variance=variance, cfa=given)
@@ -114,16 +115,16 @@ class TestCalibrate:
         truth, _ = sensor("RGGB", dead=0)
         truth[::2, 1::2] *= 1.03
         cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
-        assert cal.verdicts == ()
+        assert cal.findings == ()
 
     def test_a_monochrome_sensor_is_calibrated_as_ever(self):
         truth, good = sensor(None)
         frames = exposures(truth)
         alone = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2))
         given = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
-        assert alone.verdicts == ()
+        assert alone.findings == ()
         assert alone.colour_response is None
-        error = simulate.relative_error(given.sensitivity, alone.sensitivity, cfa="RGGB")
+        error = metrics.relative_error(given.sensitivity, alone.sensitivity, cfa="RGGB")
         # Two fits of the same data, each to the tolerance of 1e-6.
         assert np.abs(error[good]).max() < 2e-5
 
@@ -188,7 +189,7 @@ class TestCalibrate:
             frame[red] *= np.broadcast_to(1 + 0.03 * slope[col : col + SHAPE[1]], SHAPE)[red]
         with pytest.warns(errors.MisfitWarning, match="colours contradict one beam"):
             cal = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
-        (words,) = [each.message for each in cal.verdicts if each.kind == "colour"]
+        (words,) = [each.message for each in cal.findings if each.kind == "colour"]
         assert "'mask'" in words
         assert "plan.suggest" in words
 
@@ -204,7 +205,7 @@ class TestCalibrate:
         for plane in planes("RGGB").values():
             cal = equipix.calibrate(frames, shifts, mask=~plane)
             assert cal.components == 1
-            error = simulate.relative_error(cal.sensitivity, np.where(plane, truth, np.nan))
+            error = metrics.relative_error(cal.sensitivity, np.where(plane, truth, np.nan))
             assert np.nanmax(np.abs(error)) < 1e-5
 
 
@@ -231,7 +232,7 @@ class TestUniformSource:
         response = nuc.fit(levels, cfa=cfa)
         np.testing.assert_array_equal(response.flags == 0, good)
         gain = np.where(good, truth, np.nan)
-        wanted = 1 + simulate.relative_error(gain, np.ones(SHAPE), cfa=cfa)
+        wanted = 1 + metrics.relative_error(gain, np.ones(SHAPE), cfa=cfa)
         z = ((1 + response.deviation[1] - wanted) / np.sqrt(response.variances[1]))[good]
         assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=5 / np.sqrt(2 * z.size))
         corrected = response.correct(levels[2].mean, dark=None, flagged="replace")
@@ -358,16 +359,16 @@ class TestOthers:
         rng = np.random.default_rng(3)
         dark = 50 + rng.standard_normal((16, *SHAPE))
         bright = dark[::-1] + 1000 * truth
-        whole = metrics.emva_spatial(dark, bright, highpass=False)
+        whole = metrics.emva_spatial(bright, dark, highpass=False)
         off, on = (metrics.planes(each, "RGGB") for each in (dark, bright))
-        found = [metrics.emva_spatial(off[name], on[name], highpass=False) for name in off]
+        found = [metrics.emva_spatial(on[name], off[name], highpass=False) for name in off]
         assert whole.prnu.total > 0.3
         assert all(abs(each.prnu.total - 0.01) < 0.002 for each in found)
 
     def test_a_lens_is_fitted_to_all_colours(self):
         rows, cols = np.mgrid[:120, :160]
-        flat = 1000 * equipix.lens.cos4((rows - 62.0) ** 2 + (cols - 75.0) ** 2, 300.0)
-        found = equipix.lens.fit_falloff(simulate.filtered(flat, X_TRANS), cfa=X_TRANS)
+        flat = 1000 * cos4((rows - 62.0) ** 2 + (cols - 75.0) ** 2, 300.0)
+        found = equipix.lens.fit(simulate.filtered(flat, X_TRANS), cfa=X_TRANS)
         assert found.focal_length == pytest.approx(300, rel=2e-3)
 
     def test_an_experiment_on_disk_names_its_filters(self, tmp_path, run):

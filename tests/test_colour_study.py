@@ -1,10 +1,10 @@
-"""Many sensors behind colour filters: error bars, false flags, defects found, false verdicts."""
+"""Many sensors behind colour filters: error bars, false flags, defects found, false findings."""
 
 import numpy as np
 import pytest
 
 import equipix
-from equipix import cross_pattern, simulate
+from equipix import cross_pattern, metrics, simulate
 
 PATTERNS = {
     "RGGB and the like": ("RGGB", "GRBG", "GBRG", "BGGR"),
@@ -27,14 +27,14 @@ def drawn(cfa, seed):
     cal = equipix.calibrate(
         frames, SHIFTS, variance=np.full(5, NOISE**2), cfa=cfa, uncertainty=True
     )
-    error = simulate.relative_error(cal.sensitivity, np.where(good, truth, np.nan), cfa=cfa)
+    error = metrics.relative_error(cal.sensitivity, np.where(good, truth, np.nan), cfa=cfa)
     return cal, error, good
 
 
 @pytest.mark.study
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_error_bars_flags_and_verdicts_are_those_of_a_monochrome_sensor(draws, figure, pattern):
-    squares, false, missed, verdicts = [], 0, 0, 0
+def test_error_bars_flags_and_findings_are_those_of_a_monochrome_sensor(draws, figure, pattern):
+    squares, false, missed, findings = [], 0, 0, 0
     seeds = draws(200)
     for seed in seeds:
         cfas = PATTERNS[pattern]
@@ -43,7 +43,7 @@ def test_error_bars_flags_and_verdicts_are_those_of_a_monochrome_sensor(draws, f
         squares.append(np.mean(z[good] ** 2))
         false += np.count_nonzero((cal.flags != 0) & good)
         missed += np.count_nonzero((cal.flags == 0) & ~good)
-        verdicts += len(cal.verdicts)
+        findings += len(cal.findings)
     pixels = len(seeds) * (np.prod(SHAPE) - DEAD)
     z = float(np.sqrt(np.mean(squares)))
     # Errors of large scales are common to pixels, so the scatter of the draws tells the error of z.
@@ -51,10 +51,10 @@ def test_error_bars_flags_and_verdicts_are_those_of_a_monochrome_sensor(draws, f
     figure(f"z of calibrate behind {pattern}", round(z, 3), "0.97 to 1.03")
     figure(f"false flags behind {pattern}", f"{false} of {pixels}", "below 1e-4")
     figure(f"dead pixels missed behind {pattern}", missed, "0")
-    figure(f"verdicts on right models behind {pattern}", verdicts, "at most 1 %")
+    figure(f"findings on right models behind {pattern}", findings, "at most 1 %")
     assert 0.97 - 3 * error_of_z < z < 1.03 + 3 * error_of_z
     allowed = 1e-4 * pixels
     assert false <= allowed + 3 * np.sqrt(allowed)
     assert missed == 0
     allowed = 0.01 * len(seeds)
-    assert verdicts <= allowed + 3 * np.sqrt(allowed) + 1
+    assert findings <= allowed + 3 * np.sqrt(allowed) + 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, simulate
+from equipix import Flag, metrics, simulate
 from equipix.errors import EquipixWarning, MisfitWarning
 from equipix.fitting.stated_errors import sampled_frames
 
@@ -20,11 +20,11 @@ TEN = np.array(
 
 
 def calibrated(frames, shifts, **options):
-    """Calibration and the kinds of its verdicts."""
+    """Calibration and the kinds of its findings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", EquipixWarning)
         cal = equipix.calibrate(frames, shifts, **{"tolerance": 1e-4} | options)
-    return cal, [verdict.kind for verdict in cal.verdicts]
+    return cal, [finding.kind for finding in cal.findings]
 
 
 def noisy(frames, rng, noise=NOISE):
@@ -92,7 +92,7 @@ class TestSampleVariances:
             cal = equipix.calibrate(frames, CROSS, variance=variance, uncertainty=True)
         known = equipix.calibrate(frames, CROSS, variance=expected)
         error, best = (
-            simulate.relative_error(each.sensitivity, truth).std() for each in (cal, known)
+            metrics.relative_error(each.sensitivity, truth).std() for each in (cal, known)
         )
         # Weights off by 1 % or so lose less than 1e-3 of the exactness.
         assert error < 1.01 * best
@@ -125,7 +125,7 @@ class TestFalsePixels:
             flags = (cal.flags & (Flag.HOT | Flag.DEAD)) != 0
             np.testing.assert_array_equal(flags, stuck)
             good = np.where(stuck, np.nan, truth)
-            z = simulate.relative_error(cal.sensitivity, good) / cal.sensitivity_std
+            z = metrics.relative_error(cal.sensitivity, good) / cal.sensitivity_std
             # The largest of 6144 normal values is above 5.5 in one of 4000 cases.
             assert np.nanmax(np.abs(z * truth)) < 5.5
             assert kinds == []
@@ -136,7 +136,7 @@ class TestFalsePixels:
         truth[20, 30], truth[40, 50] = 2.5, 0.3
         frames = noisy(simulate.exposures(truth, simulate.wavy_beam(SENSOR, rng=6), CROSS), rng)
         cal, _ = calibrated(frames, CROSS, variance=np.full(5, NOISE**2))
-        error = simulate.relative_error(cal.sensitivity, truth)
+        error = metrics.relative_error(cal.sensitivity, truth)
         assert np.abs(error[[20, 40], [30, 50]]).max() < 5e-3
 
 

@@ -56,7 +56,7 @@ def test_the_cause_is_named(shifts, options, cause):
     with pytest.warns(errors.IdentifiabilityWarning, match=rf"only \d+ of \d+ unmasked .*{cause}"):
         found = equipix.calibrate(exposures(shifts), shifts, **options)
     assert found.is_partial
-    assert [each.kind for each in found.verdicts].count("components") == 0
+    assert [each.kind for each in found.findings].count("components") == 0
 
 
 def test_bad_pixels_are_a_cause():
@@ -80,7 +80,7 @@ def test_masked_pixels_are_not_missed():
     assert not found.is_partial
 
 
-def test_the_verdict_is_saved(tmp_path):
+def test_the_finding_is_saved(tmp_path):
     with pytest.warns(errors.IdentifiabilityWarning):
         equipix.calibrate(exposures(CROSS[:2]), CROSS[:2]).save(tmp_path / "cal.npz")
     assert equipix.load(tmp_path / "cal.npz").is_partial

@@ -1,4 +1,4 @@
-"""The demo, on a smaller sensor: its verdict, its picture, its traces."""
+"""The demo, on a smaller sensor: its finding, its picture, its traces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from equipix.pictures.comparison import draw_demo
 pytest.importorskip("matplotlib")
 
 # The hole's image is small on so small a sensor, and non-uniformity moves its centroid.
-pytestmark = pytest.mark.filterwarnings("ignore::equipix.errors.ShiftRoundingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::equipix.errors.InputWarning")
 
 SHAPE = (160, 208)
 

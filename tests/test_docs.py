@@ -22,7 +22,7 @@ import typer.main
 from pydantic import BaseModel
 
 import equipix
-from equipix import simulate
+from equipix import metrics
 from equipix.cli.app import app
 from equipix.experiment.manifest import Manifest, Sensor
 from equipix.findings import _CATEGORIES as CATEGORIES
@@ -65,7 +65,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     names: dict[str, object] = {}
     exec("\n".join(blocks("python")), names)
     cal, truth = equipix.load("first.tif"), names["truth"]
-    error = simulate.relative_error(cal.sensitivity, truth)
+    error = metrics.relative_error(cal.sensitivity, truth)
     # The largest of 19 200 normal values of this rms stays below 6 of them.
     assert np.abs(error).max() < 6 * names["camera"].noise_prediction(rng=1)[0]
     assert names["equal"].shape == truth.shape
@@ -167,8 +167,8 @@ def test_the_readme_names_attributes_that_exist():
     assert named <= {name for each in results for name in (*each.__dataclass_fields__, *dir(each))}
 
 
-def test_the_readme_describes_every_verdict_and_its_warning():
-    described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in table("verdict")}
+def test_the_readme_describes_every_finding_and_its_warning():
+    described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in table("finding")}
     assert described == {kind: warning.__name__ for kind, warning in CATEGORIES.items()}
 
 
@@ -240,7 +240,7 @@ def test_the_example_between_pixels(capsys):
 
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
-@pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 def test_the_example_of_a_monitor(capsys):
     steady, monitor = figures("drift_monitor", capsys)
     # 1 % against 0.02 % of error in the fluxes makes as much of a difference in the tilt.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import reference, simulate
+from equipix import metrics, reference, simulate
 
 CROSS = equipix.cross_pattern(5, 7)
 MOST_SWEEPS = {"multiscale": 60, "coordinate-descent": 1000}
@@ -65,7 +65,7 @@ def test_what_the_solver_leaves_is_no_flipped_exposure():
     frames, shifts, mask = random_experiment(86)
     found = minimiser(frames, shifts, mask)
     assert not found.converged
-    assert "misfit" not in {verdict.kind for verdict in found.verdicts}
+    assert "misfit" not in {finding.kind for finding in found.findings}
 
 
 @pytest.mark.study
@@ -155,7 +155,7 @@ def test_what_has_converged_is_within_an_order_of_the_estimate(case, tolerance, 
     truth = simulate.paper_sensitivity(shape, rng=1) * halves
     frames = simulate.exposures(truth, beam, CROSS)
     cal = equipix.calibrate(frames, CROSS, mask=mask, method=method, tolerance=tolerance)
-    true = np.nanmax(np.abs(simulate.relative_error(cal.sensitivity, truth)))
+    true = np.nanmax(np.abs(metrics.relative_error(cal.sensitivity, truth)))
     assert cal.converged
     assert true <= 10 * cal.error_estimate
     # By how much it is too large is asked of the median of all experiments alone; but coordinate

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from equipix import Experiment, Flag, FrameStatistics, errors, load, simulate
+from equipix import Experiment, Flag, FrameStatistics, errors, load, metrics, simulate
 from equipix.experiment import experiment as experiment_run
 from equipix.io.frames import read_frames
 from equipix.measured.defects import dead_pixels, hot_pixels
@@ -61,12 +61,12 @@ def rms(error):
 
 def test_truth_is_found_within_the_noise(calibration, virtual):
     truth = np.where(virtual.camera.good, virtual.truth.sensitivity, np.nan)
-    error = simulate.relative_error(calibration.sensitivity, truth)
+    error = metrics.relative_error(calibration.sensitivity, truth)
     # 5112 pixels: the rms of the error scatters by 1/sqrt(2 * 5112) = 1 %, that of 20 blocks by
     # 16 %, and the prediction of four draws by half of that: 5 and 4 standard deviations.
     predicted, predicted_blocks = virtual.noise_prediction(rng=3)
     assert rms(error) == pytest.approx(predicted, rel=0.06)
-    assert rms(simulate.block_means(error)) < 1.7 * predicted_blocks
+    assert rms(metrics.block_means(error)) < 1.7 * predicted_blocks
 
 
 def test_bad_pixels_are_flagged_and_no_others(calibration, virtual):
@@ -140,8 +140,8 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
                 found = experiment.run(tolerance=1e-4)
             error = np.array(found.metadata["measured_shifts"]) - virtual.truth.shifts
             errors_of[k].append(error[1:])
-            of_m = simulate.relative_error(found.sensitivity, truth)
-            blocks[k].append(rms(simulate.block_means(of_m)))
+            of_m = metrics.relative_error(found.sensitivity, truth)
+            blocks[k].append(rms(metrics.block_means(of_m)))
         blocks[2].append(virtual.noise_prediction(rng=seed)[1])
         scores.append(errors_of[1][-1] / np.array(found.metadata["measured_shift_std"])[1:])
     # Pixels uneven by 5 %, 0.029 rms, become uneven by what noise leaves of M, some 1e-3. The noise
@@ -196,7 +196,7 @@ def test_coordinate_descent_rounds_a_fraction_of_a_pixel_with_a_warning(edited):
     path = edited('aperture_before = "aperture/p1-before.tif"', "shift = [0.0, 5.3]")
     path.write_text(re.sub(r"aperture_after = .*p1-after.*\n", "", path.read_text()))
     with (
-        pytest.warns(errors.ShiftRoundingWarning, match=r"rounded to whole pixels"),
+        pytest.warns(errors.InputWarning, match=r"rounded to whole pixels"),
         pytest.warns(errors.ConvergenceWarning),
     ):
         Experiment.load(path).run(method="coordinate-descent", max_sweeps=2)
@@ -219,9 +219,9 @@ def test_real_input(data_dir):
     calibration = experiment.run(tolerance=1e-5)
     bad = np.union1d(truth["dead"], truth["hot"])
     np.testing.assert_array_equal(np.flatnonzero(calibration.flags), bad)
-    error = simulate.relative_error(calibration.sensitivity, truth["sensitivity"])
+    error = metrics.relative_error(calibration.sensitivity, truth["sensitivity"])
     assert rms(error) < 1.30e-3
-    assert rms(simulate.block_means(error)) < 1.8e-4
+    assert rms(metrics.block_means(error)) < 1.8e-4
     # Unequal pixels move a centroid by 0.008 pixel, a shift after two moves by 0.016.
     np.testing.assert_allclose(calibration.shifts, truth["shifts"], atol=4 * 0.016)
 

@@ -44,7 +44,7 @@ def test_pixels_stuck_far_above_the_signal_are_left_out(count):
     assert rms(cal.sensitivity, truth, ~bad) == pytest.approx(
         rms(wanted.sensitivity, truth, ~bad), rel=1e-3
     )
-    assert [each.kind for each in cal.verdicts] == []
+    assert [each.kind for each in cal.findings] == []
 
 
 def test_dead_pixels_without_noise_are_no_measurements():
@@ -55,7 +55,7 @@ def test_dead_pixels_without_noise_are_no_measurements():
     wanted = equipix.calibrate(frames, CROSS, variance=np.ones(5), mask=bad)
     np.testing.assert_array_equal((cal.flags & Flag.DEAD) > 0, bad)
     assert cal.reduced_chi2 == pytest.approx(wanted.reduced_chi2, rel=1e-5)
-    assert [each.kind for each in cal.verdicts] == []
+    assert [each.kind for each in cal.findings] == []
 
 
 def test_pixels_of_unusual_but_proportional_response_stay():

@@ -187,7 +187,7 @@ def test_islands_and_strips_in_the_dark_do_no_harm(size):
     cal = fitted(APART, mask)
     assert cal.converged
     assert cal.sweeps <= 100
-    assert cal.verdicts == ()
+    assert cal.findings == ()
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -233,7 +233,7 @@ def test_large_discs_converge_and_raise_no_alarm(edge, draws, figure):
         assert not (~mask & ~left & in_blocks(~mask) & (left.sum(axis=0) > 2)).any()
         lost.append(1 - np.count_nonzero(left) / np.count_nonzero(~mask))
         # That free fluxes leave the tilt open is no alarm.
-        assert {verdict.kind for verdict in cal.verdicts} == {"tilt"}
+        assert {finding.kind for finding in cal.findings} == {"tilt"}
         passes.append(cal.sweeps)
     of_discs = f"of discs of 512×512 pixels, edge of masks: {edge}"
     figure(f"most passes {of_discs}", max(passes), "at most 100")

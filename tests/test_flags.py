@@ -14,10 +14,10 @@ from equipix.exposures.fit import FitOptions
 from equipix.findings import BITS, Flag
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, Weighted, contradictory_found, weighted_fit
-from equipix.measured.defects import Findings
+from equipix.measured.defects import BadPixels
 
 CROSS = equipix.cross_pattern(2, 3)
-FINDINGS = [field.name for field in dataclasses.fields(Findings)]
+FINDINGS = [field.name for field in dataclasses.fields(BadPixels)]
 
 
 def weighted():
@@ -28,7 +28,7 @@ def weighted():
 
 def with_findings(**found):
     fitted = weighted()
-    exposures = dataclasses.replace(fitted.exposures, findings=Findings(**found))
+    exposures = dataclasses.replace(fitted.exposures, bad_pixels=BadPixels(**found))
     return fitted._replace(exposures=exposures)
 
 

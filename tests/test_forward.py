@@ -177,7 +177,7 @@ def test_a_loaded_calibration_predicts_the_same_bytes(case, suffix, tmp_path):
     np.testing.assert_array_equal(
         read.residuals(frames, variance=variance), cal.residuals(frames, variance=variance)
     )
-    assert read.verdicts == cal.verdicts
+    assert read.findings == cal.findings
 
 
 def test_a_copy_keeps_the_fit():
@@ -231,6 +231,6 @@ def test_files_of_format_1_are_read(suffix):
     assert read.rejected.shape == (5, 24, 32)
     assert read.rejected[1, 3, 4]
     assert read.beam_coefficients is None
-    assert read.verdicts == ()
+    assert read.findings == ()
     assert np.isfinite(read.predict((0, 0))).all()
     assert np.nanmedian(read.sensitivity_std) == pytest.approx(5.8e-4, rel=0.05)

@@ -127,6 +127,6 @@ def test_moves_of_half_a_pixel_round_one_way_everywhere(first):
     np.testing.assert_array_equal(np.diff(whole_moves(shifts)[:, 0]), np.diff(whole))
     rounded = Positions.of(shifts).whole().shifts[:, 0]
     np.testing.assert_allclose(rounded - first, whole, rtol=0, atol=1e-12)
-    with pytest.warns(equipix.errors.ShiftRoundingWarning):
+    with pytest.warns(equipix.errors.InputWarning):
         found = equipix.plan.identify(SHAPE, shifts)
     assert found.components == equipix.plan.identify(SHAPE, whole_moves(shifts)).components

@@ -181,7 +181,7 @@ class TestSingleFrames:
         files = equipix.Experiment.load(manifest).run(uncertainty=True)
         for cal in (arrays, files):
             assert cal.metadata["options"]["weights"] == "equal"
-            assert cal.verdicts == ()
+            assert cal.findings == ()
         np.testing.assert_array_equal(arrays.flags, files.flags)
         difference = np.abs(arrays.sensitivity - files.sensitivity)
         assert np.nanmax(difference / arrays.sensitivity_std) < 0.01

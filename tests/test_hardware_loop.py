@@ -24,7 +24,7 @@ def scene(count, bits, rng=1):
 )
 def test_words_and_memories_are_those_of_the_reference(widths, step):
     adc, gain, offset = widths
-    loop = hardware.Adaptive(SHAPE, adc_bits=adc, gain_bits=gain, offset_bits=offset, step=step)
+    loop = hardware.AdaptiveLoop(SHAPE, adc_bits=adc, gain_bits=gain, offset_bits=offset, step=step)
     g, o = np.full(SHAPE, 2 ** (gain - 1)), np.zeros(SHAPE, int)
     for frame in scene(12, adc):
         words, g, o = reference.adapt_words(frame, g, o, widths=widths, step=step)
@@ -37,7 +37,7 @@ def test_words_and_memories_are_those_of_the_reference(widths, step):
 
 def test_a_stack_is_its_frames_for_any_number_of_workers():
     frames = scene(10, 14)
-    one, other = (hardware.Adaptive(SHAPE, step=2**-4) for _ in range(2))
+    one, other = (hardware.AdaptiveLoop(SHAPE, step=2**-4) for _ in range(2))
     stack = one.update(frames, workers=1)
     each = [other.update(frame, workers=3) for frame in frames]
     assert np.array_equal(stack, each)
@@ -46,10 +46,10 @@ def test_a_stack_is_its_frames_for_any_number_of_workers():
 
 
 def test_the_memories_are_a_table():
-    loop = hardware.Adaptive(SHAPE, adc_bits=12, gain_bits=14, offset_bits=11, step=2**-4)
+    loop = hardware.AdaptiveLoop(SHAPE, adc_bits=12, gain_bits=14, offset_bits=11, step=2**-4)
     frames = scene(20, 12)
     loop.update(frames[:-1])
-    table = loop.result()
+    table = loop.correction()
     assert np.array_equal(table.apply(frames[-1]), loop.update(frames[-1]))
 
 
@@ -65,13 +65,13 @@ def test_the_memories_are_a_table():
 )
 def test_arguments_out_of_range_are_refused(options, words):
     with pytest.raises(errors.InputError, match=words):
-        hardware.Adaptive(SHAPE, **options)
+        hardware.AdaptiveLoop(SHAPE, **options)
     with pytest.raises(errors.InputError, match="neighbours"):
-        hardware.Adaptive((1, 9))
+        hardware.AdaptiveLoop((1, 9))
 
 
 def test_frames_that_do_not_fit_change_nothing():
-    loop = hardware.Adaptive(SHAPE, adc_bits=12)
+    loop = hardware.AdaptiveLoop(SHAPE, adc_bits=12)
     with pytest.raises(errors.InputError, match="holds 4096, above 4095"):
         loop.update(np.array([scene(1, 12)[0], np.full(SHAPE, 4096)], np.uint16))
     for wrong in (np.zeros(SHAPE), np.zeros((3, 3), np.uint16)):
@@ -85,7 +85,7 @@ def test_at_the_bound_of_the_step_a_chequered_pattern_does_not_grow():
     rows, cols = np.indices((16, 16))
     sign = 1 - 2 * ((rows + cols) % 2)
     frames = np.repeat((60_000 + 3000 * sign).astype(np.uint16)[None], 200, axis=0)
-    loop = hardware.Adaptive((16, 16), adc_bits=16, step=0.5)
+    loop = hardware.AdaptiveLoop((16, 16), adc_bits=16, step=0.5)
     spread = loop.update(frames).astype(float).std(axis=(1, 2))
     assert spread[-1] < 0.1 * spread[0]
     # The law behind the bound: twice the step makes it grow, in double precision.

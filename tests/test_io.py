@@ -369,9 +369,9 @@ def test_globs_are_in_natural_order(tmp_path: Path) -> None:
     literal.touch()
     assert io.find_files(str(literal)) == [literal]
     assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
-    with pytest.raises(InputError, match="'source' holds 3, expected a path"):
+    with pytest.raises(InputError, match="'frames' holds 3, expected a path"):
         equipix.average([literal, 3])  # type: ignore[list-item]
-    with pytest.raises(InputError, match="'source' names no file"):
+    with pytest.raises(InputError, match="'frames' names no file"):
         io.read_frames([])
 
 

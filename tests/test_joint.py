@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, reference, simulate
+from equipix import Flag, metrics, reference, simulate
 from equipix.errors import (
     ConvergenceWarning,
-    DriftWarning,
     IdentifiabilityWarning,
     InputError,
     MisfitWarning,
-    ShiftSignWarning,
 )
 
 SMALL = (9, 12)
@@ -68,7 +66,7 @@ def structured(seed, *, whole=False, noise=1e-3, shape=SENSOR):
 
 
 def rms_error(calibration, truth):
-    return np.sqrt(np.nanmean(simulate.relative_error(calibration.sensitivity, truth) ** 2))
+    return np.sqrt(np.nanmean(metrics.relative_error(calibration.sensitivity, truth) ** 2))
 
 
 def slope(image):
@@ -196,10 +194,10 @@ class TestBetweenPixels:
 
     def test_a_terrible_fit_is_told(self):
         frames, shifts, _ = structured(0)
-        # The misfit that a wrong sign explains is no verdict of its own.
-        with pytest.warns(ShiftSignWarning, match="squared residuals are .* times as large"):
+        # The misfit that a wrong sign explains is no finding of its own.
+        with pytest.warns(MisfitWarning, match="squared residuals are .* times as large"):
             cal = equipix.calibrate(frames, -shifts, tolerance=1e-4, variance=np.full(5, NOISE**2))
-        assert [verdict.kind for verdict in cal.verdicts] == ["sign"]
+        assert [finding.kind for finding in cal.findings] == ["sign"]
 
     def test_rounded_shifts_ruin_it(self):
         frames, shifts, truth = structured(0)
@@ -283,7 +281,7 @@ class TestFluxes:
             assert np.abs(tilt).max() < 4 * one
             assert np.abs(free.flux / flux - 1).max() < 4 * one
 
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     @pytest.mark.parametrize("is_between", [False, True], ids=["whole", "between"])
     def test_without_one_the_tilt_is_left_to_the_gauge(self, is_between):
         rng = np.random.default_rng(4)
@@ -300,7 +298,7 @@ class TestFluxes:
         np.testing.assert_allclose(told.T @ np.log(cal.flux), told.T @ np.log(flux), atol=1e-4)
 
         # Taken as equal, what is affine in the shifts becomes a tilt: section 5.
-        with pytest.warns(DriftWarning, match="the data contradict the fluxes"):
+        with pytest.warns(MisfitWarning, match="the data contradict the fluxes"):
             steady = equipix.calibrate(frames, shifts, tolerance=1e-5)
         affine = np.linalg.lstsq(hidden, np.log(flux))[0][1:]
         tilt = slope(np.log(steady.sensitivity / truth))

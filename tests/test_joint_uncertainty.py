@@ -108,7 +108,7 @@ class TestAgainstDenseAlgebra:
             assert along == pytest.approx(dense.dark_along_std, rel=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestAgainstSimulatedExperiments:
     """Sensors of 120 rows and 160 columns, 200 experiments for each setting.
 

@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.diagnosis.lamp_drift import lamp_drift
-from equipix.errors import DriftWarning
+from equipix.errors import MisfitWarning
 from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from equipix.fitting.residuals import sampled
@@ -95,9 +95,9 @@ def test_it_is_not_asked_where_fluxes_are_found():
 def test_it_is_said_and_added_to_error_bars(tmp_path):
     frames, _, _ = photograph(np.random.default_rng(2), 1e-3)
     variance = np.full(7, NOISE**2)
-    with pytest.warns(DriftWarning, match="contradict the fluxes.*4 degrees of freedom"):
+    with pytest.warns(MisfitWarning, match="contradict the fluxes.*4 degrees of freedom"):
         cal = equipix.calibrate(frames, SEVEN, variance=variance, uncertainty=True)
-    assert [verdict.kind for verdict in cal.verdicts] == ["drift"]
+    assert [finding.kind for finding in cal.findings] == ["drift"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         free = equipix.calibrate(frames, SEVEN, variance=variance, flux="fit", uncertainty=True)
@@ -154,7 +154,7 @@ def test_the_tilt_of_a_linear_drift_is_named():
     flux = np.exp(rate * np.arange(5))
     clean = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts, flux=flux)
     frames = clean + 1e-4 * np.random.default_rng(3).standard_normal(clean.shape)
-    with pytest.warns(DriftWarning, match="if it is linear in the order of the exposures"):
+    with pytest.warns(MisfitWarning, match="if it is linear in the order of the exposures"):
         cal = equipix.calibrate(frames, shifts)
     # The rate is known to the standard error of what the trend leaves: 3.5 % of its variance.
     visible = rate * np.sqrt(10 * distinct_trend(shifts))

@@ -10,6 +10,7 @@ import pytest
 
 import equipix
 from equipix import errors, lens, nuc, simulate
+from equipix.lens import cos4
 
 SHAPE = (240, 320)
 CENTRE, FOCAL = (125.0, 150.0), 500.0
@@ -21,7 +22,7 @@ def squared(shape=SHAPE, centre=CENTRE):
 
 
 def flat(rng=None):
-    light = 1000 * lens.cos4(squared(), FOCAL)
+    light = 1000 * cos4(squared(), FOCAL)
     return light if rng is None else light * simulate.paper_sensitivity(SHAPE, rng=rng)
 
 
@@ -29,17 +30,17 @@ class TestCos4:
     def test_it_is_the_fourth_power_of_the_cosine(self):
         for distance in (0.0, 10.0, 300.0):
             angle = np.arctan(distance / FOCAL)
-            assert float(lens.cos4(distance**2, FOCAL)) == pytest.approx(np.cos(angle) ** 4)
+            assert float(cos4(distance**2, FOCAL)) == pytest.approx(np.cos(angle) ** 4)
 
     def test_the_corner_of_the_array_of_the_source(self):
         # 54 mm behind a lens of 100 mm: r² = 2·27² mm².
         wanted = np.cos(np.arctan(np.sqrt(2) * 27 / 100)) ** 4
-        assert float(lens.cos4(2 * 27**2, 100.0)) == pytest.approx(wanted)
+        assert float(cos4(2 * 27**2, 100.0)) == pytest.approx(wanted)
 
 
 class TestFit:
     def test_an_exact_flat_gives_centre_and_focal_length(self):
-        found = lens.fit_falloff(flat())
+        found = lens.fit(flat())
         # Means over blocks of 5×5 pixels lie below the law at their centres by up to 2/f² times
         # 2·(5² − 1)/12 pixels² of it: 3e-5.
         assert found.centre == pytest.approx(CENTRE, abs=0.01)
@@ -49,7 +50,7 @@ class TestFit:
     def test_errors_beside_the_sensors_own_gain_are_those_stated(self):
         z = []
         for seed in range(20):
-            found = lens.fit_falloff(flat(seed))
+            found = lens.fit(flat(seed))
             z.append(
                 [
                     (found.centre[0] - CENTRE[0]) / found.std["row"],
@@ -63,21 +64,21 @@ class TestFit:
 
     def test_the_sensors_own_gain_can_be_given(self):
         sensitivity = simulate.cosine_sensitivity(SHAPE, rng=3)
-        biased = lens.fit_falloff(1000 * lens.cos4(squared(), FOCAL) * sensitivity)
-        light = 1000 * lens.cos4(squared(), FOCAL) * sensitivity
-        found = lens.fit_falloff(light, sensitivity=sensitivity)
+        biased = lens.fit(1000 * cos4(squared(), FOCAL) * sensitivity)
+        light = 1000 * cos4(squared(), FOCAL) * sensitivity
+        found = lens.fit(light, sensitivity=sensitivity)
         assert found.focal_length == pytest.approx(FOCAL, rel=3e-5)
         assert abs(biased.focal_length / FOCAL - 1) > 100 * abs(found.focal_length / FOCAL - 1)
 
     def test_dust_and_masked_corners_are_left_out(self):
         image = flat(1)
-        wanted = lens.fit_falloff(image)
+        wanted = lens.fit(image)
         image[100:106, 200:206] *= 0.3
         image[5, 5] = np.nan
         mask = np.zeros(SHAPE, bool)
         mask[:20, :20] = True
         image[:20, :20] = 0
-        found = lens.fit_falloff(image, mask=mask)
+        found = lens.fit(image, mask=mask)
         assert found.focal_length == pytest.approx(
             wanted.focal_length, abs=2 * wanted.std["focal_length"]
         )
@@ -85,12 +86,12 @@ class TestFit:
     def test_a_radial_law(self):
         rho = squared() / (np.hypot(*SHAPE) / 2) ** 2
         image = 500 * (1 - 0.3 * rho + 0.08 * rho**2)
-        found = lens.fit_falloff(image, law="radial")
+        found = lens.fit(image, law="radial")
         assert found.centre == pytest.approx(CENTRE, abs=0.01)
         assert found.coefficients == pytest.approx([-0.3, 0.08], abs=1e-4)
         np.testing.assert_allclose(found.illumination(), image / 500, rtol=1e-4)
         # cos⁴ is 1 − 2 r²/f² + 3 r⁴/f⁴ − …: the first term follows from the focal length.
-        natural = lens.fit_falloff(flat(), law="radial")
+        natural = lens.fit(flat(), law="radial")
         first = -2 * (np.hypot(*SHAPE) / 2 / FOCAL) ** 2
         assert natural.coefficients[0] == pytest.approx(first, rel=0.05)
 
@@ -106,35 +107,35 @@ class TestFit:
     )
     def test_refusals(self, given, message):
         with pytest.raises(errors.InputError, match=message):
-            lens.fit_falloff(flat(), **given)
+            lens.fit(flat(), **given)
 
     @pytest.mark.parametrize(("law", "rounds"), [("cos4", 1), ("radial", 0)])
     def test_a_fit_that_has_not_converged_is_refused(self, law, rounds, monkeypatch):
         monkeypatch.setattr(lens, "_ROUNDS", rounds)
         with pytest.raises(errors.InputError, match=f"did not converge in {rounds} steps"):
-            lens.fit_falloff(flat(1), law=law)
+            lens.fit(flat(1), law=law)
 
     def test_a_flat_without_fall_off_is_refused(self):
         with pytest.raises(errors.InputError, match="fall-off"):
-            lens.fit_falloff(np.full(SHAPE, 7.0))
+            lens.fit(np.full(SHAPE, 7.0))
         with pytest.raises(errors.InputError, match="not darker at the edge"):
-            lens.fit_falloff(1 / lens.cos4(squared(), FOCAL))
+            lens.fit(1 / cos4(squared(), FOCAL))
         # A dark in its place gave f = 5614 pixels.
         dark = 100 + np.random.default_rng(1).standard_normal(SHAPE)
         with pytest.raises(errors.InputError, match="Give the flat, not the dark"):
-            lens.fit_falloff(dark)
+            lens.fit(dark)
 
     @pytest.mark.parametrize("law", ["cos4", "radial"])
     def test_a_dark_less_the_flat_is_refused(self, law):
         with pytest.raises(
             errors.InputError, match=r"'flat' has the median -\d+\.\d+, expected light"
         ):
-            lens.fit_falloff(20 - flat(1), law=law)
+            lens.fit(20 - flat(1), law=law)
 
 
 class TestCorrection:
     def test_it_is_the_gain_that_removes_the_fall_off(self, tmp_path):
-        found = lens.fit_falloff(flat())
+        found = lens.fit(flat())
         correction = found.correction()
         assert isinstance(correction, equipix.Correction)
         np.testing.assert_allclose(correction.correct(flat()), 1000, rtol=6e-5)
@@ -146,7 +147,7 @@ class TestCorrection:
     def test_gains_that_the_flat_does_not_show_are_flagged(self):
         rho = squared() / (np.hypot(*SHAPE) / 2) ** 2
         image, masked = 1 - 1.3 * rho, rho > 0.6
-        found = lens.fit_falloff(np.where(masked, np.nan, image), law="radial")
+        found = lens.fit(np.where(masked, np.nan, image), law="radial")
         correction = found.correction()
         flagged = (correction.flags & equipix.Flag.NO_FLAT_FIELD) != 0
         np.testing.assert_array_equal(np.isnan(correction.coefficients[1]), flagged)
@@ -160,12 +161,12 @@ class TestCorrection:
         assert good.max() < 10
         assert correction.metadata["k1"] == pytest.approx(-1.3, abs=1e-3)
         assert correction.metadata["k2"] == pytest.approx(0, abs=1e-3)
-        whole = lens.fit_falloff(1 - 0.3 * rho, law="radial").correction()
+        whole = lens.fit(1 - 0.3 * rho, law="radial").correction()
         assert not whole.flags.any()
 
     def test_a_corner_with_little_light_is_not_corrected(self):
-        light = lens.cos4(squared(), 90.0)
-        correction = lens.fit_falloff(1000 * light).correction()
+        light = cos4(squared(), 90.0)
+        correction = lens.fit(1000 * light).correction()
         flagged = correction.flags != 0
         # But for the error of the law by block means, at most some 0.1 % here.
         assert flagged[light < 0.099].all()
@@ -180,14 +181,14 @@ class TestCorrection:
             equipix.average(array.frames(e, 8, rng=k), dark=dark) for k, e in enumerate(light)
         ]
         response = nuc.fit(levels, order=2)
-        fall = lens.cos4(squared(shape, (48.0, 63.0)), 150.0)
+        fall = cos4(squared(shape, (48.0, 63.0)), 150.0)
         frames = np.stack(list(array.frames(14e6 * fall, 16, rng=4)))
         corrected = response.correct(frames).mean(axis=0)
-        bent = lens.fit_falloff(corrected)
+        bent = lens.fit(corrected)
         assert bent.focal_length == pytest.approx(152.0, abs=0.05)  # as docs/nuc.md says
         assert bent.focal_length - 150 > 100 * bent.std["focal_length"]
         linear = np.polynomial.Polynomial.fit(response.levels, light, 3)
-        straight = lens.fit_falloff(linear(corrected))
+        straight = lens.fit(linear(corrected))
         assert abs(straight.focal_length - 150) < 5 * straight.std["focal_length"]
 
     def test_the_example_prints_the_corner_of_the_source(self, capsys):
@@ -206,7 +207,7 @@ class TestCombine:
 
     def test_response_curves_then_a_lens(self):
         response = nuc.fit(self.levels(), order=2)
-        falloff = lens.fit_falloff(flat()).correction()
+        falloff = lens.fit(flat()).correction()
         both = equipix.combine(response, falloff)
         frame = self.levels()[1]
         wanted = falloff.correct(response.correct(frame))
@@ -249,7 +250,7 @@ class TestCombine:
         response = nuc.fit(self.levels(), order=2)
         flags = response.flags.copy()
         flags[3, 4] |= equipix.Flag.HOT | equipix.Flag.DO_NOT_USE
-        falloff = lens.fit_falloff(flat()).correction()
+        falloff = lens.fit(flat()).correction()
         both = equipix.combine(response.with_flags(flags), falloff)
         both.save(tmp_path / "both.npz")
         loaded = equipix.load(tmp_path / "both.npz")
@@ -262,7 +263,7 @@ class TestCombine:
     def test_a_gain_after_raw_levels_is_refused(self, order, tmp_path):
         array = simulate.StaringArray.of("InSb", SHAPE, rng=1)
         frames = [list(array.frames(e, 2, rng=k)) for k, e in enumerate((0, 4e6, 8e6, 12e6))]
-        falloff = lens.fit_falloff(flat()).correction()
+        falloff = lens.fit(flat()).correction()
         raw = nuc.fit([equipix.average(each) for each in frames[1:]], order=order)
         raw.save(tmp_path / "raw.npz")
         same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
@@ -284,7 +285,7 @@ class TestCombine:
         frames = [list(array.frames(e, 2, rng=k)) for k, e in enumerate((4e6, 8e6, 12e6))]
         raw = nuc.fit([equipix.average(each) for each in frames], order=1)
         raw.save(tmp_path / "raw.npz")
-        falloff = lens.fit_falloff(flat()).correction()
+        falloff = lens.fit(flat()).correction()
         same = equipix.Polynomial(np.stack([np.zeros(SHAPE), np.ones(SHAPE)]), raw.flags)
         for then in (raw, equipix.load(tmp_path / "raw.npz"), equipix.combine(raw, same)):
             with pytest.raises(errors.InputError, match="'then' holds the offsets of raw levels"):
@@ -292,8 +293,8 @@ class TestCombine:
         learned = equipix.scene.ConstantStatistics(SHAPE, (0.0, 1.0))
         for each in simulate.MovingScene(seed=1, shape=SHAPE).frames(5):
             learned.update(each.values)
-        learned.result().save(tmp_path / "scene.npz")
-        for then in (learned.result(), equipix.load(tmp_path / "scene.npz")):
+        learned.correction().save(tmp_path / "scene.npz")
+        for then in (learned.correction(), equipix.load(tmp_path / "scene.npz")):
             with pytest.raises(errors.InputError, match="'then' is the result of a scene method"):
                 equipix.combine(raw, then)
 

@@ -494,7 +494,7 @@ class TestCorrectedFiles:
         assert np.count_nonzero(np.isnan(io.read_frames(path))) == 16 * bad
         done = correct_files(two, source, path, dtype="uint16", force=True)
         assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
-        with pytest.warns(errors.LimitedWarning, match="100% of the .* of uint8: .* uint16; or"):
+        with pytest.warns(errors.InputWarning, match="100% of the .* of uint8: .* uint16; or"):
             done = correct_files(two, source, path, dtype="uint8", force=True)
         assert done.limited == 16 * flags.size
         done = correct_files(two, source, path, dtype="float32", flagged="replace", force=True)

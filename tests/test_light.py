@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import nuc, simulate
-from equipix.errors import DriftWarning
+from equipix import metrics, nuc, simulate
+from equipix.errors import MisfitWarning
 from equipix.io.tiff import write_frames
 from equipix.measured.means import Averaged
 from equipix.measured.statistics import light_of
@@ -63,7 +63,7 @@ def test_the_light_is_no_noise(share, frames):
     common = 2000**2 * np.var(share * np.linspace(0.5, -0.5, frames), ddof=1)
     error = np.sqrt(2 * (1 + 2 * common / true) / (frames - 1) / signal.size)
     assert noise == pytest.approx(true, rel=5 * np.sqrt(2) * error)
-    assert not averaged.findings(averaged.noise).noisy.any()
+    assert not averaged.bad_pixels(averaged.noise).noisy.any()
 
 
 def test_saturated_pixels_do_not_follow_the_light():
@@ -174,7 +174,7 @@ def test_levels_with_light_that_varies_are_named_and_fitted():
     rng = np.random.default_rng(6)
     gain = 1 + 0.03 * rng.standard_normal(SHAPE)
     levels = [equipix.average(drifting(rng, x * gain, 0.05, 16)) for x in (200, 900, 1600, 2300)]
-    with pytest.warns(DriftWarning, match=r"level 3: the light varies by 1\.\d\d% rms"):
+    with pytest.warns(MisfitWarning, match=r"level 3: the light varies by 1\.\d\d% rms"):
         response = nuc.fit(levels, order=1)
     # 2 × 4800 degrees of freedom, five standard errors; V̄ follows the light of each level.
     assert np.nanmean(response.reduced_chi2) == pytest.approx(1, abs=5 * np.sqrt(2 / 9600))
@@ -209,10 +209,10 @@ def test_error_bars_with_light_that_varies(draws, figure):
         dark = equipix.average(drifting(rng, 0 * truth, 0, 16))
         averages = [equipix.average(drifting(rng, each, 0.05, 16), dark=dark) for each in signals]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DriftWarning)
+            warnings.simplefilter("ignore", MisfitWarning)
             cal = equipix.calibrate(averages, SHIFTS, uncertainty=True)
-        assert any(verdict.kind == "light" for verdict in cal.verdicts)
-        error = simulate.relative_error(cal.sensitivity, truth)
+        assert any(finding.kind == "light" for finding in cal.findings)
+        error = metrics.relative_error(cal.sensitivity, truth)
         z.append(float(np.nanmean((error / cal.sensitivity_std * cal.sensitivity) ** 2)))
     found = float(np.sqrt(np.mean(z)))
     figure("z of calibrate, light that falls by 5 % over 16 frames", found, "0.95 to 1.05")

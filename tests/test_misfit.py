@@ -182,7 +182,7 @@ def test_a_misfit_comes_before_the_drift_that_it_feigns():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", EquipixWarning)
         cal = equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2))
-    assert [verdict.kind for verdict in cal.verdicts] == ["misfit", "drift"]
+    assert [finding.kind for finding in cal.findings] == ["misfit", "drift"]
 
 
 def test_shift_std_is_no_remedy_where_it_was_given():
@@ -222,7 +222,7 @@ def test_error_bars_in_speckle_of_three_pixels_are_refused():
     """There residuals are six times as large as noise."""
     cal, _ = calibrated_in_speckle(3.0, 0)
     assert cal.sensitivity_std is None
-    assert "finer than a spline" in cal.verdicts[-1].message
+    assert "finer than a spline" in cal.findings[-1].message
     with pytest.raises(equipix.errors.InputError, match="move by whole pixels"):
         cal.std_of(equipix.metrics.mapsics.maps.tilt_weights(np.ones(SENSOR, bool)))
 
@@ -315,19 +315,19 @@ def test_the_correlation_of_white_residuals_is_normal(draws, figure):
     assert abs(rms - 1) < 4 * error / 2**0.5
 
 
-def test_it_is_a_warning_and_a_verdict():
+def test_it_is_a_warning_and_a_finding():
     frames, shifts = photograph(np.random.default_rng(7), smooth(), noise=1.3 * NOISE)
     # Of simulated and of measured noise, each of 13 000 degrees of freedom: to 0.6 %.
     with pytest.warns(
         MisfitWarning, match=r"1\.(29|3[01]?) times as large as the variances predict"
     ):
         cal = equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2))
-    assert [verdict.kind for verdict in cal.verdicts] == ["misfit"]
+    assert [finding.kind for finding in cal.findings] == ["misfit"]
 
 
 def test_data_without_noise_say_nothing():
     frames, shifts = photograph(np.random.default_rng(8), smooth(), noise=0)
-    assert equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2)).verdicts == ()
+    assert equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2)).findings == ()
 
 
 def test_a_sample_has_the_residuals_of_its_rows():

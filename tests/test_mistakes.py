@@ -44,19 +44,19 @@ def bench():
     return Bench()
 
 
-def findings(frames, dark):
-    """Kinds and messages of the verdicts."""
+def bad_pixels(frames, dark):
+    """Kinds and messages of the findings."""
     if not isinstance(dark, equipix.FrameStatistics) and dark.ndim == 3:
         dark = equipix.average(dark)
     averages = [equipix.average(each, dark=dark) for each in frames]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", errors.EquipixWarning)
-        found = equipix.calibrate(averages, SHIFTS).verdicts
-    return {verdict.kind: verdict.message for verdict in found}
+        found = equipix.calibrate(averages, SHIFTS).findings
+    return {finding.kind: finding.message for finding in found}
 
 
 def test_without_a_mistake_there_is_no_finding(bench):
-    assert findings(bench.frames, bench.dark) == {}
+    assert bad_pixels(bench.frames, bench.dark) == {}
 
 
 @pytest.mark.parametrize(("axis", "words"), [(1, "upside down"), (2, "mirrored left to right")])
@@ -64,7 +64,7 @@ def test_one_exposure_that_is_flipped_is_named(bench, axis, words):
     """Its dark was not flipped with it."""
     frames = list(bench.frames)
     frames[2] = np.flip(frames[2], axis)
-    found = findings(frames, bench.dark)["misfit"]
+    found = bad_pixels(frames, bench.dark)["misfit"]
     assert f"exposure 2 (from 0) fits better {words}" in found
 
 
@@ -80,7 +80,7 @@ def test_one_array_that_is_flipped_is_named(bench, axes, words, variance):
     known = None if variance is None else np.full(5, variance)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", errors.EquipixWarning)
-        found = equipix.calibrate(values, SHIFTS, variance=known).verdicts
+        found = equipix.calibrate(values, SHIFTS, variance=known).findings
     assert any(f"exposure 3 (from 0) fits better {words}" in each.message for each in found)
 
 
@@ -98,36 +98,36 @@ def test_a_flip_that_leaves_less_than_half_a_percent_is_named():
         warnings.simplefilter("ignore", errors.EquipixWarning)
         found = equipix.calibrate(
             values, equipix.cross_pattern(5, 7), variance=np.full(5, 1e-8)
-        ).verdicts
+        ).findings
     assert any("exposure 2 (from 0) fits better upside down" in each.message for each in found)
 
 
 @pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
 def test_some_exposures_that_are_flipped_are_a_misfit(bench, axis):
     frames = [np.flip(each, axis) if k in (1, 3) else each for k, each in enumerate(bench.frames)]
-    assert "misfit" in findings(frames, bench.dark)
+    assert "misfit" in bad_pixels(frames, bench.dark)
 
 
 @pytest.mark.parametrize(("axis", "name"), [(1, "rows"), (2, "columns")])
 def test_exposures_that_are_all_flipped_contradict_the_sign(bench, axis, name):
     """A flipped sensor moves the other way."""
     flipped = [np.flip(each, axis) for each in bench.frames]
-    found = findings(flipped, np.flip(bench.dark, axis))
+    found = bad_pixels(flipped, np.flip(bench.dark, axis))
     assert f"reverse the sign of the shifts along {name}" in found["sign"]
 
 
 def test_a_flipped_dark_is_named(bench):
-    found = findings(bench.frames, np.flip(bench.dark, 2))
+    found = bad_pixels(bench.frames, np.flip(bench.dark, 2))
     assert "pattern of the dark" in found["misfit"]
     assert "is not flipped" in found["misfit"]
 
 
 def test_a_dark_subtracted_twice_is_named(bench):
     """Averages keep its pattern; of an array only the offset of all values is left."""
-    found = findings(bench.frames, 2 * bench.dark)
+    found = bad_pixels(bench.frames, 2 * bench.dark)
     assert "pattern of the dark" in found["misfit"]
     assert "once" in found["misfit"]
-    assert "offset of" in findings(bench.frames, 2 * bench.dark.mean(axis=0))["misfit"]
+    assert "offset of" in bad_pixels(bench.frames, 2 * bench.dark.mean(axis=0))["misfit"]
 
 
 def test_a_dark_subtracted_by_half_is_named_where_it_is_large():
@@ -136,24 +136,24 @@ def test_a_dark_subtracted_by_half_is_named_where_it_is_large():
     bench.offset += 600
     dark = bench.take(np.zeros(SHAPE)).mean(axis=0)
     frames = [bench.take(signal) for signal in bench.signals]
-    assert "offset of" in findings(frames, dark / 2)["misfit"]
+    assert "offset of" in bad_pixels(frames, dark / 2)["misfit"]
 
 
 @pytest.mark.parametrize("share", [1.0, 1.2])
 def test_a_dark_as_bright_as_the_light_is_refused(bench, share):
     dark = bench.take(share * bench.signals[0])
     with pytest.raises(errors.InputError, match="is there light, and is the right dark"):
-        findings(bench.frames, dark)
+        bad_pixels(bench.frames, dark)
 
 
 def test_frames_and_dark_that_are_exchanged_are_refused(bench):
     with pytest.raises(errors.InputError, match=r"is the (right dark|dark that of these frames)"):
-        findings([bench.take(0 * bench.signals[0]) for _ in SHIFTS], bench.frames[0])
+        bad_pixels([bench.take(0 * bench.signals[0]) for _ in SHIFTS], bench.frames[0])
 
 
 def test_a_dark_that_holds_a_tenth_of_the_light_is_a_drift(bench):
     """The light of an unmoved beam is missing in all exposures; a hundredth shows nowhere."""
-    assert [*findings(bench.frames, bench.take(0.1 * bench.signals[0]))] == ["drift"]
+    assert [*bad_pixels(bench.frames, bench.take(0.1 * bench.signals[0]))] == ["drift"]
 
 
 def test_positions_in_the_place_of_frames_are_refused(bench):
@@ -167,7 +167,7 @@ def test_two_positions_in_one_average_are_a_misfit(bench, place, mixed):
     """As a pattern of names that takes files of several positions."""
     frames = list(bench.frames)
     frames[place] = np.concatenate([frames[k] for k in mixed])
-    assert "misfit" in findings(frames, bench.dark)
+    assert "misfit" in bad_pixels(frames, bench.dark)
 
 
 def arrays(bench):
@@ -175,10 +175,10 @@ def arrays(bench):
     return np.array([each.mean(axis=0) - bench.offset for each in bench.frames])
 
 
-def verdicts(values, shifts=SHIFTS, **known):
+def findings(values, shifts=SHIFTS, **known):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", errors.EquipixWarning)
-        return equipix.calibrate(values, shifts, **known).verdicts
+        return equipix.calibrate(values, shifts, **known).findings
 
 
 @pytest.mark.parametrize("std", [None, 0.02], ids=["known", "prior"])
@@ -186,7 +186,7 @@ def verdicts(values, shifts=SHIFTS, **known):
 def test_a_flux_that_is_far_off_names_the_exposure(bench, flux, std):
     """A factor of 2 made M fall by as much in five pixels: most counted as dead or hot."""
     given = [1, 1, 1, flux, 1]
-    found = verdicts(arrays(bench), flux=given, flux_std=std)
+    found = findings(arrays(bench), flux=given, flux_std=std)
     assert found[0].kind == "flux"
     assert "exposure 3 (from 0)" in found[0].message
     assert f"for its flux of {flux:g}" in found[0].message
@@ -211,7 +211,7 @@ def test_pixels_that_a_wrong_flux_contradicts_are_no_defects(flux):
 def test_a_black_exposure_is_named(bench, flux, black):
     values = arrays(bench)
     values[black] = np.random.default_rng(1).normal(5, 3, SHAPE)
-    found = {each.kind: each.message for each in verdicts(values, flux=flux)}
+    found = {each.kind: each.message for each in findings(values, flux=flux)}
     assert f"exposure {black} (from 0) has" in found["flux"]
 
 
@@ -221,7 +221,7 @@ def test_a_sensitivity_that_halves_is_no_wrong_flux_at_large_shifts():
     truth = np.tile(np.linspace(1, 0.5, 80), (60, 1))
     frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
     frames += 30 * np.random.default_rng(1).standard_normal(frames.shape)
-    assert "flux" not in {each.kind for each in verdicts(frames, shifts)}
+    assert "flux" not in {each.kind for each in findings(frames, shifts)}
 
 
 def test_a_flipped_exposure_of_a_colour_sensor_is_named():
@@ -231,7 +231,7 @@ def test_a_flipped_exposure_of_a_colour_sensor_is_named():
     frames = 1e4 * simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
     frames += 30 * np.random.default_rng(1).standard_normal(frames.shape)
     frames[2] = frames[2, :, ::-1]
-    found = verdicts(frames, shifts, cfa="RGGB", variance=np.full(5, 900.0))
+    found = findings(frames, shifts, cfa="RGGB", variance=np.full(5, 900.0))
     words = "exposure 2 (from 0) fits better mirrored left to right"
     assert any(words in each.message for each in found), [each.message for each in found]
 
@@ -240,11 +240,11 @@ def test_a_tilted_sensitivity_is_no_wrong_flux(bench):
     """The light falls by 1.2 between the same cells of the beam."""
     tilt = np.linspace(1, 0.25, SHAPE[1])
     values = np.array([tilt * each for each in bench.signals])
-    assert "flux" not in {each.kind for each in verdicts(values)}
+    assert "flux" not in {each.kind for each in findings(values)}
 
 
 def test_shifts_in_millimetres_are_named(bench):
-    found = verdicts(arrays(bench), 0.0083 * SHIFTS)
+    found = findings(arrays(bench), 0.0083 * SHIFTS)
     assert "divide millimetres by the pixel pitch" in found[0].message
 
 
@@ -252,7 +252,7 @@ def test_a_flipped_exposure_with_uncertain_shifts_is_named(bench):
     """Its shift was widened instead, by as much as the flip needs."""
     values = arrays(bench)
     values[3] = values[3][:, ::-1]
-    found = verdicts(values, shift_std=0.05, variance=np.full(5, 30.0))
+    found = findings(values, shift_std=0.05, variance=np.full(5, 30.0))
     assert any("fits better mirrored left to right" in each.message for each in found)
 
 

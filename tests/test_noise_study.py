@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import nuc, simulate
+from equipix import metrics, nuc, simulate
 from equipix.measured.defects import hot_pixels
 from equipix.measured.means import Averaged
 from equipix.measured.noise import largest_scatter, scatter, unaveraged
@@ -47,7 +47,7 @@ def ratios(rng, light, shape, sigma, frames):
     averaged = Averaged.of([equipix.average(rounded(rng, signal, variance, frames))])
     noise, true = averaged.noise, scatter(variance)
     of_mean = noise.of_mean(frames).variance(signal)
-    noisy = averaged.findings(noise).noisy
+    noisy = averaged.bad_pixels(noise).noisy
     of_frame = float(np.mean(noise.scatter(signal) / true))
     return of_frame, float(np.mean(of_mean / (true / frames + unaveraged(variance)))), noisy.mean()
 
@@ -139,7 +139,7 @@ def test_error_bars_of_calibrations(draws, figure, sigma, frames):
         ]
         cal = equipix.calibrate(averages, shifts, uncertainty=True)
         assert not cal.flags.any()
-        error = simulate.relative_error(cal.sensitivity, truth) * cal.sensitivity
+        error = metrics.relative_error(cal.sensitivity, truth) * cal.sensitivity
         z.append(float(np.nanmean((error / cal.sensitivity_std) ** 2)))
         chi2.append(cal.reduced_chi2)
     found, where = float(np.sqrt(np.mean(z))), f"σ {sigma:g}, {frames} frames"
@@ -228,7 +228,7 @@ def test_staring_arrays_with_a_dark(draws, figure, material, bits):
             for k, light in enumerate(np.linspace(2e6, 15e6, 7))
         ]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", equipix.errors.InverseWarning)
+            warnings.simplefilter("ignore", equipix.errors.MisfitWarning)
             response = nuc.fit(levels, order=3 if material == "HgCdTe" else 2)
         chi2.append(float(np.nanmean(response.reduced_chi2)))
         flagged, pixels = flagged + np.count_nonzero(response.flags), pixels + response.flags.size

@@ -20,7 +20,7 @@ SIZES = (30.0, 0.05, 4e-6, 1e-9)
 """Spread of a, K, c and e over the pixels, for signals of thousands of DN."""
 
 
-STRONG = pytest.mark.filterwarnings("ignore::equipix.errors.InverseWarning")
+STRONG = pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 """For curves of third order that bend more than a cubic inverse can follow, as they are told."""
 
 
@@ -316,11 +316,11 @@ class TestInverse:
         found = nuc.fit(levels, order=2, variance=np.full(len(LEVELS), few**2))
         assert found.metadata["inverse"]["pixels_beyond"] == 3
         assert found.metadata["inverse"]["noise_dn"] == pytest.approx(few)
-        with pytest.warns(errors.InverseWarning, match=r"in 4 of 3072 .* correct\(exact=True\)"):
+        with pytest.warns(errors.MisfitWarning, match=r"in 4 of 3072 .* correct\(exact=True\)"):
             found = nuc.fit(levels, order=2, variance=np.full(len(LEVELS), many**2))
         assert found.metadata["inverse"]["largest_error_dn"] == pytest.approx(error.max(), rel=1e-6)
 
-    def test_the_noise_of_the_verdict_is_that_of_one_frame(self):
+    def test_the_noise_of_the_finding_is_that_of_one_frame(self):
         rng = np.random.default_rng(14)
         frames = [noisy(np.repeat(each[None], 16, axis=0), rng) for each in curves(truth(1, rng))]
         response = nuc.fit([equipix.average(each) for each in frames], order=2)
@@ -337,7 +337,7 @@ class TestInverse:
         np.testing.assert_array_equal(response.correct(frame, flagged="keep"), total)
 
     # All pixels of a level's second frame are 1 DN higher, as under brighter light.
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_a_stored_dark_is_part_of_the_coefficients(self):
         rng = np.random.default_rng(9)
@@ -497,7 +497,7 @@ class TestRefusals:
             with warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 nuc.fit(given, order=1)
-            told = [each for each in said if each.category is errors.BrightDarkWarning]
+            told = [each for each in said if each.category is errors.InputWarning]
             assert len(told) == number
             assert all("is -30" in str(each.message) for each in told)
             assert all("DN at level 1. Give" in str(each.message) for each in told)
@@ -512,7 +512,7 @@ class TestRefusals:
 
     def test_clipped_values_without_a_level_given(self, levels):
         clipped = np.minimum(np.rint(levels), 3500).astype(np.float32)
-        with pytest.warns(errors.SaturationWarning, match="exactly 3500"):
+        with pytest.warns(errors.InputWarning, match="exactly 3500"):
             nuc.fit(clipped, order=1)
 
     @pytest.mark.parametrize("form", ["float64", "uint16", "averages", "less a dark"])
@@ -530,7 +530,7 @@ class TestRefusals:
 
     def test_most_of_a_level_at_one_value_is_named(self, levels):
         clipped = np.minimum(levels[[0, 3, 7]], np.quantile(levels[7], 0.2))
-        with pytest.warns(errors.SaturationWarning, match=r"80.0% .* of level 2 .*levels.toml"):
+        with pytest.warns(errors.InputWarning, match=r"80.0% .* of level 2 .*levels.toml"):
             nuc.fit(clipped, order=1)
 
     def test_even_levels_of_an_even_array_do_not_saturate(self, levels):
@@ -625,7 +625,7 @@ class TestRawAverages:
             assert np.count_nonzero(response.flags) == 0
 
     # All pixels of a level's second frame are 1 DN higher, as under brighter light.
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_a_gain_of_raw_averages_is_refused(self):
         raw = self.averages(200)[-1:]
         with pytest.raises(errors.InputError, match="'levels' are averages of raw frames"):

@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.diagnosis.orientation import chosen_exposures
-from equipix.errors import EquipixWarning, ShiftSignWarning
+from equipix.errors import EquipixWarning, MisfitWarning
 from equipix.exposures.positions import Orientation, Positions
 
 SENSOR, CROSS = (96, 120), equipix.cross_pattern(11, 19)
@@ -88,7 +88,7 @@ def test_fringes_along_rows_determine_no_sign_along_columns(mirrored):
 
 
 def test_rows_reversed_in_fringes_are_never_confirmed():
-    """With both axes in the fringes, and with one axis: no verdict, or the right one."""
+    """With both axes in the fringes, and with one axis: no finding, or the right one."""
     for seed in range(6):
         beam = fringes(SENSOR, period=12 + 6 * seed)
         if seed % 2:
@@ -124,7 +124,7 @@ class TestExposuresThatReturn:
         chosen = chosen_exposures(Positions.of(self.SHIFTS), 12)
         assert len({tuple(shift) for shift in self.SHIFTS[chosen].tolist()}) == 12
 
-    def test_get_a_verdict(self):
+    def test_get_a_finding(self):
         frames = photograph(9, simulate.wavy_beam(SENSOR, rng=9), self.SHIFTS)
         assert asked(frames, self.SHIFTS).sign == "confirmed"
         assert asked(frames, -self.SHIFTS).sign == "contradicted"
@@ -151,8 +151,8 @@ def with_nuisance(kind, frames, beam_of, rng):
 
 
 @pytest.mark.parametrize("kind", ["illumination", "ghost", "non-linear"])
-def test_nuisances_give_no_verdict(kind):
-    """In smooth beams: neither a right verdict nor a wrong one."""
+def test_nuisances_give_no_finding(kind):
+    """In smooth beams: neither a right finding nor a wrong one."""
     for seed in range(10):
         rng = np.random.default_rng([6, seed])
         beam = simulate.gaussian_beam(SENSOR, width=(300, 1000)[seed % 2])
@@ -167,7 +167,7 @@ def test_nuisances_give_no_verdict(kind):
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 def test_a_contradiction_is_a_warning_that_names_the_remedy():
     frames = photograph(1, simulate.wavy_beam(SENSOR, rng=4))
-    with pytest.warns(ShiftSignWarning, match=r"exchange the two values.*\(row, col\), not"):
+    with pytest.warns(MisfitWarning, match=r"exchange the two values.*\(row, col\), not"):
         equipix.calibrate(frames, CROSS[:, ::-1], tolerance=1e-2)
 
 
@@ -203,7 +203,7 @@ class TestOrientationsThatLeaveNoResidual:
     @pytest.mark.parametrize("way", [Orientation(cols=True), Orientation(rows=True, cols=True)])
     def test_free_fluxes_say_by_how_much_another_sensitivity_fits(self, known, way):
         cal, truth = self.calibrated(1, way.shifts(self.TRUE), **known)
-        (found,) = cal.verdicts
+        (found,) = cal.findings
         assert found.kind == ("tilt" if "flux_std" not in known else "orientation")
         assert cal.orientation.sign == "undetermined"
         assert "neither residuals nor fluxes determine the orientation" in found.message
@@ -214,7 +214,7 @@ class TestOrientationsThatLeaveNoResidual:
 
     def test_a_prior_that_excludes_the_others_says_nothing(self):
         cal, _ = self.calibrated(2, self.TRUE, flux=np.ones(7), flux_std=2e-4)
-        assert cal.verdicts == ()
+        assert cal.findings == ()
         assert cal.orientation.hidden is None
 
     @pytest.mark.parametrize("way", [Orientation(cols=True), Orientation(rows=True, cols=True)])
@@ -222,27 +222,27 @@ class TestOrientationsThatLeaveNoResidual:
         """Its fluxes agree with those given in the true orientation alone."""
         for seed in range(3):
             cal, _ = self.calibrated(seed, way.shifts(self.TRUE))
-            assert [verdict.kind for verdict in cal.verdicts] == ["orientation", "drift"]
+            assert [finding.kind for finding in cal.findings] == ["orientation", "drift"]
             assert cal.orientation.hidden == way
-            assert way.words in cal.verdicts[0].message
+            assert way.words in cal.findings[0].message
             assert "probably wrong" in cal.orientation.words
             assert cal.shift_sign == "undetermined"
 
     def test_a_right_sign_is_never_called_wrong(self):
         for seed in range(6):
             cal, _ = self.calibrated(seed, self.TRUE)
-            assert cal.verdicts == ()
+            assert cal.findings == ()
             assert cal.orientation.hidden is None
             assert "do not determine" in cal.orientation.words
 
     def test_a_drift_of_the_lamp_is_no_wrong_sign(self):
         for seed in range(6):
             cal, _ = self.calibrated(seed, self.TRUE, drift=10.0 ** -(1 + seed % 3))
-            assert [verdict.kind for verdict in cal.verdicts] == ["drift"]
+            assert [finding.kind for finding in cal.findings] == ["drift"]
 
     def test_a_prior_that_only_another_orientation_keeps_names_it_first(self):
         cal, _ = self.calibrated(3, -self.TRUE, flux=np.ones(7), flux_std=2e-4)
-        assert [verdict.kind for verdict in cal.verdicts] == ["orientation", "prior"]
+        assert [finding.kind for finding in cal.findings] == ["orientation", "prior"]
 
     def test_it_is_kept_in_files(self, tmp_path):
         cal, _ = self.calibrated(4, -self.TRUE)
@@ -253,7 +253,7 @@ class TestOrientationsThatLeaveNoResidual:
 def test_after_a_wrong_sign_no_other_cause_is_named():
     """Reversed shifts in a beam with structure also contradict fluxes and leave a misfit."""
     frames = photograph(4, simulate.wavy_beam(SENSOR, rng=5))
-    with pytest.warns(ShiftSignWarning) as told:
+    with pytest.warns(MisfitWarning) as told:
         cal = equipix.calibrate(frames, -CROSS, variance=np.full(5, 1e-6), tolerance=1e-3)
-    assert [verdict.kind for verdict in cal.verdicts] == ["sign"]
+    assert [finding.kind for finding in cal.findings] == ["sign"]
     assert len(told) == 1

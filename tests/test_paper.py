@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 SHAPE = (240, 320)
 ARMS = (11, 19)
@@ -47,7 +47,7 @@ def error_of_calibration(seed, *, draw=uniform, largest=1e-3, arms=ARMS, beam=No
     frames += draw(rng, frames.shape, largest)
     result = equipix.calibrate(frames, shifts, tolerance=tolerance or largest / 100)
     assert result.converged
-    return simulate.relative_error(result.sensitivity, truth)
+    return metrics.relative_error(result.sensitivity, truth)
 
 
 @pytest.mark.study

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 
 pytest.importorskip("numba", reason="needs requirements-bench.txt")
 pytest.importorskip("scipy", reason="needs requirements-bench.txt")
@@ -39,7 +39,7 @@ def exposed(beam):
     truth = simulate.paper_sensitivity(SHAPE, rng=3)
 
     def error_of(sensitivity):
-        return float(np.abs(simulate.relative_error(sensitivity, truth)).max())
+        return float(np.abs(metrics.relative_error(sensitivity, truth)).max())
 
     return simulate.exposures(truth, beam, SHIFTS), error_of
 

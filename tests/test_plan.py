@@ -10,13 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import equipix
-from equipix import plan, reference, simulate
+from equipix import metrics, plan, reference, simulate
 from equipix.errors import (
-    DriftWarning,
     IdentifiabilityWarning,
     InputError,
+    InputWarning,
     MisfitWarning,
-    ShiftRoundingWarning,
 )
 from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
 from equipix.plan.pattern_errors import local_variance
@@ -47,7 +46,7 @@ patterns = pytest.mark.parametrize(
 def budget_of(*arguments, **options):
     """An error budget whose warnings do not matter here."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DriftWarning)
+        warnings.simplefilter("ignore", MisfitWarning)
         return plan.error_budget(*arguments, **options)
 
 
@@ -58,9 +57,9 @@ def beam_of(shape, width):
 def solved(frames, shifts, tolerance):
     """The relative error of M, the truth being 1, where drifts and shifts are wrong on purpose."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", (DriftWarning, MisfitWarning))
+        warnings.simplefilter("ignore", (MisfitWarning, MisfitWarning))
         found = equipix.calibrate(frames, shifts, tolerance=tolerance, workers=1).sensitivity
-    return simulate.relative_error(found, np.ones(found.shape))
+    return metrics.relative_error(found, np.ones(found.shape))
 
 
 def slopes(error):
@@ -145,7 +144,7 @@ class TestIdentify:
             r"exposure 1 \(from 0\) is \[0\.3, 4\.7\] \(limit 0\.02 from whole\), the first is "
             r"\[0\.3, 0\.3\]: choose shifts that differ by whole pixels$"
         )
-        with pytest.warns(ShiftRoundingWarning, match=words):
+        with pytest.warns(InputWarning, match=words):
             found = plan.identify((48, 64), shifts)
         assert found.components == plan.identify((48, 64), equipix.cross_pattern(4, 7)).components
 
@@ -246,7 +245,7 @@ class TestDrift:
         assert tilt_rms(tilt) == pytest.approx(wanted, abs=0.05 * 10 ** np.floor(np.log10(wanted)))
 
     def test_is_loud_when_it_exceeds_the_noise(self):
-        with pytest.warns(DriftWarning, match="times the error by noise"):
+        with pytest.warns(MisfitWarning, match="times the error by noise"):
             plan.error_budget((64, 80), CROSS, noise=1e-4, drift=1e-4)
         plan.error_budget((64, 80), CROSS, noise=1e-2, drift=1e-4)  # warnings are errors here
 
@@ -404,10 +403,10 @@ class TestSuggest:
             assert steps[-1][0] == steps[-1][1]
 
     def test_says_that_drift_will_tilt(self):
-        with pytest.warns(DriftWarning):
+        with pytest.warns(MisfitWarning):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)
         plan.suggest((64, 80), 4, 5, patterns=1)  # warnings are errors here
-        with pytest.warns(DriftWarning, match="pattern 1: "):
+        with pytest.warns(MisfitWarning, match="pattern 1: "):
             plan.suggest((300, 400), 4, 5, patterns=1)  # by a tenth of the noise
 
     @pytest.mark.parametrize(

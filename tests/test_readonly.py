@@ -109,7 +109,7 @@ def test_exposures_are_read_only_views_of_the_callers_arrays():
     values, variance, mask = frames(), np.ones((5, *SHAPE)), np.zeros(SHAPE, bool)
     given = {"variance": variance, "mask": mask}
     exposures = exposures_of(values, CROSS, flux_std=1e-3, shift_std=0.1, saturation=9.0, **given)
-    assert {"values", "positions.std", "flux.std", "findings.saturated"} <= set(arrays(exposures))
+    assert {"values", "positions.std", "flux.std", "bad_pixels.saturated"} <= set(arrays(exposures))
     assert writeable(exposures) == []
     assert np.shares_memory(exposures.values, values)
     assert np.shares_memory(exposures.variance, variance)

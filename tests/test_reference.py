@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from equipix import reference, simulate
+from equipix import metrics, reference, simulate
 
 CROSS = [(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)]
 
@@ -61,7 +61,7 @@ class TestCoordinateDescent:
     def test_finds_the_truth_without_noise(self):
         sensitivity, frames = measured((8, 11), CROSS, noise=0)
         solution = reference.coordinate_descent(frames, CROSS, sweeps=1000)
-        assert abs(simulate.relative_error(solution.sensitivity, sensitivity)).max() < 1e-12
+        assert abs(metrics.relative_error(solution.sensitivity, sensitivity)).max() < 1e-12
         assert np.mean(solution.sensitivity) == pytest.approx(1, rel=1e-14)
 
     def test_the_objective_never_rises(self):

@@ -42,4 +42,4 @@ def test_a_calibration_says_so():
     with pytest.warns(errors.EquipixWarning) as caught:
         cal = equipix.calibrate(frames, CROSS)
     assert "exposures 2 and 4 are equal, value for value" in str(caught[0].message)
-    assert "repeated" in {verdict.kind for verdict in cal.verdicts}
+    assert "repeated" in {finding.kind for finding in cal.findings}

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, NoiseModel, errors, io, simulate
+from equipix import Flag, NoiseModel, errors, io, metrics, simulate
 from equipix.fitting import weighted as weights
 from equipix.fitting.outliers import rejected
 
 pytestmark = [
     # Frames with dust that is not left out, and variances that are wrong on purpose.
     pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning"),
-    pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning"),
+    pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning"),
 ]
 
 SHAPE = (120, 160)
@@ -50,7 +50,7 @@ def compared(frames, truth, dusty, **options):
     """Rms errors of a robust run over those of one masked by hand: over the grain, the frame."""
     robust = equipix.calibrate(frames, CROSS, robust=True, **options)
     by_hand = equipix.calibrate(frames, CROSS, mask=dusty, **options)
-    found, best = (simulate.relative_error(c.sensitivity, truth) for c in (robust, by_hand))
+    found, best = (metrics.relative_error(c.sensitivity, truth) for c in (robust, by_hand))
     pixels = dusty.any(axis=0)
     return robust, rms(found[pixels]) / rms(best[pixels]), rms(found) / rms(best)
 
@@ -72,7 +72,7 @@ def test_a_grain_of_dust(seed, contrast):
     # Left in, it does harm.
     plain = equipix.calibrate(frames, CROSS, variance=variance)
     pixels = dusty.any(axis=0)
-    harm = [simulate.relative_error(c.sensitivity, truth)[pixels] for c in (plain, cal)]
+    harm = [metrics.relative_error(c.sensitivity, truth)[pixels] for c in (plain, cal)]
     assert rms(harm[0]) > 1.5 * rms(harm[1])
 
 
@@ -90,7 +90,7 @@ def test_a_clean_frame_loses_nothing(seed, variance):
     }[variance]
     cal = equipix.calibrate(frames, CROSS, robust=True, variance=given)
     plain = equipix.calibrate(frames, CROSS, variance=given)
-    found, best = (simulate.relative_error(c.sensitivity, truth) for c in (cal, plain))
+    found, best = (metrics.relative_error(c.sensitivity, truth) for c in (cal, plain))
     assert rms(found) <= 1.02 * rms(best)
     # 96 000 values beyond five standard deviations by chance, each with a 3×3 mean beside: 0.1 are
     # expected, and each takes its 3×3 at most along.
@@ -156,7 +156,7 @@ def test_dust_in_several_exposures_and_a_turned_one(seed):
     options = {"rotation": rotation, "variance": np.full(6, NOISE**2)}
     robust = equipix.calibrate(frames, shifts, robust=True, **options)
     by_hand = equipix.calibrate(frames, shifts, mask=dusty, **options)
-    found, best = (simulate.relative_error(c.sensitivity, truth) for c in (robust, by_hand))
+    found, best = (metrics.relative_error(c.sensitivity, truth) for c in (robust, by_hand))
     pixels = dusty.any(axis=0)
     assert rms(found[pixels]) <= 1.1 * rms(best[pixels])
     assert rms(found) <= 1.02 * rms(best)

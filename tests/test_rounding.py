@@ -109,7 +109,7 @@ def test_a_good_array_has_no_noisy_pixel(sigma, frames, step):
     assert found.counts["noisy"] == found.counts.get("flickering", 0) == 0
     assert nuc.find_defects(response, levels[0]).counts["noisy"] == 0
     averaged = Averaged.of(levels)
-    assert not averaged.findings(averaged.noise).noisy.any()
+    assert not averaged.bad_pixels(averaged.noise).noisy.any()
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05, 0.15])

@@ -33,7 +33,7 @@ def said(levels, **options):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         nuc.fit(levels, **options)
-    return [str(each.message) for each in caught if each.category is errors.SaturationWarning]
+    return [str(each.message) for each in caught if each.category is errors.InputWarning]
 
 
 class TestAFullWell:

@@ -273,7 +273,7 @@ class TestEveryMethod:
         method = made(name, data_range=(low, high))
         for value in values[:-1]:
             method.update(value)
-        result = method.result()
+        result = method.correction()
         assert isinstance(result, equipix.Polynomial)
         assert result.metadata["scene"]["method"] == name
         # 8000 DN in single precision, through three roundings.
@@ -324,7 +324,7 @@ def test_a_scene_that_never_moves_is_reported(name):
     for _ in range(60):
         method.update(still + 0.002 * rng.standard_normal(SHAPE))
     with pytest.raises(errors.InputError, match="take a moving scene"):
-        method.result()
+        method.correction()
 
 
 @pytest.mark.parametrize(
@@ -566,10 +566,10 @@ def test_a_dead_pixel_is_flagged_and_does_not_change_the_others(name, stuck, noi
         dead[20, 30] = stuck + noise * random.standard_normal()
         other.update(dead)
     other.save(tmp_path / "state.npz")
-    for result in (other.result(), scene.load(tmp_path / "state.npz").result()):
+    for result in (other.correction(), scene.load(tmp_path / "state.npz").result()):
         assert result.flags[20, 30] == Flag.DEAD | Flag.DO_NOT_USE
         assert np.count_nonzero(result.flags) == 1
-    assert not good.result().flags.any()
+    assert not good.correction().flags.any()
     if name in ("constant-statistics", "kalman"):
         apart = np.hypot(*np.meshgrid(np.arange(48) - 20, np.arange(64) - 30, indexing="ij")) > 31
         # Its gain, 10 at most, changes the gauge by 9 of 3072 pixels.
@@ -584,8 +584,8 @@ def test_few_frames_that_count_are_told():
         method.update(frame.values)
     assert method.frames_taken == 300
     assert 0 < method.frames < 30
-    with pytest.warns(errors.UnusedInputWarning, match=f"{method.frames} of 300 frames counted"):
-        result = method.result()
+    with pytest.warns(errors.InputWarning, match=f"{method.frames} of 300 frames counted"):
+        result = method.correction()
     held = result.metadata["scene"]
     assert (held["frames"], held["frames_taken"]) == (method.frames, 300)
 

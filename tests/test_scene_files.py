@@ -46,7 +46,7 @@ def test_a_sequence_gives_what_the_methods_give(run, recorded, tmp_path, name):
     wanted = [method.update(frame) for frame in frames]
     np.testing.assert_array_equal(read_frames(corrected), wanted)
     loaded = equipix.load(output)
-    np.testing.assert_array_equal(loaded.coefficients, method.result().coefficients)
+    np.testing.assert_array_equal(loaded.coefficients, method.correction().coefficients)
     shown = json.loads(out)
     assert shown["frames"] == COUNT
     assert shown["frames_that_counted"] == method.frames
@@ -71,7 +71,9 @@ def test_a_sequence_goes_on_from_a_saved_state(run, recorded, tmp_path):
     method = scene.Registered(SHAPE, (4000, 12_000))
     for frame in frames:
         method.update(frame)
-    np.testing.assert_array_equal(equipix.load(output).coefficients, method.result().coefficients)
+    np.testing.assert_array_equal(
+        equipix.load(output).coefficients, method.correction().coefficients
+    )
 
 
 def test_the_picture_is_drawn_and_the_table_printed(run, recorded, tmp_path):

@@ -127,7 +127,7 @@ def test_no_moving_scene_teaches_nothing_or_is_named(name, kind, unmoved):
         return
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        method.result()
+        method.correction()
     assert any(
         "of the field" in str(each.message) or "counted" in str(each.message) for each in found
     )
@@ -151,7 +151,7 @@ def test_the_standard_scene_has_no_finding(name):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert method.frames_foreign == 0
-            assert not method.result().flags.any()
+            assert not method.correction().flags.any()
 
 
 @pytest.mark.study
@@ -179,7 +179,7 @@ def test_a_calibrated_camera_loses_at_most_the_floor_that_is_stated(name, draws,
                 )
                 ratios.append(after / method.floor)
                 worse.append(np.sqrt(max(after**2 - before**2, 0)) / method.floor)
-        assert method.result().metadata["scene"]["floor_dn"] == method.floor
+        assert method.correction().metadata["scene"]["floor_dn"] == method.floor
     figure(f"pattern over the stated floor, {name}, largest", max(ratios), "1 or less")
     figure(f"what is added to the pattern, over that floor, {name}", max(worse), "1 or less")
     figure(f"stated floor over the pattern, {name}, largest", 1 / min(ratios), "1.5 or less")
@@ -203,7 +203,7 @@ def test_a_dead_row_and_a_cluster_spoil_no_good_pixel(name, given):
     left = [np.std((each.gain * moving.gain)[good]) for each in (plain, method)]
     # 1.04 is what filling the gaps by their neighbours costs those beside them, a tenth of pixels.
     assert left[1] < 1.1 * left[0]
-    assert np.all(method.result().flags[dead] > 0)
+    assert np.all(method.correction().flags[dead] > 0)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "registered"])
@@ -236,14 +236,12 @@ def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_
         method.update(np.clip(np.rint(16383 * frame.values), 0, 16383).astype(np.uint16))
     method.save(tmp_path / "state.npz")
     for each in (method, scene.load(tmp_path / "state.npz")):
-        with pytest.warns(
-            errors.UnusedInputWarning, match=r"data_range=\(0, 16383\).*--bit-depth 14"
-        ):
-            each.result()
+        with pytest.warns(errors.InputWarning, match=r"data_range=\(0, 16383\).*--bit-depth 14"):
+            each.correction()
 
 
 def test_gains_that_spread_are_named():
-    with pytest.warns(errors.UnusedInputWarning, match=r"the gains spread by 23 \(limit 0.3\)"):
+    with pytest.warns(errors.InputWarning, match=r"the gains spread by 23 \(limit 0.3\)"):
         scene.adaptive._warn_of_spread(np.array([-0.04, 1.0, 50.0]))
 
 

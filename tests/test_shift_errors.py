@@ -1,4 +1,4 @@
-"""Shifts that a smooth beam does not refine: verdicts count their stated errors."""
+"""Shifts that a smooth beam does not refine: findings count their stated errors."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def calibrated(name, seed, *, times=1.0, drift=0.0, **options):
 
 
 def kinds(cal):
-    return [verdict.kind for verdict in cal.verdicts]
+    return [finding.kind for finding in cal.findings]
 
 
 @pytest.mark.parametrize("name", BEAMS)
 def test_a_steady_lamp_with_honest_shifts_has_no_drift(name):
-    """Without the variance of the shifts 8 of 10 and 5 of 6 were verdicts on the lamp."""
+    """Without the variance of the shifts 8 of 10 and 5 of 6 were findings on the lamp."""
     for seed in range(6):
         cal = calibrated(name, seed)
         assert cal.metadata["options"]["shifts"] == "undetermined"

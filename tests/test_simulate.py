@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from equipix import reference, simulate
+from equipix import metrics, reference, simulate
 from equipix.errors import FileError, InputError
 
 CROSS = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
@@ -119,7 +119,7 @@ class TestAccuracy:
         measured = 3.7 * truth
         measured[2, 3] *= 1.01
         measured[4, 5], truth[6, 7] = np.nan, np.nan
-        error = simulate.relative_error(measured, truth)
+        error = metrics.relative_error(measured, truth)
         assert np.isnan(error[4, 5])
         assert np.isnan(error[6, 7])
         assert error[2, 3] - error[0, 0] == pytest.approx(0.01, rel=1e-3)
@@ -129,12 +129,12 @@ class TestAccuracy:
         image = np.arange(24.0).reshape(4, 6)
         image[0, 0] = np.nan
         image[:2, 4:] = np.nan
-        means = simulate.block_means(image, 2)
+        means = metrics.block_means(image, 2)
         np.testing.assert_allclose(means, [[14 / 3, 5.5, np.nan], [15.5, 17.5, 19.5]])
 
     def test_block_means_refuse_an_image_smaller_than_a_block(self):
         with pytest.raises(InputError, match="smaller than one block of 16"):
-            simulate.block_means(np.ones((15, 40)))
+            metrics.block_means(np.ones((15, 40)))
 
 
 class TestNoisePrediction:
@@ -190,13 +190,13 @@ class TestNoisePrediction:
             np.mean([rms(e) for e in solves]), rel=4 / np.sqrt(1188 * 20)
         )
         # Two blocks a solve: an rms from 40 values, of which gauge and correlation leave half.
-        blocks = np.mean([rms(simulate.block_means(e)) for e in solves])
+        blocks = np.mean([rms(metrics.block_means(e)) for e in solves])
         assert found[1] == pytest.approx(blocks, rel=4 / np.sqrt(2 * 20))
 
     def solved_error(self, rng):
         frames = self.signal + np.sqrt(self.variance) * rng.standard_normal(self.signal.shape)
         solution = reference.coordinate_descent(frames, CROSS, variance=self.variance, sweeps=400)
-        return simulate.relative_error(solution.sensitivity, self.sensitivity)
+        return metrics.relative_error(solution.sensitivity, self.sensitivity)
 
     def test_refuses_variance_of_another_shape_or_zero(self):
         self.set_up((12, 17))

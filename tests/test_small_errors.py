@@ -49,7 +49,7 @@ def said(frames, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", errors.EquipixWarning)
         cal = equipix.calibrate(frames, CROSS, workers=1, **options)
-    return [each.message for each in cal.verdicts if each.kind == "misfit"]
+    return [each.message for each in cal.findings if each.kind == "misfit"]
 
 
 VARIANCE = np.full(5, NOISE**2)
@@ -119,7 +119,7 @@ def test_right_models_stay_silent(draws, figure):
         bool(said(experiment("none", seed, (48, 64), 60), variance=VARIANCE)) for seed in seeds
     )
     figure(
-        "false verdicts on right models, small errors", f"{false} of {len(seeds)}", "at most 1 %"
+        "false findings on right models, small errors", f"{false} of {len(seeds)}", "at most 1 %"
     )
     # Wanted at most 1 %, and three standard errors of what was drawn.
     assert false <= 0.01 * len(seeds) + 3 * (0.01 * len(seeds)) ** 0.5

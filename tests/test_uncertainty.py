@@ -147,7 +147,7 @@ class TestAgainstSimulatedExperiments:
     """Four sensors of 120 rows and 160 columns, fifty experiments each."""
 
     # One of a thousand right experiments shows a drift.
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     @pytest.mark.study
     @pytest.mark.parametrize("masked", [0, 0.02])
     def test_z_scores(self, masked, draws, figure):
@@ -249,7 +249,7 @@ class TestTilt:
 
     # One of a thousand right experiments shows a drift.
     @pytest.mark.study
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_scatters_as_tilt_std_says(self, draws):
         clean = simulate.exposures(
             np.ones(self.SHAPE), simulate.gaussian_beam(self.SHAPE, width=60), CROSS
@@ -268,7 +268,7 @@ class TestTilt:
         assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1, abs=error)
 
     @pytest.mark.study
-    @pytest.mark.filterwarnings("ignore::equipix.errors.DriftWarning")
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_drift_tilts_as_the_formula_says(self, draws):
         shape, shifts = (60, 80), equipix.cross_pattern(5, 7)
         clean = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts)

@@ -52,4 +52,4 @@ def test_calibrate_asks():
     frames += 1e-3 * np.random.default_rng(1).standard_normal(frames.shape)
     with pytest.warns(errors.IdentifiabilityWarning, match=r"micrometres: .* multiples of 8\.3"):
         cal = equipix.calibrate(frames, shifts, tolerance=1e-2)
-    assert "unit" in {verdict.kind for verdict in cal.verdicts}
+    assert "unit" in {finding.kind for finding in cal.findings}

@@ -65,7 +65,7 @@ def run(*arguments):
 
 def test_readings_that_are_not_used_are_named(manifest):
     with (
-        pytest.warns(errors.UnusedInputWarning, match=r"'flux' in .* is not used.* --flux fit"),
+        pytest.warns(errors.InputWarning, match=r"'flux' in .* is not used.* --flux fit"),
         pytest.warns(errors.IdentifiabilityWarning, match="leave a tilt"),
     ):
         Experiment.load(manifest).run(flux="fit", tolerance=1e-3)
@@ -77,7 +77,7 @@ def test_times_that_are_not_used_are_named(edited):
     )
     path = edited("[dark]", "[dark]")
     path.write_text(text)
-    with pytest.warns(errors.UnusedInputWarning, match=r"'time' in .* is not used.*--flux linear"):
+    with pytest.warns(errors.InputWarning, match=r"'time' in .* is not used.*--flux linear"):
         Experiment.load(path).run(tolerance=1e-3)
 
 
@@ -113,7 +113,7 @@ def test_averages_without_a_dark_are_named(manifest):
     dark = equipix.average(manifest.parent / "dark/dark.tif")
     files = [manifest.parent / f"frames/p{k}.tif" for k in range(5)]
     raw = [equipix.average(file, saturation=4095) for file in files]
-    with pytest.warns(errors.MissingDarkWarning, match=r"no dark was subtracted .*--dark"):
+    with pytest.warns(errors.InputWarning, match=r"no dark was subtracted .*--dark"):
         equipix.calibrate(raw, CROSS, tolerance=1e-3)
     # A dark that was subtracted, as averages or as an array, raises no warning.
     for offset in (dark, dark.mean):
@@ -126,12 +126,12 @@ def test_arrays_as_cameras_write_them_are_no_signal():
     signal = simulate.exposures(np.ones(SHAPE), simulate.gaussian_beam(SHAPE, width=60), CROSS)
     raw = np.rint(1000 * signal + 100 + rng.standard_normal(signal.shape))
     for given in (raw.astype(np.uint16), [*raw.astype(np.uint16)]):
-        with pytest.warns(errors.MissingDarkWarning, match="no dark was subtracted from frames"):
+        with pytest.warns(errors.InputWarning, match="no dark was subtracted from frames"):
             cal = equipix.calibrate(given, CROSS, tolerance=1e-3)
-        assert "raw" in {each.kind for each in cal.verdicts}
+        assert "raw" in {each.kind for each in cal.findings}
     for dtype in (np.int32, np.float32):
         cal = equipix.calibrate(raw.astype(dtype), CROSS, tolerance=1e-3)
-        assert cal.verdicts == ()
+        assert cal.findings == ()
 
 
 @pytest.mark.parametrize("dark", [None, True])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import equipix
-from equipix import simulate
+from equipix import metrics, simulate
 from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from peers import alternating, kuhn_lin_loranz, log_lsmr, over_relaxed
@@ -54,7 +54,7 @@ def hard_case(shape: tuple[int, int]) -> tuple[np.ndarray, ErrorOf]:
     beam = simulate.gaussian_beam(shape, width=1000 * max(1, shape[1] / 782))
 
     def error_of(sensitivity: np.ndarray) -> float:
-        return float(np.abs(simulate.relative_error(sensitivity, truth)).max())
+        return float(np.abs(metrics.relative_error(sensitivity, truth)).max())
 
     return simulate.exposures(truth, beam, SHIFTS), error_of
 

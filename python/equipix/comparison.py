@@ -156,7 +156,7 @@ def _leaves_tilt(calibration: Calibration) -> bool:
     std = calibration.tilt_std
     if std is not None and not np.isfinite(std).all():
         return True
-    return any(verdict.kind == "tilt" for verdict in calibration.verdicts)
+    return any(finding.kind == "tilt" for finding in calibration.findings)
 
 
 def _difference(first: NDArray[Any], second: NDArray[Any], open_tilt: bool) -> NDArray[Any]:

@@ -5,6 +5,20 @@ from __future__ import annotations
 import sys
 import warnings
 
+__all__ = [
+    "ConvergenceWarning",
+    "EquipixError",
+    "EquipixWarning",
+    "FileError",
+    "IdentifiabilityWarning",
+    "InputError",
+    "InputWarning",
+    "InsufficientMemoryError",
+    "MisfitWarning",
+    "SpotError",
+]
+__dir__ = __all__.copy
+
 
 class EquipixError(Exception):
     """Base class of all errors of this package."""
@@ -39,51 +53,15 @@ class ConvergenceWarning(EquipixWarning):
 
 
 class IdentifiabilityWarning(EquipixWarning):
-    """The measurements do not determine every pixel."""
+    """The measurements do not determine all that was asked for."""
 
 
-class ShiftRoundingWarning(EquipixWarning):
-    """Fractional shifts were rounded to whole pixels."""
-
-
-class ShiftSignWarning(EquipixWarning):
-    """The data contradict the sign of the shifts."""
-
-
-class DriftWarning(EquipixWarning):
-    """The light drifts: it tilts the sensitivity, or frames are not of one level."""
-
-
-class AlreadyCorrectedWarning(EquipixWarning):
-    """Frames to correct have been corrected before."""
-
-
-class LimitedWarning(EquipixWarning):
-    """Most corrected values are outside of the range of the output's type."""
-
-
-class MissingDarkWarning(EquipixWarning):
-    """Averages from which no dark was subtracted count as light."""
-
-
-class BrightDarkWarning(EquipixWarning):
-    """A dark that was subtracted is brighter than a level."""
-
-
-class UnusedInputWarning(EquipixWarning):
-    """Part of what is given is not used."""
-
-
-class SaturationWarning(EquipixWarning):
-    """Values that probably saturate count as valid."""
+class InputWarning(EquipixWarning):
+    """What was given saturates, was corrected before, has no dark, or is not used."""
 
 
 class MisfitWarning(EquipixWarning):
-    """Residuals are larger than the variances given explain."""
-
-
-class InverseWarning(EquipixWarning):
-    """The cubic that inverts response curves differs from their inverse by much of the noise."""
+    """The data contradict the model: residuals, shifts, fluxes, the dark or the curves."""
 
 
 def warn(message: str, category: type[EquipixWarning]) -> None:

@@ -1,4 +1,4 @@
-"""What limits a result, as findings; what limits a pixel, as flags."""
+"""What limits a result, as bad_pixels; what limits a pixel, as flags."""
 
 from __future__ import annotations
 
@@ -11,28 +11,24 @@ import numpy as np
 from equipix._check import Array, Bools, Floats
 from equipix.errors import (
     ConvergenceWarning,
-    DriftWarning,
     EquipixWarning,
     IdentifiabilityWarning,
+    InputWarning,
     MisfitWarning,
-    MissingDarkWarning,
-    SaturationWarning,
-    ShiftRoundingWarning,
-    ShiftSignWarning,
     warn,
 )
 
 _CATEGORIES: dict[str, type[EquipixWarning]] = {
-    "rounding": ShiftRoundingWarning,
+    "rounding": InputWarning,
     "order": IdentifiabilityWarning,
-    "saturation": SaturationWarning,
+    "saturation": InputWarning,
     "unit": IdentifiabilityWarning,
-    "raw": MissingDarkWarning,
-    "light": DriftWarning,
-    "flux": DriftWarning,
+    "raw": InputWarning,
+    "light": MisfitWarning,
+    "flux": MisfitWarning,
     "repeated": MisfitWarning,
     "partial": IdentifiabilityWarning,
-    "sign": ShiftSignWarning,
+    "sign": MisfitWarning,
     "orientation": IdentifiabilityWarning,
     "components": IdentifiabilityWarning,
     "pattern": IdentifiabilityWarning,
@@ -42,17 +38,17 @@ _CATEGORIES: dict[str, type[EquipixWarning]] = {
     "misfit": MisfitWarning,
     "cfa": MisfitWarning,
     "colour": MisfitWarning,
-    "drift": DriftWarning,
+    "drift": MisfitWarning,
     "prior": MisfitWarning,
     "variance": MisfitWarning,
     "convergence": ConvergenceWarning,
     "uncertainty": ConvergenceWarning,
 }
-"""The warning of each kind of verdict."""
+"""The warning of each kind of finding."""
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Finding:
     """A finding that limits a result.
 
     Attributes
@@ -69,13 +65,13 @@ class Verdict:
     def __post_init__(self) -> None:
         """Refuse a kind that there is not."""
         if self.kind not in _CATEGORIES:
-            raise ValueError(f"verdict of kind {self.kind!r}, expected one of {[*_CATEGORIES]}")
+            raise ValueError(f"finding of kind {self.kind!r}, expected one of {[*_CATEGORIES]}")
 
 
-def say(verdicts: Iterable[Verdict]) -> None:
+def say(findings: Iterable[Finding]) -> None:
     """Raise the warning of each; no other function warns of a calibration."""
-    for verdict in verdicts:
-        warn(verdict.message, _CATEGORIES[verdict.kind])
+    for finding in findings:
+        warn(finding.message, _CATEGORIES[finding.kind])
 
 
 class Flag(IntFlag):
@@ -111,7 +107,7 @@ BITS = {
     "out_of_range": Flag.OTHER_BAD_PIXEL | Flag.DO_NOT_USE,
 }
 """Bits that each finding sets; a saturated value is left out of its exposure, and the pixel keeps
-the sensitivity that the others determine. The last six are findings on response curves."""
+the sensitivity that the others determine. The last six are bad_pixels on response curves."""
 
 
 def set_bits(flags: Array, finding: str, pixels: Bools | None) -> None:

@@ -9,13 +9,16 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, ReadOnly, as_array, check_shape, check_word, number
+from equipix._check import Array, Bools, Floats, ReadOnly, as_array, check_shape, check_word
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import set_bits
 from equipix.measured.colour import Colours
 from equipix.measured.filters import responses
 from equipix.metrics.maps import block_means
+
+__all__ = ["LensFalloff", "fit"]
+__dir__ = __all__.copy
 
 Law = Literal["cos4", "radial"]
 
@@ -46,7 +49,7 @@ _CLIP = 5.0
 
 @dataclass(frozen=True, eq=False)
 class LensFalloff(ReadOnly):
-    """Law of the relative illumination, the result of `fit_falloff`; 1 at the centre.
+    """Law of the relative illumination, the result of `fit`; 1 at the centre.
 
     Attributes
     ----------
@@ -110,42 +113,12 @@ class LensFalloff(ReadOnly):
 
 
 def cos4(squared_distance: ArrayLike, focal_length: float) -> Floats:
-    """Relative illumination cos⁴ω at distances from the axis, tan ω = r/f.
-
-    Parameters
-    ----------
-    squared_distance : array_like of up to three dimensions
-        Square r² of the distance, in the square of the unit of `focal_length`.
-    focal_length : float
-        Focal length f of the lens.
-
-    Returns
-    -------
-    ndarray, float64
-        1/(1 + r²/f²)².
-
-    Raises
-    ------
-    InputError
-        If an argument holds no numbers, or the focal length is not above 0.
-
-    Examples
-    --------
-    The corner of an array of 54 mm behind a lens of 100 mm:
-
-    >>> from equipix import lens
-    >>> round(float(lens.cos4(27**2 + 27**2, 100.0)), 3)
-    0.762
-    """
-    if not number("focal_length", focal_length) > 0:
-        raise InputError(f"'focal_length' is {focal_length!r}, expected a number above 0")
-    squared = as_array("squared_distance", squared_distance, ndim=(0, 1, 2, 3)).astype(np.float64)
-    # as_array makes one number an array of one.
-    return (1 + squared.reshape(np.shape(squared_distance)) / focal_length**2) ** -2
+    """Relative illumination cos⁴ω = 1/(1 + r²/f²)² at squared distances r² from the axis."""
+    return np.asarray((1 + np.asarray(squared_distance) / focal_length**2) ** -2)
 
 
-def fit_falloff(
-    flat: ArrayLike,
+def fit(
+    frame: ArrayLike,
     *,
     law: Law = "cos4",
     sensitivity: ArrayLike | None = None,
@@ -156,7 +129,7 @@ def fit_falloff(
 
     Parameters
     ----------
-    flat : array_like, shape (rows, cols)
+    frame : array_like, shape (rows, cols)
         Mean frame of a uniform scene through the lens, the dark subtracted. NaN does not count. It
         must be linear in light: frames corrected by a response are so only where the array's mean
         curve is, else f is off beyond its standard error (docs/nuc.md, section 2).
@@ -199,13 +172,13 @@ def fit_falloff(
     >>> import numpy as np
     >>> from equipix import lens
     >>> rows, cols = np.mgrid[:120, :160]
-    >>> flat = 1000 * lens.cos4((rows - 62.0) ** 2 + (cols - 75.0) ** 2, 300.0)
-    >>> found = lens.fit_falloff(flat)
+    >>> squared = (rows - 62.0) ** 2 + (cols - 75.0) ** 2
+    >>> found = lens.fit(1000 / (1 + squared / 300.0**2) ** 2)
     >>> round(found.focal_length, 1), tuple(round(each, 3) for each in found.centre)
     (300.0, (62.0, 75.0))
     """
     check_word("law", law, get_args(Law))
-    image = _image(flat, sensitivity, mask)
+    image = _image(frame, sensitivity, mask)
     _refuse_negative(image)
     shape = check_shape((image.shape[0], image.shape[1]))
     colours = Colours.of(cfa)
@@ -232,8 +205,8 @@ def fit_falloff(
     if law == "cos4":
         if not found[3] > _SHOWN * std[3]:
             raise InputError(
-                f"'flat' shows a fall-off (half diagonal / focal length)² of {found[3]:.3g} with a "
-                f"standard error of {std[3]:.2g}, expected {_SHOWN:g} of them above 0: it is not "
+                f"'frame' shows a fall-off (half diagonal / focal length)² of {found[3]:.3g} "
+                f"with a standard error of {std[3]:.2g}, expected {_SHOWN:g} of them above 0: it is not "
                 "darker at the edge. Give the flat, not the dark, and less noise"
             )
         focal = float(half / np.sqrt(found[3]))
@@ -243,9 +216,9 @@ def fit_falloff(
     return LensFalloff(law, centre, float("nan"), found[3:], _plain(errors), shape, reach)
 
 
-def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | None) -> Floats:
+def _image(frame: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | None) -> Floats:
     """Return the flat as float64 without the sensor's gain, NaN where it does not count."""
-    image = as_array("flat", flat, ndim=2).astype(np.float64)
+    image = as_array("frame", frame, ndim=2).astype(np.float64)
     if sensitivity is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             image = image / _map("sensitivity", sensitivity, image.shape)
@@ -256,7 +229,7 @@ def _image(flat: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | Non
         image[given] = np.nan
     image[~np.isfinite(image)] = np.nan
     if np.count_nonzero(np.isfinite(image)) < 100:
-        raise InputError("'flat' has fewer than 100 finite values, expected those of a sensor")
+        raise InputError("'frame' has fewer than 100 finite values, expected those of a sensor")
     return image
 
 
@@ -265,7 +238,7 @@ def _refuse_negative(image: Floats) -> None:
     median = float(np.nanmedian(image))
     if not median > 0:
         raise InputError(
-            f"'flat' has the median {median:.6g}, expected light above 0: see that the dark was "
+            f"'frame' has the median {median:.6g}, expected light above 0: see that the dark was "
             "subtracted once, and from the flat"
         )
 
@@ -302,7 +275,7 @@ def _fitted(
     jacobian = _jacobian(model, found)[used]
     sizes = np.linalg.norm(jacobian, axis=0)
     if not sizes.all() or np.linalg.cond(jacobian / sizes) > _WORST:
-        raise InputError("'flat' does not determine the law: is there any fall-off in it?")
+        raise InputError("'frame' does not determine the law: is there any fall-off in it?")
     freedom = int(used.sum()) - len(found)
     variance = float(np.sum((values - model(found))[used] ** 2)) / freedom
     _check_settled(jacobian, (values - model(found))[used], variance, abs(float(found[0])))
@@ -316,7 +289,7 @@ def _check_settled(jacobian: Floats, residual: Floats, variance: float, scale: f
     gain = float(np.sum((jacobian @ step) ** 2))
     if gain > _SETTLED * variance + len(residual) * (_ROUNDING * scale) ** 2:
         raise InputError(
-            f"'flat': the fit of the law did not converge in {_ROUNDS} steps: mask what is no "
+            f"'frame': the fit of the law did not converge in {_ROUNDS} steps: mask what is no "
             "fall-off, such as vignetted corners, or take the other law"
         )
 

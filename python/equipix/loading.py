@@ -25,10 +25,10 @@ the content of ``(path, pages, metadata)``."""
 
 _NO_CORRECTIONS = {
     "dynamic correction": "maps against the temperature of the substrate: "
-    "bolometer.DynamicCorrection.load reads it, and its at(...) gives the correction at a state",
+    "bolometer.DynamicCorrection.load reads it, and its correction(...) is that of a state",
     "frame statistics": "the mean and variance of averaged frames, which correct nothing by "
     "themselves: FrameStatistics.load reads them, equipix correct subtracts them as --dark",
-    "state of a correction from the scene": "equipix.scene.load reads it; its result() is a "
+    "state of a correction from the scene": "equipix.scene.load reads it; its correction() is a "
     "correction",
 }
 """Kinds of files that are no corrections, and what they are."""

@@ -2,7 +2,6 @@
 
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.bolometer.state_fit import fit
-from equipix.metrics.maps import non_uniformity
-from equipix.simulate.bolometers import BolometerArray
 
-__all__ = ["BolometerArray", "DynamicCorrection", "fit", "non_uniformity"]
+__all__ = ["DynamicCorrection", "fit"]
+__dir__ = __all__.copy

@@ -94,7 +94,7 @@ class DynamicCorrection(ReadOnly):
         rows, cols = self.flags.shape
         return rows, cols
 
-    def at(
+    def correction(
         self, substrate_c: float, bias_v: float | None = None, *, extrapolate: bool = False
     ) -> Polynomial:
         """Correction at a state: maps of offset and gain for the frames taken there.

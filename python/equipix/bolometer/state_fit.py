@@ -13,7 +13,7 @@ from equipix._check import Array, Bools, Floats, as_array, check_shape, check_wo
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.bolometer.held_out import HIGHEST, Form, HeldOut
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
-from equipix.errors import InputError, SaturationWarning, warn
+from equipix.errors import InputError, InputWarning, warn
 from equipix.findings import Flag, set_bits, usable
 from equipix.measured.defects import DEAD_RESPONSE, relative_response
 from equipix.measured.saturation import clipping
@@ -74,7 +74,7 @@ def fit(
         times what their noise explains, or if temperature explains nothing. With any order, if the
         pattern of the array before the shutter turns back between two temperatures, as it does
         where some are exchanged. All temperatures in reversed order fit as well as the true ones.
-    SaturationWarning
+    InputWarning
         If many values of a reference are exactly the highest one, and not known to saturate.
 
     Notes
@@ -106,12 +106,12 @@ def fit(
     Examples
     --------
     >>> import numpy as np
-    >>> from equipix import bolometer
-    >>> array = bolometer.BolometerArray.of((24, 32), rng=1)
+    >>> from equipix import simulate
+    >>> array = simulate.BolometerArray.of((24, 32), rng=1)
     >>> celsius, volts = [-20, 0, 20, 40, 60], 2.0
     >>> shutter = [array.mean(each) for each in celsius]
     >>> correction = bolometer.fit(shutter, celsius, volts, order=4)
-    >>> left = correction.at(10.0).correct(array.mean(10.0))
+    >>> left = correction.correction(10.0).correct(array.mean(10.0))
     >>> bool(np.std(left) < 1e-4 * np.std(array.mean(10.0)))
     True
     """
@@ -284,7 +284,7 @@ class References:
                     f"{found.values} values of '{name}' at state {k} are exactly "
                     f"{found.level:.10g}, the highest one: they probably saturate and count as "
                     "valid: exclude their pixels by 'mask', or give averages with a 'saturation'",
-                    SaturationWarning,
+                    InputWarning,
                 )
                 return
 

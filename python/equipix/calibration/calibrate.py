@@ -168,7 +168,7 @@ def calibrate(
 
     Warns
     -----
-    ShiftRoundingWarning
+    InputWarning
         If coordinate descent rounds a shift by more than 0.02 pixel.
     IdentifiabilityWarning
         If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
@@ -177,17 +177,17 @@ def calibrate(
         degenerate with the sensitivity; if shifts look like millimetres or micrometres.
     ConvergenceWarning
         If the tolerance was not reached.
-    DriftWarning
+    MisfitWarning
         If the data contradict the fluxes given: the lamp has drifted, which hides a tilt, or one
         flux is far off.
     MisfitWarning
         If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
         neighbouring pixels are correlated, or if residuals show a curved response, an offset of all
         values, crosstalk or the pattern of the dark. The message names the likely cause.
-    SaturationWarning
+    InputWarning
         If many values are exactly at the highest one, and no saturation level is given or a higher
         one.
-    ShiftSignWarning
+    MisfitWarning
         If the data contradict the orientation of the shifts: a sign, or the order of the axes.
 
     Notes
@@ -264,7 +264,7 @@ def calibrated(
     start: Fit | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from exposures: weights, fit, orientation, flags, error bars, verdicts.
+    """Calibrate from exposures: weights, fit, orientation, flags, error bars, findings.
 
     The fit starts from `start`; `provenance` is added to the metadata.
     """
@@ -305,7 +305,7 @@ def calibrated(
         flags=flags,
         orientation=test,
         drift=drift,
-        verdicts=(*advice, *found, *last),
+        findings=(*advice, *found, *last),
         bars=bars,
         metadata=metadata | (provenance or {}),
     )

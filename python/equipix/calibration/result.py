@@ -32,7 +32,7 @@ from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
 from equipix.exposures.positions import ROUNDING, Orientation, Positions
-from equipix.findings import Verdict, determined
+from equipix.findings import Finding, determined
 from equipix.fitting.error_bars import ErrorBars, functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged
 from equipix.io.formats import save_pages
@@ -125,8 +125,8 @@ class Calibration(ReadOnly):
     weighted : Weighted or None
         The exposures with their weights and the fit, for `std_of`; None if read from a file or
         unpickled.
-    verdicts : tuple of Verdict
-        Findings that limit the result: `calibrate` has warned of each.
+    findings : tuple of Finding
+        BadPixels that limit the result: `calibrate` has warned of each.
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
@@ -176,7 +176,7 @@ class Calibration(ReadOnly):
     shift_sign: ShiftSign = "undetermined"
     orientation: OrientationTest | None = None
     drift: Drift | None = None
-    verdicts: tuple[Verdict, ...] = ()
+    findings: tuple[Finding, ...] = ()
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
 
@@ -187,7 +187,7 @@ class Calibration(ReadOnly):
         *,
         flags: NDArray[Any],
         orientation: OrientationTest,
-        verdicts: tuple[Verdict, ...],
+        findings: tuple[Finding, ...],
         drift: Drift | None,
         bars: ErrorBars | None,
         metadata: dict[str, Any],
@@ -225,7 +225,7 @@ class Calibration(ReadOnly):
             shift_sign=orientation.sign,
             orientation=orientation,
             drift=drift,
-            verdicts=verdicts,
+            findings=findings,
             cfa=filters.colours if filters is not None and filters.given else None,
             colour_response=gauge.response,
         )
@@ -240,9 +240,9 @@ class Calibration(ReadOnly):
     def is_partial(self) -> bool:
         """Whether less than half of the pixels that are not masked are determined.
 
-        The verdict of kind ``"partial"`` contains the cause.
+        The finding of kind ``"partial"`` contains the cause.
         """
-        return any(verdict.kind == "partial" for verdict in self.verdicts)
+        return any(finding.kind == "partial" for finding in self.findings)
 
     def __repr__(self) -> str:
         """Short form: sizes and how far the solver came."""
@@ -610,7 +610,7 @@ KIND = "calibration"
 
 FORMAT = 2
 """Number of the file format; a file with a higher one is refused. Format 1 held no coefficients of
-the beam and no verdicts, rotations only among the options, and the images of ``rejected`` one below
+the beam and no findings, rotations only among the options, and the images of ``rejected`` one below
 the other in one page."""
 
 _MAPS: dict[str, type] = {
@@ -671,7 +671,7 @@ def read_fields(
     if content["format"] == 1:
         options = content["metadata"]["options"]
         former = {"rotation": options["rotation"], "dark_is_fitted": options["dark"] == "fit"}
-        numbers = {**numbers, **former, "verdicts": [], "beam_tilt": [0.0, 0.0]}
+        numbers = {**numbers, **former, "findings": [], "beam_tilt": [0.0, 0.0]}
     chi2, rejected = numbers["reduced_chi2"], pages.get("rejected")
     _check_numbers(numbers, pages["beam"].shape)
     row, col = numbers["beam_origin"]
@@ -683,7 +683,7 @@ def read_fields(
         **{name: _array(numbers.get(name)) for name in ("tilt_std", "shift_std")},
         "beam_origin": (row, col),
         "rotation": np.array(numbers["rotation"], dtype=np.int64),
-        "verdicts": numbers["verdicts"],
+        "findings": numbers["findings"],
         "reduced_chi2": float("nan") if chi2 is None else chi2,
         "shift_sign": numbers.get("shift_sign", "undetermined"),
         "orientation": numbers.get("orientation"),
@@ -748,7 +748,7 @@ def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
         "rotation": fields["rotation"].tolist(),
         "beam_tilt": fields["beam_tilt"].tolist(),
         "reduced_chi2": chi2 if np.isfinite(chi2) else None,
-        "verdicts": [vars(verdict) for verdict in fields["verdicts"]],
+        "findings": [vars(finding) for finding in fields["findings"]],
         "shift_sign": fields["shift_sign"],
         "orientation": orientation,
         "drift": None if drift is None else _lists(vars(drift)),
@@ -807,12 +807,12 @@ def read_calibration(
 ) -> Calibration:
     """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
     fields = read_fields(path, pages, content)
-    verdicts = tuple(Verdict(**each) for each in fields["verdicts"])
+    findings = tuple(Finding(**each) for each in fields["findings"])
     made = {
         "history": History(**fields["history"]),
         "orientation": _read_orientation(fields["orientation"]),
         "drift": _read_drift(fields["drift"]),
-        "verdicts": verdicts,
+        "findings": findings,
     }
     return Calibration(**{**fields, **made})
 

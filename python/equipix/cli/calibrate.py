@@ -93,16 +93,16 @@ def calibrate(
     calibration.save(output, force=force)
     result = {"output": str(output), **of_calibration(calibration)}
     if not as_json:  # their messages are on stderr, as warnings
-        result["verdicts"] = ", ".join(each.kind for each in calibration.verdicts) or "none"
+        result["findings"] = ", ".join(each.kind for each in calibration.findings) or "none"
     show_result(result, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
     """Refuse a result that determines less than half of the unmasked pixels, or none."""
-    for verdict in calibration.verdicts:
-        if verdict.kind == "partial":
+    for finding in calibration.findings:
+        if finding.kind == "partial":
             raise EquipixError(
-                f"'{output}' is not written (--partial writes it): {verdict.message}"
+                f"'{output}' is not written (--partial writes it): {finding.message}"
             )
 
 

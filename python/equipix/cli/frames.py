@@ -22,7 +22,7 @@ from equipix.cli.terminal import (
     show_result,
 )
 from equipix.correction.correct_files import Corrected, correct_files, is_folder
-from equipix.errors import DriftWarning, InputError, warn
+from equipix.errors import InputError, MisfitWarning, warn
 from equipix.experiment.image_files import origin_of, refuse_repeated_files
 from equipix.io.formats import SUFFIXES
 from equipix.io.frames import read_mask
@@ -89,7 +89,7 @@ def average(
         )
     warn_of_bright_dark(frames)
     if (light := light_of(frames)).over_noise > STRAY:
-        warn(f"{light.words} (limit {STRAY:g}): see that all are of one measurement", DriftWarning)
+        warn(f"{light.words} (limit {STRAY:g}): see that all are of one measurement", MisfitWarning)
     frames.save(output, force=force)
     result = {"output": str(output), **of_statistics(frames)}
     show_result(result, as_json=as_json)

@@ -17,7 +17,7 @@ from equipix.cli.terminal import (
     show_result,
     show_table,
 )
-from equipix.errors import InputError, UnusedInputWarning, warn
+from equipix.errors import InputError, InputWarning, warn
 from equipix.exposures.positions import whole_moves
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
@@ -69,7 +69,7 @@ def plan(
     if shift_error and beam_width is None:
         warn(
             "'--shift-error' has no effect in an even beam: give '--beam-width' for another",
-            UnusedInputWarning,
+            InputWarning,
         )
     if output is not None:
         check_picture(output)

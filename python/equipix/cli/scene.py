@@ -130,7 +130,7 @@ def scene(
         learning = _method(method, source, data_range, options, resume, workers)
     with progress_bars() as progress:
         done = run_sequence(learning, source, output=corrected, force=force, progress=progress)
-    result = learning.result()
+    result = learning.correction()
     result.save(output, force=force)
     if state is not None:
         learning.save(state, force=force)

@@ -162,7 +162,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "flagged_pixels": flagged(calibration),
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
-        "verdicts": [asdict(verdict) for verdict in calibration.verdicts],
+        "findings": [asdict(finding) for finding in calibration.findings],
     }
 
 

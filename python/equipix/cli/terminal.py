@@ -168,7 +168,7 @@ def _words(value: Any) -> str:
 
 
 def _row(fields: dict[str, Any]) -> str:
-    """Words of a row: texts by themselves, such as a verdict's, and numbers with their names."""
+    """Words of a row: texts by themselves, such as a finding's, and numbers with their names."""
     if any(isinstance(each, str) for each in fields.values()):
         return ": ".join(map(str, fields.values()))
     return _words(fields)

@@ -14,11 +14,9 @@ from equipix.correction.apply import FAST, output_dtype, usual_treatment
 from equipix.correction.corrector import Corrector, Dark
 from equipix.correction.protocol import Correction, takes_dark
 from equipix.errors import (
-    AlreadyCorrectedWarning,
-    BrightDarkWarning,
     FileError,
     InputError,
-    LimitedWarning,
+    InputWarning,
     warn,
 )
 from equipix.findings import usable
@@ -132,11 +130,11 @@ def correct_files(
 
     Warns
     -----
-    AlreadyCorrectedWarning
+    InputWarning
         If files were written by this function.
-    BrightDarkWarning
+    InputWarning
         If the first frame is darker than the dark by more than a quarter of the dark.
-    LimitedWarning
+    InputWarning
         If most values had to be limited to the range of whole numbers.
     """
     wanted = _dtype(output, dtype, bit_depth, display)
@@ -268,7 +266,7 @@ def warn_of_corrected(files: list[Path], origin: str) -> None:
     warn(
         f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
         "the raw frames",
-        AlreadyCorrectedWarning,
+        InputWarning,
     )
 
 
@@ -283,7 +281,7 @@ def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> No
         warn(
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
             "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them",
-            BrightDarkWarning,
+            InputWarning,
         )
 
 
@@ -297,7 +295,7 @@ def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
     warn(
         f"{limited / values:.0%} of the corrected values were limited to the range of {dtype}: "
         f"choose 'dtype' (--dtype) {remedy}",
-        LimitedWarning,
+        InputWarning,
     )
 
 

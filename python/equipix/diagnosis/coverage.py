@@ -10,7 +10,7 @@ from equipix._native import Fit
 from equipix.diagnosis.rules import TOO_WEAK, fits_noise
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import whole_moves
-from equipix.findings import Flag, Verdict, usable
+from equipix.findings import Finding, Flag, usable
 from equipix.fitting.weighted import Weighted
 
 _LEAST = 0.5
@@ -23,14 +23,14 @@ _FEWEST = 3
 """Fewest exposures that compare pixels along both axes."""
 
 
-def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> list[Verdict]:
-    """Add the verdict on a fit that determines less than half of the pixels that are not masked.
+def with_coverage(found: list[Finding], weighted: Weighted, flags: Array) -> list[Finding]:
+    """Add the finding on a fit that determines less than half of the pixels that are not masked.
 
     It stands in the place of that on components, which it contains. A fit that ended far from its
     minimum determines none.
     """
     if not float(weighted.fit.error_estimate[-1]) <= _LARGEST_ERROR:
-        return [Verdict("partial", _far(weighted.fit)), *found]
+        return [Finding("partial", _far(weighted.fit)), *found]
     wanted = _wanted(weighted.exposures)
     determined = usable(flags) & wanted
     count, total = int(determined.sum()), int(wanted.sum())
@@ -40,7 +40,7 @@ def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> lis
         f"the exposures determine only {count} of {total} unmasked pixels (limit {_LEAST:.0%}): "
         f"{_cause(weighted, wanted & ~determined, flags)}"
     )
-    return [Verdict("partial", text), *(each for each in found if each.kind != "components")]
+    return [Finding("partial", text), *(each for each in found if each.kind != "components")]
 
 
 def _far(fit: Fit) -> str:
@@ -62,7 +62,7 @@ def _wanted(exposures: Exposures) -> Bools:
     wanted = np.zeros(exposures.shape, bool)
     for k in range(len(exposures)):
         wanted |= exposures.usable(k)
-    for found in vars(exposures.findings).values():
+    for found in vars(exposures.bad_pixels).values():
         if found is not None:
             wanted |= found
     return wanted
@@ -71,7 +71,7 @@ def _wanted(exposures: Exposures) -> Bools:
 def _cause(weighted: Weighted, missing: Bools, flags: Array) -> str:
     """Return what most of the missing pixels have in common, and the remedy."""
     exposures, fit = weighted.exposures, weighted.fit
-    if _most(missing, exposures.findings.saturated):
+    if _most(missing, exposures.bad_pixels.saturated):
         return (
             "most of the others reach the saturation level: expose less, or correct the level "
             "('saturation', 'bit_depth')"

@@ -1,4 +1,4 @@
-"""Verdicts on what was given, before any fit."""
+"""Findings on what was given, before any fit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from equipix._check import Array, Bools
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import Positions, micrometre_step, nearest_whole
-from equipix.findings import Verdict
+from equipix.findings import Finding
 from equipix.fitting.residuals import on_sensor
 from equipix.measured.saturation import clipping_advice
 
@@ -17,44 +17,44 @@ _LEAST_MOVE = 0.5
 """Least distance, in pixels, between shifts that are in pixels."""
 
 
-def on_input(exposures: Exposures) -> list[Verdict]:
-    """Verdicts on exposures that the values given contradict."""
+def on_input(exposures: Exposures) -> list[Finding]:
+    """Findings on exposures that the values given contradict."""
     found = [
         _on_clipping(exposures),
         _on_raw(exposures),
-        Verdict("light", exposures.unsteady) if exposures.unsteady else None,
+        Finding("light", exposures.unsteady) if exposures.unsteady else None,
         _on_units(exposures),
         _on_brightness(exposures),
         _on_repeats(exposures),
         _on_filters(exposures),
     ]
-    return [verdict for verdict in found if verdict is not None]
+    return [finding for finding in found if finding is not None]
 
 
-def _on_clipping(exposures: Exposures) -> Verdict | None:
-    """Verdict on a saturation level that is missing or too high."""
+def _on_clipping(exposures: Exposures) -> Finding | None:
+    """Finding on a saturation level that is missing or too high."""
     if exposures.clipped is None:
         return None
-    return Verdict("saturation", clipping_advice(exposures.clipped))
+    return Finding("saturation", clipping_advice(exposures.clipped))
 
 
-def _on_raw(exposures: Exposures) -> Verdict | None:
-    """Verdict on averages, or arrays as cameras write them, without a dark."""
+def _on_raw(exposures: Exposures) -> Finding | None:
+    """Finding on averages, or arrays as cameras write them, without a dark."""
     if not exposures.raw:
         return None
-    return Verdict(
+    return Finding(
         "raw",
         "no dark was subtracted from frames of whole numbers, so that an offset of the camera "
         "counts as light: give 'dark' to equipix.average (--dark), or subtract it before",
     )
 
 
-def _on_units(exposures: Exposures) -> Verdict | None:
-    """Verdict on shifts that look like millimetres, or like micrometres."""
+def _on_units(exposures: Exposures) -> Finding | None:
+    """Finding on shifts that look like millimetres, or like micrometres."""
     shifts = exposures.positions.shifts
     most = float(np.ptp(shifts, axis=0).max())
     if 0 < most < _LEAST_MOVE:
-        return Verdict(
+        return Finding(
             "unit",
             f"the shifts differ by {most:.2g} pixel at most (limit {_LEAST_MOVE:g}), from which "
             "next to nothing follows. Expected are pixels: divide millimetres by the pixel pitch, "
@@ -63,7 +63,7 @@ def _on_units(exposures: Exposures) -> Verdict | None:
     step = micrometre_step(shifts, exposures.shape)
     if step is None:
         return None
-    return Verdict(
+    return Finding(
         "unit",
         f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
         f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
@@ -71,25 +71,25 @@ def _on_units(exposures: Exposures) -> Verdict | None:
     )
 
 
-def _on_brightness(exposures: Exposures) -> Verdict | None:
-    """Verdict on one exposure with far more or less light than its flux says."""
+def _on_brightness(exposures: Exposures) -> Finding | None:
+    """Finding on one exposure with far more or less light than its flux says."""
     words = on_brightness(exposures)
-    return None if words is None else Verdict("flux", words)
+    return None if words is None else Finding("flux", words)
 
 
-def _on_filters(exposures: Exposures) -> Verdict | None:
-    """Verdict on a pattern of colour filters, or of the read-out, that is not the one named."""
+def _on_filters(exposures: Exposures) -> Finding | None:
+    """Finding on a pattern of colour filters, or of the read-out, that is not the one named."""
     filters = exposures.filters
-    return Verdict("cfa", filters.words) if filters is not None and filters.words else None
+    return Finding("cfa", filters.words) if filters is not None and filters.words else None
 
 
-def _on_repeats(exposures: Exposures) -> Verdict | None:
-    """Verdict on one exposure that is given for two positions."""
+def _on_repeats(exposures: Exposures) -> Finding | None:
+    """Finding on one exposure that is given for two positions."""
     pair = repeated(exposures.values, exposures.positions)
     if pair is None:
         return None
     first, second = pair
-    return Verdict(
+    return Finding(
         "repeated",
         f"exposures {first} and {second} are equal, value for value, which noise prevents: give "
         "each position its own frames, and see whether the sensor moved",

@@ -128,7 +128,7 @@ def orientation_test(
     Returns
     -------
     OrientationTest
-        The verdicts. Undetermined without a comparison where an offset is sought.
+        The findings. Undetermined without a comparison where an offset is sought.
 
     Notes
     -----
@@ -272,7 +272,7 @@ def _left(fits: Mapping[Orientation, WindowFit]) -> set[Orientation]:
 
 
 def _outcome(fits: Mapping[Orientation, WindowFit], left: set[Orientation]) -> OrientationTest:
-    """The verdicts on the axes from final fits."""
+    """The findings on the axes from final fits."""
     best = _best(fits)
     rows, cols, exchanged, turned = (_answer(left, name) for name in _QUESTIONS)
     sign: ShiftSign = "undetermined"

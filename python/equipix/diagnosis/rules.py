@@ -1,4 +1,4 @@
-"""Findings that limit a result, as data."""
+"""BadPixels that limit a result, as data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.misfit import Misfit
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.exposures.exposures import Exposures
-from equipix.findings import Verdict
+from equipix.findings import Finding
 from equipix.fitting.error_bars import (
     DarkStd,
     ErrorBars,
@@ -31,7 +31,7 @@ _NOT_FOUND = 0.1
 """Largest estimated error of M of a joint fit for which noise determines the errors."""
 
 _FEW = 0.01
-"""Smallest share of faint pixels that gives a verdict."""
+"""Smallest share of faint pixels that gives a finding."""
 
 TOO_WEAK = (
     "the light is too weak for its noise, or the measurements contradict each other: use more "
@@ -52,19 +52,19 @@ _DEGENERATE = 0.1
 """Share of the variance of a drift below which the error of its size is over three times larger."""
 
 
-def on_plan(exposures: Exposures) -> list[Verdict]:
-    """Verdicts before any fit."""
+def on_plan(exposures: Exposures) -> list[Finding]:
+    """Findings before any fit."""
     found = [_on_rounding(exposures), _on_order(exposures)]
-    return [verdict for verdict in found if verdict is not None]
+    return [finding for finding in found if finding is not None]
 
 
-def on_noise(frames: float | None) -> list[Verdict]:
-    """Verdict on variances, where those given were sample variances of so many frames."""
-    return [] if frames is None else [Verdict("variance", words(frames))]
+def on_noise(frames: float | None) -> list[Finding]:
+    """Finding on variances, where those given were sample variances of so many frames."""
+    return [] if frames is None else [Finding("variance", words(frames))]
 
 
-def unexplained(found: list[Verdict], advice: list[Verdict]) -> list[Verdict]:
-    """Verdicts that a wrong sign or unit of the shifts, or a wrong flux, does not explain."""
+def unexplained(found: list[Finding], advice: list[Finding]) -> list[Finding]:
+    """Findings that a wrong sign or unit of the shifts, or a wrong flux, does not explain."""
     kinds = {each.kind for each in (*advice, *found)}
     if {"sign", "unit"} & kinds:
         return [each for each in found if each.kind not in _BY_SHIFTS]
@@ -73,34 +73,34 @@ def unexplained(found: list[Verdict], advice: list[Verdict]) -> list[Verdict]:
 
 def on_standard_deviations(
     weighted: Weighted, options: Options, bars: ErrorBars | None, dark: DarkStd | None
-) -> list[Verdict]:
-    """Verdicts that need standard deviations: on a fitted dark, and on the error bars."""
+) -> list[Finding]:
+    """Findings that need standard deviations: on a fitted dark, and on the error bars."""
     found = [_on_dark(weighted.fit, options, dark), _on_searches(bars)]
-    return [verdict for verdict in found if verdict is not None]
+    return [finding for finding in found if finding is not None]
 
 
-def _on_searches(bars: ErrorBars | None) -> Verdict | None:
+def _on_searches(bars: ErrorBars | None) -> Finding | None:
     count = 0 if bars is None else bars.exactness["incomplete_searches"]
-    return Verdict("uncertainty", incomplete_searches(count)) if count else None
+    return Finding("uncertainty", incomplete_searches(count)) if count else None
 
 
-def _on_rounding(exposures: Exposures) -> Verdict | None:
+def _on_rounding(exposures: Exposures) -> Finding | None:
     rounding = exposures.positions.rounding
     if rounding is None:
         return None
     remedy = "use method='multiscale', or move the sensor by whole pixels"
-    return Verdict("rounding", f"{rounding.words}: {remedy}")
+    return Finding("rounding", f"{rounding.words}: {remedy}")
 
 
-def _on_order(exposures: Exposures) -> Verdict | None:
-    """Verdict on an order in which a drift in time is degenerate with a tilt."""
+def _on_order(exposures: Exposures) -> Finding | None:
+    """Finding on an order in which a drift in time is degenerate with a tilt."""
     times, positions = exposures.flux.time, exposures.positions
     if times is None or len(set(positions.rotation.tolist())) > 1:
         return None
     share = distinct_trend(positions.shifts, times)
     if share >= _DEGENERATE:
         return None
-    return Verdict(
+    return Finding(
         "order",
         f"in this order of exposures only {share:.1%} of the variance of a drift linear in time is "
         f"distinguishable from a tilt of the sensitivity (limit {_DEGENERATE:.0%}): take the "
@@ -116,8 +116,8 @@ def on_fit(
     misfit: Misfit | None,
     contradictions: Sequence[Contradiction] = (),
     colours: str | None = None,
-) -> list[Verdict]:
-    """Verdicts on a fit, the most important first.
+) -> list[Finding]:
+    """Findings on a fit, the most important first.
 
     `colours` are words on their contradiction, which explains drifts and a misfit. One exposure
     that is flipped explains the contradiction.
@@ -134,13 +134,13 @@ def on_fit(
         _on_patterns(weighted.fit),
         _on_hidden(weighted.fit, test),
         _on_faint(weighted.exposures),
-        None if colours is None else Verdict("colour", colours),
+        None if colours is None else Finding("colour", colours),
         *([] if colours else _on_residuals(drift, misfit)),
-        *(Verdict("prior", each.words) for each in contradictions),
+        *(Finding("prior", each.words) for each in contradictions),
         _on_convergence(weighted.fit, options),
         _on_uncertainty(weighted, options),
     ]
-    return [verdict for verdict in found if verdict is not None]
+    return [finding for finding in found if finding is not None]
 
 
 def is_too_far(fit: Fit) -> bool:
@@ -154,24 +154,24 @@ def fits_noise(fit: Fit) -> bool:
     return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
 
 
-def _on_uncertainty(weighted: Weighted, options: Options) -> Verdict | None:
-    """Verdict on a fit that is too far from its minimum or its beam for standard deviations."""
+def _on_uncertainty(weighted: Weighted, options: Options) -> Finding | None:
+    """Finding on a fit that is too far from its minimum or its beam for standard deviations."""
     if options.uncertainty and is_too_fine(weighted):
-        return Verdict("uncertainty", too_fine(weighted))
+        return Finding("uncertainty", too_fine(weighted))
     if not (options.uncertainty and is_too_far(weighted.fit)):
         return None
     error = float(weighted.fit.error_estimate[-1])
-    return Verdict(
+    return Finding(
         "uncertainty",
         "no standard deviations: the fit is too far from its minimum (estimated error "
         f"{error:.1e}, limit {_NOT_FOUND:g})",
     )
 
 
-def _on_sign(test: OrientationTest) -> Verdict | None:
+def _on_sign(test: OrientationTest) -> Finding | None:
     if test.sign != "contradicted":
         return None
-    return Verdict(
+    return Finding(
         "sign",
         f"{test.words}; as given and with free fluxes the squared residuals are {test.ratio:.2g} "
         "times as large. A shift grows when the sensor moves towards larger rows and columns: "
@@ -179,11 +179,11 @@ def _on_sign(test: OrientationTest) -> Verdict | None:
     )
 
 
-def _on_orientation(test: OrientationTest) -> Verdict | None:
-    """Verdict on another orientation, with which the fluxes agree as they do not as given."""
+def _on_orientation(test: OrientationTest) -> Finding | None:
+    """Finding on another orientation, with which the fluxes agree as they do not as given."""
     if test.hidden is None or not test.is_likely:
         return None
-    return Verdict(
+    return Finding(
         "orientation",
         f"the orientation of the shifts is probably wrong: with {test.hidden.changes} the data "
         "fit equally well, and the fluxes found agree with those given ten times as closely. "
@@ -192,12 +192,12 @@ def _on_orientation(test: OrientationTest) -> Verdict | None:
     )
 
 
-def _on_hidden(fit: Fit, test: OrientationTest) -> Verdict | None:
-    """Verdict on what neither residuals nor fluxes determine: a tilt, the orientation, or both."""
+def _on_hidden(fit: Fit, test: OrientationTest) -> Finding | None:
+    """Finding on what neither residuals nor fluxes determine: a tilt, the orientation, or both."""
     words = "" if test.hidden is None or test.is_likely else _undetermined(test)
     if not fit.leaves_tilt:
-        return Verdict("orientation", words) if words else None
-    return Verdict(
+        return Finding("orientation", words) if words else None
+    return Finding(
         "tilt",
         "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: turn "
         "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp"
@@ -216,11 +216,11 @@ def _undetermined(test: OrientationTest) -> str:
     )
 
 
-def _on_components(fit: Fit) -> Verdict | None:
+def _on_components(fit: Fit) -> Finding | None:
     if fit.components <= 1:
         return None
     left = int(np.count_nonzero(fit.component_labels > 0))
-    return Verdict(
+    return Finding(
         "components",
         f"the shifts leave {fit.components} parts of the sensor unconnected: the sensitivity of "
         f"{left} pixel{'s' * (left != 1)} outside the largest part is undetermined (NaN): choose "
@@ -228,10 +228,10 @@ def _on_components(fit: Fit) -> Verdict | None:
     )
 
 
-def _on_patterns(fit: Fit) -> Verdict | None:
+def _on_patterns(fit: Fit) -> Finding | None:
     if fit.smallest_ritz is None or fit.smallest_ritz >= _UNDETERMINED:
         return None
-    return Verdict(
+    return Finding(
         "pattern",
         "the shifts barely constrain a spatial pattern of the sensitivity (smallest Ritz value "
         f"{fit.smallest_ritz:.1e}, limit {_UNDETERMINED:g}): choose less regular shifts, see "
@@ -239,11 +239,11 @@ def _on_patterns(fit: Fit) -> Verdict | None:
     )
 
 
-def _on_faint(exposures: Exposures) -> Verdict | None:
-    faint = exposures.findings.faint
+def _on_faint(exposures: Exposures) -> Finding | None:
+    faint = exposures.bad_pixels.faint
     if faint is None or faint.mean() < _FEW:
         return None
-    return Verdict(
+    return Finding(
         "faint",
         f"the noise of the dark leaves M of {np.count_nonzero(faint)} pixels in "
         "weak light known to worse than 4 %, and four times worse than in bright pixels: they are "
@@ -251,7 +251,7 @@ def _on_faint(exposures: Exposures) -> Verdict | None:
     )
 
 
-def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None:
+def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Finding | None:
     if dark is None:
         return None
     along, alone = dark.along_sensitivity, dark.of_a_pixel
@@ -262,7 +262,7 @@ def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None
         known = "the fit did not determine it"
     else:
         return None
-    return Verdict(
+    return Finding(
         "dark",
         "the fitted dark is nearly degenerate with the sensitivity: with fitted fluxes it may "
         f"contain any multiple b of the sensitivity, and {known}: give the ratio of the levels as "
@@ -270,20 +270,20 @@ def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Verdict | None
     )
 
 
-def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
-    """Verdicts on fluxes and residuals, that which explains the other first.
+def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Finding]:
+    """Findings on fluxes and residuals, that which explains the other first.
 
     A misfit that wrong fluxes cause is said once. Any other that neighbours have in common makes
     the fluxes wrong too.
     """
-    of_fluxes = [Verdict("drift", drift.words)] if drift is not None and drift.is_certain else []
+    of_fluxes = [Finding("drift", drift.words)] if drift is not None and drift.is_certain else []
     if misfit is None or (of_fluxes and misfit.cause == "flux"):
         return of_fluxes
-    of_all = [Verdict("misfit", misfit.words)]
+    of_all = [Finding("misfit", misfit.words)]
     return of_fluxes + of_all if misfit.cause in _WHITE else of_all + of_fluxes
 
 
-def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
+def _on_convergence(fit: Fit, options: Options) -> Finding | None:
     if fit.ended == "converged":
         return None
     if fits_noise(fit) and not fit.lost:
@@ -299,12 +299,12 @@ def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
         )
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
     if error <= options.fit.tolerance:
-        return Verdict(
+        return Finding(
             "convergence",
             f"not converged after {sweeps} sweeps, which are too few to estimate the error: "
             "probably most pixels saturate or have no light",
         )
-    return Verdict(
+    return Finding(
         "convergence",
         f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
         f"tolerance {options.fit.tolerance:g}{remedy}",

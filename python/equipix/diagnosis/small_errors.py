@@ -13,7 +13,7 @@ from equipix._check import Array, Floats
 from equipix._native import Fit
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
-from equipix.findings import Verdict, usable
+from equipix.findings import Finding, usable
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.residuals import EXACT, FEWEST, Residuals, tested
 from equipix.fitting.weighted import Weighted
@@ -61,7 +61,7 @@ _STRONGER = {
     "drift",
     "colour",
 }
-"""Kinds of verdicts whose causes leave what looks like a small error."""
+"""Kinds of findings whose causes leave what looks like a small error."""
 
 
 class Cause(NamedTuple):
@@ -136,13 +136,13 @@ class SmallError:
 
 
 def with_small_errors(
-    found: list[Verdict],
+    found: list[Finding],
     weighted: Weighted,
     flags: Array,
     residuals: Residuals,
     options: FitOptions,
-) -> list[Verdict]:
-    """Verdicts, with that on small errors: where no other one explains them better.
+) -> list[Finding]:
+    """Findings, with that on small errors: where no other one explains them better.
 
     Values of flagged pixels that are not proportional to light are none, and residuals of a beam
     finer than its spline have their cause.
@@ -155,7 +155,7 @@ def with_small_errors(
     if not errors or ("misfit" in kinds and not errors[0].share > _MOST):
         return found
     others = [each for each in found if each.kind != "misfit"]
-    return [*others, Verdict("misfit", _words(errors))]
+    return [*others, Finding("misfit", _words(errors))]
 
 
 def _words(errors: list[SmallError]) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from equipix._check import Bools, Floats, FluxModel, Method, Progress, as_mask, naming_memory, union
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
-from equipix.errors import FileError, InputError, UnusedInputWarning, warn
+from equipix.errors import FileError, InputError, InputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described, excluded_pixels, provenance
 from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
@@ -189,7 +189,7 @@ class Experiment(Described[Manifest]):
 
         Warns
         -----
-        UnusedInputWarning
+        InputWarning
             If the file has ``flux`` or ``time`` that `flux` leaves without use.
 
         Notes
@@ -233,12 +233,12 @@ class Experiment(Described[Manifest]):
             warn(
                 f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
                 f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
-                UnusedInputWarning,
+                InputWarning,
             )
         if flux != "linear" and self._column("time") is not None:
             warn(
                 f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
-                UnusedInputWarning,
+                InputWarning,
             )
 
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:

@@ -28,7 +28,7 @@ from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions, check_reach, nearest_whole
 from equipix.measured.colour import Colours
-from equipix.measured.defects import Findings
+from equipix.measured.defects import BadPixels
 from equipix.measured.filters import Filters, mean_signal
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, measured_of
@@ -61,7 +61,7 @@ class Exposures(ReadOnly):
         Noise model of each mean frame, where the variance is to be evaluated at what a fit expects.
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
-    findings : Findings
+    bad_pixels : BadPixels
         Bad pixels found before the last fit.
     dark : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, in DN, where it is known.
@@ -90,7 +90,7 @@ class Exposures(ReadOnly):
     variance: Array | None = None
     noise: tuple[NoiseModel, ...] = ()
     offset: bool = False
-    findings: Findings = field(default_factory=Findings)
+    bad_pixels: BadPixels = field(default_factory=BadPixels)
     dark: Array | None = None
     dark_variance: Floats | None = None
     clipped: Clipping | None = None
@@ -208,7 +208,7 @@ class Exposures(ReadOnly):
             if variance is not None and variance.ndim == 3
             else variance,
             mask=None if mask is None else np.ascontiguousarray(mask[part]),
-            findings=Findings(),
+            bad_pixels=BadPixels(),
             dark=None if self.dark is None else self.dark[part],
             dark_variance=None if dark is None else np.ascontiguousarray(dark[part]),
             filters=None,
@@ -303,7 +303,7 @@ class Exposures(ReadOnly):
             offset=self.offset,
             variance=self.variance,
             mask=self.mask,
-            unreliable=self.findings.unreliable,
+            unreliable=self.bad_pixels.unreliable,
             workers=options.workers,
             progress=options.progress,
         )
@@ -363,7 +363,7 @@ def exposures_of(
             variance=measured.variance,
             noise=tuple(measured.models),
             offset=offset,
-            findings=measured.findings,
+            bad_pixels=measured.bad_pixels,
             dark=measured.dark,
             dark_variance=_of_dark(dark_variance, measured, offset=offset),
             clipped=measured.clipped,
@@ -425,7 +425,7 @@ def refuse_nothing(exposures: Exposures, given: Bools | None) -> None:
     if exposures.clipped is not None and left.any():
         raise InputError(f"'frames': {clipping_advice(exposures.clipped)}")
     for name, reason in _REASONS.items():
-        found = getattr(exposures.findings, name)
+        found = getattr(exposures.bad_pixels, name)
         if found is not None and 2 * np.count_nonzero(left & found) > np.count_nonzero(left):
             raise InputError(f"'frames' leave no usable pixel: nearly each {reason}")
 

@@ -55,7 +55,7 @@ def standard_deviations(
 ) -> tuple[ErrorBars | None, DarkStd | None]:
     """Standard deviations of sensitivity, tilt and shifts if `wanted`, and of a fitted dark.
 
-    That of a dark which was fitted together with fluxes is always given: a verdict needs it. All
+    That of a dark which was fitted together with fluxes is always given: a finding needs it. All
     are questions of one call, which sets up the linear problem once.
     """
     exposures, fit = weighted.exposures, weighted.fit

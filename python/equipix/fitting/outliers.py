@@ -225,7 +225,7 @@ def without_fallen_dust(
 ) -> tuple[Exposures, Fit]:
     """Leave out, where dust fell, the values before it did, and fit again.
 
-    Under the grain the sensitivity is then that of the later exposures. The pixels are findings.
+    Under the grain the sensitivity is then that of the later exposures. The pixels are bad_pixels.
 
     Notes
     -----
@@ -244,8 +244,8 @@ def without_fallen_dust(
             break
         moment = np.where(found, first, moment)
         before = np.arange(len(exposures))[:, None, None] < moment
-        findings = dataclasses.replace(exposures.findings, contradictory=moment > 0)
-        exposures = dataclasses.replace(exposures.without(before), findings=findings)
+        bad_pixels = dataclasses.replace(exposures.bad_pixels, contradictory=moment > 0)
+        exposures = dataclasses.replace(exposures.without(before), bad_pixels=bad_pixels)
         fit = exposures.fit(options, fit)
         if edges:
             break

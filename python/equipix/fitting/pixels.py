@@ -61,14 +61,14 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
 
 
 def _without(weighted: Weighted, dead: Bools, hot: Bools, options: Options) -> Weighted:
-    """Fit again without dead and hot pixels, which are findings then."""
+    """Fit again without dead and hot pixels, which are bad_pixels then."""
     exposures = weighted.exposures
-    findings = dataclasses.replace(
-        exposures.findings,
-        dead=union(exposures.findings.dead, dead),
-        hot=union(exposures.findings.hot, hot),
+    bad_pixels = dataclasses.replace(
+        exposures.bad_pixels,
+        dead=union(exposures.bad_pixels.dead, dead),
+        hot=union(exposures.bad_pixels.hot, hot),
     )
-    exposures = dataclasses.replace(exposures.without(dead | hot), findings=findings)
+    exposures = dataclasses.replace(exposures.without(dead | hot), bad_pixels=bad_pixels)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
@@ -147,8 +147,8 @@ def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
     faint = _faint(with_dark) & ~_faint(without) & (weighted.fit.flags == 0)
     if not faint.any():
         return weighted
-    findings = dataclasses.replace(exposures.findings, faint=faint)
-    exposures = dataclasses.replace(exposures, findings=findings)
+    bad_pixels = dataclasses.replace(exposures.bad_pixels, faint=faint)
+    exposures = dataclasses.replace(exposures, bad_pixels=bad_pixels)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options, weighted.fit))
 
 
@@ -174,7 +174,7 @@ def pixel_flags(weighted: Weighted, options: FitOptions) -> Array:
     dead, hot = odd_pixels(weighted, options)
     set_bits(flags, "dead", dead)
     set_bits(flags, "hot", hot)
-    for finding, pixels in vars(exposures.findings).items():
+    for finding, pixels in vars(exposures.bad_pixels).items():
         set_bits(flags, finding, pixels)
     return flags
 

@@ -197,9 +197,9 @@ def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
     """
     before, after = given.sum(axis=0), kept.usable().sum(axis=0)
     contradictory = (before > 2 * after) | ((before > after) & (after < _FEWEST))
-    found = union(kept.findings.contradictory, contradictory)
-    findings = dataclasses.replace(kept.findings, contradictory=found)
-    return dataclasses.replace(kept, findings=findings)
+    found = union(kept.bad_pixels.contradictory, contradictory)
+    bad_pixels = dataclasses.replace(kept.bad_pixels, contradictory=found)
+    return dataclasses.replace(kept, bad_pixels=bad_pixels)
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:

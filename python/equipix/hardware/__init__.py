@@ -1,17 +1,8 @@
 """Corrections in a camera's electronics: tables of words, their quality, the adaptive loop."""
 
-from equipix.hardware.loop import Adaptive
-from equipix.hardware.quality import Quality, Widths, quality, smallest_widths
-from equipix.hardware.table import Table, read
-from equipix.hardware.words import Format
+from equipix.hardware.loop import AdaptiveLoop
+from equipix.hardware.quality import quality, smallest_widths
+from equipix.hardware.table import Table
 
-__all__ = [
-    "Adaptive",
-    "Format",
-    "Quality",
-    "Table",
-    "Widths",
-    "quality",
-    "read",
-    "smallest_widths",
-]
+__all__ = ["AdaptiveLoop", "Table", "quality", "smallest_widths"]
+__dir__ = __all__.copy

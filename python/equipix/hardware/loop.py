@@ -16,7 +16,7 @@ _FINEST = 12
 """The finest step is 2^-12."""
 
 
-class Adaptive:
+class AdaptiveLoop:
     """Gains and offsets that follow the scene, in memories of whole numbers.
 
     Parameters
@@ -50,7 +50,7 @@ class Adaptive:
     --------
     >>> import numpy as np
     >>> from equipix import hardware
-    >>> loop = hardware.Adaptive((8, 8), adc_bits=12, step=0.25)
+    >>> loop = hardware.AdaptiveLoop((8, 8), adc_bits=12, step=0.25)
     >>> pattern = 2000 + 100 * np.random.default_rng(1).standard_normal((8, 8))
     >>> before, *_, after = loop.update(np.rint([pattern] * 100).astype(np.uint16))
     >>> bool(after.std() < 0.1 * before.std())
@@ -138,7 +138,7 @@ class Adaptive:
         )
         return out
 
-    def result(self) -> Table:
+    def correction(self) -> Table:
         """Return the memories as a table, without a coarse offset.
 
         Returns
@@ -166,7 +166,7 @@ class Adaptive:
             base=0,
         )
         blank = np.zeros(self._gain.shape, np.uint16)
-        metadata = {"equipix": __version__, "correction": "Adaptive", "step": 2.0**-self._step}
+        metadata = {"equipix": __version__, "correction": "adaptive loop", "step": 2.0**-self._step}
         return Table(
             made, blank, self._offset.copy(), self._gain.copy(), blank.astype(np.uint32), metadata
         )

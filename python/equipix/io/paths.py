@@ -44,12 +44,12 @@ def find_files(
     names = [source] if isinstance(source, str | bytes | os.PathLike) else source
     found = [path for name in names for path in _matches(name, folder)]
     if not found:
-        raise InputError("'source' names no file")
+        raise InputError("'frames' names no file")
     return found
 
 
 def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
-    pattern = str(as_path("source", name))
+    pattern = str(as_path("frames", name))
     path = folder / pattern
     if path.is_dir():
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")

@@ -32,7 +32,7 @@ from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
 
 
 def average(
-    source: ArrayLike | Iterable[ArrayLike] | str | PathLike[str] | Iterable[str | PathLike[str]],
+    frames: ArrayLike | Iterable[ArrayLike] | str | PathLike[str] | Iterable[str | PathLike[str]],
     *,
     dark: FrameStatistics | ArrayLike | None = None,
     saturation: float | None = None,
@@ -45,7 +45,7 @@ def average(
 
     Parameters
     ----------
-    source : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
+    frames : array of shape (n, rows, cols), iterable of (rows, cols), path, glob, list of paths
         The frames, in DN. Of files, every page counts: grey TIFF, PNG, PGM and BMP, all of one
         shape and depth; the file of a saved average gives that average. An iterable is taken one
         frame at a time and never collected, and files are read in small batches, so memory does not
@@ -115,15 +115,15 @@ def average(
     workers = positive_workers(workers)
     level, rejection = as_level(saturation), None if reject is None else Rejection(reject)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
-    frames = _paths_or_frames(source)
+    taken = _paths_or_frames(frames)
     out = None if mask is None else as_array("mask", mask, ndim=2)
     with naming_memory("averaging"):
-        if isinstance(frames, list):
-            statistics = _average_files(frames, level, out, workers, progress, rejection)
+        if isinstance(taken, list):
+            statistics = _average_files(taken, level, out, workers, progress, rejection)
         else:
-            given = batches(frames)
+            given = batches(taken)
             statistics = _average_batches(
-                given, level, out, workers, progress, _length(source), rejection
+                given, level, out, workers, progress, _length(frames), rejection
             )
         if reject is not None:
             statistics = dataclasses.replace(statistics, reject=float(reject))
@@ -140,12 +140,12 @@ def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
         items = iter(source)
     except TypeError as error:
         raise InputError(
-            f"'source' is a {type(source).__name__}, expected frames or the names of files"
+            f"'frames' is a {type(source).__name__}, expected frames or the names of files"
         ) from error
     for first in items:
         everything = itertools.chain([first], items)
         return list(everything) if isinstance(first, str | os.PathLike) else everything
-    raise InputError("'source' holds no frames")
+    raise InputError("'frames' holds no frames")
 
 
 def _length(source: Any) -> int:

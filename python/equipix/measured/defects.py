@@ -51,7 +51,7 @@ _AROUND = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Findings(ReadOnly):
+class BadPixels(ReadOnly):
     """Bad pixels found before the last fit: maps (rows, cols) of bool, or None.
 
     Attributes

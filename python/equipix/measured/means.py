@@ -15,7 +15,7 @@ from equipix._check import EXPOSURES, Array, Bools, Floats, Words
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
 from equipix.measured.defects import (
-    Findings,
+    BadPixels,
     blind_pixels,
     dead_pixels,
     hot_pixels,
@@ -284,7 +284,7 @@ class Averaged:
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
-    def findings(self, noise: NoiseModel | None) -> Findings:
+    def bad_pixels(self, noise: NoiseModel | None) -> BadPixels:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
@@ -299,7 +299,7 @@ class Averaged:
         dead = None
         if noise is not None or self.dark is not None:
             dead = self._dead(noise) & ~hot
-        return Findings(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
+        return BadPixels(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
     def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
         saturates = frames.saturated > 0

@@ -22,7 +22,7 @@ from equipix._check import (
 )
 from equipix.errors import InputError
 from equipix.measured.colour import Colours
-from equipix.measured.defects import Findings
+from equipix.measured.defects import BadPixels
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
 from equipix.measured.saturation import Clipping, _largest, _saturated, clipping, highest, plateau
@@ -36,7 +36,7 @@ class Measured(NamedTuple):
     mask: Bools | None
     variance: Array | None
     models: Sequence[NoiseModel]
-    findings: Findings
+    bad_pixels: BadPixels
     dark: Array | None = None
     dark_variance: Floats | None = None
     clipped: Clipping | None = None
@@ -93,14 +93,14 @@ def _of_averaged(
     if variance is not None and not models:
         variances = as_variances(cast("ArrayLike", variance), averaged.values)
     model = noise if isinstance(noise, NoiseModel) else None
-    findings = averaged.findings(model)
+    bad_pixels = averaged.bad_pixels(model)
     dark = averaged.dark
     return Measured(
         averaged.values,
-        union(findings.dead, findings.hot, findings.noisy),
+        union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy),
         variances,
         models,
-        findings,
+        bad_pixels,
         None if dark is None else dark.mean.astype(averaged.values.dtype),
         None if model is None else averaged.dark_variance(model),
         averaged.clipped,
@@ -131,13 +131,13 @@ def _of_arrays(
     level = _largest(frames) if saturation is None else as_level(saturation)
     if level is None:
         clipped = highest(clipping(each) or plateau(each) for each in values)
-        return Measured(values, None, variances, models, Findings(), clipped=clipped)
+        return Measured(values, None, variances, models, BadPixels(), clipped=clipped)
     saturated = _saturated(values, level, words)
     clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
     if saturation is None and not saturated.any():
-        return Measured(values, None, variances, models, Findings(), clipped=clipped)
-    findings = Findings(saturated=np.any(saturated, axis=0))
-    return Measured(values, saturated, variances, models, findings, clipped=clipped)
+        return Measured(values, None, variances, models, BadPixels(), clipped=clipped)
+    bad_pixels = BadPixels(saturated=np.any(saturated, axis=0))
+    return Measured(values, saturated, variances, models, bad_pixels, clipped=clipped)
 
 
 def _averaged(frames: object, words: Words, colours: Colours | None) -> Averaged | None:

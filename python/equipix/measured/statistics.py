@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, ReadOnly, check_maps
-from equipix.errors import BrightDarkWarning, FileError, InputError, warn
+from equipix.errors import FileError, InputError, InputWarning, warn
 from equipix.io.formats import load_pages, refuse_saved, save_pages, saved_kind
 from equipix.io.record import check_format, check_pages
 from equipix.measured.noise import scatter_limit, step_of
@@ -267,7 +267,7 @@ def _subtract(
         if isinstance(dark, FrameStatistics) and same_statistics(statistics.dark, dark):
             return statistics
         raise InputError(
-            "'source' is an average from which another dark than 'dark' is subtracted already: "
+            "'frames' is an average from which another dark than 'dark' is subtracted already: "
             "give the frames, or the dark that was subtracted"
         )
     if isinstance(dark, FrameStatistics):
@@ -299,7 +299,7 @@ def warn_of_bright_dark(statistics: FrameStatistics) -> None:
             f"the frames are darker than 'dark' by {below:.4g} of {level:.4g} DN in the median "
             f"(limit {DARKER:.0%}): see that frames and dark are not exchanged, and give frames "
             "from which no dark was subtracted",
-            BrightDarkWarning,
+            InputWarning,
         )
 
 

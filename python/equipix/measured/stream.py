@@ -26,7 +26,7 @@ def batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
     if isinstance(frames, np.ndarray):
         if frames.ndim != 3 or 0 in frames.shape:
             raise InputError(
-                f"'source' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
+                f"'frames' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
             )
         size = _batch_size(frames[0])
         yield from (frames[start : start + size] for start in range(0, len(frames), size))
@@ -74,7 +74,7 @@ def sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
     """
     dtype = frames.dtype
     if dtype.kind not in "buif":
-        raise InputError(f"'source' has dtype {dtype}, expected real numbers")
+        raise InputError(f"'frames' has dtype {dtype}, expected real numbers")
     masked = isinstance(frames, np.ma.MaskedArray) and dtype.kind != "f"
     return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
 
@@ -187,7 +187,7 @@ class Rejection:
         first = list(itertools.islice(frames, _START))
         if len(first) < _START:
             raise InputError(
-                f"'source' holds {len(first)} frames, expected {_START} or more to reject samples"
+                f"'frames' holds {len(first)}, expected {_START} or more to reject samples"
             )
         whole = first[0].dtype.kind in "bui"
         start = np.stack([_floats(frame) for frame in first])
@@ -223,7 +223,7 @@ class Rejection:
         share = np.count_nonzero(outside) / np.count_nonzero(known)
         if share > _MOST:
             raise InputError(
-                f"'source': {share:.0%} of frame {index} deviate by more than {self._sigmas:g} "
+                f"'frames': {share:.0%} of frame {index} deviate by more than {self._sigmas:g} "
                 f"standard deviations from those before, expected at most {_MOST:.0%}: is it "
                 "another scene? Leave out 'reject', or the frame"
             )

@@ -1,22 +1,28 @@
 """Quality of frames and sensors: noise by its kinds, non-uniformity, linearity."""
 
-from equipix.metrics.correctability import Correctability, correctability, validity_interval
-from equipix.metrics.emva import EmvaSpatial, EmvaTransfer, Split, emva_spatial, emva_transfer
-from equipix.metrics.frame_noise import ThreeDNoise, three_d_noise
-from equipix.metrics.maps import netd, planes, roughness
+from equipix.metrics.correctability import correctability, validity_interval
+from equipix.metrics.emva import emva_spatial, emva_transfer
+from equipix.metrics.frame_noise import three_d_noise
+from equipix.metrics.maps import (
+    block_means,
+    netd,
+    non_uniformity,
+    planes,
+    relative_error,
+    roughness,
+)
 
 __all__ = [
-    "Correctability",
-    "EmvaSpatial",
-    "EmvaTransfer",
-    "Split",
-    "ThreeDNoise",
+    "block_means",
     "correctability",
     "emva_spatial",
     "emva_transfer",
     "netd",
+    "non_uniformity",
     "planes",
+    "relative_error",
     "roughness",
     "three_d_noise",
     "validity_interval",
 ]
+__dir__ = __all__.copy

@@ -69,7 +69,7 @@ def correctability(
 
     Warns
     -----
-    DriftWarning
+    MisfitWarning
         If frame means scatter by more than five times the noise of a pixel: they are then hardly
         frames of one level.
 

@@ -51,8 +51,8 @@ class EmvaSpatial:
 
 @naming_memory("EMVA 1288 non-uniformity")
 def emva_spatial(
+    frames: ArrayLike | FrameStatistics,
     dark: ArrayLike | FrameStatistics,
-    bright: ArrayLike | FrameStatistics,
     *,
     gain_dn_per_e: float | None = None,
     highpass: bool = True,
@@ -61,8 +61,8 @@ def emva_spatial(
 
     Parameters
     ----------
-    dark, bright : array_like of shape (n, rows, cols), or FrameStatistics
-        Raw frames without light, and at half of saturation; release 4.0 wants 100 or more of each.
+    frames, dark : array_like of shape (n, rows, cols), or FrameStatistics
+        Raw frames at half of saturation, and without light; release 4.0 wants 100 or more of each.
     gain_dn_per_e : float, optional
         Gain K of the camera, in DN per electron: see `emva_transfer`.
     highpass : bool
@@ -114,20 +114,20 @@ def emva_spatial(
     >>> rng = np.random.default_rng(1)
     >>> sensor = 1000 * (1 + 0.01 * rng.standard_normal((60, 80)))
     >>> dark = 50 + rng.standard_normal((32, 60, 80))
-    >>> found = metrics.emva_spatial(dark, dark + sensor, highpass=False)
+    >>> found = metrics.emva_spatial(dark + sensor, dark, highpass=False)
     >>> round(found.prnu.total, 3)
     0.01
     """
-    off, on = moments("dark", dark), moments("bright", bright)
+    off, on = moments("dark", dark), moments("frames", frames)
     if off.mean.shape != on.mean.shape or min(off.mean.shape) < 2:
         raise InputError(
-            f"'bright' has frames of {on.mean.shape}, 'dark' of {off.mean.shape}: expected one "
+            f"'frames' are of {on.mean.shape}, 'dark' of {off.mean.shape}: expected one "
             "shape of two or more rows and columns"
         )
     signal = float(on.mean.mean() - off.mean.mean())
     if not signal > 0:
         raise InputError(
-            f"'bright' has the mean {on.mean.mean():.6g} DN, 'dark' {off.mean.mean():.6g}: "
+            f"'frames' have the mean {on.mean.mean():.6g} DN, 'dark' {off.mean.mean():.6g}: "
             "expected more light"
         )
     if gain_dn_per_e is not None and not number("gain_dn_per_e", gain_dn_per_e) > 0:
@@ -227,16 +227,16 @@ class EmvaTransfer:
 
 @naming_memory("photon transfer")
 def emva_transfer(
+    frames: Sequence[ArrayLike | FrameStatistics],
     dark: Sequence[ArrayLike | FrameStatistics],
-    bright: Sequence[ArrayLike | FrameStatistics],
     light: ArrayLike,
 ) -> EmvaTransfer:
     r"""Photon-transfer gain, read noise, responsivity and linearity error.
 
     Parameters
     ----------
-    dark, bright : sequence of arrays of shape (n, rows, cols), or of FrameStatistics
-        Raw frames without light and with it, two or more at each exposure; as many darks as levels,
+    frames, dark : sequence of arrays of shape (n, rows, cols), or of FrameStatistics
+        Raw frames with light and without it, two or more at each exposure; as many darks as levels,
         or one for all.
     light : array_like, shape (levels,)
         Light of each level: photons per pixel, or in any unit.
@@ -250,7 +250,7 @@ def emva_transfer(
     ------
     InputError
         If the numbers of levels do not fit, values are not finite, too few levels lie below
-        saturation, `dark` is brighter than `bright`, or their light does not differ, or the signal
+        saturation, `dark` is brighter than `frames`, or their light does not differ, or the signal
         falls by more than 5 % where the light rises.
 
     Warns
@@ -270,18 +270,18 @@ def emva_transfer(
     .. [1] European Machine Vision Association, "EMVA Standard 1288", release 4.0 linear, 2021.
     """
     levels = as_array("light", light, ndim=1).astype(np.float64)
-    for name, given in (("dark", dark), ("bright", bright)):
+    for name, given in (("frames", frames), ("dark", dark)):
         check_type(name, given, _SEQUENCES, "a list of frames or averages, one a level")
-    if len(bright) != len(levels) or len(dark) not in (1, len(levels)):
+    if len(frames) != len(levels) or len(dark) not in (1, len(levels)):
         raise InputError(
-            f"'bright' has {len(bright)} levels, 'dark' {len(dark)} and 'light' {len(levels)} "
+            f"'frames' has {len(frames)} levels, 'dark' {len(dark)} and 'light' {len(levels)} "
             "values: expected as many of each, or one 'dark' for all"
         )
     if not (np.isfinite(levels).all() and (levels >= 0).all()):
         wrong = levels[~(np.isfinite(levels) & (levels >= 0))][0]
         raise InputError(f"'light' holds {wrong:g}, expected finite numbers not below 0")
     off = np.array([_mean_and_variance("dark", each) for each in dark])
-    on = np.array([_mean_and_variance("bright", each) for each in bright])
+    on = np.array([_mean_and_variance("frames", each) for each in frames])
     signal, variance = (on - off).T
     _refuse_dark(off[:, 0], on[:, 0])
     largest = int(np.argmax(on[:, 1]))
@@ -290,7 +290,7 @@ def emva_transfer(
     linear = (signal >= _LINEAR[0] * saturation) & (signal <= _LINEAR[1] * saturation)
     if np.count_nonzero(linear) < 3 or not (signal[below] > 0).any():
         raise InputError(
-            f"'bright': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
+            f"'frames': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
             f"{saturation:.6g} DN, expected three or more"
         )
     if not np.ptp(levels[linear]) > 0:
@@ -304,7 +304,7 @@ def emva_transfer(
     gain = _slope(signal[below], variance[below])
     responsivity = _slope(levels[below], signal[below])
     if not gain > 0:
-        raise InputError(f"'bright': the noise does not rise with the signal, the gain is {gain:g}")
+        raise InputError(f"'frames': the noise does not rise with the signal, the gain is {gain:g}")
     read = float(off[:, 1].mean()) - 1 / 12
     return EmvaTransfer(
         gain,
@@ -325,7 +325,7 @@ def _refuse_dark(dark: Floats, bright: Floats) -> None:
     """Refuse levels of which none is brighter than its dark: the two are exchanged."""
     if not np.any(bright > dark):
         raise InputError(
-            f"'bright' has means up to {bright.max():.6g} DN, 'dark' from {dark.min():.6g} DN: no "
+            f"'frames' has means up to {bright.max():.6g} DN, 'dark' from {dark.min():.6g} DN: no "
             "level is brighter than its dark, expected light: see that they are not exchanged"
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Floats, as_array, naming_memory
-from equipix.errors import DriftWarning, EquipixWarning, InputError, warn
+from equipix.errors import EquipixWarning, InputError, MisfitWarning, warn
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
 _SIGMAS = 6.0
@@ -138,7 +138,7 @@ def warn_of_drift(found: Temporal) -> None:
             f"the means of 'frames' scatter by {found.drift:.3g} DN, the noise of a pixel is "
             f"{noise:.3g} DN: frames of one steady level are expected. Give those of one level, or "
             "let the source settle; its gains make each pixel scatter with the light",
-            DriftWarning,
+            MisfitWarning,
         )
 
 

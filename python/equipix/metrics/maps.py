@@ -51,7 +51,7 @@ def relative_error(
     Examples
     --------
     >>> from equipix import simulate
-    >>> simulate.relative_error([[2.0, 2.0]], [[3.0, 3.0]])
+    >>> metrics.relative_error([[2.0, 2.0]], [[3.0, 3.0]])
     array([[0., 0.]])
     """
     measured = as_array("sensitivity", sensitivity, ndim=2)
@@ -166,14 +166,14 @@ def tilt(sensitivity: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
 
 
 @naming_memory("NETD")
-def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
+def netd(cold: ArrayLike, hot: ArrayLike, delta_k: float) -> Floats:
     """Noise-equivalent temperature difference of each pixel.
 
     Parameters
     ----------
     cold, hot : array_like, shape (n, rows, cols)
         Frames of an even black body at two temperatures, two or more of each.
-    delta_t : float
+    delta_k : float
         Difference of the temperatures, in kelvin.
 
     Returns
@@ -187,7 +187,7 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     Raises
     ------
     InputError
-        If the shapes do not fit, or `delta_t` is not above 0.
+        If the shapes do not fit, or `delta_k` is not above 0.
 
     Notes
     -----
@@ -202,11 +202,11 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     >>> from equipix import metrics
     >>> noise = np.random.default_rng(1).standard_normal((2, 50, 40, 40))
     >>> cold, hot = noise + np.array([1000, 1200])[:, None, None, None]
-    >>> print(f"{np.median(metrics.netd(cold, hot, delta_t=5.0)):.3f}")
+    >>> print(f"{np.median(metrics.netd(cold, hot, delta_k=5.0)):.3f}")
     0.025
     """
-    if not number("delta_t", delta_t) > 0:
-        raise InputError(f"'delta_t' is {delta_t!r}, expected a difference above 0 kelvin")
+    if not number("delta_k", delta_k) > 0:
+        raise InputError(f"'delta_k' is {delta_k!r}, expected a difference above 0 kelvin")
     low, high = stack_of("cold", cold), stack_of("hot", hot)
     if low.shape[1:] != high.shape[1:]:
         raise InputError(f"'hot' has shape {high.shape}, expected frames of {low.shape[1:]}")
@@ -217,7 +217,7 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_t: float) -> Floats:
     freedom = round(4 / (1 / (len(low) - 1) + 1 / (len(high) - 1)))
     variance = (first.variance + second.variance) / 2 / scatter_limit(freedom + 1, sigmas=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(delta_t * np.sqrt(variance) / rise)
+        return np.asarray(delta_k * np.sqrt(variance) / rise)
 
 
 @naming_memory("roughness")
@@ -346,7 +346,7 @@ def non_uniformity(frames: ArrayLike, span: float) -> float:
     Examples
     --------
     >>> from equipix import bolometer
-    >>> bolometer.non_uniformity([[[1.0, 3.0]], [[4.0, 8.0]]], 100.0)
+    >>> metrics.non_uniformity([[[1.0, 3.0]], [[4.0, 8.0]]], 100.0)
     0.015
     """
     values = as_array("frames", frames, ndim=3).astype(np.float64)

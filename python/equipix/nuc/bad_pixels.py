@@ -252,7 +252,7 @@ def find_defects(
     MisfitWarning
         If the curves of most pixels are of another order, or the noise was not as stated; if the
         slopes show a pattern of colour filters that nobody has named.
-    DriftWarning
+    MisfitWarning
         If frame means scatter by more than five times the noise of a pixel: they are then hardly
         frames of one level.
 

@@ -16,7 +16,7 @@ from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel, median_of_noise
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import horner_inverse, least_slope
-from equipix.nuc.level_rules import inverse_verdict, warn_of_misfit
+from equipix.nuc.level_rules import inverse_finding, warn_of_misfit
 from equipix.nuc.levels import Levels, alike_pixels, levels_of
 from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
 from equipix.nuc.response import Response, common_misfit
@@ -83,15 +83,15 @@ def fit(
 
     Warns
     -----
-    SaturationWarning
+    InputWarning
         If many values are exactly the highest one, and no saturation level was given for it; or
         averages show less than half the noise of a darker level, as a full well has it.
-    BrightDarkWarning
+    InputWarning
         If the median of a level less the dark is below 0 by more than the noise of a value.
     MisfitWarning
         If the noise is known, and half of the pixels have a reduced χ² above twice that of noise:
         the order, if it is not 0, is too low, or the source was not steady.
-    InverseWarning
+    MisfitWarning
         If the cubic of orders 2 and 3 differs from the exact inverse by more than 0.3 of the noise
         of a frame at the lowest level, which adds 4 % to it, in more than 0.1 % of the usable
         pixels.
@@ -238,7 +238,7 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     flags = _flags(maps["deviation"], levels, maps.pop("rising"))
     error = maps["inverse_error"][usable(flags)]
-    metadata["inverse"] = inverse_verdict(error, levels.frame_noise)
+    metadata["inverse"] = inverse_finding(error, levels.frame_noise)
     return Response(
         **maps,
         flags=flags,
@@ -292,10 +292,10 @@ def _with_dark(variances: Floats, levels: Levels, by: By) -> Floats:
 def _flags(deviation: Floats, levels: Levels, rising: Array) -> Array:
     """Bits of `equipix.Flag` of each pixel."""
     flags = np.zeros(levels.usable.shape, np.uint32)
-    findings, undetermined = levels.findings, np.isnan(deviation[0])
-    for finding, pixels in vars(findings).items():
+    bad_pixels, undetermined = levels.bad_pixels, np.isnan(deviation[0])
+    for finding, pixels in vars(bad_pixels).items():
         set_bits(flags, finding, pixels)
     set_bits(flags, "undetermined", undetermined)
     falling = ~rising & ~undetermined
-    set_bits(flags, "falling", falling if findings.dead is None else falling & ~findings.dead)
+    set_bits(flags, "falling", falling if bad_pixels.dead is None else falling & ~bad_pixels.dead)
     return flags

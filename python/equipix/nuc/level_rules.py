@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import Array, Bools
-from equipix.errors import InputError, InverseWarning, MisfitWarning, SaturationWarning, warn
+from equipix.errors import InputError, InputWarning, MisfitWarning, warn
 from equipix.findings import usable
 from equipix.measured.defects import SIGMAS
 from equipix.measured.means import Averaged
@@ -60,7 +60,7 @@ def check_saturation(
         return
     where = [level for level, share in enumerate(shares) if share > 0] if found.level == top else []
     named = f"{_named(shares, where)} of 'levels': " if where else ""
-    warn(named + clipping_advice(found, "levels.toml", "nuc.fit"), SaturationWarning)
+    warn(named + clipping_advice(found, "levels.toml", "nuc.fit"), InputWarning)
 
 
 def _at_highest(measured: Measured) -> tuple[float, list[float]]:
@@ -172,7 +172,7 @@ def warn_of_full_wells(averaged: Averaged, mask: Bools | None) -> None:
     if full:
         first = min(full, key=lambda each: each.mean)
         darker = max(_noisier(first, scatters), key=lambda each: each.variance)
-        warn(_words(full, first, darker) + _advice(averaged, used, full), SaturationWarning)
+        warn(_words(full, first, darker) + _advice(averaged, used, full), InputWarning)
 
 
 def _noisier(bright: _Scatter, scatters: list[_Scatter]) -> list[_Scatter]:
@@ -322,7 +322,7 @@ _MOST_BEYOND = 1e-3
 """Largest share of the usable pixels that may differ by more, without a warning."""
 
 
-def inverse_verdict(difference: Array, noise: float | None) -> dict[str, float | int | None]:
+def inverse_finding(difference: Array, noise: float | None) -> dict[str, float | int | None]:
     """Compare the error of the cubic with the noise of a frame, and warn where it is large.
 
     Parameters
@@ -345,6 +345,6 @@ def inverse_verdict(difference: Array, noise: float | None) -> dict[str, float |
             f"DN, and in {beyond} of {difference.size} pixels by more than {_LARGEST_DIFFERENCE:g} "
             f"of the noise of a frame, {noise:.2g} DN: correct(exact=True), or fit a lower order "
             "or a smaller range of levels",
-            InverseWarning,
+            MisfitWarning,
         )
     return {"largest_error_dn": largest, "noise_dn": noise, "pixels_beyond": beyond}

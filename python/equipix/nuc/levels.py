@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import Array, Bools, Floats, ReadOnly, Words, as_mask, union
-from equipix.errors import BrightDarkWarning, DriftWarning, InputError, MisfitWarning, warn
+from equipix.errors import InputError, InputWarning, MisfitWarning, warn
 from equipix.measured.colour import Colours
-from equipix.measured.defects import SIGMAS, Findings, response_outliers
+from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
 from equipix.measured.filters import Filters
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, check_levels, check_variance, measured_of
@@ -60,7 +60,7 @@ class Levels(ReadOnly):
         These pixels.
     noise : tuple of LevelNoise, or None
         Noise of the mean frames, without that of the dark; None if it is unknown.
-    findings : Findings
+    bad_pixels : BadPixels
         Bad pixels.
     dark, dark_variance : ndarray, shape (rows, cols), or None
         The dark frame that was subtracted, and the variance of its mean.
@@ -79,7 +79,7 @@ class Levels(ReadOnly):
     references: Floats
     usable: Bools
     noise: tuple[LevelNoise, ...] | None
-    findings: Findings
+    bad_pixels: BadPixels
     dark: Array | None = None
     dark_variance: Floats | None = None
     raw: bool = False
@@ -105,7 +105,7 @@ class Levels(ReadOnly):
             values=values,
             usable=usable,
             references=_references(values, usable),
-            findings=Findings(dead=chosen(self.findings.dead)),
+            bad_pixels=BadPixels(dead=chosen(self.bad_pixels.dead)),
             dark=chosen(self.dark),
             dark_variance=chosen(self.dark_variance),
             filters=None,
@@ -198,12 +198,12 @@ def levels_of(
     check_saturation(measured, averaged, given)
     pedestal = 0.0 if averaged is None else averaged.pedestal
     if measured.unsteady:
-        warn(measured.unsteady, DriftWarning)
+        warn(measured.unsteady, MisfitWarning)
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
     filters = _filters(values, colours if averaged is None else averaged.colours)
-    findings = _with_odd_responses(values, noise, measured.findings, filters)
-    usable = _usable(values, findings, given)
+    bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
+    usable = _usable(values, bad_pixels, given)
     if measured.dark is not None:
         _warn_of_bright_dark(values, usable, noise, measured.dark_variance)
     references = _references(values, usable)
@@ -212,7 +212,7 @@ def levels_of(
         references=references,
         usable=usable,
         noise=noise,
-        findings=findings,
+        bad_pixels=bad_pixels,
         dark=measured.dark,
         dark_variance=measured.dark_variance,
         raw=measured.raw,
@@ -316,26 +316,26 @@ def _used(measured: Measured, mask: Bools | None) -> Array:
 def _with_odd_responses(
     values: Array,
     noise: tuple[LevelNoise, ...] | None,
-    findings: Findings,
+    bad_pixels: BadPixels,
     filters: Filters | None,
-) -> Findings:
+) -> BadPixels:
     """Add pixels that rise by less than half, or more than twice, as much as their neighbours."""
     if len(values) < 2 or not np.isfinite(values).any(axis=(1, 2)).all():
-        return findings
+        return bad_pixels
     means = [float(np.nanmedian(each)) for each in values]
     low, high = int(np.argmin(means)), int(np.argmax(means))
     rise = means[high] - means[low]
     variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
     # A rise within the noise is refused later, with the number of levels that differ.
     if rise <= SIGMAS * np.sqrt(variance) or (not noise and rise <= _scatter(values, low, high)):
-        return findings
+        return bad_pixels
     # Of a colour of less response the noise is that of the array, which is the larger one.
     usual = rise if filters is None else rise * filters.map_of(values.shape[1:])
     response = (values[high] - values[low]) / usual
     std = np.broadcast_to(np.sqrt(variance) / usual, response.shape)
     dead, hot = response_outliers(response, lambda: std)
     return dataclasses.replace(
-        findings, dead=union(findings.dead, dead), hot=union(findings.hot, hot)
+        bad_pixels, dead=union(bad_pixels.dead, dead), hot=union(bad_pixels.hot, hot)
     )
 
 
@@ -353,10 +353,10 @@ def _spread(count: int) -> Array:
     return np.linspace(0, count - 1, min(count, _SAMPLED)).astype(np.intp)
 
 
-def _usable(values: Array, findings: Findings, mask: Bools | None) -> Bools:
+def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     """Good pixels with a value at every level; refused where they are few."""
     known = np.isfinite(values)
-    bad = union(findings.dead, findings.hot, findings.noisy)
+    bad = union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy)
     usable = np.asarray(known.all(axis=0))
     if bad is not None:
         usable &= ~bad
@@ -404,7 +404,7 @@ def _warn_of_bright_dark(
         warn(
             f"the dark is brighter than a level of 'levels': the median less the dark is "
             f"{' and '.join(below)}. Give the dark frames of these levels, or none",
-            BrightDarkWarning,
+            InputWarning,
         )
 
 

@@ -1,19 +1,9 @@
 """Planning of an experiment: which pixels shifts compare, and which errors remain."""
 
-from equipix.plan.budget import ErrorBudget, error_budget
-from equipix.plan.components import Identifiability, identify
+from equipix.plan.budget import error_budget
+from equipix.plan.components import identify
 from equipix.plan.drift import advise_order, tilt_std
-from equipix.plan.pattern_errors import Spectrum
-from equipix.plan.search import Suggestion, suggest
+from equipix.plan.search import suggest
 
-__all__ = [
-    "ErrorBudget",
-    "Identifiability",
-    "Spectrum",
-    "Suggestion",
-    "advise_order",
-    "error_budget",
-    "identify",
-    "suggest",
-    "tilt_std",
-]
+__all__ = ["advise_order", "error_budget", "identify", "suggest", "tilt_std"]
+__dir__ = __all__.copy

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import Floats, as_shifts, check_shape, number, per_exposure
-from equipix.errors import DriftWarning, IdentifiabilityWarning, InputError, warn
+from equipix.errors import IdentifiabilityWarning, InputError, MisfitWarning, warn
 from equipix.exposures.positions import whole_moves
 from equipix.plan.components import identify, is_connected
 from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
@@ -27,7 +27,7 @@ _WHOLE = 0.02
 """Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
 
 _UNDETERMINED = 1e-4
-"""λ of a wave that shifts between pixels do not determine, as in a calibration's verdict."""
+"""λ of a wave that shifts between pixels do not determine, as in a calibration's finding."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,7 +156,7 @@ def error_budget(
 
     Warns
     -----
-    DriftWarning
+    MisfitWarning
         If the tilt that drift leaves exceeds the error from noise.
     IdentifiabilityWarning
         If the shifts leave parts of the sensor uncompared, or, between pixels, do not constrain a
@@ -291,5 +291,5 @@ def warn_of_drift(causes: dict[str, float], place: str = "") -> None:
             f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
             "residual: measure the flux, turn one exposure, or use larger shifts "
             "(equipix.plan.suggest)",
-            DriftWarning,
+            MisfitWarning,
         )

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
 from equipix._check import as_mask, as_shifts, check_shape, naming_memory
-from equipix.errors import InputError, ShiftRoundingWarning, warn
+from equipix.errors import InputError, InputWarning, warn
 from equipix.exposures.positions import as_rotation, round_shifts, whole_moves
 from equipix.measured.colour import Colours
 
@@ -93,7 +93,7 @@ def identify(
 
     Warns
     -----
-    ShiftRoundingWarning
+    InputWarning
         If a shift differs from the first one by no whole number of pixels.
 
     Notes
@@ -123,7 +123,7 @@ def identify(
         first = np.round(exact[0], 3).tolist()
         warn(
             f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels",
-            ShiftRoundingWarning,
+            InputWarning,
         )
     masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
     turns = as_rotation(rotation, len(whole))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import Floats, Progress, as_array, check_progress, check_shape, positive_count
-from equipix.errors import DriftWarning, InputError
+from equipix.errors import InputError, MisfitWarning
 from equipix.measured.colour import Colours
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
 from equipix.plan.components import is_connected
@@ -124,7 +124,7 @@ def suggest(
 
     Warns
     -----
-    DriftWarning
+    MisfitWarning
         For each pattern of which the tilt from drift exceeds the error from noise.
 
     Notes
@@ -184,7 +184,7 @@ def suggest(
         )
     suggestions = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DriftWarning)
+        warnings.simplefilter("ignore", MisfitWarning)
         finalists = found[: max(wanted, _FINALISTS)]
         for done, points in enumerate(finalists, start=1):
             shifts = points - points.min(axis=0)

@@ -1,23 +1,6 @@
 """Correction of non-uniformity from the scene, frame by frame, without a source."""
 
-from equipix.scene.methods import (
-    METHODS,
-    ConstantStatistics,
-    Gated,
-    Kalman,
-    LocalMean,
-    Registered,
-    load,
-)
-from equipix.scene.scene_correction import SceneCorrection
+from equipix.scene.methods import ConstantStatistics, Gated, Kalman, LocalMean, Registered
 
-__all__ = [
-    "METHODS",
-    "ConstantStatistics",
-    "Gated",
-    "Kalman",
-    "LocalMean",
-    "Registered",
-    "SceneCorrection",
-    "load",
-]
+__all__ = ["ConstantStatistics", "Gated", "Kalman", "LocalMean", "Registered"]
+__dir__ = __all__.copy

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from equipix._check import Array, as_array, as_level, check_shape, number, positive_workers
 from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
-from equipix.errors import FileError, InputError, UnusedInputWarning, warn
+from equipix.errors import FileError, InputError, InputWarning, warn
 from equipix.findings import set_bits
 from equipix.io.formats import load_pages, save_pages
 from equipix.io.record import check_format
@@ -222,7 +222,7 @@ class SceneCorrection:
                 f"counted: {self._UNLEARNED}"
             )
 
-    def result(self) -> Polynomial:
+    def correction(self) -> Polynomial:
         """Correction by the coefficients so far.
 
         Returns
@@ -239,7 +239,7 @@ class SceneCorrection:
 
         Warns
         -----
-        UnusedInputWarning
+        InputWarning
             If less than a tenth of the usable frames counted.
         """
         self.check_learned()
@@ -273,7 +273,7 @@ class SceneCorrection:
             warn(
                 f"{self.frames} of {self.frames_taken} frames counted: the scene moved hardly, or "
                 "its contrast is too low for its motion to be seen beside the pattern",
-                UnusedInputWarning,
+                InputWarning,
             )
 
     def _warn_of_still(self) -> None:
@@ -284,7 +284,7 @@ class SceneCorrection:
                 f"in {still:.0%} of the field (limit {_STILL:.0%}) nothing moves from frame to "
                 "frame: a scene that stands still there, or frames that do not follow one another, "
                 "became part of the pattern; take a scene that moves over the whole field",
-                UnusedInputWarning,
+                InputWarning,
             )
 
     def _warn_of_range(self) -> None:
@@ -296,7 +296,7 @@ class SceneCorrection:
                 f"the largest value is {self._peak:g} DN, less than {_USED:.0%} of the range "
                 f"({low:g}, {high:g}): thresholds are shares of it. Give data_range=(0, "
                 f"{2**bits - 1}), on the command line --bit-depth {bits}",
-                UnusedInputWarning,
+                InputWarning,
             )
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
@@ -410,7 +410,7 @@ def _warn_of_spread(gain: Array) -> None:
             f"the gains spread by {np.std(gain):.2g} (limit {_SPREAD:g}), from {gain.min():.2g} to "
             f"{gain.max():.2g}: the scene does not determine them; take a scene of more contrast, "
             "or less noise",
-            UnusedInputWarning,
+            InputWarning,
         )
 
 

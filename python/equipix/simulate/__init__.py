@@ -1,9 +1,7 @@
 """Virtual sensors, beams and cameras: experiments whose truth is known."""
 
-from equipix.metrics.maps import block_means, relative_error
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.beams import (
-    Beam,
     cosine_sensitivity,
     exposures,
     filtered,
@@ -13,20 +11,18 @@ from equipix.simulate.beams import (
     tilted_beam,
     wavy_beam,
 )
+from equipix.simulate.bolometers import BolometerArray
 from equipix.simulate.camera import Camera
-from equipix.simulate.moving import Frame, MovingScene
-from equipix.simulate.rig import Truth, VirtualExperiment, experiment
+from equipix.simulate.moving import MovingScene
+from equipix.simulate.rig import VirtualExperiment, experiment
 from equipix.simulate.staring import StaringArray
 
 __all__ = [
-    "Beam",
+    "BolometerArray",
     "Camera",
-    "Frame",
     "MovingScene",
     "StaringArray",
-    "Truth",
     "VirtualExperiment",
-    "block_means",
     "cosine_sensitivity",
     "experiment",
     "exposures",
@@ -34,8 +30,8 @@ __all__ = [
     "gaussian_beam",
     "noise_prediction",
     "paper_sensitivity",
-    "relative_error",
     "striped_beam",
     "tilted_beam",
     "wavy_beam",
 ]
+__dir__ = __all__.copy

@@ -107,8 +107,8 @@ class BolometerArray:
 
     Examples
     --------
-    >>> from equipix import bolometer
-    >>> array = bolometer.BolometerArray.of((24, 32), rng=1)
+    >>> from equipix import simulate
+    >>> array = simulate.BolometerArray.of((24, 32), rng=1)
     >>> shutter = array.mean(20.0)
     >>> warm = array.mean(20.0, scene_c=30.0)
     >>> print(f"{(warm - shutter).mean() / array.dn_per_v * 1e6:.0f} µV")

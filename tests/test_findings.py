@@ -1,4 +1,4 @@
-"""Verdicts: the limit of each at both sides, and what follows from one."""
+"""Findings: the limit of each at both sides, and what follows from one."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.diagnosis import rules as verdicts
+from equipix.diagnosis import rules as findings
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import ConvergenceWarning, MisfitWarning
 from equipix.exposures.fit import FitOptions
 from equipix.fitting.weighted import Options, Weighted
 from equipix.fitting.windows import WindowFit
-from equipix.measured.defects import Findings
+from equipix.measured.defects import BadPixels
 
 CROSS = equipix.cross_pattern(3, 5)
 GOOD = {
@@ -28,22 +28,22 @@ GOOD = {
     "misfit": 1000.0,
     "degrees_of_freedom": 1000,
 }
-"""What verdicts read of a fit with which nothing is wrong."""
+"""What findings read of a fit with which nothing is wrong."""
 
 
-def verdicts_on(*, variance=True, uncertainty=True, **found):
-    """Verdicts on a fit that differs from a good one in what is given."""
-    exposures = SimpleNamespace(variance=np.ones(5) if variance else None, findings=Findings())
+def findings_on(*, variance=True, uncertainty=True, **found):
+    """Findings on a fit that differs from a good one in what is given."""
+    exposures = SimpleNamespace(variance=np.ones(5) if variance else None, bad_pixels=BadPixels())
     weighted = Weighted(exposures, SimpleNamespace(**GOOD | found), None)
     options = Options(FitOptions(), uncertainty=uncertainty)
-    return verdicts.on_fit(weighted, options, OrientationTest(), None, None)
+    return findings.on_fit(weighted, options, OrientationTest(), None, None)
 
 
 def kinds(**found):
-    return [verdict.kind for verdict in verdicts_on(**found)]
+    return [finding.kind for finding in findings_on(**found)]
 
 
-def test_a_good_fit_has_no_verdict():
+def test_a_good_fit_has_no_finding():
     assert kinds() == []
 
 
@@ -68,9 +68,9 @@ def test_messages_contain_the_value_and_the_limit():
         ({"smallest_ritz": 2e-5}, "2.0e-05", "limit 0.0001"),
         ({"error_estimate": np.array([0.3])}, "3.0e-01", "limit 0.1"),
     ):
-        (verdict,) = verdicts_on(**found)
-        assert value in verdict.message
-        assert limit in verdict.message
+        (finding,) = findings_on(**found)
+        assert value in finding.message
+        assert limit in finding.message
 
 
 def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit():
@@ -97,7 +97,7 @@ def test_a_fit_too_far_from_its_minimum_has_no_standard_deviations():
         cal = equipix.calibrate(
             frames, shifts, variance=np.full(5, 1e-6), max_sweeps=1, uncertainty=True
         )
-    assert "uncertainty" in [verdict.kind for verdict in cal.verdicts]
+    assert "uncertainty" in [finding.kind for finding in cal.findings]
     assert cal.error_estimate > 0.1
     assert cal.sensitivity_std is cal.tilt_std is cal.shift_std is None
 
@@ -110,7 +110,7 @@ def test_five_standard_errors_and_three_per_cent_are_the_limit_of_chi_square():
     limit = max(0.03, 5 * np.sqrt(2 / freedom))
     for chi2 in (1 + 0.99 * limit, 1 - 0.99 * limit):
         variance = np.full(5, plain.reduced_chi2 * 1e-6 / chi2)
-        assert equipix.calibrate(frames, CROSS, variance=variance).verdicts == ()
+        assert equipix.calibrate(frames, CROSS, variance=variance).findings == ()
     for chi2 in (1 + 1.01 * limit, 1 - 1.01 * limit):
         variance = np.full(5, plain.reduced_chi2 * 1e-6 / chi2)
         with pytest.warns(MisfitWarning, match="times as large as the variances predict"):

@@ -1,4 +1,4 @@
-"""Verdicts over many right models and wrong ones; `docs/verdicts.py` makes and counts them."""
+"""Findings over many right models and wrong ones; `docs/findings.py` makes and counts them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import re
 
 import numpy as np
 import pytest
-import verdicts as study
+import wrong_models as study
 
 CAUSES = ("sign", "drift", "prior", "repeated", "unit", "misfit")
-"""Verdicts that name a cause, each false in at most one of a hundred right models."""
+"""Findings that name a cause, each false in at most one of a hundred right models."""
 
 
 def most(count):
@@ -19,23 +19,23 @@ def most(count):
 
 def test_variances_over_a_million_between_pixels_are_no_misfit():
     # The penalty determines cells that only noisy pixels see: counted whole, χ² is 1.13.
-    found = study.verdicts(*study.uneven_variances(np.random.default_rng([1, 2])))
+    found = study.findings(*study.uneven_variances(np.random.default_rng([1, 2])))
     assert "misfit" not in {each.kind for each in found}
 
 
 def test_structure_finer_than_a_spline_is_no_curved_response():
     # Residuals of 15 times the noise were named a response that is 15 % off a line.
-    found = study.verdicts(*study.WRONG["fine speckle"][0](np.random.default_rng([2, 4036])))
+    found = study.findings(*study.WRONG["fine speckle"][0](np.random.default_rng([2, 4036])))
     assert "finer than" in study.first_cause(found)
 
 
 @pytest.mark.study
-def test_right_models_have_no_verdict(draws, figure):
+def test_right_models_have_no_finding(draws, figure):
     seeds = draws(2000)
     told = {}
     for seed in seeds:
         model = study.RIGHT[seed % len(study.RIGHT)]
-        found = study.verdicts(*model(np.random.default_rng([1, study.FRESH + seed])))
+        found = study.findings(*model(np.random.default_rng([1, study.FRESH + seed])))
         told[seed] = {each.kind for each in found or ()}
     for kind in CAUSES:
         false = [seed for seed in seeds if kind in told[seed]]
@@ -49,7 +49,7 @@ def test_the_first_cause_is_the_true_one(name, draws, figure):
     model, pattern = study.WRONG[name]
     seeds = draws(20)
     first = [
-        study.first_cause(study.verdicts(*model(np.random.default_rng([2, study.FRESH + seed]))))
+        study.first_cause(study.findings(*model(np.random.default_rng([2, study.FRESH + seed]))))
         for seed in seeds
     ]
     named = [cause is not None and bool(re.search(pattern, cause)) for cause in first]

@@ -1,9 +1,9 @@
-"""Verdicts over right and wrong models: how many are false, and which cause each names first.
+"""Findings over right and wrong models: how many are false, and which cause each names first.
 
-Prints how often a verdict falls on right models of each kind, and for each wrong model how often it
+Prints how often a finding falls on right models of each kind, and for each wrong model how often it
 is noticed and how often its true cause is the first that is named.
 
-    python docs/verdicts.py [RIGHT [WRONG]]
+    python docs/findings.py [RIGHT [WRONG]]
 
 RIGHT is the number of right models in all (2000), WRONG that of each wrong model (20).
 """
@@ -35,7 +35,7 @@ CAUSES = (
     "orientation",
     "tilt",
 )
-"""Kinds of verdicts that name a cause."""
+"""Kinds of findings that name a cause."""
 
 
 def speckle(rng, period):
@@ -388,29 +388,29 @@ WRONG = {
 """Each wrong model, and what names its cause."""
 
 
-def verdicts(frames, shifts, options):
-    """Verdicts of one calibration; None where it is refused."""
+def findings(frames, shifts, options):
+    """Findings of one calibration; None where it is refused."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", EquipixWarning)
         try:
-            return equipix.calibrate(frames, shifts, tolerance=1e-4, **options).verdicts
+            return equipix.calibrate(frames, shifts, tolerance=1e-4, **options).findings
         except equipix.errors.InputError:
             return None
 
 
 def first_cause(found):
-    """The first verdict that names a cause; None without any."""
+    """The first finding that names a cause; None without any."""
     return next((each.message for each in found if each.kind in CAUSES), None)
 
 
 def right_models(count):
-    """Print the verdicts on right models of each kind."""
+    """Print the findings on right models of each kind."""
     total = Counter()
     for k, model in enumerate(RIGHT):
         seeds = range(FRESH + k, FRESH + count, len(RIGHT))
         told = Counter()
         for seed in seeds:
-            found = verdicts(*model(np.random.default_rng([1, seed])))
+            found = findings(*model(np.random.default_rng([1, seed])))
             told.update({each.kind for each in found} if found is not None else ["refused"])
         total += told
         print(f"{model.__name__:17} {len(seeds):5}  {dict(told)}", flush=True)
@@ -424,7 +424,7 @@ def wrong_models(count):
     for name, (model, pattern) in WRONG.items():
         noticed, right, told = 0, 0, Counter()
         for seed in range(FRESH, FRESH + count):
-            found = verdicts(*model(np.random.default_rng([2, seed])))
+            found = findings(*model(np.random.default_rng([2, seed])))
             first = "refused" if found is None else first_cause(found)
             noticed += first is not None
             right += first is not None and re.search(pattern, first) is not None
