@@ -103,6 +103,18 @@ def test_a_flip_that_leaves_less_than_half_a_percent_is_named():
     assert any("exposure 2 (from 0) fits better upside down" in each.message for each in found)
 
 
+def test_a_noisy_exposure_is_not_flipped_where_variances_are_too_large():
+    """Chi-square is 0.29 as given, and 0.30 to 0.31 with the exposure flipped."""
+    rng = np.random.default_rng(0)
+    truth = 1 + 0.01 * rng.standard_normal((60, 80))
+    beam = simulate.wavy_beam((60, 80), contrast=0.002, rng=1)
+    values = simulate.exposures(truth, beam, SHIFTS)
+    std = 0.01 * np.array([1, 1, 5, 1, 1])[:, None, None]
+    values += std * rng.standard_normal(values.shape)
+    with pytest.warns(errors.MisfitWarning, match="the variances are too large"):
+        equipix.calibrate(values, SHIFTS, variance=np.full(5, 2e-3))
+
+
 @pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
 def test_some_exposures_that_are_flipped_are_a_misfit(bench, axis):
     frames = [np.flip(each, axis) if k in (1, 3) else each for k, each in enumerate(bench.frames)]

@@ -9,7 +9,7 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.calibration import verdicts
+from equipix.calibration import misplaced, verdicts
 from equipix.calibration.options import Options
 from equipix.calibration.orientation import OrientationTest
 from equipix.calibration.weights import Weighted
@@ -142,3 +142,21 @@ def test_nothing_is_concluded_from_a_misfit_of_half_a_per_cent():
     low = window_fit(1e-8, 10**4, rng=rng)
     assert window_fit(1e-8 + 1.01 * 0.005**2, 10**4, rng=rng).is_far_above(low)
     assert not window_fit(1e-8 + 0.99 * 0.005**2, 10**4, rng=rng).is_far_above(low)
+
+
+@pytest.mark.parametrize("freedom", [1000, 10**6])
+def test_an_order_explains_only_what_is_above_known_noise(freedom):
+    rng = np.random.default_rng(3)
+    limit = 6 * np.sqrt(2 / freedom)
+
+    def explains(best, given):
+        best, given = (window_fit(left, freedom, rng=rng) for left in (best, given))
+        return misplaced._explains(best, given, knows_noise=True)
+
+    # Where the variances are too large, 0.25 is further below 1 than a tenth of 0.18 is.
+    assert not explains(0.25, 0.18)
+    assert not explains(0.18, 0.25)
+    assert not explains(0.9, 1 + 0.999 * limit)
+    assert explains(1, 1 + 1.001 * limit)
+    assert not explains(1.11, 2)
+    assert explains(1.09, 2)

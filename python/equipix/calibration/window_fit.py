@@ -156,6 +156,11 @@ class WindowFit:
         """Whether neighbouring residuals are uncorrelated."""
         return max(abs(each.z) for each in self.neighbours) < _WHITE
 
+    @property
+    def is_within_noise(self) -> bool:
+        """Whether variances that are known explain F. A NaN counts as explained."""
+        return not self.left > 1 + _SIGMAS * (2 / max(self.freedom, 1)) ** 0.5
+
     def is_far_above(self, low: WindowFit) -> bool:
         """Whether its F is above that of another fit by more than noise and small errors explain.
 
