@@ -13,6 +13,7 @@ from equipix.diagnosis import rules as findings
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import ConvergenceWarning, MisfitWarning
 from equipix.exposures.fit import FitOptions
+from equipix.fitting import windows
 from equipix.fitting.weighted import Options, Weighted
 from equipix.fitting.windows import WindowFit
 from equipix.measured.defects import BadPixels
@@ -141,3 +142,21 @@ def test_nothing_is_concluded_from_a_misfit_of_half_a_per_cent():
     low = window_fit(1e-8, 10**4, rng=rng)
     assert window_fit(1e-8 + 1.01 * 0.005**2, 10**4, rng=rng).is_far_above(low)
     assert not window_fit(1e-8 + 0.99 * 0.005**2, 10**4, rng=rng).is_far_above(low)
+
+
+@pytest.mark.parametrize("freedom", [1000, 10**6])
+def test_an_order_explains_only_what_is_above_known_noise(freedom):
+    rng = np.random.default_rng(3)
+    limit = 6 * np.sqrt(2 / freedom)
+
+    def explains(best, given):
+        best, given = (window_fit(left, freedom, rng=rng) for left in (best, given))
+        return windows._explains(best, given, knows_noise=True)
+
+    # Where the variances are too large, 0.25 is further below 1 than a tenth of 0.18 is.
+    assert not explains(0.25, 0.18)
+    assert not explains(0.18, 0.25)
+    assert not explains(0.9, 1 + 0.999 * limit)
+    assert explains(1, 1 + 1.001 * limit)
+    assert not explains(1.11, 2)
+    assert explains(1.09, 2)

@@ -44,7 +44,7 @@ def bench():
     return Bench()
 
 
-def bad_pixels(frames, dark):
+def findings_of(frames, dark):
     """Kinds and messages of the findings."""
     if not isinstance(dark, equipix.FrameStatistics) and dark.ndim == 3:
         dark = equipix.average(dark)
@@ -56,7 +56,7 @@ def bad_pixels(frames, dark):
 
 
 def test_without_a_mistake_there_is_no_finding(bench):
-    assert bad_pixels(bench.frames, bench.dark) == {}
+    assert findings_of(bench.frames, bench.dark) == {}
 
 
 @pytest.mark.parametrize(("axis", "words"), [(1, "upside down"), (2, "mirrored left to right")])
@@ -64,7 +64,7 @@ def test_one_exposure_that_is_flipped_is_named(bench, axis, words):
     """Its dark was not flipped with it."""
     frames = list(bench.frames)
     frames[2] = np.flip(frames[2], axis)
-    found = bad_pixels(frames, bench.dark)["misfit"]
+    found = findings_of(frames, bench.dark)["misfit"]
     assert f"exposure 2 (from 0) fits better {words}" in found
 
 
@@ -102,32 +102,44 @@ def test_a_flip_that_leaves_less_than_half_a_percent_is_named():
     assert any("exposure 2 (from 0) fits better upside down" in each.message for each in found)
 
 
+def test_a_noisy_exposure_is_not_flipped_where_variances_are_too_large():
+    """Chi-square is 0.29 as given, and 0.30 to 0.31 with the exposure flipped."""
+    rng = np.random.default_rng(0)
+    truth = 1 + 0.01 * rng.standard_normal((60, 80))
+    beam = simulate.wavy_beam((60, 80), contrast=0.002, rng=1)
+    values = simulate.exposures(truth, beam, SHIFTS)
+    std = 0.01 * np.array([1, 1, 5, 1, 1])[:, None, None]
+    values += std * rng.standard_normal(values.shape)
+    with pytest.warns(errors.MisfitWarning, match="the variances are too large"):
+        equipix.calibrate(values, SHIFTS, variance=np.full(5, 2e-3))
+
+
 @pytest.mark.parametrize("axis", [1, 2], ids=["up-down", "left-right"])
 def test_some_exposures_that_are_flipped_are_a_misfit(bench, axis):
     frames = [np.flip(each, axis) if k in (1, 3) else each for k, each in enumerate(bench.frames)]
-    assert "misfit" in bad_pixels(frames, bench.dark)
+    assert "misfit" in findings_of(frames, bench.dark)
 
 
 @pytest.mark.parametrize(("axis", "name"), [(1, "rows"), (2, "columns")])
 def test_exposures_that_are_all_flipped_contradict_the_sign(bench, axis, name):
     """A flipped sensor moves the other way."""
     flipped = [np.flip(each, axis) for each in bench.frames]
-    found = bad_pixels(flipped, np.flip(bench.dark, axis))
+    found = findings_of(flipped, np.flip(bench.dark, axis))
     assert f"reverse the sign of the shifts along {name}" in found["sign"]
 
 
 def test_a_flipped_dark_is_named(bench):
-    found = bad_pixels(bench.frames, np.flip(bench.dark, 2))
+    found = findings_of(bench.frames, np.flip(bench.dark, 2))
     assert "pattern of the dark" in found["misfit"]
     assert "is not flipped" in found["misfit"]
 
 
 def test_a_dark_subtracted_twice_is_named(bench):
     """Averages keep its pattern; of an array only the offset of all values is left."""
-    found = bad_pixels(bench.frames, 2 * bench.dark)
+    found = findings_of(bench.frames, 2 * bench.dark)
     assert "pattern of the dark" in found["misfit"]
     assert "once" in found["misfit"]
-    assert "offset of" in bad_pixels(bench.frames, 2 * bench.dark.mean(axis=0))["misfit"]
+    assert "offset of" in findings_of(bench.frames, 2 * bench.dark.mean(axis=0))["misfit"]
 
 
 def test_a_dark_subtracted_by_half_is_named_where_it_is_large():
@@ -136,24 +148,24 @@ def test_a_dark_subtracted_by_half_is_named_where_it_is_large():
     bench.offset += 600
     dark = bench.take(np.zeros(SHAPE)).mean(axis=0)
     frames = [bench.take(signal) for signal in bench.signals]
-    assert "offset of" in bad_pixels(frames, dark / 2)["misfit"]
+    assert "offset of" in findings_of(frames, dark / 2)["misfit"]
 
 
 @pytest.mark.parametrize("share", [1.0, 1.2])
 def test_a_dark_as_bright_as_the_light_is_refused(bench, share):
     dark = bench.take(share * bench.signals[0])
     with pytest.raises(errors.InputError, match="is there light, and is the right dark"):
-        bad_pixels(bench.frames, dark)
+        findings_of(bench.frames, dark)
 
 
 def test_frames_and_dark_that_are_exchanged_are_refused(bench):
     with pytest.raises(errors.InputError, match=r"is the (right dark|dark that of these frames)"):
-        bad_pixels([bench.take(0 * bench.signals[0]) for _ in SHIFTS], bench.frames[0])
+        findings_of([bench.take(0 * bench.signals[0]) for _ in SHIFTS], bench.frames[0])
 
 
 def test_a_dark_that_holds_a_tenth_of_the_light_is_a_drift(bench):
     """The light of an unmoved beam is missing in all exposures; a hundredth shows nowhere."""
-    assert [*bad_pixels(bench.frames, bench.take(0.1 * bench.signals[0]))] == ["drift"]
+    assert [*findings_of(bench.frames, bench.take(0.1 * bench.signals[0]))] == ["drift"]
 
 
 def test_positions_in_the_place_of_frames_are_refused(bench):
@@ -167,7 +179,7 @@ def test_two_positions_in_one_average_are_a_misfit(bench, place, mixed):
     """As a pattern of names that takes files of several positions."""
     frames = list(bench.frames)
     frames[place] = np.concatenate([frames[k] for k in mixed])
-    assert "misfit" in bad_pixels(frames, bench.dark)
+    assert "misfit" in findings_of(frames, bench.dark)
 
 
 def arrays(bench):

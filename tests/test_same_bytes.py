@@ -15,6 +15,7 @@ import equipix
 import same_bytes
 
 PACKAGES = Path(equipix.__file__).parents[1]
+TOOLS = Path(same_bytes.__file__).parent
 CASES = ("whole float32", "robust with", "coordinate descent, too few")
 
 ALTERED = """
@@ -29,10 +30,17 @@ def calibrate(frames, shifts, **options):
     return dataclasses.replace(found, sensitivity=sensitivity)
 """
 
+RENAMED = """
+measure_move = globals().get("measure_shift") or __getattr__("measure_shift")
+globals().pop("measure_shift", None)
+del _HOMES["measure_shift"]
+"""
+
 
 @pytest.fixture(scope="module")
 def outcome():
-    return same_bytes.run(same_bytes.Build(Path(sys.executable), PACKAGES), CASES)
+    build = same_bytes.Build(Path(sys.executable), PACKAGES, TOOLS / "byte_cases.py")
+    return same_bytes.run(build, CASES)
 
 
 def differences(old, new):
@@ -47,8 +55,9 @@ def altered(outcome, case, **fields):
 
 
 def checkout(folder, addition=""):
-    """A folder with a copy of the installed package, whose first module ends with `addition`."""
+    """Copies of the installed package, whose first module ends with `addition`, and of tools."""
     shutil.copytree(PACKAGES / "equipix", folder / "python/equipix")
+    shutil.copytree(TOOLS, folder / "tools")
     with (folder / "python/equipix/__init__.py").open("a") as file:
         file.write(addition)
     return str(folder)
@@ -64,7 +73,7 @@ def test_a_build_gives_the_same_bytes_as_itself(outcome, tmp_path, capsys):
 
 def test_a_build_that_alters_one_value_is_found(tmp_path, capsys):
     folders = [checkout(tmp_path / "old"), checkout(tmp_path / "new", ALTERED)]
-    command = ["--with-builds", *folders, "--only", "whole float32", "average"]
+    command = ["--with-builds", *folders, "--only", "whole float32", "noise and shifts"]
     assert same_bytes.main(command) == 1
     shown = capsys.readouterr().out
     assert "2 cases: 1 same, 1 differ" in shown
@@ -73,6 +82,44 @@ def test_a_build_that_alters_one_value_is_found(tmp_path, capsys):
     assert "1 of 2240 values" in line
     assert 2**-24 <= float(line.split("relative ")[1].split(",")[0]) <= 2 * 2**-23
     assert same_bytes.main([*command, "--allow", "sensitivity"]) == 0
+
+
+def test_each_build_runs_the_cases_of_its_own_checkout(tmp_path, capsys):
+    """The name of a function differs, the results do not."""
+    old, new = checkout(tmp_path / "old"), checkout(tmp_path / "new", RENAMED)
+    command = ["--with-builds", old, new, "--only", "noise and shifts"]
+    assert same_bytes.main(command) == 1
+    assert "has no attribute 'measure_shift'" in capsys.readouterr().out
+    cases = tmp_path / "new/tools/byte_cases.py"
+    text = cases.read_text().replace("equipix.measure_shift", "equipix.measure_move")
+    cases.write_text(text)
+    assert same_bytes.main(command) == 0
+    assert "1 cases: 1 same, 0 differ" in capsys.readouterr().out
+    cases.write_text(text.replace('"plans": plans', '"more noise and shifts": noise_and_shifts'))
+    assert same_bytes.main(command) == 1
+    shown = capsys.readouterr().out
+    assert "2 cases: 1 same, 1 differ" in shown
+    assert "case: only in the new" in shown
+    assert same_bytes.main([*command, "--allow", "case"]) == 0
+
+
+def test_a_case_that_one_build_lacks_is_a_difference(outcome):
+    case = "whole float32"
+    notes = {name: each for name, each in outcome.notes.items() if name != case}
+    fewer = same_bytes.Outcome(outcome.arrays, notes, outcome.numpy)
+    assert differences(outcome, fewer) == {case: {"case": "only in the old"}}
+    assert differences(fewer, outcome) == {case: {"case": "only in the new"}}
+
+
+def test_results_become_arrays_by_the_names_of_their_parts(monkeypatch):
+    monkeypatch.setitem(same_bytes.FIELDS, "Given", "first:renamed second none")
+    given = type("Given", (), {"renamed": 1.5, "second": {"a": 1, "b": [2]}, "none": None})()
+    found = same_bytes.collected({"": given, "more": [given, np.arange(3)]})
+    wanted = {"first": 1.5, "second 0": 1, "second 1": [2]}
+    within = {f"more 0 {name}": value for name, value in wanted.items()} | {"more 1": [0, 1, 2]}
+    assert {name: array.tolist() for name, array in found.items()} == wanted | within
+    with pytest.raises(TypeError):
+        same_bytes.collected({"unknown": object()})
 
 
 @pytest.mark.parametrize("field", same_bytes.COMPARED)
@@ -139,6 +186,13 @@ def test_standard_deviations_count_with_strict_alone():
 def test_a_folder_without_a_package_is_refused(tmp_path, capsys):
     assert same_bytes.main(["--with-builds", str(tmp_path), str(tmp_path)]) == 2
     assert "expected a folder that holds python/equipix" in capsys.readouterr().err
+
+
+def test_a_folder_without_cases_is_refused(tmp_path, capsys):
+    own = checkout(tmp_path)
+    (tmp_path / "tools/byte_cases.py").unlink()
+    assert same_bytes.main(["--with-builds", own, own]) == 2
+    assert "expected a folder that holds tools/byte_cases.py" in capsys.readouterr().err
 
 
 def test_an_unknown_commit_is_refused_before_anything_is_built(capsys):

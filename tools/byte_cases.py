@@ -2,7 +2,9 @@
 
 The interpreter of one build runs it: ``python byte_cases.py FOLDER [WORD ...]`` writes the results
 of the cases whose names hold one of the words, or of all, to ``FOLDER/results.npz`` and
-``FOLDER/notes.json``. Only public names are used, so the script runs against any commit.
+``FOLDER/notes.json``. Only public names are used. Each build runs the script of its own checkout:
+where a public name changes, its use here changes, but no name of a case or of a field.
+Uniform sources, scenes, corrections and their files are in `byte_corrections.py`.
 """
 
 from __future__ import annotations
@@ -10,15 +12,19 @@ from __future__ import annotations
 import json
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import equipix
+from byte_corrections import CASES as CORRECTIONS
+from byte_corrections import SHAPE, mask, reread
 from byte_scenes import (
     BETWEEN,
     BY_TURNS,
+    CROSS,
     IN_PARTS,
     NOISE,
     REVERSED,
@@ -34,7 +40,9 @@ from byte_scenes import (
     with_odd_pixels,
     written_experiment,
 )
-from same_bytes import COMPARED, REPORTED
+from equipix import detector, metrics, plan, simulate
+from equipix.plan.drift import tilt_std
+from same_bytes import COMPARED, REPORTED, collected, parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -95,6 +103,130 @@ def saved() -> Any:
 def descent(**options: Any) -> dict[str, Any]:
     """Options of the paper's method."""
     return {"method": "coordinate-descent", "tolerance": 1e-4} | options
+
+
+def calibration_files() -> Any:
+    """Calibrations, as read from files, and how far they agree."""
+    spline = Scene(shape=(48, 64), shifts=BETWEEN, contrast=0.1)
+    colours = np.where(np.indices(spline.shape).sum(axis=0) % 2 == 1, 1.0, 0.5)
+    found = {
+        "refined": spline.fit(shift_std=0.02, flux_std=1e-3, uncertainty=True),
+        "averages": Scene(shape=(48, 64)).fit(statistics(Scene(shape=(48, 64)))),
+        "colours": spline.fit(spline.frames * colours, cfa="RGGB"),
+    }
+    pair = equipix.compare([*found.values()][:2], predicted=[(2e-3, 3e-4)] * 2)
+    read = {name: reread(each) for name, each in found.items()}
+    return found | {"files": read, "pair": pair, "difference": pair.difference(0)}
+
+
+def noise_and_shifts() -> Any:
+    """Variances of a noise model, and the shift of a spot."""
+    model, signal = equipix.NoiseModel(read_noise=0.4, gain=0.2, step=1.0), np.linspace(0, 50, 101)
+    mean, (rows, cols) = model.of_mean(8, dark_variance=0.01), np.indices((48, 64))
+    places = ((20.0, 30.0), (20.3, 34.8))
+    spots = [100 + 900 * np.exp(-((rows - v) ** 2 + (cols - h) ** 2) / 18) for v, h in places]
+    return {
+        "variance": [each.variance(signal) for each in (model, mean)],
+        "scatter": [each.scatter(signal) for each in (model, mean)],
+        "rounding": [each.rounding(signal) for each in (model, mean)],
+        "shift": equipix.measure_shift(*spots),
+        "cross": equipix.cross_pattern(5, 7),
+    }
+
+
+def plans() -> Any:
+    """Plans of experiments."""
+    causes = {"drift": 1e-4, "shift_error": 0.02, "beam_width": 60.0}
+    known: dict[str, Any] = {"shift_std": 0.01, "beam_slope": (0.01, 0.02)}
+    return {
+        "whole": plan.error_budget(SHAPE, CROSS, noise=1e-3, **causes),
+        "between": plan.error_budget(SHAPE, BETWEEN, noise=1e-3, flux=[1, 0.5, 1, 2, 1]),
+        "patterns": plan.suggest(SHAPE, 4, 6, noise=1e-3, patterns=2, rng=1),
+        "apart": plan.identify(SHAPE, [(0, 0), (0, 4), (6, 0)]),
+        "masked": plan.identify(SHAPE, CROSS, mask(), cfa="RGGB"),
+        "turned": plan.identify(SHAPE, CROSS, rotation=[0, 90, 0, 180, 0]),
+        "order": [plan.advise_order(CROSS), plan.distinct_trend(CROSS)],
+        "tilt": [tilt_std(CROSS, SHAPE, flux_std=1e-4), tilt_std(CROSS, SHAPE, **known)],
+    }
+
+
+def simulated_camera() -> Any:
+    """Simulated sensors, beams, cameras and experiments."""
+    shape, place = (48, 64), 1.5 * np.indices((48, 64))
+    paper = simulate.paper_sensitivity(shape, rng=1)
+    cosine = simulate.cosine_sensitivity(shape, rng=2)
+    beams = {
+        "gaussian": simulate.gaussian_beam(shape, width=90),
+        "striped": simulate.striped_beam(shape),
+        "tilted": simulate.tilted_beam(shape),
+        "wavy": simulate.wavy_beam(shape, rng=3),
+    }
+    bad: dict[str, Any] = {"dead": np.array([[3, 4]]), "hot": np.array([[7, 9]])}
+    camera = simulate.Camera(sensitivity=paper, full_well_e=15000, **bad)
+    virtual = simulate.experiment(paper, beams["gaussian"], CROSS, frames=4, rng=6)
+    light, errors = 9000 * beams["wavy"](*place), metrics.relative_error(cosine, paper)
+    return {
+        "sensitivity": [paper, cosine, simulate.filtered(paper, "RGGB")],
+        "beam": {name: beam(*place) for name, beam in beams.items()},
+        "camera": [camera, camera.frames(light, 2, rng=4), camera.variance(light)],
+        "exposures": simulate.exposures(paper, beams["wavy"], CROSS, rotation=[90] * 5),
+        "experiment": [virtual.truth, virtual.variance_of_mean(), virtual.frames(1)],
+        "predicted": [
+            virtual.noise_prediction(rng=7),
+            simulate.noise_prediction(paper, beams["tilted"], CROSS, 1e-6, mask=paper < 1, rng=8),
+        ],
+        "errors": [errors, metrics.block_means(errors)],
+        "photons": simulate.blackbody.band_photons(3.0, np.linspace(4, 5, 9), 300.0),
+        "spectrum": simulate.blackbody.photon_exitance(np.linspace(3, 12, 19), 300.0),
+        "HgCdTe": [
+            simulate.blackbody.hgcdte_cutoff(np.linspace(0.2, 0.4, 9)),
+            simulate.blackbody.hgcdte_gap(np.linspace(0.2, 0.4, 9)),
+            simulate.blackbody.hgcdte_composition(5.1),
+        ],
+    }
+
+
+def detectors() -> Any:
+    """Spreads of composition that corrections tolerate."""
+    band = detector.HgCdTe(start_um=3.0, cutoff_um=5.1, edge_mev=4.0)
+    short = detector.ShortPass(edge_um=4.8)
+    passing = detector.HgCdTe(start_um=3.0, cutoff_um=5.1, short_pass=short)
+    one: dict[str, Any] = {"references_k": (295.0,)}
+    return {
+        "two": detector.composition_tolerance(band),
+        "none": detector.composition_tolerance(band, references_k=()),
+        "one": [detector.composition_tolerance(band, by=by, **one) for by in ("offset", "gain")],
+        "filter": detector.composition_tolerance(passing, filled_k=310.0, charge_e=1e7),
+        "band": [band.composition, band.integration_factor(290.0)],
+        "photons": band.photons(band.composition + np.linspace(-1e-3, 1e-3, 9), 300.0),
+        "transmission": short.transmission(np.linspace(4.0, 6.0, 41)),
+    }
+
+
+def staring(material: str) -> Any:
+    """A simulated array of a material."""
+    array = simulate.StaringArray.of(material, SHAPE, rng=1)
+    return {
+        "": array,
+        "frames": array.frames(8e6, 2, rng=2, warmer_k=0.1, time_s=30.0),
+        "mean": array.mean(8e6, warmer_k=0.2, time_s=60.0),
+        "changed": array.with_causes(curvature=0.01, bit_depth=12).mean(8e6),
+        "electrons": array.electrons(8e6),
+        "noise": array.temporal_noise(8e6),
+        "body": array.black_body(300.0, light_e=8e6),
+    }
+
+
+def simulated_scene() -> Any:
+    """A simulated moving scene, and errors of its coefficients."""
+    moving = simulate.MovingScene(seed=3, shape=SHAPE, stop=(4, 6))
+    return {
+        "": moving,
+        "frames": moving.frames(8),
+        "texture": moving.scene([3.2, 4.7]),
+        "pattern": moving.residual_pattern(moving.gain, moving.offset, 0.5),
+        "gain error": moving.gain_error(moving.gain * 1.01),
+    }
 
 
 CASES: dict[str, Callable[[], Any]] = {
@@ -195,15 +327,23 @@ CASES: dict[str, Callable[[], Any]] = {
     ).run(),
     "experiment, linear fluxes": lambda: given_experiment().run(flux="linear"),
     "experiment, coordinate descent": lambda: measured_experiment().run(**descent(max_sweeps=100)),
+    "calibrations in files": calibration_files,
+    "noise and shifts": noise_and_shifts,
+    "plans": plans,
+    "detectors": detectors,
+    "simulated camera": simulated_camera,
+    "simulated scene": simulated_scene,
+    **{f"simulated {name}": partial(staring, name) for name in ("PtSi", "InSb", "HgCdTe")},
+    **CORRECTIONS,
 }
 
 
 def results(outcome: Any) -> Arrays:
     """The arrays of a case; what a calibration does not have is left out."""
     if isinstance(outcome, dict):
-        return outcome
-    found = {name: getattr(outcome, name, None) for name in COMPARED + REPORTED}
-    return {name: np.asarray(value) for name, value in found.items() if value is not None}
+        return collected(outcome)
+    found = dict(parts(outcome))
+    return collected({name: found[name] for name in COMPARED + REPORTED})
 
 
 def run(names: list[str]) -> tuple[Arrays, dict[str, Any]]:

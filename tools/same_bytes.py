@@ -1,9 +1,9 @@
 """Compare the results of two builds, byte by byte.
 
 ``python tools/same_bytes.py OLD NEW`` builds two commits in git worktrees of a temporary folder,
-each with maturin in a virtual environment of its own, runs the cases of `byte_cases.py` with both,
-and prints what differs and by how much. The exit status is 1 if anything does, 2 if a build cannot
-be made or run.
+each with maturin in a virtual environment of its own, and runs with each the cases of its own
+tools/byte_cases.py, so public names may differ between the two. It prints what differs and by how
+much. The exit status is 1 if anything does, 2 if a build cannot be made or run.
 """
 
 from __future__ import annotations
@@ -27,23 +27,80 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROOT = Path(__file__).parents[1]
-CASES = Path(__file__).with_name("byte_cases.py")
+CASES = Path("tools/byte_cases.py")
+"""The script of the cases within a checkout."""
+
 STDERR = 2
+SCALARS = (bool, int, float, str, np.generic)
 
 COMPARED = (
     *("sensitivity", "beam", "flags", "flux", "shifts"),
     *("beam_origin", "component_labels", "dark", "rejected", "objective", "reduced_chi2"),
     *("sweeps", "error_estimate", "converged", "shift_sign"),
 )
-"""Attributes of a calibration whose bytes must be the same."""
+"""Fields of a calibration whose bytes must be the same."""
 
 REPORTED = ("sensitivity_std", "tilt_std", "shift_std")
-"""Attributes whose differences are shown, and count with ``--strict`` only."""
+"""Fields whose differences are shown, and count with ``--strict`` only."""
+
+FIELDS = {
+    "BolometerArray": "full_scale",
+    "Calibration": "sensitivity beam beam_origin beam_coefficients beam_tilt flags shifts rotation "
+    "flux objective reduced_chi2 components component_labels sweeps converged error_estimate "
+    "history dark dark_is_fitted rejected shift_sign drift tilt sensitivity_std tilt_std shift_std "
+    "colour_response coefficients is_partial",
+    "Camera": "offset response good full_scale",
+    "Comparison": "sensitivities agreement pairs rms block_rms largest open_tilt predicted_rms "
+    "predicted_block_rms",
+    "Correctability": "ratio low high spatial_variance temporal_variance pixels frames",
+    "Defects": "flags counts gain_percentiles misfit",
+    "Drift": "size flux_std degrees_of_freedom probability slope_covariance tilt_std trend_tilt",
+    "DynamicCorrection": "offset gain level flags",
+    "EmvaSpatial": "dsnu prnu dark_mean bright_mean",
+    "EmvaTransfer": "gain_dn_per_e read_noise_e responsivity quantum_efficiency saturation_dn "
+    "linearity_error",
+    "ErrorBudget": "shifts rms rms_by_cause tilt_by_cause spectrum distinct_trend components "
+    "noise_map",
+    "Format": "adc_bits dac_bits offset_bits gain_bits out_bits adc coarse offset gain out base "
+    "zero",
+    "Frame": "values level moving",
+    "FrameStatistics": "mean variance variance_of_mean count saturated saturation raw reject step "
+    "light_variance dark",
+    "History": "sweep objective error_estimate",
+    "Identifiability": "components labels largest equations unknowns by_colour",
+    "Kalman": "gain offset frames frames_taken frames_foreign floor gain_std offset_std",
+    "LensFalloff": "centre focal_length coefficients std reach",
+    "MovingScene": "gain offset",
+    "Polynomial": "coefficients flags leaves_offset",
+    "Quality": "before after added at_ends table",
+    "Response": "deviation variances inverse inverse_error limits reduced_chi2 used flags levels "
+    "dark saturation raw coefficients freedom valid_range largest_inverse_error order "
+    "colour_response",
+    "SceneCorrection": "gain offset frames frames_taken frames_foreign floor",
+    "ShiftMeasurement": "shift std before after",
+    "Spectrum": "rows cols values worst smallest",
+    "Spot": "position std",
+    "StaringArray": "gain_dn_per_e full_scale",
+    "Suggestion": "shifts budget",
+    "Table": "format coarse offset gain flags coefficients",
+    "ThreeDNoise": "t v h tv th vh tvh total",
+    "Tolerance": "spread half_width electrons netd_k",
+    "Truth": "sensitivity shifts dead hot dark",
+    "Widths": "offset_bits gain_bits both_bits added",
+}
+"""Fields of the results of each class: the names of its attributes.
+
+Where an attribute is renamed, ``field:attribute`` keeps the name of the field.
+"""
 
 EPILOG = """\
 Fields are attributes of a calibration (sensitivity, beam, flags, flux, shifts, dark, objective,
-sweeps, ...), 'warnings' (their categories, in order), 'texts' (their messages) and 'error'. Both
-builds use one folder of compiled dependencies, a temporary one unless CARGO_TARGET_DIR names it.
+sweeps, ...), those that the cases of other results name, 'warnings' (their categories, in order),
+'texts' (their messages) and 'error'. A case that one build alone has differs in the field 'case'.
+
+Each build runs the tools/byte_cases.py of its own checkout. Where a public name has changed, the
+scripts differ, and the names of cases and fields in them must not. Both builds use one folder of
+compiled dependencies, a temporary one unless CARGO_TARGET_DIR names it.
 
 examples:
   python tools/same_bytes.py main HEAD
@@ -58,10 +115,11 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class Build:
-    """An interpreter, and the folder that it imports equipix from."""
+    """An interpreter, the folder that it imports equipix from, and the script that it runs."""
 
     python: Path
     packages: Path
+    cases: Path
 
     @classmethod
     def at(cls, folder: Path) -> Build:
@@ -69,8 +127,11 @@ class Build:
         packages = folder.absolute() / "python"
         if not list(packages.glob("equipix/_native*")):
             raise BuildError(f"{folder}: expected a folder that holds python/equipix")
+        cases = folder.absolute() / CASES
+        if not cases.exists():
+            raise BuildError(f"{folder}: expected a folder that holds {CASES}, the cases to run")
         own = folder.absolute() / ".venv/bin/python"
-        return cls(own if own.exists() else Path(sys.executable), packages)
+        return cls(own if own.exists() else Path(sys.executable), packages, cases)
 
 
 @dataclass(frozen=True)
@@ -89,6 +150,31 @@ class Outcome:
         return self.arrays.get(case, {}) | {name: np.array(word) for name, word in words.items()}
 
 
+def collected(value: Any, name: str = "") -> dict[str, NDArray[Any]]:
+    """The numbers of results as arrays; a field is named by the parts that lead to it."""
+    if value is None:
+        return {}
+    flat = value if isinstance(value, list | tuple) else (value,)
+    if all(isinstance(each, SCALARS) for each in flat) or isinstance(value, np.ndarray):
+        return {name: np.asarray(value)}
+    found: dict[str, NDArray[Any]] = {}
+    for key, part in parts(value):
+        found |= collected(part, f"{name} {key}".strip())
+    return found
+
+
+def parts(value: Any) -> Iterator[tuple[object, Any]]:
+    """The parts of a result by their names, those of a list by their numbers."""
+    for kind in type(value).__mro__:
+        if kind.__name__ in FIELDS:
+            for word in FIELDS[kind.__name__].split():
+                field, _, attribute = word.partition(":")
+                part = getattr(value, attribute or field)
+                yield field, list(part.values()) if isinstance(part, dict) else part
+            return
+    yield from value.items() if isinstance(value, dict) else enumerate(value)
+
+
 def call(*command: str | Path, folder: Path, **variables: str) -> None:
     """Run a command; its output goes to stderr."""
     environment = os.environ | variables
@@ -102,7 +188,8 @@ def run(build: Build, words: Sequence[str] = ()) -> Outcome:
     """Run with a build, in a folder of its own, the cases whose names hold one of the words."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        call(build.python, CASES, folder, *words, folder=folder, PYTHONPATH=str(build.packages))
+        command: tuple[str | Path, ...] = (build.python, build.cases, folder, *words)
+        call(*command, folder=folder, PYTHONPATH=str(build.packages))
         with np.load(folder / "results.npz") as file:
             found = {key: file[key] for key in file.files}
         notes = json.loads((folder / "notes.json").read_text())
@@ -147,7 +234,10 @@ def largest(old: NDArray[Any], new: NDArray[Any]) -> str:
 def compared(old: Outcome, new: Outcome) -> dict[str, dict[str, str]]:
     """What differs in each case, by field."""
     found = {}
-    for case in old.notes:
+    for case in old.notes | new.notes:
+        if case not in old.notes or case not in new.notes:
+            found[case] = {"case": f"only in the {'old' if case in old.notes else 'new'}"}
+            continue
         before, after = old.fields(case), new.fields(case)
         pairs = {name: difference(before.get(name), after.get(name)) for name in before | after}
         found[case] = {name: words for name, words in pairs.items() if words}
@@ -225,7 +315,7 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--with-builds",
         nargs=2,
         metavar=("OLD", "NEW"),
-        help="two folders that hold python/equipix with its extension, instead of commits",
+        help="two checkouts with python/equipix, its extension and tools, instead of commits",
     )
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="WORD", help="cases with a word in their name"

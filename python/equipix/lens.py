@@ -206,8 +206,8 @@ def fit(
         if not found[3] > _SHOWN * std[3]:
             raise InputError(
                 f"'frame' shows a fall-off (half diagonal / focal length)² of {found[3]:.3g} "
-                f"with a standard error of {std[3]:.2g}, expected {_SHOWN:g} of them above 0: it is not "
-                "darker at the edge. Give the flat, not the dark, and less noise"
+                f"with a standard error of {std[3]:.2g}, expected {_SHOWN:g} of them above 0: it "
+                "is not darker at the edge. Give the flat, not the dark, and less noise"
             )
         focal = float(half / np.sqrt(found[3]))
         errors["focal_length"] = focal * std[3] / found[3] / 2

@@ -165,6 +165,11 @@ class WindowFit:
         """Whether neighbouring residuals are uncorrelated."""
         return max(abs(each.z) for each in self.neighbours) < _WHITE
 
+    @property
+    def is_within_noise(self) -> bool:
+        """Whether variances that are known explain F. A NaN counts as explained."""
+        return not self.left > 1 + _SIGMAS * (2 / max(self.freedom, 1)) ** 0.5
+
     def is_far_above(self, low: WindowFit) -> bool:
         """Whether its F is above that of another fit by more than noise and small errors explain.
 
@@ -336,14 +341,19 @@ def misplaced(
         }
     if not tried:
         return None
-    # In units of noise where that is known: an order explains what is above it.
-    noise = 1.0 if exposures.knows_noise else 0.0
     fits = {words: WindowFit.of(each, options) for words, each in tried.items()}
     best = min(fits, key=lambda words: fits[words].left)
-    # Where noise is not known, and may be none, all that is left may be what the solver leaves.
-    is_slight = not exposures.knows_noise and given.cannot_be_far_above(fits[best])
-    explains = fits[best].left - noise < _LEFT * (given.left - noise)
-    return best if explains and not is_slight else None
+    return best if _explains(fits[best], given, knows_noise=exposures.knows_noise) else None
+
+
+def _explains(best: WindowFit, given: WindowFit, *, knows_noise: bool) -> bool:
+    """Whether another order leaves little of what noise does not explain of the order given.
+
+    Where noise is not known, and may be none, all that is left may be what the solver leaves.
+    """
+    is_noise = given.is_within_noise if knows_noise else given.cannot_be_far_above(best)
+    noise = 1.0 if knows_noise else 0.0
+    return not is_noise and best.left - noise < _LEFT * (given.left - noise)
 
 
 def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
