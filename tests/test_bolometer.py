@@ -13,7 +13,8 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, errors, io, metrics, simulate
-from equipix.bolometer import BolometerArray, DynamicCorrection
+from equipix.bolometer import DynamicCorrection
+from equipix.simulate import BolometerArray
 
 EPS = np.finfo(np.float64).eps
 SHAPE = (24, 32)

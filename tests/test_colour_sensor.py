@@ -338,7 +338,7 @@ class TestReplacement:
         # Float32, and sums of up to some tens of values in it.
         np.testing.assert_allclose(fast, slow, rtol=1e-5)
         for label, plane in planes(cfa).items():
-            response = simulate.signal.COLOUR_RESPONSE[label]
+            response = simulate.beams.COLOUR_RESPONSE[label]
             assert 900 * response <= slow[plane].min()
             assert slow[plane].max() <= 1100 * response
 
