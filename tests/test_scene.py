@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, errors, io, scene
+from equipix import Flag, errors, scene
+from equipix.io.formats import load_pages, save_pages
 from equipix.reference import scene as reference
 from equipix.scene.methods import METHODS
 from equipix.scene.methods import load as load_state
@@ -304,12 +305,12 @@ class TestEveryMethod:
     def test_a_damaged_state_is_refused(self, name, tmp_path):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        pages, content = io.load_pages(tmp_path / "state.npz")
+        pages, content = load_pages(tmp_path / "state.npz")
         lacking = {key: page for key, page in pages.items() if key != "offset"}
         cut = pages | {"gain": pages["gain"][:-1]}
         wrong = pages | {"gain": pages["gain"] + np.float32(np.nan)}
         for damaged, message in ((lacking, "lacks the map 'offset'"), (cut, "47"), (wrong, "NaN")):
-            io.save_pages(tmp_path / "damaged.npz", damaged, content, force=True)
+            save_pages(tmp_path / "damaged.npz", damaged, content, force=True)
             with pytest.raises(errors.FileError, match=f"damaged.npz: is damaged: .*{message}"):
                 load_state(tmp_path / "damaged.npz")
 

@@ -7,7 +7,8 @@ import warnings
 import numpy as np
 import pytest
 
-from equipix import errors, io, scene
+from equipix import errors, scene
+from equipix.io.formats import load_pages, save_pages
 from equipix.scene.methods import METHODS
 from equipix.scene.methods import load as load_state
 from equipix.simulate import MovingScene
@@ -254,12 +255,12 @@ def test_a_state_of_which_a_value_was_changed_is_refused(name, page, tmp_path):
     for frame in MovingScene(seed=1, shape=SHAPE).frames(60):
         method.update(frame.values)
     method.save(tmp_path / "state.npz")
-    pages, content = io.load_pages(tmp_path / "state.npz")
+    pages, content = load_pages(tmp_path / "state.npz")
     changed = pages[page].copy()
     changed[3, 4] += np.float32(0.5)
-    io.save_pages(tmp_path / "changed.npz", pages | {page: changed}, content)
+    save_pages(tmp_path / "changed.npz", pages | {page: changed}, content)
     with pytest.raises(errors.FileError, match=r"changed.npz: is damaged"):
         load_state(tmp_path / "changed.npz")
-    io.save_pages(tmp_path / "range.npz", pages, content | {"data_range": [0, 2]})
+    save_pages(tmp_path / "range.npz", pages, content | {"data_range": [0, 2]})
     with pytest.raises(errors.FileError, match=r"range.npz: is damaged: 'digest'"):
         load_state(tmp_path / "range.npz")
