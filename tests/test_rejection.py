@@ -170,7 +170,7 @@ def test_wrong_limits_are_refused(reject):
 def test_few_frames_and_other_scenes_are_refused():
     rng = np.random.default_rng(11)
     _, frames = clean_frames(12, rng)
-    with pytest.raises(errors.InputError, match="holds 8 frames, expected 9"):
+    with pytest.raises(errors.InputError, match="holds 8, expected 9"):
         equipix.average(frames[:8], reject=5)
     frames[10] = frames[10, :, ::-1]
     with pytest.raises(errors.InputError, match=r"% of frame 10 deviate .* another scene"):
