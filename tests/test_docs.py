@@ -198,6 +198,12 @@ def test_links_lead_somewhere(page):
     assert [link for link in links if not (path.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", sorted({*PAGES} - {"CHANGELOG.md", "docs/studies.md"}))
+def test_scripts_and_tests_that_pages_name_exist(page):
+    named = r"(?:(?:benches|docs|examples|tools)/\w+|tests/(?:\w+/)*test_\w+)\.(?:py|rs)"
+    assert [each for each in re.findall(named, TEXTS[page]) if not (ROOT / each).exists()] == []
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_links_to_sections_lead_to_headings(page):
     path = ROOT / page
