@@ -55,7 +55,6 @@ BESIDE = {
 """Core modules beside the chain: they use these, and what is right of `geometry`."""
 
 SHARED = {
-    "centroid": {"Image"},
     "io": {"Depth", "Format", "Outcome", "Picture", "Problem"},
 }
 """What files of a core folder take from the folder's own file, though that uses them: circles that
