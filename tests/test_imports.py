@@ -45,10 +45,10 @@ CHAIN = (
 BESIDE = {
     "apply": set[str](),
     "centroid": {"connectivity"},
+    "curves": set[str](),
     "fixed_point": set[str](),
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
-    "response": set[str](),
     "scene": {"geometry"},
     "statistics": set[str](),
 }

@@ -140,7 +140,7 @@
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
 //!
-//! response        response curves from levels of a uniform source  (uses parallel and below)
+//! curves          response curves from levels of a uniform source  (uses parallel and below)
 //! scene           gain and offset from a moving scene  (uses geometry and below)
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
@@ -185,6 +185,7 @@ mod coarse;
 pub mod connectivity;
 pub mod control;
 pub mod convergence;
+pub mod curves;
 pub mod error;
 pub mod exposures;
 pub mod fit;
@@ -206,7 +207,6 @@ pub mod parts;
 mod prior;
 mod random;
 mod reduced;
-pub mod response;
 mod ritz;
 pub mod scene;
 pub mod solve;

@@ -6,19 +6,19 @@
 //! descent      the method of the paper, sweep by sweep
 //! multiscale   Gauss-Newton steps on all scales at once, with the beam eliminated
 //! joint        Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated
-//! response     pixels that do not respond to light
+//! dead_pixels  pixels that do not respond to light
 //! weak         pixels in weak light, and the prior of their M
 //! ```
 
 mod calibrate;
 mod course;
+mod dead_pixels;
 mod descent;
 mod found;
 mod joint;
 mod multiscale;
 mod options;
 mod refuse;
-mod response;
 mod start;
 mod weak;
 

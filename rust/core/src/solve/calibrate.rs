@@ -1,8 +1,8 @@
 //! From exposures to the sensitivity of their sensor: which solver minimises F, and the result at whole shifts.
 
+use super::dead_pixels::without_response;
 use super::found::Found;
 use super::options::{Method, Options};
-use super::response::without_response;
 use super::{descent, joint, multiscale, refuse};
 use crate::beam::Beam;
 use crate::connectivity::{Components, NONE, Tie};
