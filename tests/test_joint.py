@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, reference, simulate
+import reference
+from equipix import Flag, simulate
 from equipix.errors import (
     ConvergenceWarning,
     DriftWarning,

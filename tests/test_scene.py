@@ -7,8 +7,8 @@ import pytest
 
 import equipix
 from equipix import Flag, errors, io, scene
-from equipix.reference import scene as reference
 from equipix.simulate import MovingScene
+from reference import scene as reference
 
 SHAPE = (48, 64)
 NAMES = tuple(scene.METHODS)

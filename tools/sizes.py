@@ -2,8 +2,7 @@
 
 Lines of a Python function are counted without its docstring, those of a Rust function from ``fn``
 to its closing brace; Rust tests count as lines, not as functions. The second table is of the
-Python package without ``reference/``. Public names are those of the imported package, which must be
-built.
+Python package. Public names are those of the imported package, which must be built.
 """
 
 from __future__ import annotations
@@ -190,11 +189,7 @@ def print_names(sources: dict[Path, str]) -> None:
 def main() -> None:
     """Print the tables."""
     print_functions()
-    sources = {
-        path: path.read_text()
-        for path in sorted(PACKAGE.rglob("*.py"))
-        if PACKAGE / "reference" not in path.parents
-    }
+    sources = {path: path.read_text() for path in sorted(PACKAGE.rglob("*.py"))}
     print()
     print_modules(sources)
     sys.path.insert(0, str(PACKAGE.parent))

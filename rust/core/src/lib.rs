@@ -157,7 +157,7 @@
 //!   [`solve`] and [`convergence`].
 //! - To **average or read frames**: [`statistics::Accumulator`], and `io` for files.
 //! - To **work on this crate**: ARCHITECTURE.md and CONTRIBUTING.md of the repository; a new kernel
-//!   starts from the NumPy reference in `python/equipix/reference`.
+//!   starts from the NumPy reference in `tests/reference`.
 //!
 //! # References
 //!
