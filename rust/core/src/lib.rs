@@ -122,10 +122,11 @@
 //! joint           the linear problem with the pixels eliminated: beam, fluxes and shifts
 //! reduced         the linear problem with the beam eliminated
 //! sweep           a sweep of coordinate descent, the method of the paper
-//! coarse          hats on a coarse grid, and the matrix of a problem in them
 //! convergence     how far M still is from the minimum, large scales included
 //! ritz            the smallest Ritz value, from conjugate gradients
 //! beam            the light that a sensor sees of the beam from any position
+//! weak_light      the prior of M where light is weak: what decides it, and its part of a linear problem
+//! coarse          hats on a coarse grid, and the matrix of a problem in them
 //! connectivity    what the measurements can compare; connected pixels
 //! information     the information D = Σ w c² L² of each pixel on M: its inverse variance with a known beam
 //! exposures       measurements, weights, positions, fluxes; the one check of their values
@@ -204,7 +205,6 @@ mod padded;
 pub mod parallel;
 #[doc(hidden)]
 pub mod parts;
-mod prior;
 mod random;
 mod reduced;
 mod ritz;
@@ -215,6 +215,7 @@ pub mod sweep;
 #[cfg(test)]
 mod testing;
 pub mod uncertainty;
+mod weak_light;
 
 pub use beam::Beam;
 pub use control::Control;

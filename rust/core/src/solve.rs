@@ -7,7 +7,6 @@
 //! multiscale   Gauss-Newton steps on all scales at once, with the beam eliminated
 //! joint        Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated
 //! dead_pixels  pixels that do not respond to light
-//! weak         pixels in weak light, and the prior of their M
 //! ```
 
 mod calibrate;
@@ -20,7 +19,6 @@ mod multiscale;
 mod options;
 mod refuse;
 mod start;
-mod weak;
 
 pub use calibrate::calibrate;
 pub(crate) use multiscale::minimise as multiscale;

@@ -15,8 +15,8 @@ use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::padded::Padding;
 use crate::parallel::Workers;
-use crate::prior::Prior;
 use crate::ritz::{Lowest, Ritz};
+use crate::weak_light::Prior;
 
 /// Values that a thread takes at a time.
 const BLOCK: usize = 1 << 16;

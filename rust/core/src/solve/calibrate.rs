@@ -14,8 +14,8 @@ use crate::frames::Real;
 use crate::geometry::Geometry;
 use crate::memory;
 use crate::parallel::Workers;
-use crate::prior::Prior;
 use crate::reduced;
+use crate::weak_light::Prior;
 
 /// Minimises F, and gives M in the gauge mean(M) = 1 over the pixels of each component.
 ///
@@ -166,7 +166,7 @@ fn weakly_tied<T: Real>(
 /// | with turned exposures, each view's sums and their total | 16 for each cell of each view, 8 for each cell |
 ///
 /// The components come after the solver, with less: M, L, 22 for each pixel and 13 for each cell. What weak
-/// light takes besides is asked for where it is found (`weak.rs`).
+/// light takes besides is asked for where it is found (`weak_light/decision.rs`).
 fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let geometry = exposures.geometry();
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);

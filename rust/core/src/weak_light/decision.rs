@@ -1,4 +1,4 @@
-//! Where light is weak: the noise that decides it, and the prior of M there.
+//! Where light is weak: the noise that decides it, and the prior that follows.
 //!
 //! λ follows from D at the first beam, that of equal pixels but for bright ones, and from the variance σ² of a
 //! measurement of unit weight. σ² is that of residuals, rounded up to a power of 2: methods that see nearly the
@@ -7,17 +7,12 @@
 
 use std::sync::Arc;
 
-use crate::connectivity::{Components, NONE, Tie};
+use super::prior::{self, LIT, Prior};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
-use crate::joint::{self, System};
 use crate::memory;
-use crate::parallel::Workers;
-use crate::prior::{self, LIT, Prior};
-use crate::reduced::ConjugateGradients;
-use crate::sweep::{Estimate, Plain};
 
 /// D of the faintest pixel that single precision serves, as a share of a bright pixel's: fainter ones have a
 /// prior even without noise.
@@ -29,6 +24,36 @@ const BYTES: [u64; 2] = [16, 8];
 /// Bytes that a prior takes likewise: λ, λ in the units of the search and pieces; and the components that these
 /// are (`connectivity.rs`).
 const BYTES_OF_PRIOR: [u64; 2] = [16 + 22, 13];
+
+/// A linear problem in which light may be weak.
+pub(crate) trait Problem<T: Real> {
+    /// What is measured.
+    fn exposures(&self) -> &Exposures<'_, T>;
+
+    /// The variance of a measurement of weight 1 as residuals show it, where `pixels` have a measurement and
+    /// `freed` unknowns are left to a prior; `None` where there are too few degrees of freedom.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
+    fn variance(
+        &self,
+        pixels: &mut Option<usize>,
+        freed: f64,
+        control: &Control,
+    ) -> Result<Option<f64>>;
+
+    /// The least D above 0 and that of a bright pixel, where the mean of M is 1.
+    fn range(&mut self, control: &Control) -> Result<[f64; 2]>;
+
+    /// D at the first beam.
+    fn first_information(&self, control: &Control) -> Result<Vec<f64>>;
+
+    /// The piece of connected pixels of each pixel, for D at the first beam.
+    fn pieces(&self, information: &[f64], control: &Control) -> Result<Arc<[i32]>>;
+
+    /// Takes this prior, or none; whether that is another one than before.
+    fn take(&mut self, prior: Option<Prior>) -> bool;
+}
 
 /// The prior while it is sought.
 pub(crate) struct WeakLight {
@@ -43,11 +68,11 @@ pub(crate) struct WeakLight {
     /// The piece of connected pixels of each pixel, once one has a prior.
     pieces: Option<Arc<[i32]>>,
     /// How many unknowns the data leave to the prior.
-    pub(super) freed: f64,
+    pub(crate) freed: f64,
 }
 
 impl WeakLight {
-    pub(super) const fn new() -> Self {
+    pub(crate) const fn new() -> Self {
         Self {
             noise: 0.0,
             variance: f64::INFINITY,
@@ -70,13 +95,38 @@ impl WeakLight {
         rounded_up(self.noise.max(FAINTEST * bright / LIT))
     }
 
+    /// Whether residuals are so large, or light so weak, that some pixels may need a prior.
+    pub(crate) fn may_be<T: Real>(
+        &mut self,
+        problem: &mut impl Problem<T>,
+        control: &Control,
+    ) -> Result<bool> {
+        let noise = problem.variance(&mut self.pixels, self.freed, control)?;
+        self.hears(problem.exposures(), noise);
+        let [least, bright] = problem.range(control)?;
+        Ok(may_be_weak(least, self.sought(bright)))
+    }
+
+    /// Gives a problem, whose beam is up to date, the prior that follows from it; whether it has changed.
+    pub(crate) fn update<T: Real>(
+        &mut self,
+        problem: &mut impl Problem<T>,
+        control: &Control,
+    ) -> Result<bool> {
+        let noise = problem.variance(&mut self.pixels, self.freed, control)?;
+        if !self.hears(problem.exposures(), noise) {
+            return Ok(false);
+        }
+        let range = problem.range(control)?;
+        let found = self.decide(problem, range, control)?;
+        Ok(found.is_some_and(|prior| problem.take(prior)))
+    }
+
     /// The prior, if it is another one; `range` is the least D and that of a bright pixel.
     fn decide<T: Real>(
         &mut self,
-        exposures: &Exposures<'_, T>,
+        problem: &impl Problem<T>,
         [least, bright]: [f64; 2],
-        pieces: impl FnOnce(&[f64]) -> Result<Arc<[i32]>>,
-        workers: &Workers,
         control: &Control,
     ) -> Result<Option<Option<Prior>>> {
         let variance = self.sought(bright);
@@ -89,19 +139,24 @@ impl WeakLight {
         if !falls || !is_weak {
             return Ok(None);
         }
-        let information = match self.first.take() {
-            Some(information) => information,
-            None => first_information(exposures, workers, control)?,
+        let information = if let Some(information) = self.first.take() {
+            information
+        } else {
+            check_memory(problem.exposures(), BYTES)?;
+            problem.first_information(control)?
         };
         control.check()?;
         let weights = prior::weights(&information, variance);
         control.check()?;
         self.freed = prior::freed(&weights, &information, variance, 0.0);
         let prior = if weights.iter().any(|&weight| weight > 0.0) {
-            check_memory(exposures, BYTES_OF_PRIOR)?;
-            let found = self.pieces.take().map_or_else(|| pieces(&information), Ok)?;
-            self.pieces = Some(Arc::clone(&found));
-            Some(Prior::new(weights, found))
+            check_memory(problem.exposures(), BYTES_OF_PRIOR)?;
+            let pieces = match self.pieces.take() {
+                Some(pieces) => pieces,
+                None => problem.pieces(&information, control)?,
+            };
+            self.pieces = Some(Arc::clone(&pieces));
+            Some(Prior::new(weights, pieces))
         } else {
             None
         };
@@ -109,91 +164,8 @@ impl WeakLight {
         Ok(Some(prior))
     }
 
-    /// Whether residuals are so large, or light so weak, that some pixels may need a prior.
-    pub(super) fn may_be<T: Real>(
-        &mut self,
-        estimate: &Estimate<'_, '_, T>,
-        search: &ConjugateGradients<'_, '_, T>,
-        control: &Control,
-    ) -> Result<bool> {
-        let exposures = search.reduced.exposures;
-        let pixels = self.count(exposures, control)?;
-        self.hears(exposures, estimate.variance(pixels, self.freed));
-        let [least, bright] = search.reduced.information_range();
-        Ok(may_be_weak(least, self.sought(bright)))
-    }
-
-    /// How many pixels have a measurement.
-    fn count<T: Real>(&mut self, exposures: &Exposures<'_, T>, control: &Control) -> Result<usize> {
-        let pixels = match self.pixels {
-            Some(pixels) => pixels,
-            None => exposures.measured_pixels(control)?,
-        };
-        self.pixels = Some(pixels);
-        Ok(pixels)
-    }
-
-    /// Gives an estimate, whose beam is up to date, the prior that follows from it; whether it has changed.
-    pub(super) fn update<T: Real>(
-        &mut self,
-        estimate: &mut Estimate<'_, '_, T>,
-        search: &mut ConjugateGradients<'_, '_, T>,
-        control: &Control,
-    ) -> Result<bool> {
-        let exposures = search.reduced.exposures;
-        let pixels = self.count(exposures, control)?;
-        if !self.hears(exposures, estimate.variance(pixels, self.freed)) {
-            return Ok(false);
-        }
-        if search.reduced.range == [0.0; 2] {
-            search.reduced.linearise(&estimate.sensitivity, estimate.beams(), None, control)?;
-        }
-        let connected = |_: &[f64]| {
-            let ties = vec![Tie::Firm; exposures.sensor().len()];
-            Ok(Components::of(exposures, &ties, control)?.pixels.into())
-        };
-        let (range, workers) = (search.reduced.information_range(), search.workers());
-        let found = self.decide(exposures, range, connected, workers, control)?;
-        let Some(prior) = found else { return Ok(false) };
-        if prior.is_none() && estimate.prior.is_none() {
-            return Ok(false);
-        }
-        estimate.prior = prior;
-        search.renew();
-        Ok(true)
-    }
-
-    /// Gives a joint problem the prior that follows from its state; whether it has changed.
-    pub(super) fn update_joint<T: Real>(
-        &mut self,
-        system: &mut System<'_, '_, T>,
-        control: &Control,
-    ) -> Result<bool> {
-        let exposures = system.pass.exposures;
-        let noise = system.variance(joint::freedom(system), self.freed);
-        if !self.hears(exposures, noise) {
-            return Ok(false);
-        }
-        let connected = |information: &[f64]| {
-            let piece = |d: &f64| if *d > 0.0 { 0 } else { NONE };
-            Ok(information.iter().map(piece).collect())
-        };
-        let square = system.mean * system.mean;
-        let (range, workers) = (prior::range(&system.information()), system.pass.workers);
-        let range = range.map(|d| d * square);
-        let found = self.decide(exposures, range, connected, workers, control)?;
-        let Some(prior) = found else { return Ok(false) };
-        let mean = system.mean;
-        system.prior = prior.map(|prior| {
-            let mut weights: Vec<f64> = prior.weights.iter().map(|w| w / (mean * mean)).collect();
-            system.pass.few.lost_pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
-            joint::Prior { weights, mean }
-        });
-        Ok(true)
-    }
-
     /// The pixels of a result of this mean that the prior holds, and how many unknowns the data leave to it.
-    pub(super) fn held(
+    pub(crate) fn held(
         &self,
         weights: &[f64],
         mut information: Vec<f64>,
@@ -217,16 +189,6 @@ fn may_be_weak(least: f64, variance: f64) -> bool {
     least < CHANGE * LIT * variance
 }
 
-/// D at the first beam.
-fn first_information<T: Real>(
-    exposures: &Exposures<'_, T>,
-    workers: &Workers,
-    control: &Control,
-) -> Result<Vec<f64>> {
-    check_memory(exposures, BYTES)?;
-    Estimate::first_information(exposures, workers, control)
-}
-
 /// Whether there are so many bytes for each pixel and each cell of each view.
 fn check_memory<T: Real>(exposures: &Exposures<'_, T>, bytes: [u64; 2]) -> Result<()> {
     let cells: usize = exposures.geometry().views.iter().map(|view| view.shape.len()).sum();
@@ -234,22 +196,4 @@ fn check_memory<T: Real>(exposures: &Exposures<'_, T>, bytes: [u64; 2]) -> Resul
     memory::check(needed, || {
         format!("weak light in {} exposures of {}", exposures.count(), exposures.sensor())
     })
-}
-
-/// A sweep of coordinate descent; returns F + R before it where there is a prior, else F after it.
-pub(super) fn sweep<T: Real>(
-    estimate: &mut Estimate<'_, '_, T>,
-    search: &mut ConjugateGradients<'_, '_, T>,
-    control: &Control,
-) -> Result<f64> {
-    if estimate.prior.is_none() {
-        return estimate.sweep(control);
-    }
-    let slope = search.reduced.scale.slope();
-    let objective = estimate.slopes::<Plain>(slope, &mut search.residual, control)?;
-    let (m, prior) = (&estimate.sensitivity, estimate.prior.as_ref());
-    search.reduced.linearise(m, estimate.beams(), prior, control)?;
-    search.sweep_step();
-    estimate.advance::<Plain>(&search.x, 1.0);
-    Ok(objective)
 }
