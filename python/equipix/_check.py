@@ -241,6 +241,14 @@ def number(name: str, value: float) -> float:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
 
 
+def positive(name: str, value: float, *, zero: bool = False) -> float:
+    """A finite number above 0, or 0 where that is allowed, checked."""
+    checked = number(name, value)
+    if not (0 < checked < np.inf or (zero and checked == 0)):
+        raise InputError(f"'{name}' is {value!r}, expected a finite number above 0{' or 0' * zero}")
+    return checked
+
+
 def as_level(saturation: float | None) -> float | None:
     """The saturation level, checked; None where there is none."""
     if saturation is None:

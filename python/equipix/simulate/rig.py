@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from equipix.measured.noise import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.beams import Beam, filtered, window
 from equipix.simulate.camera import Camera, Pixels
-from equipix.simulate.recording import Recording, Stream, write_experiment
+from equipix.simulate.recording import Stream, write_experiment
 
 FULL_SCALE_E = 20_000.0
 """Electrons that fill the range of the ADC where no gain is given."""
@@ -206,23 +207,22 @@ class VirtualExperiment:
         InputError
             If `folder` is not the name of a folder.
         """
-        path = as_path("folder", folder)
-        return write_experiment(self._recording(), path, force=force, progress=progress)
-
-    def _recording(self) -> Recording:
-        """All streams, with what else the folder holds."""
-        each, hole = range(len(self.positions)), self.aperture_count
-        return Recording(
-            bit_depth=self.camera.bit_depth,
-            frame_bytes=self.camera.response.size * (1 if self.camera.bit_depth == 8 else 2),
-            dark=Stream(self.dark(), self.dark_count),
-            exposures=[Stream(self.frames(k), self.count) for k in each],
-            moves=[
-                (Stream(self.aperture_before(k), hole), Stream(self.aperture_after(k), hole))
-                for k in each[1:]
-            ],
+        camera, hole = self.camera, self.aperture_count
+        streams = {"dark/dark.tif": Stream(self.dark, self.dark_count)}
+        for k in range(len(self.positions)):
+            streams[f"frames/p{k}.tif"] = Stream(partial(self.frames, k), self.count)
+        for k in range(1, len(self.positions)):
+            streams[f"aperture/p{k}-before.tif"] = Stream(partial(self.aperture_before, k), hole)
+            streams[f"aperture/p{k}-after.tif"] = Stream(partial(self.aperture_after, k), hole)
+        cfa = None if self.cfa is None else self.cfa.written
+        return write_experiment(
+            as_path("folder", folder),
+            streams,
+            frame_bytes=camera.response.size * (1 if camera.bit_depth == 8 else 2),
+            sensor={"name": "virtual", "bit_depth": camera.bit_depth, "cfa": cfa},
             truth=vars(self.truth),
-            cfa=None if self.cfa is None else self.cfa.written,
+            force=force,
+            progress=progress,
         )
 
 
