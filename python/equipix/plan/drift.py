@@ -210,7 +210,7 @@ def tilt_std(
         variance += np.square(_each("shift_std", shift_std, (count, 2)) * slope).sum(axis=1)
     if np.linalg.matrix_rank(positions - positions.mean(axis=0)) < 2:
         return np.full(2, np.inf)
-    return np.asarray(slope_std(positions, np.sqrt(variance)) * shape)
+    return tilt_of_fluxes(shape, positions, np.sqrt(variance))
 
 
 def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
@@ -278,16 +278,12 @@ def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
     return np.argsort(ranks[best]).astype(np.int64)
 
 
-def _hidden_share(
-    ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _hidden_share(ranks: NDArray[np.int64], basis: Floats, times: Floats) -> Floats:
     """Share of a trend without a residual, in orders (m, n); differences by rounding count as 0."""
     return np.asarray(np.round(np.sum((times[ranks] @ basis) ** 2, axis=1), _TIE))
 
 
-def _exchanged(
-    ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _exchanged(ranks: NDArray[np.int64], basis: Floats, times: Floats) -> NDArray[np.int64]:
     """Exchange the pair of exposures that reduces the share most, until none does."""
     first, second = np.triu_indices(len(ranks), 1)
     apart = basis[first] - basis[second]

@@ -20,7 +20,7 @@ class Stream(NamedTuple):
     """Frames of one file, made one at a time when they are written, and their number."""
 
     frames: Callable[[], Iterator[NDArray[Any]]]
-    count: int
+    length: int
 
 
 def write_experiment(
@@ -43,10 +43,10 @@ def write_experiment(
             "of a folder that holds nothing but an experiment written before"
         )
     with folder_beside(target) as folder:
-        counter = _Counter(progress, sum(stream.count for stream in streams.values()))
+        counter = _Counter(progress, sum(stream.length for stream in streams.values()))
         for name, stream in streams.items():
             (folder / name).parent.mkdir(exist_ok=True)
-            nbytes = stream.count * frame_bytes
+            nbytes = stream.length * frame_bytes
             write_frames(folder / name, counter.pass_on(stream.frames()), nbytes=nbytes)
         np.savez(folder / "truth.npz", **truth)
         manifest = _manifest(sensor, sum(name.startswith("frames/") for name in streams))
