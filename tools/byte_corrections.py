@@ -164,11 +164,11 @@ def dynamic(*, bodies: bool = True, averaged: bool = False, **options: Any) -> A
     )
     options["black_bodies"] = tuple(others) if bodies else None
     found = bolometer.fit(shutter, *STATES.T, **options)
-    inside = found.at(14.5, 2.0)
+    inside = found.correction(14.5, 2.0)
     return {
         "": found,
         "inside": inside,
-        "outside": found.at(70.0, 2.0, extrapolate=True),
+        "outside": found.correction(70.0, 2.0, extrapolate=True),
         "corrected": corrected(inside, np.array([stack[4, 0] for stack in stacks])),
         "files": reread(found, bolometer.DynamicCorrection.load),
     }
@@ -327,7 +327,7 @@ def table_of(table: Any) -> Any:
         "": table,
         "words": [words, *table.applied(words)],
         "corrected": [table.correct(FRAMES, flagged=way) for way in FLAGGED],
-        "files": reread(table, hardware.read, ".bin", ".hex", ".h"),
+        "files": reread(table, hardware.table.read, ".bin", ".hex", ".h"),
     }
 
 
@@ -343,7 +343,7 @@ def costs() -> Any:
 
 def adaptive(bits: int = 14, **options: Any) -> Any:
     """Memories that follow a scene."""
-    loop = hardware.Adaptive(SHAPE, adc_bits=bits, **options)
+    loop = hardware.AdaptiveLoop(SHAPE, adc_bits=bits, **options)
     frames = moving_frames() >> (14 - bits)
     seen = [loop.update(frames[:60]), *(loop.update(frame) for frame in frames[60::9])]
     return {"seen": seen, "words": [loop.gain, loop.offset], "result": loop.correction()}
@@ -409,7 +409,7 @@ def written() -> Any:
     return {
         "corrections": [equipix.load(f"{name}.npz") for name in ("nuc", "given", "scene")],
         "scene": [tifffile.imread("seen.tif"), scene.load("state.npz")],
-        "hardware": hardware.read("words.bin"),
+        "hardware": hardware.table.read("words.bin"),
     }
 
 

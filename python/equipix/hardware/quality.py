@@ -84,10 +84,8 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     >>> narrow.added > 10 * wide.added
     True
     """
-    raw = as_array("frames", frames, ndim=3)
+    raw, exact, before = _level("frames", correction, frames)
     table = Table.of(correction, **options)
-    exact = correction.correct(raw, flagged="nan")
-    before = correctability(exact)
     words = table.digitise(raw)[:, usable(table.flags)]
     at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
     _refuse_clipped(raw, table, words, at_ends)
@@ -172,7 +170,7 @@ def smallest_widths(
     if sought or not len(levels):
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
     Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
-    measured = [_level(correction, frames) for frames in levels]
+    measured = [_level("levels", correction, frames) for frames in levels]
 
     def worst(offset_bits: int, gain_bits: int) -> float:
         widths = {"offset_bits": offset_bits, "gain_bits": gain_bits}
@@ -195,8 +193,8 @@ class _Level(NamedTuple):
     before: Correctability
 
 
-def _level(correction: Correction, frames: ArrayLike) -> _Level:
-    raw = as_array("levels", frames, ndim=3)
+def _level(name: str, correction: Correction, frames: ArrayLike) -> _Level:
+    raw = as_array(name, frames, ndim=3)
     exact = correction.correct(raw, flagged="nan")
     return _Level(raw, exact, correctability(exact))
 

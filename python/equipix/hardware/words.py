@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,12 @@ from equipix.errors import InputError
 
 _NARROWEST, WIDEST = 8, 16
 """Widths of words, in bits."""
+
+WIDTHS = ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits")
+"""Names of the widths of a `Format`."""
+
+STEPS = ("adc", "coarse", "offset", "gain", "out")
+"""Names of the exponents of its steps."""
 
 _EXPONENT = 40
 """Steps are from 2^-40 to 2^40 DN."""
@@ -58,9 +64,9 @@ class Format:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        for name in ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits"):
+        for name in WIDTHS:
             check_width(name, getattr(self, name))
-        for name in ("adc", "coarse", "offset", "gain", "out"):
+        for name in STEPS:
             value = getattr(self, name)
             if not isinstance(value, int) or abs(value) > _EXPONENT:
                 raise InputError(f"'{name}' is {value!r}, expected -{_EXPONENT} to {_EXPONENT}")
@@ -80,15 +86,13 @@ class Format:
     @property
     def arithmetic(self) -> tuple[int, int, int, int, int, int, int]:
         """Numbers that the compiled part needs."""
-        return (
-            self.adc_bits,
-            self.out_bits,
-            self.adc,
-            self.offset,
-            self.gain,
-            self.out,
-            self.base,
-        )
+        return self.adc_bits, self.out_bits, self.adc, self.offset, self.gain, self.out, self.base
+
+    @property
+    def stored(self) -> dict[str, int]:
+        """Bits of the words of a pixel, by the names of a table's arrays."""
+        widths = (self.dac_bits, self.offset_bits, self.gain_bits)
+        return dict(zip(("coarse", "offset", "gain"), widths, strict=True))
 
     @property
     def shifts(self) -> tuple[int, int, int]:
@@ -157,7 +161,7 @@ class Words:
     def finest(self, values: Floats, not_below: int) -> int:
         """Return the exponent of the finest step with which the largest values fit."""
         exponent, ends = not_below, np.array([values.min(), values.max()])
-        largest = Words(self.name, self.bits, self.signed, -(2**self.bits), self.floor)
+        largest = replace(self, lowest=-(2**self.bits))
         while exponent < _EXPONENT and largest.outside(ends, exponent):
             exponent += 1
         return exponent
@@ -183,9 +187,7 @@ class Words:
         wide = [
             bits
             for bits in range(self.bits + 1, WIDEST + 1)
-            if not Words(self.name, bits, self.signed, self.lowest, self.floor).outside(
-                values, exponent
-            )
+            if not replace(self, bits=bits).outside(values, exponent)
         ]
         others = f"another {self.name}_step, or flag these pixels"
         return f"{wide[0]} bits would hold them; or take {others}" if wide else f"take {others}"
