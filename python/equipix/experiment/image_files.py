@@ -113,12 +113,11 @@ def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
     """Give the keys that name files of measurements, with the files."""
     if manifest.dark is not None:
         yield Entry("dark", "", entry_files(path, manifest.dark.frames))
-    if isinstance(manifest, LevelManifest):
-        for name, level in zip(manifest.names, manifest.level, strict=True):
-            yield Entry("frames", name, entry_files(path, level.frames), "level")
-        return
-    for exposure in manifest.exposure:
-        for key in ("frames", "aperture_before", "aperture_after"):
+    kind = "level" if isinstance(manifest, LevelManifest) else "exposure"
+    for name, frames in manifest.measurements:
+        yield Entry("frames", name, entry_files(path, frames), kind)
+    for exposure in () if isinstance(manifest, LevelManifest) else manifest.exposure:
+        for key in ("aperture_before", "aperture_after"):
             entry = getattr(exposure, key)
             if entry is not None:
                 yield Entry(key, exposure.name, entry_files(path, entry))

@@ -212,6 +212,11 @@ class LevelManifest(_Table):
             for index, each in enumerate(self.level)
         ]
 
+    @property
+    def measurements(self) -> list[tuple[str, str | list[str]]]:
+        """Name and frames of each level."""
+        return [(name, each.frames) for name, each in zip(self.names, self.level, strict=True)]
+
 
 class Manifest(_Table):
     """The whole experiment.toml."""
@@ -243,18 +248,14 @@ class Manifest(_Table):
                 raise _problem(f"'{key}' is missing in exposure '{missing[0]}': give all or none")
         return self
 
-
-def read_manifest(path: Path) -> Manifest:
-    """Read and check the experiment.toml `path`."""
-    return _read(path, Manifest)
-
-
-def read_level_manifest(path: Path) -> LevelManifest:
-    """Read and check the levels.toml `path`."""
-    return _read(path, LevelManifest)
+    @property
+    def measurements(self) -> list[tuple[str, str | list[str]]]:
+        """Name and frames of each exposure."""
+        return [(each.name, each.frames) for each in self.exposure]
 
 
-def _read(path: Path, model: type[_Content]) -> _Content:
+def read_manifest(path: Path, model: type[_Content]) -> _Content:
+    """Read and check the experiment.toml or levels.toml `path`."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
