@@ -9,13 +9,18 @@ from os import PathLike
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import numpy.typing as npt
+from numpy.typing import NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
+
+ArrayLike: TypeAlias = npt.ArrayLike
 
 Array: TypeAlias = NDArray[Any]
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Ints: TypeAlias = NDArray[np.int64]
 
 Bools: TypeAlias = NDArray[np.bool_]
 
