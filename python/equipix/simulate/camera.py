@@ -1,16 +1,14 @@
 """A virtual camera: photons to digital numbers, one frame at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, as_array, check_bit_depth, check_shape, positive
+from equipix._check import Array, Floats, Rng, as_array, check_bit_depth, check_shape, positive
 from equipix.errors import InputError
 
 Pixels: TypeAlias = "NDArray[np.int64]"
@@ -43,8 +41,8 @@ class Digitised:
         return int(2**self.bit_depth - 1)
 
     def _frames(
-        self, drawn: Callable[[np.random.Generator], NDArray[Any]], count: int, rng: Rng
-    ) -> Iterator[NDArray[Any]]:
+        self, drawn: Callable[[np.random.Generator], Array], count: int, rng: Rng
+    ) -> Iterator[Array]:
         """Make frames one at a time: values in DN, which may be overwritten, as whole numbers."""
         random = np.random.default_rng(rng)
         for _ in range(count):
@@ -173,12 +171,12 @@ class Camera(Digitised):
         good.flat[np.concatenate([self.dead, self.hot])] = False
         return good
 
-    def variance(self, light: Floats) -> Floats:
+    def variance(self, light_e: Floats) -> Floats:
         """Variance of one frame, saturation aside.
 
         Parameters
         ----------
-        light : ndarray, shape (rows, cols)
+        light_e : ndarray, shape (rows, cols)
             Mean photoelectrons of a pixel of sensitivity 1.
 
         Returns
@@ -186,14 +184,14 @@ class Camera(Digitised):
         ndarray, shape (rows, cols), float64
             In DN²: gain²·(light·M + read noise²) + 1/12; the last term is the rounding.
         """
-        return self.gain_dn_per_e**2 * (light * self.response + self.read_noise_e**2) + 1 / 12
+        return self.gain_dn_per_e**2 * (light_e * self.response + self.read_noise_e**2) + 1 / 12
 
-    def frames(self, light: Floats, count: int, *, rng: Rng) -> Iterator[NDArray[Any]]:
+    def frames(self, light_e: Floats, count: int, *, rng: Rng) -> Iterator[Array]:
         """Make frames of a steady light, one at a time.
 
         Parameters
         ----------
-        light : ndarray, shape (rows, cols)
+        light_e : ndarray, shape (rows, cols)
             Mean photoelectrons of a pixel of sensitivity 1; 0 for dark frames.
         count : int
             Number of frames.
@@ -208,7 +206,7 @@ class Camera(Digitised):
         Raises
         ------
         InputError
-            With the first frame, if light is below 0 anywhere, or is no number.
+            If light is below 0 anywhere, or is no number.
 
         Notes
         -----
@@ -217,10 +215,10 @@ class Camera(Digitised):
         their place: a quarter of the time, for a skewness of 0.03 at most. Values are computed in
         float32, which rounds them by less than 0.005 DN at 16 bits.
         """
-        electrons = light * self.response
+        electrons = light_e * self.response
         if not (electrons >= 0).all():
             raise InputError(
-                f"'light' goes down to {np.min(electrons):.3g} electrons, expected 0 or more "
+                f"'light_e' goes down to {np.min(electrons):.3g} electrons, expected 0 or more "
                 "everywhere: is the beam below 0, as one of a large contrast?"
             )
         normal = self._is_normal(electrons)
