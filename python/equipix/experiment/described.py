@@ -1,7 +1,5 @@
 """What both kinds of manifest share: averages, masks, provenance."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -159,7 +157,7 @@ class Described(Generic[_Manifest]):
             If images differ in shape or depth, or two are the same; if the mask file is of another
             shape, a region reaches beyond the sensor, or nothing is left.
         """
-        shape = check_formats(self._images())
+        shape: tuple[int, int] = check_formats(self._images())
         count = len(self.manifest.measurements)
         given = None if mask is None else as_mask(mask, (count, *shape))
         excluded = union(given, self._excluded(shape))

@@ -1,27 +1,21 @@
 """A calibration experiment on disk, as experiment.toml describes it, and its evaluation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Bools, Floats, FluxModel, Method, Progress
+from equipix._check import Array, ArrayLike, FluxModel, Method, Progress
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError, InputWarning, warn
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described
-from equipix.experiment.image_files import check_formats
 from equipix.experiment.manifest import Manifest
-from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.defects import hot_pixels
-from equipix.measured.means import Averaged
 
 _ROUGH = 1e-4
 """Tolerance of the fit that the aperture's images are corrected by: 3e-5 pixel."""
@@ -54,19 +48,7 @@ class Experiment(Described[Manifest]):
 
     _model, _dtype = Manifest, np.float32
 
-    def check_formats(self) -> None:
-        """Read the files' headers: all images must be of one shape and depth.
-
-        Raises
-        ------
-        FileError
-            If a file cannot be read or differs from the first dark frames.
-        """
-        check_formats(self._images())
-
-    def measure_shifts(
-        self, calibration: Calibration | None = None
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+    def measure_shifts(self, calibration: Calibration | None = None) -> tuple[Array, Array]:
         """Shift of each exposure and its standard error.
 
         Parameters
@@ -197,9 +179,21 @@ class Experiment(Described[Manifest]):
         averaged = self._average(dark, workers, progress)
         colours = Equalisation.of_colours(averaged.filters, dark)
         shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
-        exposures = self._exposures(averaged, shifts, std, flux, excluded, fit_options)
+        whole = fit_options.whole_shifts
+        exposures = exposures_of(
+            averaged,
+            shifts,
+            mask=excluded,
+            shift_std=std if std.any() and not whole else None,
+            flux=self._column("flux") if flux is None else flux,
+            flux_std=self._column("flux_std") if flux is None else None,
+            time=self._column("time") if flux == "linear" else None,
+            rotation=[exposure.rotation for exposure in self.manifest.exposure],
+        )
         start = None
-        if self._is_moved() and not fit_options.whole_shifts:
+        if whole:
+            exposures = exposures.whole(std)
+        elif self._is_moved():
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
@@ -228,29 +222,6 @@ class Experiment(Described[Manifest]):
                 f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
                 InputWarning,
             )
-
-    def _exposures(
-        self,
-        averaged: Averaged,
-        shifts: Floats,
-        std: Floats,
-        flux: FluxModel | None,
-        mask: Bools | None,
-        options: FitOptions,
-    ) -> Exposures:
-        """The exposures from averaged frames and the file."""
-        refined = std.any() and not options.whole_shifts
-        exposures = exposures_of(
-            averaged,
-            shifts,
-            mask=mask,
-            shift_std=std if refined else None,
-            flux=self._column("flux") if flux is None else flux,
-            flux_std=self._column("flux_std") if flux is None else None,
-            time=self._column("time") if flux == "linear" else None,
-            rotation=[exposure.rotation for exposure in self.manifest.exposure],
-        )
-        return exposures.whole(std) if options.whole_shifts else exposures
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""

@@ -1,15 +1,12 @@
 """Levels of a uniform source on disk, as levels.toml describes them, and their evaluation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import By, Order, Progress, Words
+from equipix._check import ArrayLike, By, Order, Progress, Words
 from equipix.errors import EquipixWarning, warn
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import LevelManifest

@@ -1,7 +1,5 @@
 """The content of experiment.toml and levels.toml, checked: errors name the value and its place."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -54,6 +52,8 @@ Text = Annotated[str, Field(min_length=1)]
 Files = Text | Annotated[list[Text], Field(min_length=1)]
 
 Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+
+Errors = Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
 Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
@@ -149,10 +149,7 @@ class Exposure(_Table):
     aperture_before: Files | None = None
     aperture_after: Files | None = None
     shift: Pair | None = None
-    shift_std: (
-        Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
-        | None
-    ) = None
+    shift_std: Errors | None = None
     flux: Positive | None = None
     flux_std: Positive | None = None
     time: FiniteFloat | None = None

@@ -1,7 +1,5 @@
 """Tables as C headers, with a function that applies them bit by bit."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from dataclasses import asdict

@@ -1,11 +1,10 @@
 """The line of each pixel as offset and gain words."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from equipix._check import Array, Bools, Floats
 from equipix._native import __version__
@@ -144,11 +143,7 @@ def _refuse_unresponsive(gain: Floats) -> None:
 
 
 def refuse_far_offsets(
-    found: Content,
-    line: tuple[Floats, Floats],
-    widths: dict[str, int],
-    steps: Steps,
-    lowest: float,
+    found: Content, line: tuple[Floats, Floats], widths: dict[str, int], steps: Steps, lowest: float
 ) -> None:
     """Refuse few offsets far from most that make the words of all the others coarse.
 
@@ -305,20 +300,13 @@ def _chord(
     planes: Floats, used: Bools, low: float, high: float
 ) -> tuple[tuple[Floats, Floats], float]:
     """Line parallel to the chord with the smallest largest deviation, and the largest sag."""
-    ends = [_curve(planes, value) for value in (low, high)]
+    ends = [np.asarray(polyval(value, planes)) for value in (low, high)]
     gain = (ends[1] - ends[0]) / (high - low)
     offset = ends[0] - gain * low
     lowest, highest = np.zeros(gain.shape), np.zeros(gain.shape)
     for value in np.linspace(low, high, _STEPS):
-        away = _curve(planes, value) - offset - gain * value
+        away = polyval(value, planes) - offset - gain * value
         lowest, highest = np.minimum(lowest, away), np.maximum(highest, away)
     sag = (highest - lowest)[used & np.isfinite(gain)]
     # Half of the sag is left on either side.
     return (offset + (lowest + highest) / 2, gain), float(sag.max(initial=0))
-
-
-def _curve(planes: Floats, raw: float) -> Floats:
-    total = np.zeros(planes.shape[1:])
-    for plane in planes[::-1]:
-        total = total * raw + plane
-    return total

@@ -1,12 +1,9 @@
 """The adaptive loop with memories of whole numbers."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import Array, as_array, check_shape, positive_workers, read_only
+from equipix._check import Array, ArrayLike, as_array, check_shape, positive_workers, read_only
 from equipix._native import __version__
 from equipix.errors import InputError
 from equipix.hardware.table import Table

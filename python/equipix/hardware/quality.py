@@ -1,20 +1,17 @@
 """How much quality C the words of a table cost, and which widths suffice."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Array, as_array, naming_memory, number
+from equipix._check import Array, ArrayLike, as_array, naming_memory, positive
 from equipix.correction.protocol import Correction
 from equipix.errors import InputError
 from equipix.findings import usable
 from equipix.hardware.table import Table
-from equipix.hardware.words import check_width
 from equipix.metrics import correctability
 from equipix.metrics.correctability import Correctability
 
@@ -134,11 +131,7 @@ class Widths:
 
 @naming_memory("widths of a table")
 def smallest_widths(
-    correction: Correction,
-    levels: Sequence[ArrayLike],
-    *,
-    added: float = 0.1,
-    **options: Any,
+    correction: Correction, levels: Sequence[ArrayLike], *, added: float = 0.1, **options: Any
 ) -> Widths:
     """Find the smallest widths of the memories that cost no more than a share of the noise.
 
@@ -164,8 +157,7 @@ def smallest_widths(
     InputError
         As of `quality`; or if `options` names a width that is sought.
     """
-    if not number("added", added) > 0:
-        raise InputError(f"'added' is {added!r}, expected more than 0")
+    positive("added", added)
     sought = {"offset_bits", "gain_bits"} & set(options)
     if sought or not len(levels):
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
@@ -173,15 +165,21 @@ def smallest_widths(
     measured = [_level("levels", correction, frames) for frames in levels]
 
     def worst(offset_bits: int, gain_bits: int) -> float:
+        """Most that words add over all levels; infinite where those of usable pixels do not fit."""
         widths = {"offset_bits": offset_bits, "gain_bits": gain_bits}
-        return _worst(correction, measured, widths | options)
+        try:
+            table = Table.of(correction, **widths, **options)
+        except InputError:
+            # With 16 bits they fit.
+            return float("inf")
+        return max(_added(table.correct(raw), exact, before) for raw, exact, before in measured)
 
     found = {
         "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
         "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
         "both": {bits: worst(bits, bits) for bits in _WIDTHS},
     }
-    offset, gain, both = (_first(each.items(), added) for each in found.values())
+    offset, gain, both = (_first(each, added) for each in found.values())
     return Widths(offset, gain, both, found)
 
 
@@ -199,21 +197,7 @@ def _level(name: str, correction: Correction, frames: ArrayLike) -> _Level:
     return _Level(raw, exact, correctability(exact))
 
 
-def _worst(correction: Correction, levels: list[_Level], options: dict[str, Any]) -> float:
-    """Most that words add over all levels; infinite where those of usable pixels do not fit."""
-    try:
-        table = Table.of(correction, **options)
-    except InputError:
-        # With 16 bits they fit.
-        return float("inf")
-    return max(_added(table.correct(raw), exact, before) for raw, exact, before in levels)
-
-
-def _first(found: Iterable[tuple[int, float]], limit: float) -> int | None:
+def _first(found: dict[int, float], limit: float) -> int | None:
     """Return the smallest width from which on none adds more than the limit."""
-    last = None
-    for bits, added in sorted(found, reverse=True):
-        if added > limit:
-            break
-        last = check_width("bits", bits)
-    return last
+    widths = takewhile(lambda bits: not found[bits] > limit, sorted(found, reverse=True))
+    return min(widths, default=None)

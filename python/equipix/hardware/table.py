@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import (
     Array,
+    ArrayLike,
     Flagged,
     Floats,
     ReadOnly,

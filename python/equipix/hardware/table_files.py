@@ -12,8 +12,6 @@ coarse offset, the fine offset in two's complement, and the gain; the address is
 Flags of a pixel follow its word as a comment.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib
@@ -112,11 +110,10 @@ def read_header(path: Path, text: str, first: str = "") -> dict[str, Any]:
         If the file holds no table, or one of a newer version.
     """
     try:
-        told = json.loads(text.removeprefix(first))
+        told: Any = json.loads(text.removeprefix(first)) if text.startswith(first) else None
     except ValueError:
         told = None
-    ours = text.startswith(first) and isinstance(told, dict)
-    if not ours or told.get("kind") != "equipix table":
+    if not isinstance(told, dict) or told.get("kind") != "equipix table":
         raise FileError(f"{path}: {_FOREIGN}")
     version = told.get("version")
     if version != NEWEST:

@@ -1,7 +1,5 @@
 """Widths of words, the steps that they stand for, and how values become words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -66,14 +64,13 @@ class Format:
         """Refuse numbers out of range."""
         for name in WIDTHS:
             check_width(name, getattr(self, name))
-        for name in STEPS:
+        limits = dict.fromkeys(STEPS, _EXPONENT) | {"base": 2**31 - 1, "zero": 2**31 - 1}
+        for name, limit in limits.items():
             value = getattr(self, name)
-            if not isinstance(value, int) or abs(value) > _EXPONENT:
-                raise InputError(f"'{name}' is {value!r}, expected -{_EXPONENT} to {_EXPONENT}")
-        for name in ("base", "zero"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or abs(value) >= 2**31:
-                raise InputError(f"'{name}' is {value!r}, expected a whole number of 32 bits")
+            if not isinstance(value, int) or abs(value) > limit:
+                raise InputError(
+                    f"'{name}' is {value!r}, expected a whole number from -{limit} to {limit}"
+                )
         product, offset, out = self.shifts
         bits = max(32 + product, 16 + offset, out)
         if bits > _SUM_BITS:

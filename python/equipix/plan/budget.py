@@ -1,15 +1,12 @@
 """The error budget of a planned calibration: noise, lamp drift, errors of the shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, as_shifts, check_shape, per_exposure, positive
+from equipix._check import ArrayLike, Floats, Ints, as_shifts, check_shape, per_exposure, positive
 from equipix.errors import IdentifiabilityWarning, InputError, MisfitWarning, warn
 from equipix.exposures.positions import whole_moves
 from equipix.plan import pattern_errors
@@ -69,7 +66,7 @@ class ErrorBudget:
         return f"<ErrorBudget of {len(self.shifts)} exposures: {self.rms:.1e} rms ({causes})>"
 
     @cached_property
-    def noise_map(self) -> NDArray[np.float64]:
+    def noise_map(self) -> Floats:
         """Standard deviation of M from noise, shape (rows, cols); inf where not determined.
 
         By halves of the sensor it is within 10 % of simulation; within 25 % where a few long or
@@ -200,11 +197,7 @@ def error_budget(
 
 
 def check_causes(
-    shape: tuple[int, int],
-    noise: float,
-    drift: float,
-    shift_error: float,
-    beam_width: float | None,
+    shape: tuple[int, int], noise: float, drift: float, shift_error: float, beam_width: float | None
 ) -> None:
     """Refuse a sensor of one pixel, and causes of errors that are not numbers.
 
@@ -244,7 +237,7 @@ def _between_pixels(shifts: Floats, waves: Spectrum) -> bool:
     return True
 
 
-def _components(shape: tuple[int, int], positions: NDArray[np.int64], between: bool) -> int:
+def _components(shape: tuple[int, int], positions: Ints, between: bool) -> int:
     """Count the components, and warn of more than one."""
     fits = np.all(np.abs(positions) < shape)
     components = 1

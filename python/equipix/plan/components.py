@@ -1,16 +1,13 @@
 """Which pixels a pattern of shifts compares."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import as_mask, as_shifts, check_shape, naming_memory, union
+from equipix._check import Array, Ints, as_mask, as_shifts, check_shape, naming_memory, union
 from equipix.errors import InputError, InputWarning, warn
 from equipix.exposures.positions import as_rotation, round_shifts, whole_moves
 from equipix.measured.colour import Colours
@@ -39,7 +36,7 @@ class Identifiability:
     """
 
     components: int
-    labels: NDArray[Any]
+    labels: Array
     largest: int
     equations: int
     unknowns: int
@@ -146,9 +143,7 @@ def identify(
     )
 
 
-def is_connected(
-    shape: tuple[int, int], positions: NDArray[np.int64], colours: Colours | None = None
-) -> bool:
+def is_connected(shape: tuple[int, int], positions: Ints, colours: Colours | None = None) -> bool:
     """Whether whole shifts compare all pixels of a sensor, by a part of it three spans wide.
 
     A part that is connected by itself proves it: such parts cover the sensor, overlap, and stay

@@ -1,16 +1,12 @@
 """Errors of a pattern of shifts: by noise, by frequency, by errors of the shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
-from numpy.typing import NDArray
 
-from equipix._check import Floats
+from equipix._check import Array, Floats, Ints
 from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 
@@ -30,7 +26,7 @@ _NOISE, _TOLERANCE = 1e-3, 1e-4
 
 def local_variance(
     shape: tuple[int, int],
-    positions: NDArray[np.int64],
+    positions: Ints,
     powers: Floats,
     width: float | None,
     *,
@@ -72,19 +68,19 @@ def local_variance(
         )
 
 
-def _seen_by(size: int, places: NDArray[np.int64]) -> Floats:
+def _seen_by(size: int, places: Ints) -> Floats:
     """Whether exposure l covers row (or column) i of the beam, counted from the first: (i, l)."""
     away = np.arange(size + places.max())[:, None] - places
     return ((away >= 0) & (away < size)).astype(np.float64)
 
 
-def _light(size: int, positions: NDArray[np.int64], width: float | None) -> Floats:
+def _light(size: int, positions: Ints, width: float | None) -> Floats:
     """Square of a Gaussian beam's factor along one axis, at each row (or column): (k, i)."""
     places = np.arange(size) + positions[:, None] - (size - 1) / 2
     return np.ones(places.shape) if width is None else np.exp(-2 * (places / width) ** 2)
 
 
-def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats) -> float:
+def factor(shape: tuple[int, int], positions: Ints, powers: Floats) -> float:
     """What `local_variance` must be multiplied by, from draws of noise.
 
     It counts the longer ways, and nearly periodic waves with them. It falls with the size of the
@@ -196,9 +192,9 @@ class Spectrum:
         λ there.
     """
 
-    rows: NDArray[np.float64]
-    cols: NDArray[np.float64]
-    values: NDArray[Any]
+    rows: Floats
+    cols: Floats
+    values: Array
     worst: tuple[float, float]
     smallest: float
 
@@ -210,7 +206,7 @@ class Spectrum:
         )
 
 
-def spectrum(shifts: NDArray[Any], powers: NDArray[np.float64]) -> Spectrum:
+def spectrum(shifts: Array, powers: Floats) -> Spectrum:
     """Evaluate λ(q) = Σ c² − |Σ c² e^{iq·d}|² / Σ c², which is n − |Σ e^{iq·d}|²/n for c = 1."""
     rows = np.linspace(0, 0.5, _FREQUENCIES + 1)
     cols = np.linspace(-0.5, 0.5, 2 * _FREQUENCIES + 1)
@@ -234,7 +230,7 @@ def spectrum(shifts: NDArray[Any], powers: NDArray[np.float64]) -> Spectrum:
     return Spectrum(rows, cols, values, worst, float(values[row, col]))
 
 
-def smallest_near(found: Spectrum, shifts: NDArray[Any]) -> float:
+def smallest_near(found: Spectrum, shifts: Array) -> float:
     """Refine the smallest λ between the frequencies of the spectrum, for fluxes of 1.
 
     Shifts between pixels may make a wave periodic whose frequency is none of the grid's.

@@ -1,7 +1,5 @@
 """Patterns of shifts that leave little error, sought by exchanging one position at a time."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -183,7 +181,7 @@ def suggest(
             f"{'' if colours is None else ' of each colour alone'}; allow more of either"
         )
     suggestions = []
-    causes = {"noise": noise, "shift_error": shift_error, "beam_width": beam_width}
+    causes: dict[str, Any] = {"noise": noise, "shift_error": shift_error, "beam_width": beam_width}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MisfitWarning)
         finalists = found[: max(wanted, _FINALISTS)]

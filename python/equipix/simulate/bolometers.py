@@ -1,15 +1,12 @@
 """A simulated array of uncooled bolometers: bridge, thermal balance, self-heating by the bias."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, check_shape, positive
+from equipix._check import Array, ArrayLike, Floats, Rng, check_shape, positive
 from equipix.detector.photons import exitance, integrated, kelvin_of
 from equipix.errors import InputError
 from equipix.simulate.camera import PixelArray
@@ -256,7 +253,7 @@ class BolometerArray(PixelArray):
         rng: Rng,
         scene_c: float | None = None,
         bias_v: float | None = None,
-    ) -> Iterator[NDArray[Any]]:
+    ) -> Iterator[Array]:
         """Make frames of a steady state, one at a time.
 
         Parameters

@@ -1,16 +1,14 @@
 """A virtual experiment on disk: TIFF files and the manifest that names them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from equipix._check import Progress
+from equipix._check import Array, Progress
 from equipix.errors import FileError
 from equipix.io.paths import folder_beside, replace_folder
 from equipix.io.tiff import write_frames
@@ -19,7 +17,7 @@ from equipix.io.tiff import write_frames
 class Stream(NamedTuple):
     """Frames of one file, made one at a time when they are written, and their number."""
 
-    frames: Callable[[], Iterator[NDArray[Any]]]
+    frames: Callable[[], Iterator[Array]]
     length: int
 
 
@@ -43,11 +41,11 @@ def write_experiment(
             "of a folder that holds nothing but an experiment written before"
         )
     with folder_beside(target) as folder:
-        counter = _Counter(progress, sum(stream.length for stream in streams.values()))
+        done, total = count(1), sum(stream.length for stream in streams.values())
         for name, stream in streams.items():
             (folder / name).parent.mkdir(exist_ok=True)
-            nbytes = stream.length * frame_bytes
-            write_frames(folder / name, counter.pass_on(stream.frames()), nbytes=nbytes)
+            frames = _reported(stream.frames(), progress, done, total)
+            write_frames(folder / name, frames, nbytes=stream.length * frame_bytes)
         np.savez(folder / "truth.npz", **truth)
         manifest = _manifest(sensor, sum(name.startswith("frames/") for name in streams))
         (folder / "experiment.toml").write_text(manifest, encoding="utf-8")
@@ -69,19 +67,14 @@ def _manifest(sensor: Mapping[str, object], exposures: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-class _Counter:
-    """Reports frames as they are written."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-
-    def pass_on(self, frames: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-        """Yield the frames, each reported when it has been written."""
-        for frame in frames:
-            yield frame
-            self._done += 1
-            if self._progress is not None:
-                self._progress(self._done, self._total, "writing")
+def _reported(
+    frames: Iterator[Array], progress: Progress | None, done: Iterator[int], total: int
+) -> Iterator[Array]:
+    """Yield frames, each reported when it has been written."""
+    for frame in frames:
+        yield frame
+        if progress is not None:
+            progress(next(done), total, "writing")
 
 
 def _may_replace(target: Path, force: bool) -> bool:

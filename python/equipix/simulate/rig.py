@@ -1,18 +1,14 @@
 """A virtual calibration experiment: a camera on a stage in a steady beam, and a hole."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Progress, Rng, as_array, as_shifts
+from equipix._check import Array, ArrayLike, Floats, Progress, Rng, as_array, as_shifts
 from equipix.errors import InputError
 from equipix.io.paths import as_path
 from equipix.measured.colour import Colours
@@ -100,36 +96,27 @@ class VirtualExperiment:
     @property
     def truth(self) -> Truth:
         """What a calibration should find."""
-        camera = self.camera
-        return Truth(
-            sensitivity=camera.response,
-            shifts=self.positions,
-            dead=camera.dead,
-            hot=camera.hot,
-            dark=camera.offset,
-            gain_dn_per_e=camera.gain_dn_per_e,
-        )
+        c = self.camera
+        return Truth(c.response, self.positions, c.dead, c.hot, c.offset, c.gain_dn_per_e)
 
-    def frames(self, k: int) -> Iterator[NDArray[Any]]:
+    def frames(self, k: int) -> Iterator[Array]:
         """Make the frames of exposure `k`, one at a time."""
         return self._stream(self.beam, k, self.count, _FRAMES, k)
 
-    def dark(self) -> Iterator[NDArray[Any]]:
+    def dark(self) -> Iterator[Array]:
         """Make the dark frames, one at a time."""
         rng = np.random.default_rng([self.entropy, _DARK])
         return self.camera.frames(np.zeros(self.camera.shape), self.dark_count, rng=rng)
 
-    def aperture_before(self, k: int) -> Iterator[NDArray[Any]]:
+    def aperture_before(self, k: int) -> Iterator[Array]:
         """Make the frames of the hole before the move to exposure `k`, from 1 on."""
         return self._stream(self.hole, k - 1, self.aperture_count, _BEFORE, k)
 
-    def aperture_after(self, k: int) -> Iterator[NDArray[Any]]:
+    def aperture_after(self, k: int) -> Iterator[Array]:
         """Make the frames of the hole after the move to exposure `k`, from 1 on."""
         return self._stream(self.hole, k, self.aperture_count, _AFTER, k)
 
-    def _stream(
-        self, beam: Beam, position: int, count: int, kind: int, k: int
-    ) -> Iterator[NDArray[Any]]:
+    def _stream(self, beam: Beam, position: int, count: int, kind: int, k: int) -> Iterator[Array]:
         light = window(beam, self.camera.shape, self.positions[position])
         rng = np.random.default_rng([self.entropy, kind, k])
         return self.camera.frames(light, count, rng=rng)

@@ -1,16 +1,13 @@
 """A virtual staring array: why pixels answer the same light differently, cause by cause."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, check_bit_depth, check_shape
+from equipix._check import Array, ArrayLike, Floats, Rng, check_bit_depth, check_shape
 from equipix.detector.photons import band_photons
 from equipix.errors import InputError
 from equipix.simulate.beams import filtered
@@ -271,7 +268,7 @@ class StaringArray(PixelArray):
         rng: Rng,
         warmer_k: float = 0.0,
         time_s: float | None = None,
-    ) -> Iterator[NDArray[Any]]:
+    ) -> Iterator[Array]:
         """Make frames of a steady light, one at a time.
 
         Parameters
