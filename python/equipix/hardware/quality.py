@@ -166,7 +166,7 @@ def smallest_widths(
 
     def worst(offset_bits: int, gain_bits: int) -> float:
         """Most that words add over all levels; infinite where those of usable pixels do not fit."""
-        widths = {"offset_bits": offset_bits, "gain_bits": gain_bits}
+        widths: dict[str, Any] = {"offset_bits": offset_bits, "gain_bits": gain_bits}
         try:
             table = Table.of(correction, **widths, **options)
         except InputError:
