@@ -81,11 +81,7 @@ class Described(Generic[_Manifest]):
         """All image files, each once."""
         mask = self.manifest.sensor.mask
         masks: list[Path] = [] if mask is None else entry_files(self.path, mask)
-        return list(dict.fromkeys([*self._images(), *masks]))
-
-    def _images(self) -> list[Path]:
-        """The files of measurements, each once, those of the dark first."""
-        return image_files(self.path, self.manifest)
+        return list(dict.fromkeys([*image_files(self.path, self.manifest), *masks]))
 
     def _statistics(
         self,
@@ -157,7 +153,7 @@ class Described(Generic[_Manifest]):
             If images differ in shape or depth, or two are the same; if the mask file is of another
             shape, a region reaches beyond the sensor, or nothing is left.
         """
-        shape: tuple[int, int] = check_formats(self._images())
+        shape: tuple[int, int] = check_formats(image_files(self.path, self.manifest))
         count = len(self.manifest.measurements)
         given = None if mask is None else as_mask(mask, (count, *shape))
         excluded = union(given, self._excluded(shape))

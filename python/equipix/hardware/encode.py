@@ -12,7 +12,7 @@ from equipix.correction.protocol import Correction
 from equipix.errors import InputError
 from equipix.findings import set_bits, usable
 from equipix.hardware.table_files import Content
-from equipix.hardware.words import WIDEST, Format, Words
+from equipix.hardware.words import Format, Words
 
 _FINEST_GAIN = -40
 """Exponent of the finest step of a gain."""
@@ -190,20 +190,12 @@ def _refuse_extreme(words: Words, gain: Floats, used: Bools) -> None:
         far = gain >= min(words.limits[1] * float(np.median(gain)), gain.max())
     pixels = used.copy()
     pixels[used] = far
+    bits = words.wide_enough(gain, lambda wider: wider.finest(gain, _FINEST_GAIN))
     raise InputError(
         f"'gain_bits' is {words.bits}: no gain_step holds gains from {gain.min():.6g} to "
         f"{gain.max():.6g}, of which {float(np.median(gain)):.6g} is the median. Flag DO_NOT_USE "
-        f"the pixels far from it: {_places(pixels)}{_wider(words, gain)}"
+        f"the pixels far from it: {_places(pixels)}{f'; or take {bits} gain_bits' if bits else ''}"
     )
-
-
-def _wider(words: Words, gain: Floats) -> str:
-    """Say how many bits would hold all gains."""
-    for bits in range(words.bits + 1, WIDEST + 1):
-        wider = Words(words.name, bits, lowest=words.lowest)
-        if not wider.outside(gain, wider.finest(gain, _FINEST_GAIN)):
-            return f"; or take {bits} gain_bits"
-    return ""
 
 
 def _coarse(pedestal: Floats, bits: int, steps: Steps, lowest: float) -> tuple[Floats, int]:

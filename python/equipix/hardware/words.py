@@ -1,7 +1,9 @@
 """Widths of words, the steps that they stand for, and how values become words."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -180,11 +182,12 @@ class Words:
             )
         return self.rounded(values, exponent)
 
+    def wide_enough(self, values: Floats, step: Callable[[Self], int]) -> int:
+        """Bits that hold all values, in steps that follow from the wider words; 0 if none do."""
+        wider = (replace(self, bits=bits) for bits in range(self.bits + 1, WIDEST + 1))
+        return next((each.bits for each in wider if not each.outside(values, step(each))), 0)
+
     def _remedy(self, values: Floats, exponent: int) -> str:
-        wide = [
-            bits
-            for bits in range(self.bits + 1, WIDEST + 1)
-            if not replace(self, bits=bits).outside(values, exponent)
-        ]
+        bits = self.wide_enough(values, lambda _: exponent)
         others = f"another {self.name}_step, or flag these pixels"
-        return f"{wide[0]} bits would hold them; or take {others}" if wide else f"take {others}"
+        return f"{bits} bits would hold them; or take {others}" if bits else f"take {others}"
