@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, LevelExperiment, errors, io, metrics, nuc
+from equipix import Flag, LevelExperiment, errors, metrics, nuc
 from equipix.correction.correct_files import correct_files, picture
+from equipix.io import frames as images
+from equipix.io import tiff
 from equipix.io.frames import description, read_frames
 from equipix.io.png import write_png
 from equipix.io.tiff import write_frames
@@ -382,11 +384,9 @@ class TestCorrectedFiles:
         _, call = corrected
         whole, _ = call("whole.tif")
         read = []
-        monkeypatch.setattr(io.images, "_AT_ONCE", 1)
-        stream = io.tiff.stream_frames
-        monkeypatch.setattr(
-            io.tiff, "stream_frames", lambda path: read.append(path) or stream(path)
-        )
+        monkeypatch.setattr(images, "_AT_ONCE", 1)
+        stream = tiff.stream_frames
+        monkeypatch.setattr(tiff, "stream_frames", lambda path: read.append(path) or stream(path))
         single, _ = call("single.tif")
         assert len(read) == 1
         np.testing.assert_array_equal(read_frames(single), read_frames(whole))

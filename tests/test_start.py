@@ -131,7 +131,6 @@ def test_the_help_loads_no_command():
         "equipix._native",
         "equipix.cli",
         "equipix.cli.app",
-        "equipix.cli.terminal",
         "equipix.errors",
     }
 

@@ -9,13 +9,18 @@ from os import PathLike
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import numpy.typing as npt
+from numpy.typing import NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
+
+ArrayLike: TypeAlias = npt.ArrayLike
 
 Array: TypeAlias = NDArray[Any]
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Ints: TypeAlias = NDArray[np.int64]
 
 Bools: TypeAlias = NDArray[np.bool_]
 
@@ -239,6 +244,14 @@ def number(name: str, value: float) -> float:
         return float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
+
+
+def positive(name: str, value: float, *, zero: bool = False) -> float:
+    """A finite number above 0, or 0 where that is allowed, checked."""
+    checked = number(name, value)
+    if not (0 < checked < np.inf or (zero and checked == 0)):
+        raise InputError(f"'{name}' is {value!r}, expected a finite number above 0{' or 0' * zero}")
+    return checked
 
 
 def as_level(saturation: float | None) -> float | None:

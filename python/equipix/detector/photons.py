@@ -1,13 +1,10 @@
 """Photons of black bodies, cut-off of HgCdTe, heat of a bias pulse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Floats, number
+from equipix._check import ArrayLike, Floats, number, positive
 from equipix.errors import InputError
 
 _SECOND_RADIATION = 14387.768775
@@ -89,9 +86,8 @@ def band_photons(
     2.03
     """
     cutoff = np.asarray(cutoff_um, np.float64)
-    for name, values in (("start_um", start_um), ("temperature_k", temperature_k)):
-        if not 0 < values < np.inf:
-            raise InputError(f"'{name}' is {values!r}, expected a finite number above 0")
+    positive("start_um", start_um)
+    positive("temperature_k", temperature_k)
     wrong = cutoff[~((cutoff >= start_um) & (cutoff < np.inf))]
     if wrong.size:
         raise InputError(f"'cutoff_um' holds {wrong.flat[0]:g}, expected {start_um:g} or more")

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import (
     Array,
-    Bools,
+    ArrayLike,
     Flagged,
     Floats,
     ReadOnly,
@@ -27,17 +25,9 @@ from equipix.correction.apply import apply
 from equipix.correction.protocol import Correction, cfa_of, check_correction
 from equipix.errors import FileError, InputError
 from equipix.findings import usable
-from equipix.hardware.c_header import from_c_header, to_c_header
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
-from equipix.hardware.table_files import (
-    Content,
-    check_words,
-    from_binary,
-    from_memory_image,
-    to_binary,
-    to_memory_image,
-)
-from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
+from equipix.hardware.table_files import Content, check_words
+from equipix.hardware.words import WIDTHS, Format, check_width, chosen_exponent, exponent_of
 from equipix.io.paths import as_path, write_whole
 from equipix.measured.colour import Colours
 
@@ -169,23 +159,29 @@ class Table(ReadOnly):
             If a width or a step is out of range, the correction is curved, or words of usable
             pixels do not fit; the message has their number and the width that would hold them.
         """
-        widths = {
-            "adc_bits": adc_bits,
-            "dac_bits": dac_bits,
-            "offset_bits": offset_bits,
-            "gain_bits": gain_bits,
-            "out_bits": out_bits,
-        }
-        steps = {
-            "dac_step": dac_step,
-            "offset_step": offset_step,
-            "gain_step": gain_step,
-            "out_step": out_step,
-        }
-        content = content_of(
-            correction, widths, steps, adc_step=adc_step, lowest=lowest, linearise=linearise
+        check_correction("correction", correction)
+        bits = zip(WIDTHS, (adc_bits, dac_bits, offset_bits, gain_bits, out_bits), strict=True)
+        widths = {name: check_width(name, width) for name, width in bits}
+        if not np.isfinite(number("lowest", lowest)):
+            raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
+        adc, out = exponent_of("adc_step", adc_step), chosen_exponent("out_step", out_step)
+        steps = Steps(
+            adc,
+            chosen_exponent("dac_step", dac_step),
+            chosen_exponent("offset_step", offset_step),
+            chosen_exponent("gain_step", gain_step),
+            adc + widths["adc_bits"] - widths["out_bits"] if out is None else out,
         )
-        return cls(*content)
+        with naming_memory("making a table"):
+            line, sag = line_of(correction, linearise)
+            found = encode(line, correction.flags, widths, steps, float(lowest))
+            refuse_far_offsets(found, line, widths, steps, float(lowest))
+        colours = cfa_of(correction)
+        cfa = {} if colours is None else {"cfa": colours.rows}
+        metadata = {**origin(correction), **cfa, **found.metadata}
+        if linearise is not None:
+            metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
+        return cls(*found._replace(metadata=metadata))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -222,8 +218,16 @@ class Table(ReadOnly):
         InputError
             If a shape does not fit, or a usable pixel is not finite.
         """
-        raw = self._frames(frames)
-        return digitised(raw, self.coarse, usable(self.flags), self.format)
+        raw, f, used = self._frames(frames), self.format, usable(self.flags)
+        pedestal = np.ldexp(self.coarse.astype(np.float64), f.coarse)
+        words = np.empty(raw.shape, np.uint16)
+        for source, target in zip(_each(raw), _each(words), strict=True):
+            lost = int(np.count_nonzero(~np.isfinite(source) & used))
+            if lost:
+                raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
+            steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
+            target[...] = np.clip(steps, 0, f.largest_word)
+        return words
 
     def apply(self, frames: ArrayLike, *, workers: int | None = None) -> Array:
         """Corrected words, bit by bit as the electronics gives them.
@@ -250,7 +254,22 @@ class Table(ReadOnly):
     def applied(self, frames: ArrayLike, *, workers: int | None = None) -> Applied:
         """Like `apply`, with the numbers of outputs that were limited."""
         raw = self._frames(frames)
-        return applied(raw, self.gain, self.offset, self.format, positive_workers(workers))
+        if raw.dtype not in (np.uint8, np.uint16):
+            raise InputError(
+                f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
+                "table.digitise(frames) makes them of raw values"
+            )
+        words = np.ascontiguousarray(raw, np.uint16)
+        out, stack = np.empty(words.shape, np.uint16), (-1, *self.shape)
+        below, above = _native.apply_words(
+            words.reshape(stack),
+            np.ascontiguousarray(self.gain),
+            np.ascontiguousarray(self.offset),
+            out.reshape(stack),
+            self.format.arithmetic,
+            workers=positive_workers(workers),
+        )
+        return Applied(out, below, above)
 
     def correct(
         self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
@@ -317,9 +336,9 @@ class Table(ReadOnly):
 
 
 _FORMATS = {
-    ".bin": (to_binary, from_binary),
-    ".h": (to_c_header, from_c_header),
-    ".hex": (to_memory_image, from_memory_image),
+    ".bin": (table_files.to_binary, table_files.from_binary),
+    ".hex": (table_files.to_memory_image, table_files.from_memory_image),
+    ".h": (c_header.to_c_header, c_header.from_c_header),
 }
 
 SUFFIXES = tuple(_FORMATS)
@@ -329,8 +348,7 @@ SUFFIXES = tuple(_FORMATS)
 def write(content: Content, path: str | PathLike[str], *, force: bool) -> None:
     """Write a file, which appears whole or not at all."""
     file = as_path("path", path)
-    encode_file, _ = _FORMATS[_suffix(file)]
-    data = encode_file(content, file.stem)
+    data = _FORMATS[_suffix(file)][0](content, file.stem)
     with write_whole(path, force=force) as temporary:
         temporary.write_bytes(data)
 
@@ -344,9 +362,9 @@ def read_content(path: str | PathLike[str]) -> Content:
         If the file cannot be read, holds something else, or is incomplete or of another version.
     """
     file = as_path("path", path)
-    _, decode_file = _FORMATS[_suffix(file)]
+    decoded = _FORMATS[_suffix(file)][1]
     try:
-        content: Content = decode_file(file, file.read_bytes())
+        content = decoded(file, file.read_bytes())
     except FileError:
         raise
     except OSError as error:
@@ -361,55 +379,6 @@ def _suffix(path: Path) -> str:
     if suffix not in _FORMATS:
         raise InputError(f"'{path}' ends in none of {', '.join(SUFFIXES)}, which name the format")
     return suffix
-
-
-def content_of(
-    correction: Correction,
-    widths: Mapping[str, int],
-    steps: Mapping[str, float | None],
-    *,
-    adc_step: float,
-    lowest: float,
-    linearise: tuple[float, float] | None,
-) -> Content:
-    """Make the parts of a table, as `Table.of` describes them.
-
-    Raises
-    ------
-    InputError
-        As of `Table.of`.
-    """
-    check_correction("correction", correction)
-    bits = {name: check_width(name, width) for name, width in widths.items()}
-    if not np.isfinite(number("lowest", lowest)):
-        raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
-    exponents = _exponents(exponent_of("adc_step", adc_step), steps, bits)
-    with naming_memory("making a table"):
-        offset, gain, sag = line_of(correction, linearise)
-        found = encode((offset, gain), correction.flags, bits, exponents, float(lowest))
-        refuse_far_offsets(found, (offset, gain), bits, exponents, float(lowest))
-    colours = cfa_of(correction)
-    metadata = {
-        **origin(correction),
-        **({} if colours is None else {"cfa": colours.rows}),
-        "lowest": float(lowest),
-        "largest_error_dn": found.largest_error,
-    }
-    if linearise is not None:
-        metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
-    return Content(found.format, found.coarse, found.offset, found.gain, found.flags, metadata)
-
-
-def _exponents(adc: int, steps: Mapping[str, float | None], bits: Mapping[str, int]) -> Steps:
-    """Exponents of the steps; unless given, the output has the range of the ADC."""
-    out = chosen_exponent("out_step", steps["out_step"])
-    return Steps(
-        adc,
-        chosen_exponent("dac_step", steps["dac_step"]),
-        chosen_exponent("offset_step", steps["offset_step"]),
-        chosen_exponent("gain_step", steps["gain_step"]),
-        adc + bits["adc_bits"] - bits["out_bits"] if out is None else out,
-    )
 
 
 def read(path: str | PathLike[str]) -> Table:
@@ -445,40 +414,6 @@ class Applied(NamedTuple):
     words: Array
     below: int
     above: int
-
-
-def digitised(raw: Array, coarse: Array, used: Bools, f: Format) -> Array:
-    """Words of the ADC behind the subtracting amplifier, as `Table.digitise` describes them."""
-    pedestal = np.ldexp(coarse.astype(np.float64), f.coarse)
-    words = np.empty(raw.shape, np.uint16)
-    for source, target in zip(_each(raw), _each(words), strict=True):
-        lost = int(np.count_nonzero(~np.isfinite(source) & used))
-        if lost:
-            raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
-        steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
-        target[...] = np.clip(steps, 0, f.largest_word)
-    return words
-
-
-def applied(raw: Array, gain: Array, offset: Array, f: Format, workers: int | None) -> Applied:
-    """Correct words of the ADC, and count the outputs that were limited."""
-    if raw.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
-            "table.digitise(frames) makes them of raw values"
-        )
-    words = np.ascontiguousarray(raw, np.uint16)
-    out = np.empty(words.shape, np.uint16)
-    stack = (-1, *gain.shape)
-    below, above = _native.apply_words(
-        words.reshape(stack),
-        np.ascontiguousarray(gain),
-        np.ascontiguousarray(offset),
-        out.reshape(stack),
-        f.arithmetic,
-        workers=workers,
-    )
-    return Applied(out, below, above)
 
 
 def _each(stack: Array) -> Array:
