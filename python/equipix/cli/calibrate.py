@@ -12,7 +12,7 @@ import typer
 
 from equipix._check import FluxModel, Method
 from equipix.calibration.result import Calibration
-from equipix.cli.summary import of_calibration, summary
+from equipix.cli.summary import of_calibration, summary, told
 from equipix.cli.terminal import (
     Force,
     Json,
@@ -92,9 +92,7 @@ def calibrate(
         _refuse_partial(calibration, output)
     calibration.save(output, force=force)
     result = {"output": str(output), **of_calibration(calibration)}
-    if not as_json:  # their messages are on stderr, as warnings
-        result["findings"] = ", ".join(each.kind for each in calibration.findings) or "none"
-    show_result(result, as_json=as_json)
+    show_result(result | told(calibration.findings, as_json=as_json), as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from equipix._check import Display, Flagged, OutputType
-from equipix.cli.summary import of_statistics
+from equipix.cli.summary import of_statistics, told
 from equipix.cli.terminal import (
     Force,
     Json,
@@ -22,20 +22,15 @@ from equipix.cli.terminal import (
     show_result,
 )
 from equipix.correction.correct_files import Corrected, correct_files, is_folder
-from equipix.errors import InputError, MisfitWarning, warn
+from equipix.errors import InputError
 from equipix.experiment.image_files import origin_of, refuse_repeated_files
+from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.frames import read_mask
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.loading import load
 from equipix.measured.average import average as average_frames
-from equipix.measured.statistics import (
-    STRAY,
-    light_of,
-    refuse_subtracted,
-    saved_shape,
-    warn_of_bright_dark,
-)
+from equipix.measured.statistics import AVERAGED, refuse_subtracted, saved_shape
 
 commands = typer.Typer()
 
@@ -87,11 +82,9 @@ def average(
             workers=workers,
             progress=progress,
         )
-    warn_of_bright_dark(frames)
-    if (light := light_of(frames)).over_noise > STRAY:
-        warn(f"{light.words} (limit {STRAY:g}): see that all are of one measurement", MisfitWarning)
+    said = say(*ask(AVERAGED, frames))
     frames.save(output, force=force)
-    result = {"output": str(output), **of_statistics(frames)}
+    result = {"output": str(output), **of_statistics(frames), **told(said, as_json=as_json)}
     show_result(result, as_json=as_json)
 
 

@@ -11,7 +11,7 @@ import typer
 
 from equipix._check import Array, By, Flagged, naming_memory
 from equipix.cli.summary import flagged as flag_counts
-from equipix.cli.summary import summary
+from equipix.cli.summary import summary, told
 from equipix.cli.terminal import (
     Cfa,
     Force,
@@ -86,7 +86,8 @@ def fit(
             progress=progress,
         )
     response.save(output, force=force)
-    show_result({"output": str(output), **summary(response)}, as_json=as_json)
+    result = {"output": str(output), **summary(response)}
+    show_result(result | told(response.findings, as_json=as_json), as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc defects response.tif level/*.tif -o flagged.tif")
@@ -148,7 +149,7 @@ def defects(
     result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
     result |= {kind: f"not determinable {why}" for kind, why in found.not_determinable.items()}
     result |= {"percentiles_of_K": found.gain_percentiles, "flagged_pixels": flag_counts(flagged)}
-    show_result(result, as_json=as_json)
+    show_result(result | told(found.findings, as_json=as_json), as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc quality response.tif level/*.tif")

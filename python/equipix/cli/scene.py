@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
+from equipix.cli.summary import told
 from equipix.cli.terminal import (
     Force,
     Json,
@@ -136,7 +137,8 @@ def scene(
         learning.save(state, force=force)
     if picture is not None:
         save_figure(draw_sequence(done, result), picture, force=force)
-    show_result(_summary(output, learning, done), as_json=as_json)
+    figures = _summary(output, learning, done)
+    show_result(figures | told(result.findings, as_json=as_json), as_json=as_json)
 
 
 def _method(

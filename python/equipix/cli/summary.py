@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
@@ -11,7 +12,7 @@ from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.protocol import Correction, sensor_of
-from equipix.findings import Flag, usable
+from equipix.findings import Finding, Flag, usable
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
 
@@ -32,7 +33,15 @@ def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[s
         "order": len(content.coefficients) - 1,
         **_learned(content),
         "flagged_pixels": flagged(content),
+        **told(content.findings),
     }
+
+
+def told(findings: Iterable[Finding], *, as_json: bool = True) -> dict[str, Any]:
+    """Findings; their kinds alone where messages are on stderr, as warnings, already."""
+    if as_json:
+        return {"findings": [asdict(each) for each in findings]}
+    return {"findings": ", ".join(each.kind for each in findings) or "none"}
 
 
 def _learned(correction: Correction) -> dict[str, Any]:
@@ -64,6 +73,7 @@ def of_response(response: Response) -> dict[str, Any]:
         "largest_inverse_error": response.largest_inverse_error,
         **({} if prediction is None else {"prediction_errors": prediction}),
         "flagged_pixels": flagged(response),
+        **told(response.findings),
     }
 
 
@@ -112,6 +122,7 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_order": correction.axes.bias_order,
         "gain_order": None if correction.gain is None else correction.gain_axes.order,
         "flagged_pixels": flagged(correction),
+        **told(correction.findings),
     }
 
 
@@ -162,7 +173,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "flagged_pixels": flagged(calibration),
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
-        "findings": [asdict(finding) for finding in calibration.findings],
+        **told(calibration.findings),
     }
 
 

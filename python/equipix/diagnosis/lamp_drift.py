@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, ReadOnly
+from equipix.fitting.error_bars import ErrorBars
 from equipix.fitting.residuals import EXACT, FEWEST, Residuals, on_sensor, testable
 from equipix.fitting.stated_errors import flux_variance
 from equipix.fitting.weighted import Weighted
@@ -168,6 +169,15 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     probability = chi2_tail(float(scatter @ scatter), freedom)
     trend = np.abs(_slope_of_trend(columns, rest, exposures.flux.time)) * exposures.shape
     return Drift(size, flux_std, freedom, probability, covariance, tilt, trend)
+
+
+def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
+    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
+    if not drift.is_added:
+        return bars
+    hidden = response * np.sqrt(drift.variance_map(response))
+    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
+    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
 
 
 def _free_fluxes(

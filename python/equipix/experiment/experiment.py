@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from equipix._check import Bools, Floats, FluxModel, Method, Progress, as_mask, naming_memory, union
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
-from equipix.errors import FileError, InputError, InputWarning, warn
+from equipix.errors import FileError, InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described, excluded_pixels, provenance
 from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
 from equipix.experiment.manifest import Manifest, entry_files, read_manifest
 from equipix.exposures.exposures import Exposures, exposures_of
 from equipix.exposures.fit import FitOptions
+from equipix.findings import Finding, say
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.colour import Colours
@@ -200,7 +201,7 @@ class Experiment(Described[Manifest]):
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
-        self._warn_of_unused(flux)
+        said = say(*self._unused(flux))
         if flux == "linear" and self._column("time") is None:
             raise InputError(
                 f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
@@ -225,21 +226,21 @@ class Experiment(Described[Manifest]):
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
         origin = provenance(self.path, self.manifest, hashes, shifts, std, averaged.noise)
-        return calibrated(exposures, options, start=start, provenance=origin)
+        return calibrated(exposures, options, start=start, said=said, provenance=origin)
 
-    def _warn_of_unused(self, flux: FluxModel | None) -> None:
-        """Warn of values in the file that the fluxes to find leave without use."""
+    def _unused(self, flux: FluxModel | None) -> list[Finding]:
+        """Findings on values in the file that the fluxes to find leave without use."""
+        words = []
         if flux is not None and self._column("flux") is not None:
-            warn(
+            words.append(
                 f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
-                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
-                InputWarning,
+                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior"
             )
         if flux != "linear" and self._column("time") is not None:
-            warn(
-                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
-                InputWarning,
+            words.append(
+                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)"
             )
+        return [Finding("unused", each, "input", "note") for each in words]
 
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:
         """Pixels that the file or the caller excludes."""

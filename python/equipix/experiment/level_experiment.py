@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix._check import By, Order, Progress, Words, as_mask, naming_memory, union
-from equipix.errors import EquipixWarning, FileError, InputError, warn
+from equipix.errors import FileError, InputError
 from equipix.experiment.described import Described, excluded_pixels
 from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
 from equipix.experiment.manifest import LevelManifest, read_level_manifest
+from equipix.findings import Finding, say
 from equipix.measured.colour import Colours
 from equipix.measured.defects import SIGMAS
 from equipix.measured.means import Averaged
@@ -95,7 +96,7 @@ class LevelExperiment(Described[LevelManifest]):
 
         Warns
         -----
-        EquipixWarning
+        MisfitWarning
             If the mean of a level is lower than that of a level with a lower value, beside the
             warnings of `equipix.nuc.fit`.
         """
@@ -107,7 +108,9 @@ class LevelExperiment(Described[LevelManifest]):
         refuse_repeats(self.path, self.manifest, hashes)
         averaged = self._average(workers, progress)
         levels = levels_of(averaged, mask=excluded)
-        self._warn_of_order(levels)
+        if words := self._falling(levels):
+            said = say(Finding("light", words, "misfit"))
+            levels = replace(levels, findings=levels.findings + said)
         origin = self._provenance(averaged, levels.references.tolist(), hashes)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
@@ -132,8 +135,8 @@ class LevelExperiment(Described[LevelManifest]):
                     raise FileError(f"{self.path}: {error}") from error
         return averaged
 
-    def _warn_of_order(self, levels: Levels) -> None:
-        """Warn of values of levels that do not rise with the means by more than noise explains."""
+    def _falling(self, levels: Levels) -> str | None:
+        """Say which values of levels do not rise with the means by more than noise explains."""
         entries = zip(self.manifest.level, self.manifest.names, strict=True)
         known = [
             (level.value, name, mean, sigma)
@@ -145,13 +148,12 @@ class LevelExperiment(Described[LevelManifest]):
         known.sort(key=lambda each: each[0])
         for (_, below, least, one), (_, above, most, other) in pairwise(known):
             if most < least - SIGMAS * np.hypot(one, other):
-                warn(
+                return (
                     f"{self.path}: the mean of the frames falls from {least:.6g} DN in level "
                     f"'{below}' to {most:.6g} DN in level '{above}', whose 'value' is higher: see "
-                    "that each value is that of its frames",
-                    EquipixWarning,
+                    "that each value is that of its frames"
                 )
-                return
+        return None
 
     def _dark(self, workers: int | None, progress: Progress | None) -> FrameStatistics | None:
         if self.manifest.dark is None:

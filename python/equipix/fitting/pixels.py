@@ -134,7 +134,7 @@ _FEWEST = 16
 """Fewer lit pixels are chance."""
 
 
-def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
+def without_faint_pixels(weighted: Weighted, options: Options) -> Weighted:
     """Find pixels that the noise of the dark makes unreliable, and leave them out of mean(M).
 
     The solver knows the noise of exposures alone. The noise of their common dark adds to it where
@@ -143,13 +143,13 @@ def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
     exposures = weighted.exposures
     if exposures.dark_variance is None:
         return weighted
-    without, with_dark = std_of_pixels(weighted, options.workers)
+    without, with_dark = std_of_pixels(weighted, options.fit.workers)
     faint = _faint(with_dark) & ~_faint(without) & (weighted.fit.flags == 0)
     if not faint.any():
         return weighted
     bad_pixels = dataclasses.replace(exposures.bad_pixels, faint=faint)
     exposures = dataclasses.replace(exposures, bad_pixels=bad_pixels)
-    return weighted._replace(exposures=exposures, fit=exposures.fit(options, weighted.fit))
+    return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
 def _faint(std: Array) -> Bools:

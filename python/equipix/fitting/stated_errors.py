@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import Array, Floats
+from equipix._native import Fit
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import WIDEST, in_beam
 from equipix.fitting.residuals import Residuals, sampled
@@ -53,7 +54,7 @@ class Contradiction(NamedTuple):
         )
 
 
-def widened(weighted: Weighted, options: Options) -> tuple[Weighted, list[Contradiction]]:
+def widened(weighted: Weighted, options: Options) -> Weighted:
     """Repeat a fit with wider priors where the data contradict those given.
 
     Notes
@@ -67,12 +68,13 @@ def widened(weighted: Weighted, options: Options) -> tuple[Weighted, list[Contra
     """
     found = [_explained(each, weighted, options) for each in contradictions(weighted)]
     if not found:
-        return weighted, []
+        return weighted
     exposures = weighted.exposures
     for each in found:
         exposures = _wider(exposures, each)
     fit = exposures.fit(options.fit, weighted.fit)
-    return weighted._replace(exposures=exposures, fit=fit), found
+    replaced = {**weighted.replaced, **{each.name: each.words for each in found}}
+    return weighted._replace(exposures=exposures, fit=fit, replaced=replaced)
 
 
 def contradictions(weighted: Weighted) -> list[Contradiction]:
@@ -198,18 +200,17 @@ def sampled_frames(variance: Array | None) -> float | None:
     return frames if abs(fourth - 1) < _LIKE else None
 
 
-def steadied(
-    exposures: Exposures, weighted: Weighted, options: Options
-) -> tuple[Weighted, float | None]:
-    """Fit with a noise model of each exposure, where the variances scatter like sample variances.
+def steady_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:
+    """Fit exposures, with a noise model of each if their variances scatter like sample variances.
 
-    Also returns the number of frames that they seem to be of; None where they are left as they are.
+    The fit begins from `start`.
     """
+    weighted = weighted_fit(exposures, options, start)
     is_given = exposures.knows_noise and not exposures.offset
     frames = sampled_frames(exposures.variance) if is_given else None
     variance = exposures.variance
     if frames is None or variance is None or _explains_residuals(weighted, options.fit.workers):
-        return weighted, None
+        return weighted
     usable, number, response = exposures.usable(), max(2, round(frames)), exposures.response
     period = (1, 1) if exposures.filters is None else exposures.filters.colours.period
     in_dn = (
@@ -220,7 +221,8 @@ def steadied(
         for k, (signal, each) in enumerate(in_dn)
     )
     exposures = dataclasses.replace(exposures, variance=None, noise=models)
-    return weighted_fit(exposures, options, weighted.fit), frames
+    steady = weighted_fit(exposures, options, weighted.fit)
+    return steady._replace(replaced={"variance": words(frames)})
 
 
 def _explains_residuals(weighted: Weighted, workers: int | None) -> bool:

@@ -26,7 +26,7 @@ from equipix._check import (
 from equipix.correction.apply import apply
 from equipix.correction.protocol import Correction, cfa_of, check_correction
 from equipix.errors import FileError, InputError
-from equipix.findings import usable
+from equipix.findings import Finding, usable
 from equipix.hardware import c_header, table_files
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
 from equipix.hardware.table_files import Content, check_words
@@ -185,6 +185,11 @@ class Table(ReadOnly):
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.gain.shape
         return rows, cols
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What limits the correction that it is of."""
+        return tuple(Finding(**each) for each in self.metadata.get("findings", ()))
 
     @property
     def coefficients(self) -> Floats:
@@ -382,6 +387,7 @@ def content_of(
         **({} if colours is None else {"cfa": colours.rows}),
         "lowest": float(lowest),
         "largest_error_dn": found.largest_error,
+        "findings": [vars(each) for each in correction.findings],
     }
     if linearise is not None:
         metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
