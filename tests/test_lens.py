@@ -128,7 +128,7 @@ class TestFit:
     @pytest.mark.parametrize("law", ["cos4", "radial"])
     def test_a_dark_less_the_flat_is_refused(self, law):
         with pytest.raises(
-            errors.InputError, match=r"'flat' has the median -\d+\.\d+, expected light"
+            errors.InputError, match=r"'frame' has the median -\d+\.\d+, expected light"
         ):
             lens.fit(20 - flat(1), law=law)
 

@@ -57,7 +57,7 @@ def beam_of(shape, width):
 def solved(frames, shifts, tolerance):
     """The relative error of M, the truth being 1, where drifts and shifts are wrong on purpose."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", (MisfitWarning, MisfitWarning))
+        warnings.simplefilter("ignore", MisfitWarning)
         found = equipix.calibrate(frames, shifts, tolerance=tolerance, workers=1).sensitivity
     return metrics.relative_error(found, np.ones(found.shape))
 

@@ -176,7 +176,7 @@ def _refuse_units(shifts: object) -> None:
         if unit is not None and str(unit) not in _PIXELS:
             raise InputError(
                 f"'shifts' has the unit {unit}, expected plain numbers of pixels: divide by the "
-                "pixel pitch, see 'From micrometres to pixels' in README"
+                "pixel pitch, see 'From micrometres to pixels' in docs/shifts.md"
             )
     if isinstance(first, str):
         raise InputError(

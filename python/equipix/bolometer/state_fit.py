@@ -106,7 +106,7 @@ def fit(
     Examples
     --------
     >>> import numpy as np
-    >>> from equipix import simulate
+    >>> from equipix import bolometer, simulate
     >>> array = simulate.BolometerArray.of((24, 32), rng=1)
     >>> celsius, volts = [-20, 0, 20, 40, 60], 2.0
     >>> shutter = [array.mean(each) for each in celsius]

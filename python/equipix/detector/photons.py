@@ -83,8 +83,8 @@ def band_photons(
 
     Examples
     --------
-    >>> from equipix.simulate import blackbody
-    >>> low, high = blackbody.band_photons(3.0, 5.1, 290.0), blackbody.band_photons(3.0, 5.1, 310.0)
+    >>> from equipix.detector import photons
+    >>> low, high = photons.band_photons(3.0, 5.1, 290.0), photons.band_photons(3.0, 5.1, 310.0)
     >>> round(float(high / low), 2)
     2.03
     """
@@ -138,8 +138,8 @@ def hgcdte_cutoff(composition: ArrayLike, temperature_k: float = 77.0) -> Floats
 
     Examples
     --------
-    >>> from equipix.simulate import blackbody
-    >>> round(float(blackbody.hgcdte_cutoff(0.225)), 1)
+    >>> from equipix.detector import photons
+    >>> round(float(photons.hgcdte_cutoff(0.225)), 1)
     10.0
     """
     return np.asarray(EV_UM / hgcdte_gap(composition, temperature_k))
@@ -187,8 +187,8 @@ def hgcdte_composition(cutoff_um: float, temperature_k: float = 77.0) -> float:
 
     Examples
     --------
-    >>> from equipix.simulate import blackbody
-    >>> round(blackbody.hgcdte_composition(10.0), 4)
+    >>> from equipix.detector import photons
+    >>> round(photons.hgcdte_composition(10.0), 4)
     0.2254
     """
     low, high = (float(hgcdte_cutoff(x, temperature_k)) for x in (LARGEST_X, 0.0))

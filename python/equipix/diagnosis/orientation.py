@@ -41,7 +41,7 @@ AS_GIVEN = Orientation()
 _QUESTIONS = {"rows": "rows", "cols": "columns", "exchanged": "order of axes", "turned": "turns"}
 
 _REMEDY = (
-    "compare the axes of the stage once with the figure of shifts in README, or put an object with "
+    "compare the axes of the stage once with the figure in docs/shifts.md, or put an object with "
     "structure into the beam"
 )
 

@@ -342,7 +342,7 @@ def _refuse_falling(light: Floats, signal: Floats, linear: Bools) -> None:
         raise InputError(
             f"'light' is {light[before]:g} at level {before} and {light[after]:g} at level {after},"
             f" where the signal is {signal[before]:.6g} and {signal[after]:.6g} DN: expected light "
-            "that rises with the signal, one value for each level in the order of 'bright'"
+            "that rises with the signal, one value for each level in the order of 'frames'"
         )
 
 
