@@ -9,6 +9,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats, union
 from equipix.exposures.fit import FitOptions
 from equipix.findings import set_bits
+from equipix.fitting.outliers import weights_of
 from equipix.fitting.residuals import FEWEST, in_search
 from equipix.fitting.weighted import Options, Weighted
 from equipix.measured.defects import response_outliers
@@ -191,9 +192,7 @@ def _weights(weighted: Weighted) -> Floats:
     exposures = weighted.exposures
     total = np.zeros(exposures.shape)
     for k in range(len(exposures)):
-        variance = 1.0 if exposures.variance is None else exposures.variance[k]
-        used = exposures.used(weighted.fit, k)
-        total += np.divide(1.0, variance, where=used, out=np.zeros(exposures.shape))
+        total += weights_of(exposures.variance, k, exposures.used(weighted.fit, k))
     return total
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from equipix._check import Array, Floats
 from equipix._native import Fit
 from equipix.exposures.exposures import Exposures
-from equipix.exposures.positions import WIDEST, in_beam
-from equipix.fitting.residuals import Residuals, sampled
+from equipix.exposures.positions import WIDEST
+from equipix.fitting.residuals import Residuals, axes_of, left_by, sampled
 from equipix.fitting.weighted import Options, Weighted, weighted_fit
 from equipix.fitting.windows import misplaced
 from equipix.measured.noise import NoiseModel, chi2_tail, photon_transfer
@@ -125,7 +125,7 @@ def _contradiction(
     total, freedom = np.zeros(len(deviations)), 0
     for values, scale in zip(deviations.T, std.T, strict=True):
         known = scale > 0
-        left, unknowns = _rest(columns[known] / scale[known, None], values[known] / scale[known])
+        left, unknowns = left_by(columns[known] / scale[known, None], values[known] / scale[known])
         total[known] += left**2
         freedom += len(left) - unknowns
     if freedom < 1:
@@ -134,12 +134,6 @@ def _contradiction(
     if chi2_tail(float(total.sum()), freedom) >= _RARE or factor < _FACTOR:
         return None
     return Contradiction(name, factor, freedom, tuple(np.argsort(-total)[:2].tolist()))
-
-
-def _rest(columns: Array, values: Array) -> tuple[Floats, int]:
-    """What least squares along columns leaves, and their rank."""
-    found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=None)
-    return np.asarray(values - columns @ found), int(rank)
 
 
 def _wider(exposures: Exposures, found: Contradiction) -> Exposures:
@@ -289,7 +283,7 @@ def unrefined(weighted: Weighted, residuals: Residuals) -> Unrefined | None:
         if not lengths[1] <= _ON_A_LINE * lengths[0]:
             return None
         directions = directions[1:]
-    axes = [_axes(turn) for turn in positions.rotation.tolist()]
+    axes = [axes_of(turn).T for turn in positions.rotation.tolist()]
     slopes = np.einsum("da,nab,bnkrc->dnkrc", directions, axes, residuals.slopes)
     return Unrefined(slopes, np.sqrt(directions**2 @ np.square(positions.std).T))
 
@@ -339,10 +333,3 @@ def _with_prior(slopes: Floats, values: Floats, std: Floats, scale: float) -> tu
     spread = normal + normal @ np.diag(std**2) @ normal
     squares = product @ np.linalg.pinv(spread, hermitian=True) @ product
     return np.asarray(errors), float(squares)
-
-
-def _axes(turn: int) -> Array:
-    """Return A: a step along the sensor's axes in the beam."""
-    return np.stack(
-        [in_beam(p, turn, (1, 1)) - in_beam((0, 0), turn, (1, 1)) for p in np.eye(2)], 1
-    )
