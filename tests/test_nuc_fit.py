@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, NoiseModel, errors, nuc, reference
+import reference
+from equipix import Flag, NoiseModel, errors, nuc
 from equipix.measured.means import Averaged
 from equipix.simulate import StaringArray
 

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import equipix
-from equipix import metrics, plan, reference, simulate
+import reference
+from equipix import metrics, plan, simulate
 from equipix.errors import (
     IdentifiabilityWarning,
     InputError,

@@ -8,10 +8,10 @@ import pytest
 import equipix
 from equipix import Flag, errors, scene
 from equipix.io.formats import load_pages, save_pages
-from equipix.reference import scene as reference
 from equipix.scene.methods import METHODS
 from equipix.scene.methods import load as load_state
 from equipix.simulate import MovingScene
+from reference import scene as reference
 
 SHAPE = (48, 64)
 NAMES = tuple(METHODS)
