@@ -24,8 +24,10 @@ from pydantic import BaseModel
 import equipix
 from equipix import metrics
 from equipix.cli.app import app
+from equipix.diagnosis.inputs import BEFORE
+from equipix.diagnosis.rules import AFTER, LAST
 from equipix.experiment.manifest import LevelManifest, Manifest, Sensor
-from equipix.findings import _CATEGORIES as CATEGORIES
+from equipix.findings import WARNINGS
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -182,7 +184,8 @@ def test_the_pages_name_attributes_that_exist(header, page, result):
 def test_the_page_describes_every_finding_and_its_warning():
     rows = table("finding", "docs/calibration.md")
     described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in rows}
-    assert described == {kind: warning.__name__ for kind, warning in CATEGORIES.items()}
+    rules = [*BEFORE, *AFTER, *LAST]
+    assert described == {rule.kind: WARNINGS[rule.concern].__name__ for rule in rules}
 
 
 def test_the_page_describes_every_flag():

@@ -10,8 +10,9 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
-from equipix.diagnosis.inputs import on_brightness, on_input
+from equipix.diagnosis.inputs import BEFORE, on_brightness
 from equipix.exposures.exposures import exposures_of
+from equipix.findings import ask
 
 SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
 
@@ -273,7 +274,7 @@ def test_a_finding_calls_an_exposure_by_its_name(bench):
     values[3] *= 0.5
     names = [f"position {k}" for k in range(5)]
     exposures = exposures_of(values, SHIFTS)
-    (found,) = on_input(dataclasses.replace(exposures, names=tuple(names)))
+    (found,) = ask(BEFORE, dataclasses.replace(exposures, names=tuple(names)))
     assert "exposure 3 ('position 3') has 0.5 times the light" in found.message
 
 

@@ -13,7 +13,7 @@ from equipix._check import Array, Floats, ReadOnly, number
 from equipix.bolometer.states import Axes, Regressor
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import FileError, InputError
-from equipix.findings import set_bits
+from equipix.findings import Finding, set_bits
 from equipix.io.formats import load_pages, save_pages
 from equipix.io.record import check_format, check_pages
 from equipix.measured.defects import DEAD_RESPONSE
@@ -42,6 +42,8 @@ class DynamicCorrection(ReadOnly):
         Bits of `equipix.Flag`.
     metadata : dict
         Options and prediction errors, as JSON values.
+    findings : tuple of Finding
+        What limits the result, each also a warning of the fit.
 
     Raises
     ------
@@ -65,6 +67,7 @@ class DynamicCorrection(ReadOnly):
     gain_axes: Axes
     flags: Array
     metadata: dict[str, Any] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -145,7 +148,7 @@ class DynamicCorrection(ReadOnly):
         planes = np.stack([offset, gain])
         flags = self.flags.copy()
         set_bits(flags, "non_responding", response < DEAD_RESPONSE)
-        return Polynomial(planes, flags, metadata, leaves_offset=True)
+        return Polynomial(planes, flags, metadata, leaves_offset=True, findings=self.findings)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `DynamicCorrection.load` reads.
@@ -233,6 +236,7 @@ def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: 
         "axes": asdict(fields["axes"]),
         "gain_axes": asdict(fields["gain_axes"]),
         "metadata": fields["metadata"],
+        "findings": [vars(each) for each in fields["findings"]],
     }
     save_pages(path, pages, content, force=force)
 
@@ -260,6 +264,7 @@ def read_fields(
         "gain_axes": _axes(content["gain_axes"]),
         "flags": pages["flags"],
         "metadata": content["metadata"],
+        "findings": tuple(Finding(**each) for each in content["findings"]),
     }
 
 

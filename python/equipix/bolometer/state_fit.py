@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Floats, as_array, check_shape, check_word, described
 from equipix.bolometer.dynamic import DynamicCorrection
-from equipix.bolometer.held_out import HIGHEST, Form, HeldOut
+from equipix.bolometer.held_out import HIGHEST, STATES, Form, HeldOut, Judged
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
-from equipix.errors import InputError, InputWarning, warn
-from equipix.findings import Flag, set_bits, usable
+from equipix.errors import InputError
+from equipix.findings import Finding, Flag, ask, say, set_bits, usable
 from equipix.measured.defects import DEAD_RESPONSE, relative_response
 from equipix.measured.saturation import clipping
 from equipix.measured.statistics import FrameStatistics
@@ -122,11 +122,12 @@ def fit(
     flags = flags_of(taken, bodies, mask)
     check_word("regressor", regressor, get_args(Regressor))
     good, form = usable(flags), Form(powers, regressor)
-    taken.warn_of_clipping("shutter", good)
-    for k, body in enumerate(bodies or ()):
-        body.warn_of_clipping(f"black_bodies[{k}]", good)
+    named = {"shutter": taken, **{f"black_bodies[{k}]": b for k, b in enumerate(bodies or ())}}
+    clipped = [each.clipping(name, good) for name, each in named.items()]
+    said = say(*(Finding("saturation", words, "input") for words in clipped if words))
     shown = Shown(taken.values, states, good, form, taken.noise(good))
-    chosen, errors = shown.order(order)
+    chosen, errors, more = shown.order(order)
+    said += more
     axes, offset = shown.coefficients(chosen)
     level = shown.coefficients_of_mean(chosen)
     metadata: dict[str, Any] = {
@@ -139,11 +140,11 @@ def fit(
         "prediction_errors": errors,
     }
     if bodies is None:
-        return DynamicCorrection(offset, None, level, axes, axes, flags, metadata)
+        return DynamicCorrection(offset, None, level, axes, axes, flags, metadata, said)
     rise = _response(bodies, states, good, form)
-    chosen, metadata["gain_prediction_errors"] = rise.order(order)
+    chosen, metadata["gain_prediction_errors"], more = rise.order(order)
     gain_axes, gain = rise.coefficients(chosen)
-    return DynamicCorrection(offset, gain, level, axes, gain_axes, flags, metadata)
+    return DynamicCorrection(offset, gain, level, axes, gain_axes, flags, metadata, said + more)
 
 
 def _response(bodies: list[References], states: States, good: Bools, form: Form) -> Shown:
@@ -194,21 +195,17 @@ class Shown:
         axes = self.states.axes(order, *self.form)
         return np.asarray(solver_of(axes, self.states) @ self.mean)
 
-    def order(self, order: int | Literal["auto"]) -> tuple[int, list[float] | None]:
-        """Order that is given, or that which best predicts, and the prediction error of each."""
+    def order(
+        self, order: int | Literal["auto"]
+    ) -> tuple[int, list[float] | None, tuple[Finding, ...]]:
+        """Order that is given, or that which best predicts; prediction errors, and findings."""
+        given = None
         if not (isinstance(order, str) and order == "auto"):
             given = _checked_order(order)
-            if self.is_offset:
-                self._held_out().warn_of_exchanged()
-            return given, None
         held_out = self._held_out()
-        if len(self.states.groups) == 1:
-            held_out.warn_of_repeats()
-            return 0, None
-        chosen = held_out.chosen()
-        if self.is_offset:
-            held_out.warn_of_constant(chosen)
-        return chosen
+        chosen, errors = held_out.chosen() if given is None else (given, None)
+        said = say(*ask(STATES, Judged(held_out, chosen, errors, self.is_offset)))
+        return chosen, errors or None, said
 
     def _held_out(self) -> HeldOut:
         """Values of usable pixels, of which some are to be predicted."""
@@ -275,18 +272,17 @@ class References:
         noise = np.array([each[good].mean() for each in self.variance])
         return noise if np.isfinite(noise).all() else None
 
-    def warn_of_clipping(self, name: str, good: Bools) -> None:
-        """Warn of values of usable pixels at exactly the highest one."""
+    def clipping(self, name: str, good: Bools) -> str | None:
+        """Say that values of usable pixels are at exactly the highest one."""
         for k, frame in enumerate(self.values):
             found = clipping(np.where(good, frame, np.nan))
             if found is not None:
-                warn(
+                return (
                     f"{found.values} values of '{name}' at state {k} are exactly "
                     f"{found.level:.10g}, the highest one: they probably saturate and count as "
-                    "valid: exclude their pixels by 'mask', or give averages with a 'saturation'",
-                    InputWarning,
+                    "valid: exclude their pixels by 'mask', or give averages with a 'saturation'"
                 )
-                return
+        return None
 
 
 def _stack(name: str, given: Any) -> Array:

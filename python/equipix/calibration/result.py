@@ -27,14 +27,15 @@ from equipix._check import (
 from equipix._native import Beam
 from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficients
 from equipix.correction.protocol import depth_of
+from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
 from equipix.exposures.positions import ROUNDING, Orientation, Positions
 from equipix.findings import Finding, determined
-from equipix.fitting.error_bars import ErrorBars, functional_std
-from equipix.fitting.weighted import Weighted, check_unchanged
+from equipix.fitting.error_bars import functional_std
+from equipix.fitting.weighted import Weighted, check_unchanged, sampled_arrays
 from equipix.io.formats import save_pages
 from equipix.io.record import check_format, check_pages
 from equipix.measured.colour import Colours
@@ -183,17 +184,14 @@ class Calibration(ReadOnly):
     @classmethod
     def of(
         cls,
-        weighted: Weighted,
-        *,
-        flags: NDArray[Any],
-        orientation: OrientationTest,
+        evidence: Evidence,
         findings: tuple[Finding, ...],
-        drift: Drift | None,
-        bars: ErrorBars | None,
         metadata: dict[str, Any],
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
-        exposures, fit, dtype = weighted.exposures, weighted.fit, weighted.exposures.values.dtype
+        exposures, fit, bars = evidence.exposures, evidence.fit, evidence.bars
+        dtype, flags, orientation = exposures.values.dtype, evidence.flags, evidence.orientation
+        weighted = evidence.weighted._replace(sampled=sampled_arrays(exposures))
         filters, gauge = exposures.filters, gauge_of(weighted, flags)
         std, offset = None if bars is None else bars.sensitivity, fit.offset
         return cls(
@@ -224,7 +222,7 @@ class Calibration(ReadOnly):
             rejected=weighted.rejected,
             shift_sign=orientation.sign,
             orientation=orientation,
-            drift=drift,
+            drift=evidence.drift,
             findings=findings,
             cfa=filters.colours if filters is not None and filters.given else None,
             colour_response=gauge.response,
@@ -831,15 +829,6 @@ def _read_drift(content: dict[str, Any] | None) -> Drift | None:
     names = ("slope_covariance", "tilt_std", "trend_tilt")
     arrays = {name: np.array(content[name]) for name in names}
     return Drift(**{**content, **arrays})
-
-
-def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
-    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
-    if not drift.is_added:
-        return bars
-    hidden = response * np.sqrt(drift.variance_map(response))
-    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
-    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

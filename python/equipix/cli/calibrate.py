@@ -10,7 +10,7 @@ import typer
 
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
-from equipix.cli.summary import of_calibration, summary
+from equipix.cli.summary import of_calibration, summary, told
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
@@ -61,8 +61,7 @@ def calibrate(
         _refuse_partial(calibration, output)
     calibration.save(output, force=force)
     result = {"output": str(output), **of_calibration(calibration)}
-    if not as_json:  # their messages are on stderr, as warnings
-        result["findings"] = ", ".join(each.kind for each in calibration.findings) or "none"
+    result |= told(calibration.findings, as_json=as_json)
     terminal.show_result(result, as_json=as_json)
 
 

@@ -6,10 +6,11 @@ from typing import Annotated, Any
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import known, of_statistics
+from equipix.cli.summary import known, of_statistics, told
 from equipix.correction.correct_files import Corrected, correct_files, is_folder
-from equipix.errors import InputError, MisfitWarning, warn
+from equipix.errors import InputError
 from equipix.experiment.image_files import origin_of, refuse_repeated_files
+from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.loading import load
@@ -54,13 +55,10 @@ def average(
             offset = average_frames(dark, **common, **of_dark)
             statistics.refuse_subtracted(offset, " ".join(dark))
         found = average_frames(frames, dark=offset, mask=excluded, **common, **options)
-    statistics.warn_of_bright_dark(found)
-    light = statistics.light_of(found)
-    if light.over_noise > statistics.STRAY:
-        limit = f"(limit {statistics.STRAY:g})"
-        warn(f"{light.words} {limit}: see that all are of one measurement", MisfitWarning)
+    said = say(*ask(statistics.AVERAGED, found))
     found.save(output, force=force)
-    terminal.show_result({"output": str(output), **of_statistics(found)}, as_json=as_json)
+    result = {"output": str(output), **of_statistics(found), **told(said, as_json=as_json)}
+    terminal.show_result(result, as_json=as_json)
 
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")

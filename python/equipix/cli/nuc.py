@@ -11,7 +11,7 @@ from equipix import metrics
 from equipix._check import Array, By, Flagged, naming_memory
 from equipix.cli import terminal
 from equipix.cli.summary import flagged as flag_counts
-from equipix.cli.summary import summary
+from equipix.cli.summary import summary, told
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.io.formats import SUFFIXES
@@ -68,7 +68,13 @@ def fit(
             progress=progress,
         )
     response.save(output, force=force)
-    terminal.show_result({"output": str(output), **summary(response)}, as_json=as_json)
+    figures = summary(response) | told(response.findings, as_json=as_json)
+    result = {"output": str(output), **figures}
+        "output": str(output),
+        **summary(response),
+        **told(response.findings, as_json=as_json),
+    }
+    terminal.show_result(result, as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc defects response.tif level/*.tif -o flagged.tif")
@@ -111,6 +117,7 @@ def defects(
     result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
     result |= {kind: f"not determinable {why}" for kind, why in found.not_determinable.items()}
     result |= {"percentiles_of_K": found.gain_percentiles, "flagged_pixels": flag_counts(flagged)}
+    result |= told(found.findings, as_json=as_json)
     terminal.show_result(result, as_json=as_json)
 
 

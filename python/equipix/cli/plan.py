@@ -5,8 +5,10 @@ from typing import Annotated, Any
 import typer
 
 from equipix.cli import terminal
-from equipix.errors import InputError, InputWarning, warn
+from equipix.cli.summary import told
+from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
+from equipix.findings import Finding, say
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
 from equipix.plan.budget import ErrorBudget, error_budget
@@ -54,10 +56,8 @@ def plan(
             "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
         )
     if causes["shift_error"] and causes["beam_width"] is None:
-        warn(
-            "'--shift-error' has no effect in an even beam: give '--beam-width' for another",
-            InputWarning,
-        )
+        words = "'--shift-error' has no effect in an even beam: give '--beam-width' for another"
+        say(Finding("unused", words, "input", "note"))
     check_picture(output)
     terminal.check_output(output, force=force)
     if shifts is not None:
@@ -111,6 +111,7 @@ def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
         "distinct_trend": budget.distinct_trend,
         "order": order.tolist(),
         "distinct_trend_in_order": distinct_trend(budget.shifts[order]),
+        **told(budget.findings),
     }
 
 

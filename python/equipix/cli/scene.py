@@ -8,6 +8,7 @@ import numpy as np
 import typer
 
 from equipix.cli import terminal
+from equipix.cli.summary import told
 from equipix.errors import InputError
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
@@ -98,7 +99,8 @@ def scene(
         learning.save(state, force=force)
     if picture is not None:
         save_figure(draw_sequence(done, result), picture, force=force)
-    terminal.show_result(_summary(output, learning, done), as_json=as_json)
+    figures = _summary(output, learning, done)
+    terminal.show_result(figures | told(result.findings, as_json=as_json), as_json=as_json)
 
 
 def _method(

@@ -1,6 +1,6 @@
 """Main figures of what the command line reads and writes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any, TypeAlias
 
@@ -10,7 +10,7 @@ from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.protocol import Correction, sensor_of
-from equipix.findings import Flag, usable
+from equipix.findings import Finding, Flag, usable
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
 
@@ -31,6 +31,13 @@ def known(**figures: Any) -> dict[str, Any]:
     return {name: value for name, value in figures.items() if value not in (None, "")}
 
 
+def told(findings: Iterable[Finding], *, as_json: bool = True) -> dict[str, Any]:
+    """Findings; their kinds alone where messages are on stderr, as warnings, already."""
+    if as_json:
+        return {"findings": [asdict(each) for each in findings]}
+    return {"findings": ", ".join(each.kind for each in findings) or "none"}
+
+
 def _of_correction(correction: Correction) -> dict[str, Any]:
     """Collect the main figures of any correction, and how it was learned from a scene."""
     scene = correction.metadata.get("scene")
@@ -41,6 +48,7 @@ def _of_correction(correction: Correction) -> dict[str, Any]:
         "order": len(correction.coefficients) - 1,
         **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
         "flagged_pixels": flagged(correction),
+        **told(correction.findings),
     }
 
 
@@ -64,6 +72,7 @@ def of_response(response: Response) -> dict[str, Any]:
         "largest_inverse_error": response.largest_inverse_error,
         **known(prediction_errors=options.get("prediction_errors")),
         "flagged_pixels": flagged(response),
+        **told(response.findings),
     }
 
 
@@ -106,6 +115,7 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_order": correction.axes.bias_order,
         "gain_order": None if correction.gain is None else correction.gain_axes.order,
         "flagged_pixels": flagged(correction),
+        **told(correction.findings),
     }
 
 
@@ -155,7 +165,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "flagged_pixels": flagged(calibration),
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
-        "findings": [asdict(finding) for finding in calibration.findings],
+        **told(calibration.findings),
     }
 
 

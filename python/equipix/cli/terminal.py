@@ -217,10 +217,8 @@ def _words(value: Any) -> str:
 
 
 def _row(fields: dict[str, Any]) -> str:
-    """Words of a row: texts by themselves, such as a finding's, and numbers with their names."""
-    if any(isinstance(each, str) for each in fields.values()):
-        return ": ".join(map(str, fields.values()))
-    return _words(fields)
+    """Words of a row: of a finding its kind and its message, else numbers with their names."""
+    return f"{fields['kind']}: {fields['message']}" if "kind" in fields else _words(fields)
 
 
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]

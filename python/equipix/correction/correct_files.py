@@ -16,10 +16,8 @@ from equipix.correction.protocol import Correction, takes_dark
 from equipix.errors import (
     FileError,
     InputError,
-    InputWarning,
-    warn,
 )
-from equipix.findings import usable
+from equipix.findings import Finding, say, usable
 from equipix.io.formats import refuse_saved
 from equipix.io.frames import description, frame_format, stream_frames
 from equipix.io.paths import find_files, folder_beside, refuse_inputs, write_whole
@@ -263,11 +261,11 @@ def warn_of_corrected(files: list[Path], origin: str) -> None:
     others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
     same = bool(origin) and marks[corrected[0]].endswith(origin)
     by = "by this correction" if same else "by another correction"
-    warn(
+    words = (
         f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
-        "the raw frames",
-        InputWarning,
+        "the raw frames"
     )
+    say(Finding("corrected", words, "input"))
 
 
 def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> None:
@@ -278,11 +276,11 @@ def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> No
     offset = np.asarray(given.mean if isinstance(given, FrameStatistics) else given)
     level, below = np.nanmedian(offset), np.nanmedian(offset - frame)
     if level > 0 and below > DARKER * level:
-        warn(
+        words = (
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
-            "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them",
-            InputWarning,
+            "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them"
         )
+        say(Finding("bright_dark", words, "input"))
 
 
 def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
@@ -292,11 +290,11 @@ def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
     remedy = "float32, or more bits in 'bit_depth' (--bit-depth)"
     if dtype == np.uint8:
         remedy = "uint16; or 'display' (--display linear), which scales frames to 8 bits"
-    warn(
+    words = (
         f"{limited / values:.0%} of the corrected values were limited to the range of {dtype}: "
-        f"choose 'dtype' (--dtype) {remedy}",
-        InputWarning,
+        f"choose 'dtype' (--dtype) {remedy}"
     )
+    say(Finding("limited", words, "input"))
 
 
 def _count(file: Path, correction: Correction) -> int:

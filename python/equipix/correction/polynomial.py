@@ -14,6 +14,7 @@ from equipix._check import Array, Flagged, ReadOnly, check_type
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.protocol import Correction, cfa_of, check_correction, depth_of
 from equipix.errors import InputError
+from equipix.findings import Finding
 from equipix.io.formats import save_pages
 from equipix.io.record import check_format, check_pages
 
@@ -40,6 +41,8 @@ class Polynomial(ReadOnly):
     leaves_offset : bool
         Whether corrected frames hold an offset, such as the mean one of raw levels, which no gain
         may multiply.
+    findings : tuple of Finding
+        What limits it: of two corrections combined, those of both.
 
     Raises
     ------
@@ -52,6 +55,7 @@ class Polynomial(ReadOnly):
     metadata: dict[str, Any] = field(default_factory=dict)
     saturation: float | None = None
     leaves_offset: bool = False
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -135,6 +139,7 @@ class Polynomial(ReadOnly):
             "saturation": self.saturation,
             "leaves_offset": self.leaves_offset,
             "metadata": self.metadata,
+            "findings": [vars(each) for each in self.findings],
         }
         save_pages(path, pages, content, force=force)
 
@@ -152,6 +157,7 @@ def read_polynomial(
         content["metadata"],
         None if level is None else float(level),
         bool(content.get("leaves_offset", False)),
+        tuple(Finding(**each) for each in content["findings"]),
     )
 
 
@@ -221,7 +227,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     if sensor:
         metadata["sensor"] = sensor
     level: float | None = getattr(first, "saturation", None)
-    return Polynomial(coefficients, first.flags | then.flags, metadata, level, leaves)
+    flags, findings = first.flags | then.flags, first.findings + then.findings
+    return Polynomial(coefficients, flags, metadata, level, leaves, findings)
 
 
 def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import Flagged, described
 from equipix.errors import InputError
+from equipix.findings import Finding
 from equipix.measured.colour import Colours
 from equipix.measured.statistics import FrameStatistics
 
@@ -30,6 +31,10 @@ class Correction(Protocol):
     @property
     def metadata(self) -> dict[str, Any]:
         """Versions, options and origin, as JSON values."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What limits it."""
 
     @property
     def coefficients(self) -> NDArray[Any]:

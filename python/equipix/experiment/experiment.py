@@ -7,12 +7,13 @@ import numpy as np
 from equipix._check import Array, ArrayLike, FluxModel, Method, Progress
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
-from equipix.errors import InputError, InputWarning, warn
+from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import Manifest
 from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
+from equipix.findings import Finding, say
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.defects import hot_pixels
@@ -167,7 +168,7 @@ class Experiment(Described[Manifest]):
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
-        self._warn_of_unused(flux)
+        said = say(*self._unused(flux))
         if flux == "linear" and self._column("time") is None:
             raise InputError(
                 f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
@@ -207,21 +208,21 @@ class Experiment(Described[Manifest]):
             measured_shifts=shifts.tolist(),
             measured_shift_std=std.tolist(),
         )
-        return calibrated(exposures, options, start=start, provenance=origin)
+        return calibrated(exposures, options, start=start, said=said, provenance=origin)
 
-    def _warn_of_unused(self, flux: FluxModel | None) -> None:
-        """Warn of values in the file that the fluxes to find leave without use."""
+    def _unused(self, flux: FluxModel | None) -> list[Finding]:
+        """Findings on values in the file that the fluxes to find leave without use."""
+        words = []
         if flux is not None and self._column("flux") is not None:
-            warn(
+            words.append(
                 f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
-                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
-                InputWarning,
+                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior"
             )
         if flux != "linear" and self._column("time") is not None:
-            warn(
-                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
-                InputWarning,
+            words.append(
+                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)"
             )
+        return [Finding("unused", each, "input", "note") for each in words]
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""

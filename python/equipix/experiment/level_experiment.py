@@ -1,15 +1,15 @@
 """Levels of a uniform source on disk, as levels.toml describes them, and their evaluation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import itemgetter
 
 import numpy as np
 
 from equipix._check import ArrayLike, By, Order, Progress, Words
-from equipix.errors import EquipixWarning, warn
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import LevelManifest
+from equipix.findings import Finding, say
 from equipix.measured.defects import SIGMAS
 from equipix.nuc.curve_fit import fitted
 from equipix.nuc.levels import Levels, levels_of
@@ -84,7 +84,7 @@ class LevelExperiment(Described[LevelManifest]):
 
         Warns
         -----
-        EquipixWarning
+        MisfitWarning
             If the mean of a level is lower than that of a level with a lower value, beside the
             warnings of `equipix.nuc.fit`.
         """
@@ -94,7 +94,9 @@ class LevelExperiment(Described[LevelManifest]):
         dark = None if entry is None else self._dark(entry, workers, progress)
         averaged = self._average(dark, workers, progress)
         levels = levels_of(averaged, mask=excluded)
-        self._warn_of_order(levels)
+        if words := self._falling(levels):
+            said = say(Finding("light", words, "misfit"))
+            levels = replace(levels, findings=levels.findings + said)
         named = zip(self.manifest.names, self.manifest.level, levels.references, strict=True)
         written = [
             {"name": name, "value": level.value, "unit": level.unit, "mean": float(mean)}
@@ -103,18 +105,17 @@ class LevelExperiment(Described[LevelManifest]):
         origin = self._provenance(hashes, averaged.noise, levels=written)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
-    def _warn_of_order(self, levels: Levels) -> None:
-        """Warn of values of levels that do not rise with the means by more than noise explains."""
+    def _falling(self, levels: Levels) -> str | None:
+        """Say which values of levels do not rise with the means by more than noise explains."""
         values = [level.value for level in self.manifest.level]
         sigmas = np.sqrt(levels.variances)
         entries = zip(values, self.manifest.names, levels.references, sigmas, strict=True)
         known = sorted((each for each in entries if each[0] is not None), key=itemgetter(0))
         for (_, below, least, one), (_, above, most, other) in pairwise(known):
             if most < least - SIGMAS * np.hypot(one, other):
-                warn(
+                return (
                     f"{self.path}: the mean of the frames falls from {least:.6g} DN in level "
                     f"'{below}' to {most:.6g} DN in level '{above}', whose 'value' is higher: see "
-                    "that each value is that of its frames",
-                    EquipixWarning,
+                    "that each value is that of its frames"
                 )
-                return
+        return None

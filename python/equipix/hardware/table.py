@@ -24,7 +24,8 @@ from equipix._check import (
 from equipix.correction.apply import apply
 from equipix.correction.protocol import Correction, cfa_of, check_correction
 from equipix.errors import FileError, InputError
-from equipix.findings import usable
+from equipix.findings import Finding, usable
+from equipix.hardware import c_header, table_files
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
 from equipix.hardware.table_files import Content, check_words
 from equipix.hardware.words import WIDTHS, Format, check_width, chosen_exponent, exponent_of
@@ -178,7 +179,8 @@ class Table(ReadOnly):
             refuse_far_offsets(found, line, widths, steps, float(lowest))
         colours = cfa_of(correction)
         cfa = {} if colours is None else {"cfa": colours.rows}
-        metadata = {**origin(correction), **cfa, **found.metadata}
+        findings = [vars(each) for each in correction.findings]
+        metadata = {**origin(correction), **cfa, **found.metadata, "findings": findings}
         if linearise is not None:
             metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
         return cls(*found._replace(metadata=metadata))
@@ -188,6 +190,11 @@ class Table(ReadOnly):
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.gain.shape
         return rows, cols
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What limits the correction that it is of."""
+        return tuple(Finding(**each) for each in self.metadata.get("findings", ()))
 
     @property
     def coefficients(self) -> Floats:

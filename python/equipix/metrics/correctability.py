@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from equipix._check import Bools, Floats, as_array, naming_memory, number
 from equipix.errors import InputError
-from equipix.metrics.frame_noise import signed_root, stack_of, temporal_of, warn_of_drift
+from equipix.findings import ask, say
+from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def correctability(
     if not 0 < number("confidence", confidence) < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
     found = temporal_of(stack, _as_mask(mask, stack.shape[1:]))
-    warn_of_drift(found)
+    say(*ask(STEADY, found))
     n, pixels = found.frames, int(np.count_nonzero(found.used))
     if pixels < 2:
         raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Floats, ReadOnly, check_type, naming_memory
 from equipix.correction.protocol import named_cfa
-from equipix.errors import InputError, MisfitWarning, warn
-from equipix.findings import set_bits, usable
+from equipix.errors import InputError
+from equipix.findings import Finding, ask, say, set_bits, usable
 from equipix.measured.colour import Colours, planes_of
 from equipix.measured.defects import DefectLimits, noisy_pixels, often_rejected, response_outliers
 from equipix.measured.filters import Filters
@@ -22,9 +22,9 @@ from equipix.measured.noise import (
     step_of,
 )
 from equipix.measured.statistics import FrameStatistics, Light, light_of
-from equipix.metrics.frame_noise import stack_of, temporal_of, warn_of_drift
+from equipix.metrics.frame_noise import STEADY, stack_of, temporal_of
 from equipix.nuc.curves import response_at
-from equipix.nuc.level_rules import warn_of_misfit
+from equipix.nuc.level_rules import CURVES, Curves
 from equipix.nuc.response import Response, common_misfit
 
 _SAMPLED = 4096
@@ -89,9 +89,10 @@ def of_frames(
     good: Bools,
     limits: DefectLimits,
     cfa: Colours | None = None,
-) -> dict[str, Bools]:
-    """Bad pixels by their noise; `good` are those whose curves are usable."""
+) -> tuple[dict[str, Bools], tuple[Finding, ...]]:
+    """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
     slow, light = None, Light()
+    said: tuple[Finding, ...] = ()
     if isinstance(frames, FrameStatistics):
         _check_shape(frames.mean.shape, good.shape)
         mean, variance, count = frames.mean, frames.variance, int(frames.count.max())
@@ -100,7 +101,7 @@ def of_frames(
         stack = stack_of("frames", frames)
         _check_shape(stack.shape[1:], good.shape)
         over_time = temporal_of(stack, ~good)
-        warn_of_drift(over_time)
+        said = say(*ask(STEADY, over_time))
         mean, variance, count = over_time.mean, over_time.variance, over_time.frames
         step = step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
         slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
@@ -117,7 +118,10 @@ def of_frames(
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
         noisy = noisy | often_rejected(missing, count)
-    return {"noisy": noisy} if slow is None else {"noisy": noisy, "flickering": flickering & slow}
+    found = {"noisy": noisy}
+    if slow is not None:
+        found["flickering"] = flickering & slow
+    return found, said
 
 
 def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
@@ -204,6 +208,8 @@ class Defects(ReadOnly):
     not_determinable : dict of str to str
         Kinds that these frames are too few for, with the reason. Pixels that were found
         nevertheless are flagged.
+    findings : tuple of Finding
+        What limits the result, each also a warning.
     """
 
     flags: Array
@@ -212,6 +218,7 @@ class Defects(ReadOnly):
     misfit: float = float("nan")
     limits: DefectLimits = field(default_factory=DefectLimits)
     not_determinable: dict[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
 
 def find_defects(
@@ -297,9 +304,14 @@ def find_defects(
         misfit = common_misfit(response)
         slope = mean_slope(response)
         colours, filters = _filters(response, named_cfa(response, cfa), slope)
+        said: tuple[Finding, ...] = ()
+        if filters is not None and filters.words:
+            said = say(Finding("cfa", filters.words, "misfit"))
         found = of_response(response, slope, limits, misfit, filters)
         if frames is not None:
-            found |= of_frames(frames, usable(response.flags), limits, colours)
+            by_noise, more = of_frames(frames, usable(response.flags), limits, colours)
+            found |= by_noise
+            said += more
     flags = response.flags.copy()
     for kind, pixels in found.items():
         set_bits(flags, kind, pixels)
@@ -310,8 +322,8 @@ def find_defects(
     known = gain[np.isfinite(gain)]
     percentiles = np.percentile(known, PERCENTILES) if known.size else np.full(len(PERCENTILES), 0)
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
-    warn_of_misfit(response, misfit)
-    return Defects(flags, counts, named, misfit, limits, few)
+    said += say(*ask(CURVES, Curves(response, misfit)))
+    return Defects(flags, counts, named, misfit, limits, few, said)
 
 
 def _filters(
@@ -321,8 +333,4 @@ def _filters(
     if response.cfa is not None:
         return response.cfa, None
     filters = Filters.of(given, slope)
-    if filters is None:
-        return None, None
-    if filters.words:
-        warn(filters.words, MisfitWarning)
-    return filters.colours, filters
+    return (None, None) if filters is None else (filters.colours, filters)

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import Array, Bools, Floats, ReadOnly, Words, as_mask, union
-from equipix.errors import InputError, InputWarning, MisfitWarning, warn
+from equipix.errors import InputError
+from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours
 from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
 from equipix.measured.filters import Filters
@@ -20,7 +21,7 @@ from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, check_levels, check_variance, measured_of
 from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
 from equipix.measured.statistics import FrameStatistics
-from equipix.nuc.level_rules import check_saturation
+from equipix.nuc.level_rules import GIVEN, Given
 
 _LEVELS = Words("'levels'", "level")
 
@@ -73,6 +74,8 @@ class Levels(ReadOnly):
         given; None if it is unknown.
     filters : Filters or None
         Colour filters of the pixels, where they are given or stand out of the levels.
+    findings : tuple of Finding
+        What limits them.
     """
 
     values: Array
@@ -86,6 +89,7 @@ class Levels(ReadOnly):
     saturation: float | None = None
     frame_noise: float | None = None
     filters: Filters | None = None
+    findings: tuple[Finding, ...] = ()
 
     @property
     def cfa(self) -> Colours | None:
@@ -195,19 +199,15 @@ def levels_of(
         check_variance(variance, count)
     measured = measured_of(source, variance, saturation, words=_LEVELS)
     given = None if mask is None else as_mask(mask, measured.values.shape)
-    check_saturation(measured, averaged, given)
+    said = say(*ask(GIVEN, Given(measured, averaged, given)))
     pedestal = 0.0 if averaged is None else averaged.pedestal
-    if measured.unsteady:
-        warn(measured.unsteady, MisfitWarning)
     noise = _noise_of(measured, pedestal)
     values = _used(measured, given)
     filters = _filters(values, colours if averaged is None else averaged.colours)
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
     usable = _usable(values, bad_pixels, given)
-    if measured.dark is not None:
-        _warn_of_bright_dark(values, usable, noise, measured.dark_variance)
     references = _references(values, usable)
-    return Levels(
+    checked = Levels(
         values=values,
         references=references,
         usable=usable,
@@ -220,6 +220,7 @@ def levels_of(
         frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
         filters=filters,
     )
+    return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
 
 
 def _filters(values: Array, colours: Colours | None) -> Filters | None:
@@ -229,10 +230,7 @@ def _filters(values: Array, colours: Colours | None) -> Filters | None:
         return None if colours is None else Filters.of(colours, values[0])
     medians = [float(np.nanmedian(each)) for each in values]
     low, high = int(np.argmin(medians)), int(np.argmax(medians))
-    found = Filters.of(colours, values[high] - values[low] if high != low else values[0])
-    if found is not None and found.words:
-        warn(found.words, MisfitWarning)
-    return found
+    return Filters.of(colours, values[high] - values[low] if high != low else values[0])
 
 
 def _references(values: Array, usable: Bools) -> Floats:
@@ -376,36 +374,40 @@ def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     return usable
 
 
-def _warn_of_bright_dark(
-    values: Array,
-    usable: Bools,
-    noise: tuple[LevelNoise, ...] | None,
-    dark_variance: Floats | None,
-) -> None:
-    """Warn of levels whose median less the dark is below 0 by more than the noise of a value.
+def _on_bright_dark(levels: Levels) -> str | None:
+    """Say that the median of a level less the dark is below 0 by more than the noise of a value.
 
     Where no noise is known the scatter of the level takes its place. Medians are those of a sample
     of the usable pixels.
     """
-    sample = np.flatnonzero(usable)
+    if levels.dark is None:
+        return None
+    sample = np.flatnonzero(levels.usable)
     sample = sample[_spread(len(sample))]
-    of_dark = 0.0 if dark_variance is None else float(np.median(dark_variance))
+    of_dark = 0.0 if levels.dark_variance is None else float(np.median(levels.dark_variance))
     below = []
-    for level, every in enumerate(values):
+    for level, every in enumerate(levels.values):
         each = every.reshape(-1)[sample]
         median = float(np.median(each))
-        if noise is None:
+        if levels.noise is None:
             sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)
         else:
-            sigma = np.sqrt(float(noise[level].variance(median)) + of_dark)
+            sigma = np.sqrt(float(levels.noise[level].variance(median)) + of_dark)
         if median < -SIGMAS * sigma:
             below.append(f"{median:.6g} DN at level {level}")
-    if below:
-        warn(
-            f"the dark is brighter than a level of 'levels': the median less the dark is "
-            f"{' and '.join(below)}. Give the dark frames of these levels, or none",
-            InputWarning,
-        )
+    if not below:
+        return None
+    return (
+        f"the dark is brighter than a level of 'levels': the median less the dark is "
+        f"{' and '.join(below)}. Give the dark frames of these levels, or none"
+    )
+
+
+_CHECKED: tuple[Rule[Levels], ...] = (
+    Rule("cfa", "misfit", lambda levels: levels.filters.words if levels.filters else None),
+    Rule("bright_dark", "input", _on_bright_dark),
+)
+"""What is asked of levels that can be fitted."""
 
 
 def _cause(values: Array, missing: Sequence[float], odd: float) -> str:

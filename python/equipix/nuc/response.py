@@ -14,7 +14,7 @@ from equipix._check import Array, Bools, Flagged, Floats, ReadOnly, as_array, na
 from equipix.correction.apply import apply, apply_polynomial, dark_frame, is_stored
 from equipix.correction.protocol import cfa_of, depth_of, named_cfa
 from equipix.errors import InputError
-from equipix.findings import usable
+from equipix.findings import Finding, usable
 from equipix.io.formats import save_pages
 from equipix.io.record import check_format, check_pages
 from equipix.measured.colour import Colours
@@ -71,6 +71,8 @@ class Response(ReadOnly):
         Colour filters of the pixels, where they were given.
     colour_response : dict of str to float, or None
         Response of each colour to the source, of mean 1 over the pixels.
+    findings : tuple of Finding
+        What limits the result, each also a warning of the fit.
 
     Notes
     -----
@@ -94,6 +96,7 @@ class Response(ReadOnly):
     metadata: dict[str, Any] = field(default_factory=dict)
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
+    findings: tuple[Finding, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -369,6 +372,7 @@ def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: 
         "raw": fields["raw"],
         "saturation": fields["saturation"],
         "metadata": fields["metadata"],
+        "findings": [vars(each) for each in fields["findings"]],
     }
     if fields["cfa"] is not None:
         content["cfa"] = fields["cfa"].rows
@@ -407,6 +411,7 @@ def read_fields(
         "metadata": content["metadata"],
         "cfa": Colours.of(content.get("cfa")),
         "colour_response": content.get("colour_response"),
+        "findings": tuple(Finding(**each) for each in content["findings"]),
     }
 
 

@@ -1,14 +1,15 @@
 """The error budget of a planned calibration: noise, lamp drift, errors of the shifts."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
 
 from equipix._check import ArrayLike, Floats, Ints, as_shifts, check_shape, per_exposure, positive
-from equipix.errors import IdentifiabilityWarning, InputError, MisfitWarning, warn
+from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
+from equipix.findings import Finding, Rule, ask, say
 from equipix.plan import pattern_errors
 from equipix.plan.components import identify, is_connected
 from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
@@ -48,6 +49,8 @@ class ErrorBudget:
         that is distinct from a tilt: see `advise_order`.
     components : int
         Number of connected components; of more than one, the errors are those within each.
+    findings : tuple of Finding
+        What limits the pattern, each also a warning.
     """
 
     shape: tuple[int, int]
@@ -59,6 +62,7 @@ class ErrorBudget:
     distinct_trend: float
     components: int
     _variances: Callable[[], Iterable[Floats]]
+    findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
         """Short form: the errors by cause."""
@@ -163,7 +167,7 @@ def error_budget(
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
     positions = whole_moves(exact)
     waves = pattern_errors.spectrum(exact, powers)
-    components = _components(sizes, positions, _between_pixels(exact, waves))
+    components = _components(sizes, positions, _between_pixels(exact))
     scale = noise**2 * pattern_errors.factor(sizes, positions, powers)
     variances = partial(
         pattern_errors.local_variance, sizes, positions, powers, beam_width, scale=scale
@@ -179,8 +183,7 @@ def error_budget(
         "drift": float(tilt_rms(drift_tilt)),
         "shift_error": moved,
     }
-    warn_of_drift(causes)
-    return ErrorBudget(
+    budget = ErrorBudget(
         shape=sizes,
         shifts=exact,
         rms=float(np.linalg.norm(list(causes.values()))),
@@ -194,6 +197,7 @@ def error_budget(
         components=components,
         _variances=variances,
     )
+    return replace(budget, findings=say(*ask(_RULES, budget)))
 
 
 def check_causes(
@@ -214,51 +218,63 @@ def check_causes(
         positive("beam_width", beam_width)
 
 
-def _between_pixels(shifts: Floats, waves: Spectrum) -> bool:
-    """Whether shifts lie between pixels; warns if a wave is periodic in all of them.
+def _between_pixels(shifts: Floats) -> bool:
+    """Whether shifts lie between pixels.
 
     Such shifts compare each pixel with parts of several cells, so no part of the sensor is
     unconnected; but a wave of the same phase in all exposures is undetermined.
     """
     moves = shifts - shifts[0]
-    if np.abs(moves - np.rint(moves)).max() <= _WHOLE:
-        return False
-    if (
-        np.isfinite(waves.worst).all()
-        and pattern_errors.smallest_near(waves, shifts) < _UNDETERMINED
-    ):
-        row, col = waves.worst
-        warn(
-            f"the shifts do not constrain a wave of ({row:.3f}, {col:.3f}) cycles per pixel, which "
-            "has the same phase in all exposures: choose less regular shifts "
-            "(equipix.plan.suggest)",
-            IdentifiabilityWarning,
-        )
-    return True
+    return bool(np.abs(moves - np.rint(moves)).max() > _WHOLE)
 
 
 def _components(shape: tuple[int, int], positions: Ints, between: bool) -> int:
-    """Count the components, and warn of more than one."""
+    """Count the components."""
     fits = np.all(np.abs(positions) < shape)
-    components = 1
-    if not (fits and (between or is_connected(shape, positions))):
-        components = identify(shape, positions).components
-    if components > 1 and not between:
-        warn(
-            f"the shifts leave {components} parts of the sensor unconnected: the errors are those "
-            "within a part: choose other shifts (equipix.plan.suggest)",
-            IdentifiabilityWarning,
-        )
-    return components
+    if fits and (between or is_connected(shape, positions)):
+        return 1
+    return identify(shape, positions).components
 
 
-def warn_of_drift(causes: dict[str, float], place: str = "") -> None:
-    """Warn of a tilt from drift that exceeds the noise, of the pattern that `place` names."""
-    if causes["drift"] > causes["noise"] > 0:
-        warn(
-            f"{place}lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
-            f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
-            "residual: measure the flux, turn one exposure, or use larger shifts "
-            "(equipix.plan.suggest)",
-            MisfitWarning,
-        )
+def _on_wave(budget: ErrorBudget) -> str | None:
+    """Say that a wave is periodic in all of shifts between pixels."""
+    waves = budget.spectrum
+    if not (_between_pixels(budget.shifts) and np.isfinite(waves.worst).all()):
+        return None
+    if not pattern_errors.smallest_near(waves, budget.shifts) < _UNDETERMINED:
+        return None
+    row, col = waves.worst
+    return (
+        f"the shifts do not constrain a wave of ({row:.3f}, {col:.3f}) cycles per pixel, which "
+        "has the same phase in all exposures: choose less regular shifts (equipix.plan.suggest)"
+    )
+
+
+def _on_components(budget: ErrorBudget) -> str | None:
+    """Say that shifts of whole pixels leave parts of the sensor unconnected."""
+    if budget.components <= 1 or _between_pixels(budget.shifts):
+        return None
+    return (
+        f"the shifts leave {budget.components} parts of the sensor unconnected: the errors are "
+        "those within a part: choose other shifts (equipix.plan.suggest)"
+    )
+
+
+def _on_drift(budget: ErrorBudget) -> str | None:
+    """Say that the tilt from drift exceeds the noise."""
+    drift, noise = (budget.rms_by_cause[cause] for cause in ("drift", "noise"))
+    if not drift > noise > 0:
+        return None
+    return (
+        f"lamp drift will tilt the sensitivity by {drift:.1e} rms, {drift / noise:.1f} times the "
+        "error by noise, and leaves no residual: measure the flux, turn one exposure, or use "
+        "larger shifts (equipix.plan.suggest)"
+    )
+
+
+_RULES: tuple[Rule[ErrorBudget], ...] = (
+    Rule("pattern", "identifiability", _on_wave),
+    Rule("components", "identifiability", _on_components),
+    Rule("drift", "misfit", _on_drift),
+)
+"""What is asked of a pattern of shifts."""

@@ -8,8 +8,9 @@ from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import Array, Ints, as_mask, as_shifts, check_shape, naming_memory, union
-from equipix.errors import InputError, InputWarning, warn
+from equipix.errors import InputError
 from equipix.exposures.positions import as_rotation, round_shifts, whole_moves
+from equipix.findings import Finding, say
 from equipix.measured.colour import Colours
 
 
@@ -119,10 +120,8 @@ def identify(
     whole, rounding = whole_moves(exact), round_shifts(exact)[1]
     if rounding is not None:
         first = np.round(exact[0], 3).tolist()
-        warn(
-            f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels",
-            InputWarning,
-        )
+        words = f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels"
+        say(Finding("rounding", words, "input"))
     masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
     turns = as_rotation(rotation, len(whole))
     colours = Colours.of(cfa)

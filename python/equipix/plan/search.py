@@ -1,16 +1,17 @@
 """Patterns of shifts that leave little error, sought by exchanging one position at a time."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import Floats, Progress, as_array, check_progress, check_shape, positive_count
-from equipix.errors import InputError, MisfitWarning
+from equipix.errors import EquipixWarning, InputError
+from equipix.findings import say
 from equipix.measured.colour import Colours
-from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
+from equipix.plan.budget import ErrorBudget, check_causes, error_budget
 from equipix.plan.components import is_connected
 from equipix.plan.drift import advise_order, tilt_of_fluxes, tilt_rms
 
@@ -183,7 +184,7 @@ def suggest(
     suggestions = []
     causes: dict[str, Any] = {"noise": noise, "shift_error": shift_error, "beam_width": beam_width}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MisfitWarning)
+        warnings.simplefilter("ignore", EquipixWarning)
         finalists = found[: max(wanted, _FINALISTS)]
         for done, points in enumerate(finalists, start=1):
             shifts = points - points.min(axis=0)
@@ -193,7 +194,8 @@ def suggest(
             report(done, len(finalists), "judging patterns")
     suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
     for number, suggestion in enumerate(suggestions[:wanted], start=1):
-        warn_of_drift(suggestion.budget.rms_by_cause, f"pattern {number}: ")
+        found_of = suggestion.budget.findings
+        say(*(replace(each, message=f"pattern {number}: {each.message}") for each in found_of))
     return suggestions[:wanted]
 
 
