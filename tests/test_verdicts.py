@@ -28,6 +28,8 @@ GOOD = {
     "error_estimate": np.array([1e-7]),
     "misfit": 1000.0,
     "degrees_of_freedom": 1000,
+    "lost": [],
+    "sweeps": np.array([70]),
 }
 """What verdicts read of a fit with which nothing is wrong."""
 
@@ -78,6 +80,31 @@ def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit()
     far = {"error_estimate": np.array([0.3])}
     assert kinds(**far, uncertainty=False) == []
     assert kinds(**far, is_joint=False) == []
+
+
+@pytest.mark.parametrize(
+    ("found", "remedy"),
+    [
+        ({"ended": "stalled"}, "use a larger 'tolerance', or mask pixels that receive almost no"),
+        ({"ended": "stalled", "error_estimate": np.array([2.0])}, "use more light or more frames"),
+        ({"ended": "sweeps used"}, "allow more sweeps"),
+    ],
+)
+def test_measurements_left_out_add_a_remedy_and_take_none(found, remedy):
+    """Whatever their number: one of a million says little of why a search did not end."""
+    found = {"error_estimate": np.array([1e-3])} | found
+    plain = verdicts_on(**found, uncertainty=False)[-1].message
+    assert remedy in plain
+    assert "left out" not in plain
+    one, many = (
+        verdicts_on(**found, lost=lost, uncertainty=False)[-1].message
+        for lost in ([[], [7]], [[1, 2], [7]])
+    )
+    assert one == (
+        f"{plain}. Besides, 1 measurement along ragged edges of masks was left out: where that is "
+        "many, use masks with smooth edges"
+    )
+    assert many.startswith(f"{plain}. Besides, 3 measurements along ragged edges of masks were ")
 
 
 def experiment(noise=1e-3, contrast=0.0, shifts=CROSS + 0.25):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from equipix import _native
-from equipix.calibration.verdicts import TOO_WEAK, Verdict, fits_noise
+from equipix.calibration.verdicts import TOO_WEAK, Verdict, fits_noise, left_out
 from equipix.flags import Flag, usable
 from equipix.shifts import whole_moves
 
@@ -50,14 +50,12 @@ def with_coverage(found: list[Verdict], weighted: Weighted, flags: Array) -> lis
 def _far(fit: Fit) -> str:
     """Return the words on a fit that ended far from its minimum."""
     more = "use larger shifts in a beam with more structure"
-    if fit.lost:
-        more += ", or masks with smooth edges"
     if fit.ended == "sweeps used":
         more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
         f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) and not fit.lost else more}"
+        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
     )
 
 

@@ -222,6 +222,18 @@ def fits_noise(fit: Fit) -> bool:
     return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
 
 
+def left_out(fit: Fit) -> str:
+    """Words on the measurements that a fit lost, another cause of slow convergence; or none."""
+    count = sum(map(len, fit.lost))
+    if not count:
+        return ""
+    return (
+        f". Besides, {count} measurement{'s' * (count != 1)} along ragged edges of masks "
+        f"{'were' if count != 1 else 'was'} left out: where that is many, use masks with smooth "
+        "edges"
+    )
+
+
 def _on_uncertainty(weighted: Weighted, options: Options) -> Verdict | None:
     """Verdict on a fit that is too far from its minimum or its beam for standard deviations."""
     if options.uncertainty and is_too_fine(weighted):
@@ -354,12 +366,10 @@ def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Verdict]:
 def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
     if fit.ended == "converged":
         return None
-    if fits_noise(fit) and not fit.lost:
+    if fits_noise(fit):
         remedy = f": {TOO_WEAK}"
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"
-    elif fit.lost:
-        remedy = ", and no longer decreasing: use masks with smooth edges, or a larger 'tolerance'"
     else:
         remedy = (
             ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
@@ -375,5 +385,5 @@ def _on_convergence(fit: Fit, options: Options) -> Verdict | None:
     return Verdict(
         "convergence",
         f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
-        f"tolerance {options.fit.tolerance:g}{remedy}",
+        f"tolerance {options.fit.tolerance:g}{remedy}{left_out(fit)}",
     )
