@@ -264,7 +264,8 @@ fn many_stand_apart_in_three_tenths_of_a_part_or_half_of_an_exposure() {
     // Ten columns of 16 measurements apart beside 9 and 11 that are not: 160 of 640 pixels.
     let comb = |first: usize| {
         move |pixel: usize| {
-            col(pixel) >= first && (col(pixel) >= first + 20 || (col(pixel) - first) % 2 == 0)
+            col(pixel) >= first
+                && (col(pixel) >= first + 20 || (col(pixel) - first).is_multiple_of(2))
         }
     };
     assert!(fit_without(&comb(9)).lost.is_empty());
