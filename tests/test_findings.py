@@ -121,6 +121,31 @@ def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit(
     assert kinds(evidence, **far, is_joint=False) == []
 
 
+@pytest.mark.parametrize(
+    ("found", "remedy"),
+    [
+        ({"ended": "stalled"}, "use a larger 'tolerance', or mask pixels that receive almost no"),
+        ({"ended": "stalled", "error_estimate": np.array([2.0])}, "use more light or more frames"),
+        ({"ended": "sweeps used"}, "allow more sweeps"),
+    ],
+)
+def test_measurements_left_out_add_a_remedy_and_take_none(evidence, found, remedy):
+    """Whatever their number: one of a million says little of why a search did not end."""
+    found = {"error_estimate": np.array([1e-3]), "lost": []} | found
+    plain = findings_on(evidence, **found, uncertainty=False)[-1].message
+    assert remedy in plain
+    assert "left out" not in plain
+    one, many = (
+        findings_on(evidence, **found | {"lost": lost}, uncertainty=False)[-1].message
+        for lost in ([[], [7]], [[1, 2], [7]])
+    )
+    assert one == (
+        f"{plain}. Besides, 1 measurement along ragged edges of masks was left out: where that is "
+        "many, use masks with smooth edges"
+    )
+    assert many.startswith(f"{plain}. Besides, 3 measurements along ragged edges of masks were ")
+
+
 def experiment(noise=1e-3, contrast=0.0, shifts=CROSS + 0.25):
     rng = np.random.default_rng(3)
     truth = simulate.cosine_sensitivity((24, 30), rng=rng)

@@ -470,7 +470,8 @@ class Calibration(ReadOnly):
         ndarray, shape (n, rows, cols)
             Residuals in the units of the frames; where variances are known, in standard
             deviations of a measurement. NaN where nothing is measured or predicted. Measurements
-            that the fit left out, along ragged edges of masks, have residuals beyond their noise.
+            that the fit left out, along ragged edges of masks, may have residuals beyond their
+            noise.
 
         Raises
         ------
@@ -479,10 +480,12 @@ class Calibration(ReadOnly):
 
         Notes
         -----
-        M and L fit some of the noise of the exposures that the calibration was made from: the mean
-        square of their residuals in standard deviations is `reduced_chi2` times the degrees of
-        freedom over the number of measurements. For an exposure held out it is above 1, by the
-        variance of the prediction.
+        M and L fit some of the noise of the exposures that the calibration was made from. Where the
+        fit used all of their measurements, the mean square of the residuals in standard deviations
+        is `reduced_chi2` times the degrees of freedom over the number of measurements. It is not
+        that where measurements were left out, along ragged edges of masks or as outliers, or where
+        pixels with one or two measurements left the search. For an exposure held out it is above
+        1, by the variance of the prediction.
         """
         measured = measured_of(frames, variance)
         values = measured.values

@@ -70,10 +70,6 @@ def fit(
     response.save(output, force=force)
     figures = summary(response) | told(response.findings, as_json=as_json)
     result = {"output": str(output), **figures}
-        "output": str(output),
-        **summary(response),
-        **told(response.findings, as_json=as_json),
-    }
     terminal.show_result(result, as_json=as_json)
 
 

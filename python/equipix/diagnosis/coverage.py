@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from equipix import _native
-from equipix._check import Bools
-from equipix.diagnosis.evidence import Evidence
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.positions import whole_moves
-from equipix.findings import Flag, usable
-from equipix.fitting.error_bars import fits_noise
+from equipix._native import Fit
+        f"{error:.1e}, limit {_LARGEST_ERROR:g}): "
+        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
 
 _LEAST = 0.5
 """Least share of the pixels not masked by the caller that a calibration must determine."""
@@ -29,6 +26,18 @@ TOO_WEAK = (
 )
 
 
+def left_out(fit: Fit) -> str:
+    """Words on the measurements that a fit lost, another cause of slow convergence; or none."""
+    count = sum(map(len, fit.lost))
+    if not count:
+        return ""
+    return (
+        f". Besides, {count} measurement{'s' * (count != 1)} along ragged edges of masks "
+        f"{'were' if count != 1 else 'was'} left out: where that is many, use masks with smooth "
+        "edges"
+    )
+
+
 def too_far(evidence: Evidence) -> str | None:
     """Say that the fit ended so far from its minimum that it determines no pixel."""
     fit = evidence.fit
@@ -36,14 +45,12 @@ def too_far(evidence: Evidence) -> str | None:
     if error <= _LARGEST_ERROR:  # a NaN is not
         return None
     more = "use larger shifts in a beam with more structure"
-    if fit.lost:
-        more += ", or masks with smooth edges"
     if fit.ended == "sweeps used":
         more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
         f"{error:.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) and not fit.lost else more}"
+        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
     )
 
 

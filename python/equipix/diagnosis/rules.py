@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from equipix.diagnosis.coverage import TOO_WEAK, too_far, too_few
+from equipix.diagnosis.coverage import TOO_WEAK, left_out, too_far, too_few
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
@@ -150,12 +150,10 @@ def _on_convergence(e: Evidence) -> str | None:
     fit, tolerance = e.fit, e.options.fit.tolerance
     if fit.ended == "converged":
         return None
-    if fits_noise(fit) and not fit.lost:
+    if fits_noise(fit):
         remedy = f": {TOO_WEAK}"
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"
-    elif fit.lost:
-        remedy = ", and no longer decreasing: use masks with smooth edges, or a larger 'tolerance'"
     else:
         remedy = (
             ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
@@ -169,7 +167,7 @@ def _on_convergence(e: Evidence) -> str | None:
         )
     return (
         f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
-        f"tolerance {tolerance:g}{remedy}"
+        f"tolerance {tolerance:g}{remedy}{left_out(fit)}"
     )
 
 
