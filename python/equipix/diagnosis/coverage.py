@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from equipix import _native
+from equipix._check import Bools
 from equipix._native import Fit
-        f"{error:.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
+from equipix.diagnosis.evidence import Evidence
+from equipix.exposures.exposures import Exposures
+from equipix.exposures.positions import whole_moves
+from equipix.findings import Flag, usable
+from equipix.fitting.error_bars import fits_noise
 
 _LEAST = 0.5
 """Least share of the pixels not masked by the caller that a calibration must determine."""
