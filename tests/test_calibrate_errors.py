@@ -71,7 +71,7 @@ def with_value(array, place, value):
         ({"shifts": Lengths(CROSS, "um")}, "'shifts' has the unit um, expected .* pixel pitch"),
         ({"shifts": [(Length(9), 0.0)] * 5}, "'shifts' has the unit um"),
         ({"frames": np.full((5, 8, 9), np.nan)}, "'frames' holds no finite number"),
-        ({"mask": np.ones((8, 9), bool)}, "'mask' leaves no measurement"),
+        ({"mask": np.ones((8, 9), bool)}, "'mask' excludes all pixels"),
         ({"mask": np.ones((8, 8), bool)}, "'mask' has shape"),
         ({"mask": np.zeros((9, 8), bool)}, r"'mask' has shape \(9, 8\), expected \(8, 9\) or"),
         ({"mask": np.zeros((8, 9, 5), bool)}, r"'mask' has shape \(8, 9, 5\)"),

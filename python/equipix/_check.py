@@ -292,15 +292,21 @@ def union(*masks: Bools | None) -> Bools | None:
     return functools.reduce(np.logical_or, given) if given else None
 
 
-def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
-    """Mask of one exposure or of all, of frames of that shape."""
-    array = as_array("mask", mask, ndim=(2, 3))
+def as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+    """Mask of frames of that shape (rows, cols), or (n, rows, cols): of each or of all of them."""
+    if mask is None:
+        return None
+    shapes = list(dict.fromkeys([shape[-2:], shape]))
+    array = as_array("mask", mask, ndim=tuple(map(len, shapes)))
     if array.dtype != np.bool_:
         raise InputError(
             f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
         )
-    if array.shape not in (shape[1:], shape):
-        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
+    if array.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise InputError(f"'mask' has shape {array.shape}, expected {wanted}")
+    if array.all():
+        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     return array
 
 

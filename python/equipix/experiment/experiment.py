@@ -244,9 +244,7 @@ class Experiment(Described[Manifest]):
     def _excluded(self, mask: ArrayLike | None) -> Bools | None:
         """Pixels that the file or the caller excludes."""
         shape = check_formats(self._images()[:1])
-        given = None
-        if mask is not None:
-            given = as_mask(mask, (len(self.manifest.exposure), *shape))
+        given = as_mask(mask, (len(self.manifest.exposure), *shape))
         return union(given, excluded_pixels(self.path, self.manifest, shape))
 
     def _exposures(

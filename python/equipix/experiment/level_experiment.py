@@ -101,7 +101,7 @@ class LevelExperiment(Described[LevelManifest]):
         """
         check_order(order, by)
         shape = check_formats(self._images())
-        given = None if mask is None else as_mask(mask, (len(self.manifest.level), *shape))
+        given = as_mask(mask, (len(self.manifest.level), *shape))
         excluded = union(given, excluded_pixels(self.path, self.manifest, shape))
         hashes = sha256_of([self.path, *self.files()])
         refuse_repeats(self.path, self.manifest, hashes)

@@ -351,7 +351,7 @@ def exposures_of(
     with naming_memory("calibrating"):
         measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
         count = len(measured.values)
-        given = None if mask is None else as_mask(mask, measured.values.shape)
+        given = as_mask(mask, measured.values.shape)
         positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
         rows, cols = measured.values.shape[1:]
         check_reach(shifts, positions, (rows, cols))

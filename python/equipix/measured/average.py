@@ -15,13 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Progress, as_array, as_floats, as_level, naming_memory, positive_workers
+from equipix._check import (
+    Progress,
+    as_array,
+    as_floats,
+    as_level,
+    as_mask,
+    naming_memory,
+    positive_workers,
+)
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
 from equipix.measured.statistics import (
     FrameStatistics,
-    _check_mask,
     _masked,
     _step,
     _subtract,
@@ -166,7 +173,7 @@ def _average_files(
     if rejection is None:
         with suppress(UnsupportedFileError):
             if mask is not None:
-                _check_mask(mask, frame_format(paths[0])[0][1:])
+                as_mask(mask, frame_format(paths[0])[0][1:])
             maps = _native.average_files(paths, level, mask, workers, progress)
             return _statistics(maps, frame_format(paths[0])[1], level)
     if any(saved_shape(path) for path in paths):
@@ -197,7 +204,7 @@ def _saved(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
             f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
         )
-    _check_mask(mask, statistics.mean.shape)
+    as_mask(mask, statistics.mean.shape)
     return statistics if mask is None else dataclasses.replace(statistics, light_variance=None)
 
 
@@ -239,7 +246,7 @@ def _average_batches(
     everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
     if rejection is not None:
         dtype, everything = np.dtype(np.float64), rejection.cleaned(everything)
-    _check_mask(mask, first.shape[1:])
+    as_mask(mask, first.shape[1:])
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, workers)
     done = 0
     for batch in everything:

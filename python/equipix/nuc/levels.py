@@ -194,7 +194,7 @@ def levels_of(
     if (count := _count(source)) is not None:
         check_variance(variance, count)
     measured = measured_of(source, variance, saturation, words=_LEVELS)
-    given = None if mask is None else as_mask(mask, measured.values.shape)
+    given = as_mask(mask, measured.values.shape)
     check_saturation(measured, averaged, given)
     pedestal = 0.0 if averaged is None else averaged.pedestal
     if measured.unsteady:
@@ -363,8 +363,6 @@ def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     wanted = np.ones_like(usable)
     if mask is not None:
         wanted &= ~mask.reshape(-1, *usable.shape).all(axis=0)
-    if not wanted.any():
-        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     share = float(usable.sum() / int(wanted.sum()))
     if share < FEWEST_VALID or not usable.any():
         missing = [1 - np.mean(each[wanted]) for each in known]

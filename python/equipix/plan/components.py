@@ -125,7 +125,7 @@ def identify(
             f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels",
             InputWarning,
         )
-    masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
+    masked = as_mask(mask, (len(whole), *sizes))
     turns = as_rotation(rotation, len(whole))
     colours = Colours.of(cfa)
     with naming_memory("identifying"):
