@@ -11,7 +11,7 @@ import pytest
 import equipix
 from equipix import errors, simulate
 from equipix.diagnosis.inputs import on_brightness, on_input
-from equipix.exposures.exposures import exposures_of
+from given import exposures_of
 
 SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
 

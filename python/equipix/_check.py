@@ -280,10 +280,11 @@ def per_exposure(
     return array
 
 
-def check_count(name: str, got: int, count: int) -> None:
-    """Refuse an argument that has not one entry for each exposure."""
+def check_count(name: str, got: int, count: int, one: str = "exposure") -> None:
+    """Refuse an argument that has not one entry for each exposure, or level."""
     if got != count:
-        raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")
+        article = "an" if one[0] in "aeiou" else "a"
+        raise InputError(f"'{name}' has {got} entries, expected {count}: one {article} {one}")
 
 
 def union(*masks: Bools | None) -> Bools | None:

@@ -17,13 +17,16 @@ from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described, excluded_pixels, provenance
 from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
 from equipix.experiment.manifest import Manifest, entry_files, read_manifest
-from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.colour import Colours
 from equipix.measured.defects import hot_pixels
 from equipix.measured.means import Averaged
+from equipix.measured.measured import measured_of
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
 _ROUGH = 1e-4
@@ -258,16 +261,21 @@ class Experiment(Described[Manifest]):
     ) -> Exposures:
         """The exposures from averaged frames and the file."""
         refined = std.any() and not options.whole_shifts
-        exposures = exposures_of(
-            averaged,
-            shifts,
-            mask=mask,
-            shift_std=std if refined else None,
-            flux=self._column("flux") if flux is None else flux,
-            flux_std=self._column("flux_std") if flux is None else None,
-            time=self._column("time") if flux == "linear" else None,
-            rotation=[exposure.rotation for exposure in self.manifest.exposure],
-        )
+        with naming_memory("calibrating"):
+            measured = measured_of(averaged)
+            positions = Positions.of(
+                shifts,
+                rotation=[exposure.rotation for exposure in self.manifest.exposure],
+                std=std if refined else None,
+                shape=measured.values.shape,
+            )
+            fluxes = Flux.of(
+                self._column("flux") if flux is None else flux,
+                self._column("flux_std") if flux is None else None,
+                self._column("time") if flux == "linear" else None,
+                len(measured),
+            )
+            exposures = Exposures.of(measured, positions, fluxes, mask=mask)
         return exposures.whole(std) if options.whole_shifts else exposures
 
     def _average(self, dark: FrameStatistics, options: FitOptions) -> Averaged:

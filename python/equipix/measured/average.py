@@ -27,6 +27,7 @@ from equipix._check import (
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
+from equipix.measured.saturation import level_of
 from equipix.measured.statistics import (
     FrameStatistics,
     _masked,
@@ -175,7 +176,8 @@ def _average_files(
             if mask is not None:
                 as_mask(mask, frame_format(paths[0])[0][1:])
             maps = _native.average_files(paths, level, mask, workers, progress)
-            return _statistics(maps, frame_format(paths[0])[1], level)
+            dtype = frame_format(paths[0])[1]
+            return _statistics(maps, dtype, level_of(dtype, level))
     if any(saved_shape(path) for path in paths):
         return _saved(paths, level, mask, rejection)
     stream = stream_frames(paths, workers=workers)
@@ -218,18 +220,11 @@ def _statistics(
         variance / count,
         count,
         saturated,
-        saturation=_level_of(dtype, level),
+        saturation=level,
         raw=dtype.kind in "iu",
         step=_step(mean, variance, count),
         light_variance=None if np.isnan(light_variance) else light_variance,
     )
-
-
-def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
-    """Saturation level of samples of a dtype: the largest whole number, unless given."""
-    if level is None and dtype.kind in "iu":
-        return float(np.iinfo(dtype).max)
-    return level
 
 
 def _average_batches(
@@ -242,7 +237,7 @@ def _average_batches(
     rejection: Rejection | None,
 ) -> FrameStatistics:
     first = next(given)
-    dtype, level = sum_dtype(first), _level_of(first.dtype, level)
+    dtype, level = sum_dtype(first), level_of(first.dtype, level)
     everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
     if rejection is not None:
         dtype, everything = np.dtype(np.float64), rejection.cleaned(everything)

@@ -109,7 +109,9 @@ class Averaged:
         colours: Colours | None = None,
     ) -> Self:
         """Reduce the statistics of all exposures."""
-        averaged = cls(len(frames), words=words, colours=colours)
+        levels = {each.saturation for each in frames}
+        saturation = levels.pop() if len(levels) == 1 else None
+        averaged = cls(len(frames), saturation=saturation, words=words, colours=colours)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -264,9 +266,9 @@ class Averaged:
         """A saturation level that was not given, if the values show one."""
         return highest(self._clipped)
 
-    def models(self, noise: NoiseModel) -> list[NoiseModel]:
+    def models(self, noise: NoiseModel) -> tuple[NoiseModel, ...]:
         """Noise model of each mean frame without that of the dark, from that of one frame."""
-        return [noise.of_mean(frames) for frames in self._frames]
+        return tuple(noise.of_mean(frames) for frames in self._frames)
 
     def dark_variance(self, noise: NoiseModel) -> Floats | None:
         """Variance of the dark that was subtracted from all, from the noise of one frame.

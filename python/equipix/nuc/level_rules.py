@@ -14,7 +14,7 @@ from equipix.measured.defects import SIGMAS
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured
 from equipix.measured.noise import inliers, scatter_limit
-from equipix.measured.saturation import Clipping, clipping_advice, is_of_bits
+from equipix.measured.saturation import ROUNDING, Clipping, clipping_advice, is_of_bits, whole
 from equipix.nuc.response import Response
 
 _MOST_AT_HIGHEST = 0.5
@@ -25,9 +25,6 @@ _WHOLE = 0.99
 
 _FEWEST_JUDGED = 16
 """Fewest pixels of an array whose spread is judged."""
-
-_ROUNDING = 1e-9
-"""Relative rounding of means from which a dark was subtracted, and added again."""
 
 
 def check_saturation(
@@ -65,13 +62,13 @@ def check_saturation(
 
 def _at_highest(measured: Measured) -> tuple[float, list[float]]:
     """Highest finite raw value of all levels, and the share of each level's pixels there."""
-    tops = [_highest(_raw_level(measured, level)) for level in range(len(measured.values))]
+    tops = [_highest(measured.raw_values(level)) for level in range(len(measured.values))]
     top = max(tops)
     if not np.isfinite(top) or top <= 0 or measured.values[0].size < _FEWEST_JUDGED:
         return top, [0.0] * len(tops)
-    least = top * (1 - _ROUNDING)
-    return _whole(top), [
-        _share(_raw_level(measured, level), least) if each >= least else 0.0
+    least = top * (1 - ROUNDING)
+    return whole(top), [
+        _share(measured.raw_values(level), least) if each >= least else 0.0
         for level, each in enumerate(tops)
     ]
 
@@ -88,17 +85,12 @@ def _share(raw: Array, least: float) -> float:
     return int(np.count_nonzero(known & (raw >= least))) / max(1, count)
 
 
-def _whole(top: float) -> float:
-    """The whole number that a mean is but for rounding, or the mean."""
-    return float(np.rint(top)) if abs(top - np.rint(top)) <= _ROUNDING * top else top
-
-
 def _others_differ(measured: Measured, crowded: Sequence[int]) -> bool:
     """Whether another level has most of its pixels below its highest value."""
     for level in set(range(len(measured.values))) - set(crowded):
-        raw = _raw_level(measured, level)
+        raw = measured.raw_values(level)
         top = _highest(raw)
-        if np.isfinite(top) and _share(raw, top - _ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
+        if np.isfinite(top) and _share(raw, top - ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
             return True
     return False
 
@@ -116,14 +108,6 @@ def _refuse_whole(top: float, shares: Sequence[float], crowded: Sequence[int]) -
 def _named(shares: Sequence[float], levels: Sequence[int]) -> str:
     """Name levels with their shares."""
     return " and ".join(f"{shares[each]:.1%} of the values of level {each}" for each in levels)
-
-
-def _raw_level(measured: Measured, level: int) -> Array:
-    """Values of a level before the dark was subtracted; NaN where they are known to saturate."""
-    values: Array = measured.values[level]
-    if measured.mask is not None and measured.mask.ndim == 3:
-        values = np.where(measured.mask[level], np.nan, values)
-    return values if measured.dark is None else values + measured.dark
 
 
 _SHARE = 0.5
