@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, bolometer, errors, io, metrics, simulate
-from equipix.bolometer import BolometerArray, DynamicCorrection
+from equipix import Flag, bolometer, errors, metrics, simulate
+from equipix.bolometer import DynamicCorrection
+from equipix.io.formats import load_pages, save_pages
+from equipix.simulate import BolometerArray
 
 EPS = np.finfo(np.float64).eps
 SHAPE = (24, 32)
@@ -299,8 +301,8 @@ class TestFiles:
     )
     def test_damaged_files_are_refused(self, both, tmp_path, change, message):
         both.save(tmp_path / "kept.npz")
-        pages, content = io.load_pages(tmp_path / "kept.npz")
-        io.save_pages(tmp_path / "kept.npz", pages, content | change, force=True)
+        pages, content = load_pages(tmp_path / "kept.npz")
+        save_pages(tmp_path / "kept.npz", pages, content | change, force=True)
         with pytest.raises(errors.FileError, match=message):
             DynamicCorrection.load(tmp_path / "kept.npz")
 

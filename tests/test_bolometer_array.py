@@ -7,8 +7,8 @@ import pytest
 
 import equipix
 from equipix import errors
-from equipix.bolometer import BolometerArray
 from equipix.detector import photons as physics
+from equipix.simulate import BolometerArray
 
 SHAPE = (12, 16)
 KELVIN = 293.15

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import io
 from equipix._check import Method
 from equipix.calibration.result import FORMAT
 from equipix.errors import ConvergenceWarning, FileError, InputError, InputWarning
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.positions import Positions, Rounding
+from equipix.io.formats import load_pages, save_pages
 
 CROSS = equipix.cross_pattern(2, 3)
 
@@ -282,8 +282,8 @@ class TestFiles:
     def test_a_newer_format_is_refused(self, calibration, tmp_path):
         path = tmp_path / "cal.npz"
         calibration.save(path)
-        pages, content = io.load_pages(path)
-        io.save_pages(path, pages, content | {"format": FORMAT + 1}, force=True)
+        pages, content = load_pages(path)
+        save_pages(path, pages, content | {"format": FORMAT + 1}, force=True)
         with pytest.raises(FileError, match=f"has format {FORMAT + 1}.*reads up to {FORMAT}"):
             equipix.load(path)
 
@@ -319,8 +319,8 @@ class TestFiles:
     def test_damaged_numbers_are_refused_by_name(self, calibration, tmp_path, changed):
         path = tmp_path / "cal.npz"
         calibration.save(path)
-        pages, content = io.load_pages(path)
+        pages, content = load_pages(path)
         numbers = content["calibration"] | changed
-        io.save_pages(path, pages, content | {"calibration": numbers}, force=True)
+        save_pages(path, pages, content | {"calibration": numbers}, force=True)
         with pytest.raises(FileError, match="damaged or incomplete calibration"):
             equipix.load(path)

@@ -13,6 +13,10 @@ from equipix import Flag, io, loading, simulate
 from equipix.correction.apply import apply
 from equipix.correction.correct_files import correct_files
 from equipix.errors import FileError, InputError
+from equipix.io.formats import load_pages, save_pages
+from equipix.io.frames import read_frames
+from equipix.io.record import check_format, check_pages
+from equipix.io.tiff import write_frames
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -39,12 +43,12 @@ class Bent:
     def save(self, path, *, force=False):
         pages = {"flags": self.flags, "coefficients": self.coefficients}
         content = {"kind": "bent response", "format": 1, "metadata": self.metadata}
-        io.save_pages(path, pages, content, force=force)
+        save_pages(path, pages, content, force=force)
 
 
 def read_bent(path, pages, content):
-    io.check_format(path, content, "bent response", 1)
-    io.check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
+    check_format(path, content, "bent response", 1)
+    check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
     return Bent(pages["coefficients"], pages["flags"], content["metadata"])
 
 
@@ -142,7 +146,7 @@ class TestFiles:
     def test_are_corrected_as_arrays_are(self, bent, images, tmp_path):
         frames, source = images
         assert correct_files(bent, source, tmp_path / "out.tif", flagged="replace").frames == 4
-        found = io.read_frames(tmp_path / "out.tif")
+        found = read_frames(tmp_path / "out.tif")
         wanted = equipix.Corrector(bent, "float32", flagged="replace").apply(frames)
         np.testing.assert_array_equal(found, wanted)
         np.testing.assert_allclose(
@@ -152,10 +156,10 @@ class TestFiles:
     def test_of_other_types_are_corrected_in_single_precision(self, bent, tmp_path):
         frames = raw_frames(2)
         for dtype in (np.float64, np.int32, ">u2"):
-            io.write_frames(tmp_path / "raw.tif", frames.astype(dtype), nbytes=1)
+            write_frames(tmp_path / "raw.tif", frames.astype(dtype), nbytes=1)
             correct_files(bent, [str(tmp_path / "raw.tif")], tmp_path / "out.tif", force=True)
             wanted = equipix.Corrector(bent, "float32", flagged="nan").apply(frames)
-            np.testing.assert_array_equal(io.read_frames(tmp_path / "out.tif"), wanted)
+            np.testing.assert_array_equal(read_frames(tmp_path / "out.tif"), wanted)
 
     @pytest.mark.parametrize("dark", ["none", "dark.tif"])
     def test_another_dark_is_refused_where_there_is_none(self, bent, images, tmp_path, dark):
@@ -215,12 +219,12 @@ class TestLoad:
     def test_names_the_kind_of_a_damaged_file(self, bent, tmp_path):
         path = tmp_path / "bent.tif"
         bent.save(path)
-        pages, content = io.load_pages(path)
+        pages, content = load_pages(path)
         del content["metadata"]
-        io.save_pages(path, pages, content, force=True)
+        save_pages(path, pages, content, force=True)
         with pytest.raises(FileError, match="damaged or incomplete bent response: KeyError"):
             equipix.load(path)
-        io.save_pages(path, {"flags": pages["flags"]}, content, force=True)
+        save_pages(path, {"flags": pages["flags"]}, content, force=True)
         with pytest.raises(FileError, match="is damaged: lacks the page 'coefficients'"):
             equipix.load(path)
 
@@ -241,7 +245,7 @@ class TestCommandLine:
         output = tmp_path / "out.tif"
         assert run("correct", saved, tmp_path / "raw.tif", "-o", output)[0] == 0
         limit = rounding(bent, frames)
-        np.testing.assert_allclose(io.read_frames(output), bent.correct(frames), rtol=0, atol=limit)
+        np.testing.assert_allclose(read_frames(output), bent.correct(frames), rtol=0, atol=limit)
         status, _, err = run(
             "correct", saved, tmp_path / "raw.tif", "-o", output, "--force", "--dark", "none"
         )

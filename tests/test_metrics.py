@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import errors, io, metrics, nuc
+from equipix import errors, metrics, nuc
+from equipix.io.frames import read_frames
 from equipix.metrics.correctability import _fisher_quantile
 from equipix.metrics.emva import high_passed, split_variances
 from equipix.metrics.frame_noise import Moments, temporal_of
@@ -504,8 +505,8 @@ def set_001(data_dir):
         kind: sorted(each for each in groups if each[0] == kind and len(each[2]) == 2)
         for kind in "bd"
     }
-    bright, dark = ([io.read_frames(each[2]) for each in pairs[kind]] for kind in "bd")
-    many = {each[0]: io.read_frames(each[2]) for each in groups if len(each[2]) == 50}
+    bright, dark = ([read_frames(each[2]) for each in pairs[kind]] for kind in "bd")
+    many = {each[0]: read_frames(each[2]) for each in groups if len(each[2]) == 50}
     return dark, bright, [each[1][1] for each in pairs["b"]], many
 
 

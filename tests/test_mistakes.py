@@ -23,7 +23,7 @@ class Bench:
         self.rng = np.random.default_rng(seed)
         truth = simulate.paper_sensitivity(SHAPE, rng=self.rng)
         self.offset = 200 + 10 * self.rng.standard_normal(SHAPE)
-        self.signals = [truth * simulate.signal.window(_beam, SHAPE, shift) for shift in SHIFTS]
+        self.signals = [truth * simulate.beams.window(_beam, SHAPE, shift) for shift in SHIFTS]
         self.dark = self.take(0 * truth)
         self.frames = [self.take(signal) for signal in self.signals]
 

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, cli, errors, io, nuc
+from equipix import Flag, cli, errors, nuc
+from equipix.io.formats import load_pages, save_pages
+from equipix.io.frames import read_frames, stream_frames
+from equipix.io.tiff import write_frames
 
 SHAPE = (24, 32)
 LEVELS = (200.0, 1000.0, 2000.0, 3000.0)
@@ -78,8 +81,8 @@ class TestFile:
     def test_with_other_metadata_is_refused(self, response, tmp_path, change, message):
         path = tmp_path / "r.npz"
         response.save(path)
-        pages, content = io.load_pages(path)
-        io.save_pages(path, pages, content | change, force=True)
+        pages, content = load_pages(path)
+        save_pages(path, pages, content | change, force=True)
         with pytest.raises(errors.FileError, match=message):
             equipix.load(path)
 
@@ -87,13 +90,13 @@ class TestFile:
     def test_with_a_page_missing_or_cut_is_refused(self, response, tmp_path, name):
         path = tmp_path / "r.npz"
         response.save(path)
-        pages, content = io.load_pages(path)
+        pages, content = load_pages(path)
         for changed in (None, pages[name][:-1], pages[name][..., :-1]):
             if changed is not None and changed.size == 0:
                 continue  # no file holds an empty page
             rest = {key: page for key, page in pages.items() if key != name}
             cut = rest if changed is None else rest | {name: changed}
-            io.save_pages(path, cut, content, force=True)
+            save_pages(path, cut, content, force=True)
             with pytest.raises(errors.FileError, match="damaged"):
                 equipix.load(path)
 
@@ -169,11 +172,9 @@ class TestCommandLine:
 
     def test_correct_applies_a_response(self, response, tmp_path):
         response.save(tmp_path / "r.tif")
-        equipix.io.write_frames(tmp_path / "raw.tif", iter(frames()), nbytes=1)
+        write_frames(tmp_path / "raw.tif", iter(frames()), nbytes=1)
         self.run("correct", tmp_path / "r.tif", tmp_path / "raw.tif", "-o", tmp_path / "c.tif")
-        corrected = np.concatenate(
-            [each for _, each in equipix.io.stream_frames([tmp_path / "c.tif"])]
-        )
+        corrected = np.concatenate([each for _, each in stream_frames([tmp_path / "c.tif"])])
         np.testing.assert_array_equal(corrected, response.correct(frames()))
 
 
@@ -218,7 +219,7 @@ class TestRealCamera:
         for order in (1, 2, 3):
             response = nuc.fit(rest, order=order)
             for level in held:
-                frames = equipix.io.read_frames(sorted(folder.glob(f"b_{level:03}_snap_*.png")))
+                frames = read_frames(sorted(folder.glob(f"b_{level:03}_snap_*.png")))
                 ratios[level, order] = equipix.metrics.correctability(response.correct(frames))
                 ratios[level, 0] = equipix.metrics.correctability(frames)
             # Few of the 307 200 pixels are inverted worse than noise.

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Experiment, cli, errors, io, simulate
+from equipix import Experiment, cli, errors, simulate
+from equipix.io.formats import load_pages, save_pages
 from equipix.io.tiff import write_frames
 
 SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
@@ -89,8 +90,8 @@ def test_the_step_of_a_file_without_one_is_found(tmp_path, monkeypatch, step, da
 def test_a_file_with_something_else_than_numbers_is_refused(tmp_path, name, value):
     raw = np.random.default_rng(4).integers(10, 60, (2, 7, *SHAPE)).astype(np.uint16)
     equipix.average(raw[0], dark=equipix.average(raw[1])).save(tmp_path / "a.npz")
-    pages, content = io.load_pages(tmp_path / "a.npz")
-    io.save_pages(tmp_path / "a.npz", pages, content | {name: value}, force=True)
+    pages, content = load_pages(tmp_path / "a.npz")
+    save_pages(tmp_path / "a.npz", pages, content | {name: value}, force=True)
     if value is None and "step" not in name:
         assert getattr(equipix.FrameStatistics.load(tmp_path / "a.npz"), name) is None
         return

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, errors, io, scene
+from equipix import Flag, errors, scene
+from equipix.io.formats import load_pages, save_pages
 from equipix.reference import scene as reference
+from equipix.scene.methods import METHODS
+from equipix.scene.methods import load as load_state
 from equipix.simulate import MovingScene
 
 SHAPE = (48, 64)
-NAMES = tuple(scene.METHODS)
+NAMES = tuple(METHODS)
 DESCENTS = ("local-mean", "gated", "registered")
 
 
 def made(name, shape=SHAPE, data_range=(0, 1), **options):
-    return scene.METHODS[name](shape, data_range, **options)
+    return METHODS[name](shape, data_range, **options)
 
 
 def frames(count, *, seed=5, shape=SHAPE, **options):
@@ -287,8 +290,8 @@ class TestEveryMethod:
         with pytest.raises(
             errors.FileError, match=r"state.npz: holds a state of a sensor \(48, 64\)"
         ):
-            scene.load(tmp_path / "state.npz", shape=(64, 64))
-        other = scene.METHODS[NAMES[NAMES.index(name) - 1]]
+            load_state(tmp_path / "state.npz", shape=(64, 64))
+        other = METHODS[NAMES[NAMES.index(name) - 1]]
         with pytest.raises(errors.FileError, match=rf"holds a state of '{name}', expected"):
             other.load(tmp_path / "state.npz")
         with pytest.raises(errors.FileError, match=r"equipix.scene.load reads it"):
@@ -297,19 +300,19 @@ class TestEveryMethod:
         method.save(tmp_path / "newer.npz")
         monkeypatch.undo()
         with pytest.raises(errors.FileError, match=r"newer.npz: has format 5"):
-            scene.load(tmp_path / "newer.npz")
+            load_state(tmp_path / "newer.npz")
 
     def test_a_damaged_state_is_refused(self, name, tmp_path):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        pages, content = io.load_pages(tmp_path / "state.npz")
+        pages, content = load_pages(tmp_path / "state.npz")
         lacking = {key: page for key, page in pages.items() if key != "offset"}
         cut = pages | {"gain": pages["gain"][:-1]}
         wrong = pages | {"gain": pages["gain"] + np.float32(np.nan)}
         for damaged, message in ((lacking, "lacks the map 'offset'"), (cut, "47"), (wrong, "NaN")):
-            io.save_pages(tmp_path / "damaged.npz", damaged, content, force=True)
+            save_pages(tmp_path / "damaged.npz", damaged, content, force=True)
             with pytest.raises(errors.FileError, match=f"damaged.npz: is damaged: .*{message}"):
-                scene.load(tmp_path / "damaged.npz")
+                load_state(tmp_path / "damaged.npz")
 
     def test_another_shape_is_refused(self, name):
         with pytest.raises(errors.InputError, match=r"'frame' is float64 of shape \(64, 48\)"):
@@ -566,7 +569,7 @@ def test_a_dead_pixel_is_flagged_and_does_not_change_the_others(name, stuck, noi
         dead[20, 30] = stuck + noise * random.standard_normal()
         other.update(dead)
     other.save(tmp_path / "state.npz")
-    for result in (other.correction(), scene.load(tmp_path / "state.npz").result()):
+    for result in (other.correction(), load_state(tmp_path / "state.npz").result()):
         assert result.flags[20, 30] == Flag.DEAD | Flag.DO_NOT_USE
         assert np.count_nonzero(result.flags) == 1
     assert not good.correction().flags.any()
@@ -620,16 +623,16 @@ class TestDamagedStates:
     def refused(self, tmp_path, monkeypatch, message, name="kalman", maps=None, **content):
         method = made(name)
         path = tmp_path / "state.npz"
-        write = scene.adaptive.write_state
+        write = scene.scene_correction.write_state
 
         def damaged(path, pages, held, *, force):
             held["counts"] |= content.pop("counts", {})
             write(path, pages | (maps or {}), held | content, force=force)
 
-        monkeypatch.setattr("equipix.scene.adaptive.write_state", damaged)
+        monkeypatch.setattr("equipix.scene.scene_correction.write_state", damaged)
         method.save(path)
         with pytest.raises(errors.FileError, match=message):
-            scene.load(path)
+            load_state(path)
 
     @pytest.mark.parametrize("shape", [5, None, [48], [48.5, 64]])
     def test_shapes(self, tmp_path, monkeypatch, shape):
@@ -650,4 +653,4 @@ class TestDamagedStates:
 def test_workers_are_checked_before_the_file(tmp_path):
     made("gated").save(tmp_path / "state.npz")
     with pytest.raises(errors.InputError, match="'workers' is 0"):
-        scene.load(tmp_path / "state.npz", workers=0)
+        load_state(tmp_path / "state.npz", workers=0)

@@ -41,7 +41,8 @@ from byte_scenes import (
     written_experiment,
 )
 from equipix import detector, metrics, plan, simulate
-from equipix.plan.drift import tilt_std
+from equipix.detector import photons
+from equipix.plan.drift import distinct_trend, tilt_std
 from same_bytes import COMPARED, REPORTED, collected, parts
 
 if TYPE_CHECKING:
@@ -145,8 +146,8 @@ def plans() -> Any:
         "apart": plan.identify(SHAPE, [(0, 0), (0, 4), (6, 0)]),
         "masked": plan.identify(SHAPE, CROSS, mask(), cfa="RGGB"),
         "turned": plan.identify(SHAPE, CROSS, rotation=[0, 90, 0, 180, 0]),
-        "order": [plan.advise_order(CROSS), plan.distinct_trend(CROSS)],
-        "tilt": [tilt_std(CROSS, SHAPE, flux_std=1e-4), tilt_std(CROSS, SHAPE, **known)],
+        "order": [plan.advise_order(CROSS), distinct_trend(CROSS)],
+        "tilt": [tilt_std(SHAPE, CROSS, flux_std=1e-4), tilt_std(SHAPE, CROSS, **known)],
     }
 
 
@@ -176,12 +177,12 @@ def simulated_camera() -> Any:
             simulate.noise_prediction(paper, beams["tilted"], CROSS, 1e-6, mask=paper < 1, rng=8),
         ],
         "errors": [errors, metrics.block_means(errors)],
-        "photons": simulate.blackbody.band_photons(3.0, np.linspace(4, 5, 9), 300.0),
-        "spectrum": simulate.blackbody.photon_exitance(np.linspace(3, 12, 19), 300.0),
+        "photons": photons.band_photons(3.0, np.linspace(4, 5, 9), 300.0),
+        "spectrum": photons.photon_exitance(np.linspace(3, 12, 19), 300.0),
         "HgCdTe": [
-            simulate.blackbody.hgcdte_cutoff(np.linspace(0.2, 0.4, 9)),
-            simulate.blackbody.hgcdte_gap(np.linspace(0.2, 0.4, 9)),
-            simulate.blackbody.hgcdte_composition(5.1),
+            photons.hgcdte_cutoff(np.linspace(0.2, 0.4, 9)),
+            photons.hgcdte_gap(np.linspace(0.2, 0.4, 9)),
+            photons.hgcdte_composition(5.1),
         ],
     }
 

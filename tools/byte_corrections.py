@@ -17,6 +17,8 @@ import tifffile
 import equipix
 from byte_scenes import Scene, given_experiment
 from equipix import bolometer, hardware, lens, metrics, nuc, scene, simulate
+from equipix.hardware.table import read as read_table
+from equipix.scene.methods import load as load_scene
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -164,11 +166,11 @@ def dynamic(*, bodies: bool = True, averaged: bool = False, **options: Any) -> A
     )
     options["black_bodies"] = tuple(others) if bodies else None
     found = bolometer.fit(shutter, *STATES.T, **options)
-    inside = found.at(14.5, 2.0)
+    inside = found.correction(14.5, 2.0)
     return {
         "": found,
         "inside": inside,
-        "outside": found.at(70.0, 2.0, extrapolate=True),
+        "outside": found.correction(70.0, 2.0, extrapolate=True),
         "corrected": corrected(inside, np.array([stack[4, 0] for stack in stacks])),
         "files": reread(found, bolometer.DynamicCorrection.load),
     }
@@ -215,7 +217,7 @@ def learned(kind: Any, dtype: str = "uint16", **options: Any) -> Any:
     frames = moving_frames().astype(dtype)
     method = kind(SHAPE, (0.0, 16383.0), saturation=16383.0, **options)
     seen = [method.update(frame) for frame in frames[:60]]
-    resumed = reread(method, scene.load, ".tif") | reread(method, kind.load, ".npz")
+    resumed = reread(method, load_scene, ".tif") | reread(method, load_scene, ".npz")
     seen += [method.update(frame) for frame in frames[60:]]
     for other in resumed.values():
         for frame in frames[60:]:
@@ -327,7 +329,7 @@ def table_of(table: Any) -> Any:
         "": table,
         "words": [words, *table.applied(words)],
         "corrected": [table.correct(FRAMES, flagged=way) for way in FLAGGED],
-        "files": reread(table, hardware.read, ".bin", ".hex", ".h"),
+        "files": reread(table, read_table, ".bin", ".hex", ".h"),
     }
 
 
@@ -343,7 +345,7 @@ def costs() -> Any:
 
 def adaptive(bits: int = 14, **options: Any) -> Any:
     """Memories that follow a scene."""
-    loop = hardware.Adaptive(SHAPE, adc_bits=bits, **options)
+    loop = hardware.AdaptiveLoop(SHAPE, adc_bits=bits, **options)
     frames = moving_frames() >> (14 - bits)
     seen = [loop.update(frames[:60]), *(loop.update(frame) for frame in frames[60::9])]
     return {"seen": seen, "words": [loop.gain, loop.offset], "result": loop.correction()}
@@ -408,8 +410,8 @@ def written() -> Any:
     command("hardware", "nuc.npz", "-o", "words.bin", "--linearise", "900", "9000", "--force")
     return {
         "corrections": [equipix.load(f"{name}.npz") for name in ("nuc", "given", "scene")],
-        "scene": [tifffile.imread("seen.tif"), scene.load("state.npz")],
-        "hardware": hardware.read("words.bin"),
+        "scene": [tifffile.imread("seen.tif"), load_scene("state.npz")],
+        "hardware": read_table("words.bin"),
     }
 
 
@@ -421,10 +423,10 @@ def figures() -> Any:
     pair = equipix.average(dark), equipix.average(frames)
     return {
         "three": metrics.three_d_noise(frames),
-        "transfer": metrics.emva_transfer([dark], bright, 8 * light),
-        "spatial": metrics.emva_spatial(dark, frames),
-        "plain": metrics.emva_spatial(dark, frames, gain_dn_per_e=0.2, highpass=False),
-        "averages": metrics.emva_spatial(*pair),
+        "transfer": metrics.emva_transfer(bright, [dark], 8 * light),
+        "spatial": metrics.emva_spatial(frames, dark),
+        "plain": metrics.emva_spatial(frames, dark, gain_dn_per_e=0.2, highpass=False),
+        "averages": metrics.emva_spatial(*pair[::-1]),
         "correctability": metrics.correctability(frames),
         "masked": metrics.correctability(frames, mask=mask(), confidence=0.9),
         "netd": metrics.netd(frames, hot, 2.5),

@@ -27,9 +27,16 @@ from equipix.correction.apply import apply
 from equipix.correction.protocol import Correction, cfa_of, check_correction
 from equipix.errors import FileError, InputError
 from equipix.findings import usable
-from equipix.hardware import c_header, table_files
+from equipix.hardware.c_header import from_c_header, to_c_header
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
-from equipix.hardware.table_files import Content, check_words
+from equipix.hardware.table_files import (
+    Content,
+    check_words,
+    from_binary,
+    from_memory_image,
+    to_binary,
+    to_memory_image,
+)
 from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
 from equipix.io.paths import as_path, write_whole
 from equipix.measured.colour import Colours
@@ -309,7 +316,11 @@ class Table(ReadOnly):
         return raw
 
 
-_FORMATS = {".bin": table_files, ".hex": table_files, ".h": c_header}
+_FORMATS = {
+    ".bin": (to_binary, from_binary),
+    ".h": (to_c_header, from_c_header),
+    ".hex": (to_memory_image, from_memory_image),
+}
 
 SUFFIXES = tuple(_FORMATS)
 """Suffixes of files of tables."""
@@ -318,7 +329,8 @@ SUFFIXES = tuple(_FORMATS)
 def write(content: Content, path: str | PathLike[str], *, force: bool) -> None:
     """Write a file, which appears whole or not at all."""
     file = as_path("path", path)
-    data = _FORMATS[_suffix(file)].encoded(content, file.stem)
+    encode_file, _ = _FORMATS[_suffix(file)]
+    data = encode_file(content, file.stem)
     with write_whole(path, force=force) as temporary:
         temporary.write_bytes(data)
 
@@ -332,9 +344,9 @@ def read_content(path: str | PathLike[str]) -> Content:
         If the file cannot be read, holds something else, or is incomplete or of another version.
     """
     file = as_path("path", path)
-    kind = _FORMATS[_suffix(file)]
+    _, decode_file = _FORMATS[_suffix(file)]
     try:
-        content: Content = kind.decoded(file, file.read_bytes())
+        content: Content = decode_file(file, file.read_bytes())
     except FileError:
         raise
     except OSError as error:
