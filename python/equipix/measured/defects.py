@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from equipix._check import Array, Bools, Floats, ReadOnly, number
+from equipix._check import Array, Bools, ReadOnly, number
 from equipix.errors import InputError
 from equipix.measured.noise import NoiseModel, scatter_limit
 from equipix.measured.statistics import FrameStatistics, light_of
@@ -475,21 +475,6 @@ def _median(values: Array) -> Array:
     squares = np.lib.stride_tricks.sliding_window_view(padded, (_WIDTH, _WIDTH))
     median: Array = np.median(squares[:, :, ::_EVERY, ::_EVERY], axis=(2, 3))
     return median
-
-
-def relative_response(rise: Floats, good: Bools) -> Floats:
-    """Response of each pixel over the array's, at each state."""
-    mean = rise[:, good].mean(axis=1)
-    scatter = rise[:, good].std(axis=1)
-    weak = np.flatnonzero(~(np.abs(mean) > scatter))
-    if weak.size:
-        k = int(weak[0])
-        raise InputError(
-            f"'black_bodies' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
-            f"{scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels see: "
-            "take black bodies further apart"
-        )
-    return np.asarray(rise / mean[:, None, None])
 
 
 @dataclass(frozen=True)

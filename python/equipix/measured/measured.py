@@ -214,6 +214,7 @@ def _of_arrays(
     colours: Colours | None,
 ) -> Measured:
     """Arrays: only what the caller gives is known of them."""
+    _refuse_shapes(frames, words)
     values = as_floats(words.argument.strip("'"), frames, ndim=3)
     if 0 in values.shape:
         raise InputError(
@@ -235,6 +236,15 @@ def _of_arrays(
         raw=is_unsigned(frames),
         colours=colours,
     )
+
+
+def _refuse_shapes(frames: object, words: Words) -> None:
+    """Refuse arrays of several shapes, before they become one array."""
+    arrays = frames if isinstance(frames, list | tuple) else []
+    shapes = list(dict.fromkeys(each.shape for each in arrays if isinstance(each, np.ndarray)))
+    if len(shapes) > 1:
+        named = " and ".join(map(str, shapes[:2]))
+        raise InputError(f"{words.argument} holds arrays of shapes {named}, expected one shape")
 
 
 def _noise_of(
@@ -286,10 +296,6 @@ def check_levels(levels: object) -> None:
         )
     if isinstance(levels, np.ndarray):
         _refuse_last_axis(levels)
-    shapes = list(dict.fromkeys(each.shape for each in known))
-    if len(shapes) > 1:
-        named = " and ".join(map(str, shapes[:2]))
-        raise InputError(f"'levels' holds arrays of shapes {named}, expected one (rows, cols)")
 
 
 def _refuse_last_axis(levels: Array) -> None:
