@@ -198,6 +198,22 @@ class TestBadPixels:
         assert np.isnan(corrected).sum() == 3
         assert np.nanstd(corrected) < LIMIT * simulated.span
 
+    def test_dead_and_hot_pixels_are_told_by_their_neighbours(self):
+        """Towards the edge the black body is weak: over the mean of the array 122 good ones are dead."""
+        rows, cols = np.mgrid[-1:1:96j, -1:1:128j]
+        light = 1 - 0.35 * (rows**2 + cols**2)
+        light[20, 30], light[3, 4], light[30:33, 40:43], light[10, 50] = 0, 0.1, 0.1, 2.5
+        array = simulate.BolometerArray.of(light.shape, rng=1)
+        at = [0.0, 20.0, 40.0]
+        cold, warm = ([array.mean(c, scene_c=scene_c) for c in at] for scene_c in (20.0, 60.0))
+        hot = [one + (other - one) * light for one, other in zip(cold, warm, strict=True)]
+        shutter = [array.mean(c) for c in at]
+        found = bolometer.fit(shutter, at, 2.0, order=1, black_bodies=(cold, hot))
+        wanted = np.zeros(light.shape, np.uint32)
+        wanted[light <= 0.1] = Flag.DEAD | Flag.DO_NOT_USE
+        wanted[10, 50] = Flag.HOT | Flag.DO_NOT_USE
+        np.testing.assert_array_equal(found.flags, wanted)
+
     def test_no_good_pixel_is_refused(self, simulated):
         shutter, mask = np.array(simulated.shutter), np.ones(SHAPE, bool)
         shutter[0, 0, 0], mask[0, 0] = np.nan, False

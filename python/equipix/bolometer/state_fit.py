@@ -16,7 +16,7 @@ from equipix.bolometer.held_out import HIGHEST, Form, HeldOut
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
 from equipix.errors import InputError, InputWarning, warn
 from equipix.findings import Flag, set_bits, usable
-from equipix.measured.defects import DEAD_RESPONSE, BadPixels
+from equipix.measured.defects import BadPixels, response_outliers
 from equipix.measured.measured import Measured, measured_of
 from equipix.measured.saturation import clipping
 from equipix.measured.statistics import FrameStatistics
@@ -95,10 +95,11 @@ def fit(
     the others. The lowest order within 0.1 % of the smallest error is taken; `metadata` has the
     errors.
 
-    Pixels with a missing value in a reference, and masked ones, are flagged ``NO_FLAT_FIELD``,
-    those with less than half of the mean response ``DEAD``, and those with a saturated sample in an
-    average, or the largest number of the type in an array of whole numbers, ``SATURATED``; they
-    count in no mean. Without black bodies no response is known, so no pixel is flagged ``DEAD``.
+    Pixels with a missing value in a reference, and masked ones, are flagged ``NO_FLAT_FIELD``, and
+    those with a saturated sample in an average, or the largest number of the type in an array of
+    whole numbers, ``SATURATED``. Those with less than half of the response of their neighbours are
+    flagged ``DEAD``, with more than twice of it ``HOT``, by the test of `equipix.nuc.fit`. They
+    count in no mean. Without black bodies no response is known, so neither is flagged.
 
     References
     ----------
@@ -300,7 +301,7 @@ def response_of(bodies: Sequence[Measured], good: Bools) -> tuple[Floats, Floats
 
 
 def flags_of(shutter: Measured, bodies: Sequence[Measured], mask: ArrayLike | None) -> Array:
-    """Flags of pixels without values, masked, saturated, or that do not respond."""
+    """Flags of pixels without values, masked, saturated, or of another response than others."""
     unknown, saturated = np.zeros((2, *shutter.shape), bool)
     for each in (shutter, *bodies):
         unknown |= ~np.isfinite(each.values).all(axis=0)
@@ -308,16 +309,20 @@ def flags_of(shutter: Measured, bodies: Sequence[Measured], mask: ArrayLike | No
             saturated |= each.bad_pixels.saturated
     if (given := as_mask(mask, shutter.shape)) is not None:
         unknown |= given
-    good, dead = ~(unknown | saturated), np.zeros(shutter.shape, bool)
+    good, dead, hot = ~(unknown | saturated), None, None
     if bodies and good.any():
-        response = response_of(bodies, good)[0].mean(axis=0)
-        dead = good & ~(response >= DEAD_RESPONSE)
-    if not (good & ~dead).any():
+        response, variance = response_of(bodies, good)
+        mean = np.where(good, response.mean(axis=0), np.nan)
+        error = 0.0 if variance is None else float(np.sqrt(variance.sum())) / len(variance)
+        dead, hot = response_outliers(mean, lambda: np.full(mean.shape, error))
+        good &= ~(dead | hot)
+    if not good.any():
         raise InputError(
             "'shutter' has no pixel with a value at every state below saturation, expected some"
         )
     flags = np.zeros(shutter.shape, np.uint32)
     set_bits(flags, "undetermined", unknown)
     set_bits(flags, "dead", dead)
+    set_bits(flags, "hot", hot)
     flags[saturated] |= np.uint32(Flag.SATURATED | Flag.DO_NOT_USE)
     return flags
