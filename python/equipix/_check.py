@@ -212,12 +212,17 @@ def check_bit_depth(bits: int) -> None:
         raise InputError(f"'bit_depth' is {bits!r}, expected 8 to 16")
 
 
+def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:
+    """Whether a value is a whole number, and no truth value, from `least` to `most`."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return whole and bool(least <= value <= most)
+
+
 def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:
         return None
-    whole = isinstance(workers, int | np.integer) and not isinstance(workers, bool)
-    if not whole or not 1 <= workers <= _MOST_WORKERS:
+    if not is_whole(workers, 1, _MOST_WORKERS):
         raise InputError(
             f"'workers' is {workers!r}, expected a whole number from 1 to {_MOST_WORKERS} or None"
         )
@@ -226,7 +231,7 @@ def positive_workers(workers: int | None) -> int | None:
 
 def positive_count(name: str, value: int) -> int:
     """A whole number above 0, checked; above 64 bits it becomes the largest of 64 bits."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not is_whole(value, 1):
         raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
     return min(int(value), 2**63 - 1)
 

@@ -15,6 +15,7 @@ from equipix.errors import InputError
 from equipix.findings import set_bits
 from equipix.measured.colour import Colours
 from equipix.measured.filters import responses
+from equipix.measured.noise import ROBUST
 from equipix.metrics.maps import block_means
 
 __all__ = ["LensFalloff", "fit"]
@@ -261,7 +262,7 @@ def _fitted(
     for _ in range(3):
         found = _least_squares(model, values, used, found)
         residual = values - model(found)
-        spread = 1.4826 * np.median(np.abs(residual[used]))
+        spread = ROBUST * np.median(np.abs(residual[used]))
         used = np.abs(residual) <= max(_CLIP * spread, 1e-9 * abs(found[0]))
     found = _least_squares(model, values, used, found)
     jacobian = _jacobian(model, found)[used]

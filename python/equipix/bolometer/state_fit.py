@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, Words, as_mask, check_word, described, union
+from equipix._check import Array, Bools, Floats, Words, as_mask, check_word, is_whole, union
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.bolometer.held_out import HIGHEST, Form, HeldOut
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
@@ -214,15 +214,14 @@ def _bias_order(states: States, given: int | None) -> int:
     """Highest power of V², checked."""
     if given is None:
         return min(1, len(states.biases) - 1)
-    if isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 0:
+    if not is_whole(given, 0):
         raise InputError(f"'bias_order' is {given!r}, expected a whole number from 0, or None")
     return int(given)
 
 
 def _checked_order(order: int | str) -> int:
-    whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if not whole or not 0 <= int(order) <= HIGHEST:
-        raise InputError(f"'order' is {described(order)}, expected 0 to {HIGHEST} or 'auto'")
+    if not is_whole(order, 0, HIGHEST):
+        raise InputError(f"'order' is {order!r}, expected 0 to {HIGHEST} or 'auto'")
     return int(order)
 
 

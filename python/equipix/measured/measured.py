@@ -202,7 +202,7 @@ def _of_averaged(
         raw=averaged.raw,
         unsteady=averaged.unsteady,
         colours=averaged.colours,
-        names=averaged.names,
+        names=tuple(averaged.names),
     )
 
 

@@ -184,7 +184,7 @@ def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Sca
     kept = inliers(variances, scatter_limit(frames))
     common = _common(variances[kept], rise[kept], frames - 1)
     mean, variance = (
-        float(_raw_average(averaged, level)[used].mean()),
+        float(averaged.raw_values(level)[used].mean()),
         float(variances[kept].mean()),
     )
     return _Scatter(level, mean, variance, variance - common)
@@ -216,12 +216,6 @@ def _by_rise(variances: Array, rise: Array) -> float:
     return covariance**2 / steepness
 
 
-def _raw_average(averaged: Averaged, level: int) -> Array:
-    """Mean values of a level before the dark was subtracted."""
-    values: Array = averaged.values[level]
-    return values if averaged.dark is None else values + averaged.dark.mean
-
-
 def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
     """Say which levels saturate, with the numbers of the darkest of them."""
     named = " and ".join(f"level {each.level}" for each in full)
@@ -243,10 +237,8 @@ def _advice(averaged: Averaged, used: Bools, full: list[_Scatter]) -> str:
         return ""  # less a dark that was not kept
     saturate = [each.level for each in full]
     free = [level for level in range(averaged.count) if level not in saturate]
-    low = min(float(np.quantile(_raw_average(averaged, level)[used], _TAIL)) for level in saturate)
-    highest = max(
-        float(np.quantile(_raw_average(averaged, level)[used], 1 - _TAIL)) for level in free
-    )
+    low = min(float(np.quantile(averaged.raw_values(level)[used], _TAIL)) for level in saturate)
+    highest = max(float(np.quantile(averaged.raw_values(level)[used], 1 - _TAIL)) for level in free)
     if np.floor(low) <= highest:
         return ""
     level = f"{np.floor(low):.10g}"
