@@ -199,7 +199,7 @@ class TestBadPixels:
         assert np.nanstd(corrected) < LIMIT * simulated.span
 
     def test_dead_and_hot_pixels_are_told_by_their_neighbours(self):
-        """Towards the edge the black body is weak: half of the mean of all is above 122 good ones."""
+        """Towards the edge light is weak: 122 good ones are below half of the mean of all."""
         rows, cols = np.mgrid[-1:1:96j, -1:1:128j]
         light = 1 - 0.35 * (rows**2 + cols**2)
         light[20, 30], light[3, 4], light[30:33, 40:43], light[10, 50] = 0, 0.1, 0.1, 2.5
