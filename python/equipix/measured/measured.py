@@ -269,7 +269,8 @@ def _noise_of(
         return (), numbers.astype(np.float64)
     if shape != values.shape:
         raise InputError(
-            f"'variance' has shape {shape}, expected {(len(values),)} or {values.shape}"
+            f"'variance' has shape {shape}, expected {(len(values),)}, one number for each "
+            f"{words.one}, or {values.shape}"
         )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return (), numbers.astype(values.dtype, copy=False)
