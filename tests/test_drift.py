@@ -8,9 +8,9 @@ import pytest
 import equipix
 from equipix import plan, simulate
 from equipix.diagnosis.inputs import BEFORE
-from equipix.exposures.exposures import exposures_of
 from equipix.findings import ask
 from equipix.plan import drift
+from given import exposures_of
 
 CROSS = equipix.cross_pattern(11, 19).astype(float)
 CCD = (582, 782)

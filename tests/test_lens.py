@@ -100,7 +100,8 @@ class TestFit:
         [
             ({"law": "cos3"}, "'law' is 'cos3'"),
             ({"sensitivity": np.ones((2, 2))}, "'sensitivity' has shape"),
-            ({"mask": np.ones(SHAPE, bool)}, "fewer than 100 finite"),
+            ({"mask": np.arange(np.prod(SHAPE)).reshape(SHAPE) > 50}, "fewer than 100 finite"),
+            ({"mask": np.ones(SHAPE, bool)}, "'mask' excludes all pixels"),
             ({"mask": np.full(SHAPE, np.nan)}, "'mask' has dtype float64, expected bool"),
             ({"mask": np.zeros(SHAPE, np.uint8)}, "'mask' has dtype uint8, expected bool"),
         ],

@@ -170,7 +170,7 @@ class TestCorrectability:
             ({"frames": np.ones((3, 4, 4))}, "are all equal"),
             ({"frames": np.full((3, 4, 4), np.nan)}, "has 0 pixels"),
             ({"frames": np.eye(4)[None] * [[[1]], [[2]]], "confidence": 1.0}, "'confidence'"),
-            ({"frames": np.ones((3, 4, 4)), "mask": np.ones((2, 2), bool)}, "'mask' is bool"),
+            ({"frames": np.ones((3, 4, 4)), "mask": np.ones((2, 2), bool)}, "'mask' has shape"),
         ],
     )
     def test_refusals(self, given, message):

@@ -11,8 +11,8 @@ import pytest
 import equipix
 from equipix import errors, simulate
 from equipix.diagnosis.inputs import BEFORE, on_brightness
-from equipix.exposures.exposures import exposures_of
 from equipix.findings import ask
+from given import exposures_of
 
 SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
 

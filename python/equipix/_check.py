@@ -217,12 +217,17 @@ def check_bit_depth(bits: int) -> None:
         raise InputError(f"'bit_depth' is {bits!r}, expected 8 to 16")
 
 
+def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:
+    """Whether a value is a whole number, and no truth value, from `least` to `most`."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return whole and bool(least <= value <= most)
+
+
 def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:
         return None
-    whole = isinstance(workers, int | np.integer) and not isinstance(workers, bool)
-    if not whole or not 1 <= workers <= _MOST_WORKERS:
+    if not is_whole(workers, 1, _MOST_WORKERS):
         raise InputError(
             f"'workers' is {workers!r}, expected a whole number from 1 to {_MOST_WORKERS} or None"
         )
@@ -231,7 +236,7 @@ def positive_workers(workers: int | None) -> int | None:
 
 def positive_count(name: str, value: int) -> int:
     """A whole number above 0, checked; above 64 bits it becomes the largest of 64 bits."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not is_whole(value, 1):
         raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
     return min(int(value), 2**63 - 1)
 
@@ -293,10 +298,11 @@ def per_exposure(
     return array
 
 
-def check_count(name: str, got: int, count: int) -> None:
-    """Refuse an argument that has not one entry for each exposure."""
+def check_count(name: str, got: int, count: int, one: str = "exposure") -> None:
+    """Refuse an argument that has not one entry for each exposure, or level."""
     if got != count:
-        raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")
+        article = "an" if one[0] in "aeiou" else "a"
+        raise InputError(f"'{name}' has {got} entries, expected {count}: one {article} {one}")
 
 
 def union(*masks: Bools | None) -> Bools | None:
@@ -305,15 +311,21 @@ def union(*masks: Bools | None) -> Bools | None:
     return functools.reduce(np.logical_or, given) if given else None
 
 
-def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
-    """Mask of one exposure or of all, of frames of that shape."""
-    array = as_array("mask", mask, ndim=(2, 3))
+def as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+    """Mask of frames of that shape (rows, cols), or (n, rows, cols): of each or of all of them."""
+    if mask is None:
+        return None
+    shapes = list(dict.fromkeys([shape[-2:], shape]))
+    array = as_array("mask", mask, ndim=tuple(map(len, shapes)))
     if array.dtype != np.bool_:
         raise InputError(
             f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
         )
-    if array.shape not in (shape[1:], shape):
-        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
+    if array.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise InputError(f"'mask' has shape {array.shape}, expected {wanted}")
+    if array.all():
+        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     return array
 
 

@@ -10,19 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import FluxModel, Method, Progress
+from equipix._check import FluxModel, Method, Progress, naming_memory
 from equipix._native import Fit
 from equipix.calibration.result import Calibration
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.inputs import BEFORE
 from equipix.diagnosis.rules import AFTER, LAST
-from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
 from equipix.findings import Finding, ask, say
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.pixels import without_faint_pixels, without_false_pixels
 from equipix.fitting.stated_errors import steady_fit, widened
 from equipix.fitting.weighted import Options, Weighted, is_to_be_fitted
+from equipix.measured.colour import Colours
+from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics
 
@@ -227,21 +231,16 @@ def calibrate(
     True
     """
     fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
-    exposures = exposures_of(
-        frames,
-        shifts,
-        variance=variance,
-        mask=mask,
-        saturation=saturation,
-        flux=flux,
-        flux_std=flux_std,
-        time=time,
-        rotation=rotation,
-        shift_std=shift_std,
-        offset=is_to_be_fitted(dark),
-        dark_variance=dark_variance,
-        cfa=cfa,
-    )
+    with naming_memory("calibrating"):
+        measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
+        exposures = Exposures.of(
+            measured,
+            Positions.of(shifts, rotation=rotation, std=shift_std, shape=measured.values.shape),
+            Flux.of(flux, flux_std, time, len(measured)),
+            mask=mask,
+            offset=is_to_be_fitted(dark),
+            dark_variance=dark_variance,
+        )
     if fit_options.whole_shifts:
         exposures = exposures.whole()
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))

@@ -4,19 +4,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, FluxModel, Method, Progress
+from equipix._check import Array, ArrayLike, FluxModel, Method, Progress, naming_memory
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import Manifest
-from equipix.exposures.exposures import exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
 from equipix.findings import Finding, say
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.defects import hot_pixels
+from equipix.measured.measured import measured_of
 
 _ROUGH = 1e-4
 """Tolerance of the fit that the aperture's images are corrected by: 3e-5 pixel."""
@@ -181,16 +184,21 @@ class Experiment(Described[Manifest]):
         colours = Equalisation.of_colours(averaged.filters, dark)
         shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
         whole = fit_options.whole_shifts
-        exposures = exposures_of(
-            averaged,
-            shifts,
-            mask=excluded,
-            shift_std=std if std.any() and not whole else None,
-            flux=self._column("flux") if flux is None else flux,
-            flux_std=self._column("flux_std") if flux is None else None,
-            time=self._column("time") if flux == "linear" else None,
-            rotation=[exposure.rotation for exposure in self.manifest.exposure],
-        )
+        with naming_memory("calibrating"):
+            measured = measured_of(averaged)
+            positions = Positions.of(
+                shifts,
+                rotation=[exposure.rotation for exposure in self.manifest.exposure],
+                std=std if std.any() and not whole else None,
+                shape=measured.values.shape,
+            )
+            fluxes = Flux.of(
+                self._column("flux") if flux is None else flux,
+                self._column("flux_std") if flux is None else None,
+                self._column("time") if flux == "linear" else None,
+                len(measured),
+            )
+            exposures = Exposures.of(measured, positions, fluxes, mask=excluded)
         start = None
         if whole:
             exposures = exposures.whole(std)

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from equipix._check import Floats, number
+from equipix._check import Floats, is_whole, number
 from equipix.errors import InputError
 
 _NARROWEST, WIDEST = 8, 16
@@ -107,8 +107,7 @@ class Format:
 
 def check_width(name: str, bits: object) -> int:
     """Refuse a width out of range."""
-    whole = isinstance(bits, int | np.integer) and not isinstance(bits, bool)
-    if not whole or not _NARROWEST <= bits <= WIDEST:  # type: ignore[operator]
+    if not is_whole(bits, _NARROWEST, WIDEST):
         raise InputError(f"'{name}' is {bits!r}, expected {_NARROWEST} to {WIDEST} bits")
     return int(bits)  # type: ignore[call-overload, no-any-return]
 

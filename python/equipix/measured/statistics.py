@@ -236,19 +236,6 @@ def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> fl
     return step_of(means * np.where(variances > 0, counts, 1))
 
 
-def _check_mask(mask: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
-    """Refuse a mask of frames of that shape that is none, or leaves no pixel."""
-    if mask is None:
-        return
-    if mask.dtype != np.bool_ or mask.shape != shape:
-        raise InputError(
-            f"'mask' is {mask.dtype} of shape {mask.shape}, expected bool of shape {shape}, True "
-            f"= do not use{': give mask != 0' if mask.shape == shape else ''}"
-        )
-    if mask.all():
-        raise InputError("'mask' is True in every pixel, expected some pixels to use")
-
-
 def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStatistics:
     """Return averages without the pixels of a mask."""
     if mask is None:

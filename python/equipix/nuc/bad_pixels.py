@@ -11,16 +11,10 @@ from equipix._check import Array, Bools, Floats, ReadOnly, check_type, naming_me
 from equipix.correction.protocol import named_cfa
 from equipix.errors import InputError
 from equipix.findings import Finding, ask, say, set_bits, usable
+from equipix.measured import defects, noise
 from equipix.measured.colour import Colours, planes_of
-from equipix.measured.defects import DefectLimits, noisy_pixels, often_rejected, response_outliers
+from equipix.measured.defects import DefectLimits
 from equipix.measured.filters import Filters
-from equipix.measured.noise import (
-    MEDIAN_SQUARE,
-    NoiseModel,
-    photon_transfer,
-    scatter_limit,
-    step_of,
-)
 from equipix.measured.statistics import FrameStatistics, Light, light_of
 from equipix.metrics.frame_noise import STEADY, stack_of, temporal_of
 from equipix.nuc.curves import response_at
@@ -103,8 +97,8 @@ def of_frames(
         over_time = temporal_of(stack, ~good)
         said = say(*ask(STEADY, over_time))
         mean, variance, count = over_time.mean, over_time.variance, over_time.frames
-        step = step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
-        slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
+        step = noise.step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
+        slow = defects.flickering_pixels(over_time.steps, variance, count, limits.correlation)
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
     common = light.variance(mean)
@@ -113,11 +107,11 @@ def of_frames(
     noisy = flickering = np.zeros(good.shape, bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
-        flickering = noisy_pixels(*of_level)
-        noisy = noisy_pixels(*of_level, times=limits.noise, light=[common])
+        flickering = defects.noisy_pixels(*of_level)
+        noisy = defects.noisy_pixels(*of_level, times=limits.noise, light=[common])
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
-        noisy = noisy | often_rejected(missing, count)
+        noisy = noisy | defects.often_rejected(missing, count)
     found = {"noisy": noisy}
     if slow is not None:
         found["flickering"] = flickering & slow
@@ -137,15 +131,15 @@ def _dead(response: Response, slope: Floats, usual: Floats | float, least: float
         return np.zeros(slope.shape, bool)
     # Of a line; that of a higher order at 0, which is larger than that of the mean slope.
     std = np.sqrt(np.nan_to_num(response.variances[1])) / usual
-    return response_outliers(slope, lambda: std, least=least)[0]
+    return defects.response_outliers(slope, lambda: std, least=least)[0]
 
 
 def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
     """Pixels whose curve fits worse than noise, and the misfit of the array, explain."""
     found = np.zeros(response.shape, bool)
-    common = sigmas**2 * max(0.0, misfit - 1) / MEDIAN_SQUARE
+    common = sigmas**2 * max(0.0, misfit - 1) / noise.MEDIAN_SQUARE
     for freedom in np.unique(response.freedom[response.freedom > 0]):
-        limit = scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
+        limit = noise.scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
         found |= (response.freedom == freedom) & (response.reduced_chi2 > limit)
     return found
 
@@ -158,29 +152,22 @@ def _common_noise(
     step: float,
     light: Array,
     period: tuple[int, int],
-) -> NoiseModel | None:
+) -> noise.NoiseModel | None:
     """Noise that pixels of a signal have in common; None of equal frames that are not rounded."""
     known = good & np.isfinite(mean) & np.isfinite(variance)
     if not known.any():
         known = np.isfinite(mean) & np.isfinite(variance)
-    points = photon_transfer(mean, variance, known, count, step, light, period)
+    points = noise.photon_transfer(mean, variance, known, count, step, light, period)
     if not len(points):
         raise InputError("'frames' hold no value: they show no noise")
     if step == 0 and not points[:, 1].any():
         return None
-    return NoiseModel.fit(points, step=step)
+    return noise.NoiseModel.fit(points, step=step)
 
 
 def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:
     if found != shape:
         raise InputError(f"'frames' has frames of {found}, the sensor {shape}")
-
-
-def _von_neumann(steps: Floats, variance: Floats, count: int) -> Floats:
-    """Von Neumann's ratio of each pixel less 2, in its standard deviations."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = steps / (variance * (count - 1))
-    return np.asarray((ratio - 2) / 2 * np.sqrt((count**2 - 1) / max(1, count - 2)))
 
 
 PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)

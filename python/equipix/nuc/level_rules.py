@@ -14,7 +14,7 @@ from equipix.measured.defects import SIGMAS
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured
 from equipix.measured.noise import inliers, scatter_limit
-from equipix.measured.saturation import Clipping, clipping_advice, is_of_bits
+from equipix.measured.saturation import ROUNDING, Clipping, clipping_advice, is_of_bits, whole
 from equipix.nuc.response import Response
 
 _MOST_AT_HIGHEST = 0.5
@@ -25,9 +25,6 @@ _WHOLE = 0.99
 
 _FEWEST_JUDGED = 16
 """Fewest pixels of an array whose spread is judged."""
-
-_ROUNDING = 1e-9
-"""Relative rounding of means from which a dark was subtracted, and added again."""
 
 
 class Given(NamedTuple):
@@ -69,13 +66,13 @@ def _on_saturation(given: Given) -> str | None:
 
 def _at_highest(measured: Measured) -> tuple[float, list[float]]:
     """Highest finite raw value of all levels, and the share of each level's pixels there."""
-    tops = [_highest(_raw_level(measured, level)) for level in range(len(measured.values))]
+    tops = [_highest(measured.raw_values(level)) for level in range(len(measured.values))]
     top = max(tops)
     if not np.isfinite(top) or top <= 0 or measured.values[0].size < _FEWEST_JUDGED:
         return top, [0.0] * len(tops)
-    least = top * (1 - _ROUNDING)
-    return _whole(top), [
-        _share(_raw_level(measured, level), least) if each >= least else 0.0
+    least = top * (1 - ROUNDING)
+    return whole(top), [
+        _share(measured.raw_values(level), least) if each >= least else 0.0
         for level, each in enumerate(tops)
     ]
 
@@ -92,17 +89,12 @@ def _share(raw: Array, least: float) -> float:
     return int(np.count_nonzero(known & (raw >= least))) / max(1, count)
 
 
-def _whole(top: float) -> float:
-    """The whole number that a mean is but for rounding, or the mean."""
-    return float(np.rint(top)) if abs(top - np.rint(top)) <= _ROUNDING * top else top
-
-
 def _others_differ(measured: Measured, crowded: Sequence[int]) -> bool:
     """Whether another level has most of its pixels below its highest value."""
     for level in set(range(len(measured.values))) - set(crowded):
-        raw = _raw_level(measured, level)
+        raw = measured.raw_values(level)
         top = _highest(raw)
-        if np.isfinite(top) and _share(raw, top - _ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
+        if np.isfinite(top) and _share(raw, top - ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
             return True
     return False
 
@@ -120,14 +112,6 @@ def _refuse_whole(top: float, shares: Sequence[float], crowded: Sequence[int]) -
 def _named(shares: Sequence[float], levels: Sequence[int]) -> str:
     """Name levels with their shares."""
     return " and ".join(f"{shares[each]:.1%} of the values of level {each}" for each in levels)
-
-
-def _raw_level(measured: Measured, level: int) -> Array:
-    """Values of a level before the dark was subtracted; NaN where they are known to saturate."""
-    values: Array = measured.values[level]
-    if measured.mask is not None and measured.mask.ndim == 3:
-        values = np.where(measured.mask[level], np.nan, values)
-    return values if measured.dark is None else values + measured.dark
 
 
 _SHARE = 0.5
@@ -208,7 +192,7 @@ def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Sca
     kept = inliers(variances, scatter_limit(frames))
     common = _common(variances[kept], rise[kept], frames - 1)
     mean, variance = (
-        float(_raw_average(averaged, level)[used].mean()),
+        float(averaged.raw_values(level)[used].mean()),
         float(variances[kept].mean()),
     )
     return _Scatter(level, mean, variance, variance - common)
@@ -240,12 +224,6 @@ def _by_rise(variances: Array, rise: Array) -> float:
     return covariance**2 / steepness
 
 
-def _raw_average(averaged: Averaged, level: int) -> Array:
-    """Mean values of a level before the dark was subtracted."""
-    values: Array = averaged.values[level]
-    return values if averaged.dark is None else values + averaged.dark.mean
-
-
 def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
     """Say which levels saturate, with the numbers of the darkest of them."""
     named = " and ".join(f"level {each.level}" for each in full)
@@ -267,10 +245,8 @@ def _advice(averaged: Averaged, used: Bools, full: list[_Scatter]) -> str:
         return ""  # less a dark that was not kept
     saturate = [each.level for each in full]
     free = [level for level in range(averaged.count) if level not in saturate]
-    low = min(float(np.quantile(_raw_average(averaged, level)[used], _TAIL)) for level in saturate)
-    highest = max(
-        float(np.quantile(_raw_average(averaged, level)[used], 1 - _TAIL)) for level in free
-    )
+    low = min(float(np.quantile(averaged.raw_values(level)[used], _TAIL)) for level in saturate)
+    highest = max(float(np.quantile(averaged.raw_values(level)[used], 1 - _TAIL)) for level in free)
     if np.floor(low) <= highest:
         return ""
     level = f"{np.floor(low):.10g}"

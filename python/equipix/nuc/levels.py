@@ -18,7 +18,7 @@ from equipix.measured.colour import Colours
 from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
 from equipix.measured.filters import Filters
 from equipix.measured.means import Averaged
-from equipix.measured.measured import Measured, check_levels, check_variance, measured_of
+from equipix.measured.measured import Measured, averaged_of, check_levels, measured_of
 from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
@@ -190,20 +190,20 @@ def levels_of(
 ) -> Levels:
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
     check_levels(levels)
-    colours = Colours.of(cfa)
-    averaged = _averaged(levels, colours)
+    averaged = averaged_of(levels, _LEVELS, Colours.of(cfa))
     if averaged is not None and averaged.raw and averaged.count > 1:
         averaged = averaged.counted_from_lowest()
     source = levels if averaged is None else averaged
-    if (count := _count(source)) is not None:
-        check_variance(variance, count)
-    measured = measured_of(source, variance, saturation, words=_LEVELS)
-    given = None if mask is None else as_mask(mask, measured.values.shape)
+    measured = measured_of(source, variance, saturation, words=_LEVELS, colours=Colours.of(cfa))
+    if measured.variance is not None:
+        _check_variance(measured.variance)
+    given = as_mask(mask, measured.values.shape)
     said = say(*ask(GIVEN, Given(measured, averaged, given)))
-    pedestal = 0.0 if averaged is None else averaged.pedestal
-    noise = _noise_of(measured, pedestal)
-    values = _used(measured, given)
-    filters = _filters(values, colours if averaged is None else averaged.colours)
+    noise = _noise_of(measured, 0.0 if averaged is None else averaged.pedestal)
+    # Arrays hold values where they saturate, averages NaN.
+    excluded = given if averaged is not None else union(given, measured.mask)
+    values = measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
+    filters = _filters(values, measured.colours)
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
     usable = _usable(values, bad_pixels, given)
     references = _references(values, usable)
@@ -215,12 +215,24 @@ def levels_of(
         bad_pixels=bad_pixels,
         dark=measured.dark,
         dark_variance=measured.dark_variance,
-        raw=measured.raw,
-        saturation=_saturation_of(levels, saturation),
+        raw=measured.raw and averaged is not None,
+        saturation=measured.saturation,
         frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
         filters=filters,
     )
     return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
+
+
+def _check_variance(variance: Array) -> None:
+    """Refuse variances that are not one number above 0 for each level."""
+    if variance.ndim != 1:
+        raise InputError(
+            f"'variance' has shape {variance.shape}, expected ({len(variance)},), one number a "
+            "level, or a NoiseModel: a pixel's own sample variance makes weights noisy"
+        )
+    wrong = variance[~(np.isfinite(variance) & (variance > 0))]
+    if wrong.size:
+        raise InputError(f"'variance' holds {wrong[0]:g}, expected finite numbers above 0, in DN²")
 
 
 def _filters(values: Array, colours: Colours | None) -> Filters | None:
@@ -238,14 +250,6 @@ def _references(values: Array, usable: Bools) -> Floats:
     return np.array([each[usable].mean(dtype=np.float64) for each in values])
 
 
-def _count(source: object) -> int | None:
-    """Number of levels given; None where they are no sequence, which is refused later."""
-    if isinstance(source, Averaged):
-        return source.count
-    known = isinstance(source, list | tuple) or (isinstance(source, np.ndarray) and source.ndim > 0)
-    return len(source) or None if known else None  # type: ignore[arg-type]
-
-
 def _frame_noise(
     averaged: Averaged | None, noise: tuple[LevelNoise, ...] | None, references: Floats
 ) -> float | None:
@@ -257,40 +261,14 @@ def _frame_noise(
     return None if noise is None else float(np.sqrt(noise[lowest].variance(references[lowest])))
 
 
-def _saturation_of(levels: object, given: float | None) -> float | None:
-    """Return the level of saturation given, or that of averages where all have one."""
-    if isinstance(levels, Averaged):
-        return levels.saturation
-    if given is not None or not isinstance(levels, list | tuple):
-        return given
-    known = {getattr(each, "saturation", None) for each in levels}
-    return known.pop() if len(known) == 1 else None
-
-
-def _averaged(levels: object, colours: Colours | None) -> Averaged | None:
-    """Statistics of all levels, reduced; None for arrays."""
-    if isinstance(levels, Averaged):
-        return levels
-    if not isinstance(levels, list | tuple) or not levels:
-        return None
-    if not all(isinstance(each, FrameStatistics) for each in levels):
-        return None
-    averaged = Averaged(
-        len(levels), saturation=_saturation_of(levels, None), words=_LEVELS, colours=colours
-    )
-    for each in levels:
-        averaged.add(each)
-    return averaged
-
-
 def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | None:
     """Noise of each mean frame, from noise models or one variance a level.
 
     What rounding leaves in a mean is that at the median of the level, less what all pixels have in
     common, which V̄ takes.
     """
-    if measured.models:
-        pairs = zip(measured.models, measured.values, strict=True)
+    if measured.noise:
+        pairs = zip(measured.noise, measured.values, strict=True)
         return tuple(_level_noise(model, values, pedestal) for model, values in pairs)
     if measured.variance is None:
         return None
@@ -302,13 +280,6 @@ def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNois
     slope = model.gain / model.frames
     common = float(model.rounding(signal)) - model.rounding_apart(signal, values)
     return LevelNoise(float(model.variance(signal)) - common - slope * signal, slope, pedestal)
-
-
-def _used(measured: Measured, mask: Bools | None) -> Array:
-    """Values with NaN where the caller masks them or, of arrays, where they saturate."""
-    saturated = measured.mask if measured.mask is not None and measured.mask.ndim == 3 else None
-    excluded = union(mask, saturated)
-    return measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
 
 
 def _with_odd_responses(
@@ -361,8 +332,6 @@ def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     wanted = np.ones_like(usable)
     if mask is not None:
         wanted &= ~mask.reshape(-1, *usable.shape).all(axis=0)
-    if not wanted.any():
-        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     share = float(usable.sum() / int(wanted.sum()))
     if share < FEWEST_VALID or not usable.any():
         missing = [1 - np.mean(each[wanted]) for each in known]

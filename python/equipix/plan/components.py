@@ -122,7 +122,7 @@ def identify(
         first = np.round(exact[0], 3).tolist()
         words = f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels"
         say(Finding("rounding", words, "input"))
-    masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
+    masked = as_mask(mask, (len(whole), *sizes))
     turns = as_rotation(rotation, len(whole))
     colours = Colours.of(cfa)
     with naming_memory("identifying"):

@@ -7,8 +7,11 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from equipix._check import Array, Floats, Ints
-from equipix.exposures.exposures import exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
+from equipix.measured.measured import measured_of
 
 _BLOCK = 64
 """Rows at a time, at least."""
@@ -98,7 +101,8 @@ def factor(shape: tuple[int, int], positions: Ints, powers: Floats) -> float:
         frames = light + _NOISE * rng.standard_normal(light.shape)
         # A bare fit, without the test of the sign. One thread: on so small a part two are slower.
         options = FitOptions(tolerance=_TOLERANCE, workers=1)
-        solved = exposures_of(frames, positions, flux=powers).fit(options)
+        measured, flux = measured_of(frames), Flux.of(powers, None, None, len(powers))
+        solved = Exposures.of(measured, Positions.of(positions), flux).fit(options)
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
         ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))

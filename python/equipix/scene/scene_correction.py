@@ -11,7 +11,15 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from equipix._check import Array, as_array, as_level, check_shape, number, positive_workers
+from equipix._check import (
+    Array,
+    as_array,
+    as_level,
+    check_shape,
+    is_whole,
+    number,
+    positive_workers,
+)
 from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import FileError, InputError
@@ -439,7 +447,7 @@ _RULES: tuple[Rule[_Learned], ...] = (
 
 def whole_number(name: str, value: int) -> int:
     """A whole number from 0, checked."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+    if not is_whole(value, 0):
         raise InputError(f"'{name}' is {value!r}, expected a whole number")
     return int(value)
 
