@@ -28,7 +28,7 @@ from equipix.correction.correct_files import warn_of_corrected
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.image_files import origin_of
 from equipix.experiment.level_experiment import LevelExperiment
-from equipix.io.formats import SUFFIXES, refuse_saved
+from equipix.io.formats import SUFFIXES, raw_header
 from equipix.io.frames import read_frames, read_mask
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.loading import load, load_response
@@ -214,7 +214,6 @@ def _quality(
 def _raw(source: list[str], correction: Path) -> Array:
     """Read raw frames, refuse files that equipix has saved, and warn of corrected ones."""
     files = find_files(source)
-    for file in files:
-        refuse_saved(file)
-    warn_of_corrected(files, origin_of(correction))
+    marks = {file: raw_header(file).description for file in files}
+    warn_of_corrected(marks, origin_of(correction))
     return read_frames(files)

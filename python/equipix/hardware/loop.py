@@ -166,7 +166,12 @@ class AdaptiveLoop:
             base=0,
         )
         blank = np.zeros(self._gain.shape, np.uint16)
-        metadata = {"equipix": __version__, "correction": "adaptive loop", "step": 2.0**-self._step}
+        metadata = {
+            "equipix": __version__,
+            "correction": "adaptive loop",
+            "step": 2.0**-self._step,
+            "leaves_offset": True,  # the mean offset is 0: that of raw frames stays
+        }
         return Table(
             made, blank, self._offset.copy(), self._gain.copy(), blank.astype(np.uint32), metadata
         )

@@ -265,7 +265,8 @@ class SceneCorrection:
         }
         _warn_of_spread(gain[flags == 0])
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
-        return Polynomial(coefficients, flags, metadata)
+        # The mean of the offsets is 0, so that of raw frames stays.
+        return Polynomial(coefficients, flags, metadata, self._saturation, leaves_offset=True)
 
     def _warn_of_few(self) -> None:
         """Warn where so few frames counted that the scene moved hardly, or was not seen to."""
