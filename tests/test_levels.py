@@ -533,11 +533,13 @@ class TestCorrectedFiles:
         assert call("16.tif", "--dtype", "uint16")[1]["limited_values"] == 0
 
     def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
-        from equipix.correction import corrector as module
+        from equipix.correction import apply as module
 
         response, _ = corrected
-        made, real = [], module.native
-        monkeypatch.setattr(module, "native", lambda *given: made.append(1) or real(*given))
+        made, real = [], module.Prepared
+        monkeypatch.setattr(
+            module, "Prepared", lambda *given, **more: made.append(1) or real(*given, **more)
+        )
         source = [str(folder / "level?.tif")]
         done = correct_files(response, source, tmp_path / "all", dtype="uint16")
         assert (done.frames, len(made)) == (64, 1)

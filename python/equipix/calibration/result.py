@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from equipix._check import (
     Array,
     Bools,
-    Flagged,
     Floats,
     Progress,
     ReadOnly,
@@ -25,8 +24,7 @@ from equipix._check import (
     per_exposure,
 )
 from equipix._native import Beam
-from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficients
-from equipix.correction.protocol import depth_of
+from equipix.correction.apply import CorrectionBase
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
@@ -46,7 +44,7 @@ from equipix.metrics.maps import slope_pixels, tilt
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(ReadOnly):
+class Calibration(CorrectionBase):
     """Calibrated sensor, the result of `calibrate`; its arrays are read-only.
 
     Attributes
@@ -180,6 +178,10 @@ class Calibration(ReadOnly):
     findings: tuple[Finding, ...] = ()
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
+    takes_dark: ClassVar[bool] = True
+    limits: ClassVar[None] = None
+    saturation: ClassVar[None] = None
+    leaves_offset: ClassVar[bool] = False
 
     @classmethod
     def of(
@@ -229,10 +231,14 @@ class Calibration(ReadOnly):
         )
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.sensitivity.shape
-        return rows, cols
+    def needs_dark(self) -> bool:
+        """Whether frames are corrected less a dark, and none is stored."""
+        return self.dark is None
+
+    @property
+    def colours(self) -> Colours | None:
+        """Colour filters of the pixels, also where the sensor in `metadata` alone has them."""
+        return self.cfa or super().colours
 
     @property
     def is_partial(self) -> bool:
@@ -341,53 +347,6 @@ class Calibration(ReadOnly):
             )
         return float(std[0]) if np.ndim(weights) == 2 else std
 
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
-        flagged: Flagged = "nan",
-        out: NDArray[Any] | None = None,
-    ) -> NDArray[Any]:
-        """Frames as a sensor of equal pixels would have given them: (frame − dark) / M.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Raw frames, in DN.
-        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the one that is part of the calibration, another
-            (of averaged frames the mean), or none where it is already subtracted.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
-            (NaN still where M is undetermined), or the mean of the nearest good pixels around.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`;
-            whole numbers hold no NaN, so they need another `flagged`.
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `dark` is "stored" and none is stored, `flagged` is unknown, or
-            frames are whole numbers of another bit depth than the sensor in `metadata`.
-        """
-        return apply_gain(
-            frames,
-            gain=self.sensitivity,
-            dark=dark_or_stored(dark, self.dark),
-            stored=self.dark,
-            flags=self.flags,
-            flagged=flagged,
-            out=out,
-            depth=depth_of(self),
-            cfa=self.cfa,
-        )
-
     @property
     def coefficients(self) -> NDArray[Any]:
         """Coefficients of the corrected frame Σ c_j y^j, shape (2, rows, cols).
@@ -395,7 +354,16 @@ class Calibration(ReadOnly):
         c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
         Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
         """
-        return gain_coefficients(self.sensitivity, self.dark).astype(self.sensitivity.dtype)
+        return self._planes.astype(self.sensitivity.dtype)
+
+    @property
+    def _planes(self) -> NDArray[Any]:
+        """The coefficients in double precision."""
+        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
+            inverse = 1 / self.sensitivity.astype(np.float64)
+            offset = np.zeros_like(inverse) if self.dark is None else -self.dark * inverse
+        offset[np.isnan(inverse)] = np.nan
+        return np.stack([offset, inverse])
 
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).

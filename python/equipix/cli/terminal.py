@@ -17,7 +17,8 @@ from equipix._check import Array, Bools
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
-from equipix.io.frames import read_mask
+from equipix.io.formats import raw_header
+from equipix.io.frames import read_frames, read_mask
 from equipix.io.paths import find_files, refuse_inputs
 
 Report = Callable[[int, int, str], None]
@@ -121,10 +122,10 @@ def check_output(
 def raw_frames(frames: Iterable[str], correction: Path | None = None) -> Array:
     """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
     files = find_files(frames)
-    raw = image_files.raw_frames(files)
+    marks = {file: raw_header(file).description for file in files}
     if correction is not None:
-        warn_of_corrected(files, image_files.origin_of(correction))
-    return raw
+        warn_of_corrected(marks, image_files.origin_of(correction))
+    return read_frames(files)
 
 
 def given(*paths: Path | None) -> list[Path]:

@@ -150,7 +150,12 @@ class AdaptiveLoop:
         steps = zip(STEPS, (0, 0, adc - offset, 1 - gain, 0), strict=True)
         made = Format(**dict(widths), **dict(steps), base=0)
         blank = np.zeros(self._gain.shape, np.uint16)
-        metadata = {"equipix": __version__, "correction": "adaptive loop", "step": 2.0**-self._step}
+        metadata = {
+            "equipix": __version__,
+            "correction": "adaptive loop",
+            "step": 2.0**-self._step,
+            "leaves_offset": True,  # the mean offset is 0: that of raw frames stays
+        }
         return Table(
             made, blank, self._offset.copy(), self._gain.copy(), blank.astype(np.uint32), metadata
         )

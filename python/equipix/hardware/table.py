@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -16,13 +16,12 @@ from equipix._check import (
     Flagged,
     Floats,
     ReadOnly,
-    as_array,
     naming_memory,
     number,
     positive_workers,
 )
-from equipix.correction.apply import apply
-from equipix.correction.protocol import Correction, cfa_of, check_correction
+from equipix.correction.apply import CorrectionBase, apply, checked_frames
+from equipix.correction.protocol import Correction, Dark, check_correction, with_dark
 from equipix.errors import FileError, InputError
 from equipix.findings import Finding, usable
 from equipix.hardware import c_header, table_files
@@ -34,7 +33,7 @@ from equipix.measured.colour import Colours
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Table(ReadOnly):
+class Table(CorrectionBase):
     r"""Words of a correction: a coarse offset ahead of the ADC, fine offset and gain behind it.
 
     Attributes
@@ -88,6 +87,11 @@ class Table(ReadOnly):
     gain: Array
     flags: Array
     metadata: dict[str, Any] = field(default_factory=dict)
+    dark: ClassVar[None] = None
+    takes_dark: ClassVar[bool] = False
+    needs_dark: ClassVar[bool] = False
+    limits: ClassVar[None] = None
+    saturation: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -177,19 +181,27 @@ class Table(ReadOnly):
             line, sag = line_of(correction, linearise)
             found = encode(line, correction.flags, widths, steps, float(lowest))
             refuse_far_offsets(found, line, widths, steps, float(lowest))
-        colours = cfa_of(correction)
-        cfa = {} if colours is None else {"cfa": colours.rows}
-        findings = [vars(each) for each in correction.findings]
-        metadata = {**origin(correction), **cfa, **found.metadata, "findings": findings}
+        colours = correction.colours
+        metadata = {
+            **origin(correction),
+            **({} if colours is None else {"cfa": colours.rows}),
+            **({"leaves_offset": True} if correction.leaves_offset else {}),
+            **found.metadata,
+            "findings": [vars(each) for each in correction.findings],
+        }
         if linearise is not None:
             metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
         return cls(*found._replace(metadata=metadata))
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.gain.shape
-        return rows, cols
+    def leaves_offset(self) -> bool:
+        """Whether words were made of a correction that leaves an offset."""
+        return bool(self.metadata.get("leaves_offset", False))
+
+    @property
+    def colours(self) -> Colours | None:
+        """Colour filters of the pixels, where they are known."""
+        return Colours.of(self.metadata.get("cfa"))
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -225,7 +237,7 @@ class Table(ReadOnly):
         InputError
             If a shape does not fit, or a usable pixel is not finite.
         """
-        raw, f, used = self._frames(frames), self.format, usable(self.flags)
+        raw, f, used = checked_frames(frames, self.shape), self.format, usable(self.flags)
         pedestal = np.ldexp(self.coarse.astype(np.float64), f.coarse)
         words = np.empty(raw.shape, np.uint16)
         for source, target in zip(_each(raw), _each(words), strict=True):
@@ -260,7 +272,7 @@ class Table(ReadOnly):
 
     def applied(self, frames: ArrayLike, *, workers: int | None = None) -> Applied:
         """Like `apply`, with the numbers of outputs that were limited."""
-        raw = self._frames(frames)
+        raw = checked_frames(frames, self.shape)
         if raw.dtype not in (np.uint8, np.uint16):
             raise InputError(
                 f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
@@ -279,7 +291,12 @@ class Table(ReadOnly):
         return Applied(out, below, above)
 
     def correct(
-        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Dark = "stored",
+        flagged: Flagged = "nan",
+        out: Array | None = None,
     ) -> Array:
         """Raw frames as amplifier, ADC and table correct them, in DN.
 
@@ -287,6 +304,8 @@ class Table(ReadOnly):
         ----------
         frames : array_like, shape (rows, cols) or (n, rows, cols)
             Raw frames in DN, as without the DAC.
+        dark : "stored"
+            No other: the offsets are words of the table.
         flagged : {"nan", "keep", "replace"}
             The value of pixels flagged ``DO_NOT_USE``: NaN, the code 0, or the mean of the nearest
             good pixels around.
@@ -301,15 +320,16 @@ class Table(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, `flagged` is unknown, or a usable pixel is not finite.
+            If a shape does not fit, `flagged` is unknown, a usable pixel is not finite, or frames
+            are of another bit depth than the sensor.
         """
+        with_dark(self, dark)
 
-        def formula(frame: Array, corrected: Array) -> None:
+        def formula(frame: Array) -> Array:
             words = self.apply(self.digitise(frame))
-            corrected[...] = np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
+            return np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
 
-        cfa = Colours.of(self.metadata.get("cfa"))
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, cfa=cfa)
+        return apply(self, frames, dark, flagged, out, formula)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.hardware.read` reads bit by bit.
@@ -334,12 +354,6 @@ class Table(ReadOnly):
     def _content(self) -> Content:
         arrays = (self.coarse, self.offset, self.gain, self.flags)
         return Content(self.format, *arrays, self.metadata)
-
-    def _frames(self, frames: ArrayLike) -> Array:
-        raw = as_array("frames", frames, ndim=(2, 3))
-        if raw.shape[-2:] != self.shape:
-            raise InputError(f"'frames' has shape {raw.shape}, the table {self.shape}")
-        return raw
 
 
 _FORMATS = {

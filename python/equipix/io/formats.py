@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from equipix.errors import FileError, InputError
 from equipix.io import tiff
-from equipix.io.frames import frame_format
+from equipix.io.frames import Header, frame_format, header
 from equipix.io.paths import as_path, reading, write_whole
 from equipix.io.record import KEY, _check_sum, checksum
 
@@ -119,7 +119,11 @@ def kind_of(path: Path) -> str | None:
     if read is None:
         return None
     with reading(path):
-        description = read(path)
+        return _kind(read(path))
+
+
+def _kind(description: str) -> str | None:
+    """Kind of content that the text of a file names."""
     try:
         content = json.loads(description)
     except ValueError:
@@ -147,10 +151,22 @@ def refuse_saved(path: Path) -> None:
     FileError
         With what the file holds.
     """
-    kind = saved_kind(path)
+    _refuse_kind(path, saved_kind(path))
+
+
+def _refuse_kind(path: Path, kind: str | None) -> None:
     if kind is not None:
         article = "" if kind.endswith("s") else "a "
         raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
+
+
+def raw_header(path: Path) -> Header:
+    """Shape, dtype and text of raw frames; what `save_pages` wrote is refused like there."""
+    if path.suffix.lower() == ".npz":
+        refuse_saved(path)
+    found = header(path)
+    _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)
+    return found
 
 
 def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:

@@ -273,7 +273,8 @@ class SceneCorrection:
         learned = _Learned(*counts, still, self._range, self._peak, gain[flags == 0])
         said = say(*ask(_RULES, learned))
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
-        return Polynomial(coefficients, flags, metadata, findings=said)
+        # The mean of the offsets is 0, so that of raw frames stays.
+        return Polynomial(coefficients, flags, metadata, self._saturation, True, said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `load` goes on with the same bytes.
