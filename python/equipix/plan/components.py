@@ -125,7 +125,7 @@ def identify(
             f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels",
             InputWarning,
         )
-    masked = as_mask(mask, (len(whole), *sizes))
+    masked = as_mask(mask, (len(whole), *sizes), may_be_whole=True)
     turns = as_rotation(rotation, len(whole))
     colours = Colours.of(cfa)
     with naming_memory("identifying"):
