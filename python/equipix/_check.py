@@ -311,7 +311,9 @@ def union(*masks: Bools | None) -> Bools | None:
     return functools.reduce(np.logical_or, given) if given else None
 
 
-def as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+def as_mask(
+    mask: ArrayLike | None, shape: tuple[int, ...], *, may_be_whole: bool = False
+) -> Bools | None:
     """Mask of frames of that shape (rows, cols), or (n, rows, cols): of each or of all of them."""
     if mask is None:
         return None
@@ -324,7 +326,7 @@ def as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
         raise InputError(f"'mask' has shape {array.shape}, expected {wanted}")
-    if array.all():
+    if array.all() and not may_be_whole:
         raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     return array
 
