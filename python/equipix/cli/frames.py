@@ -27,7 +27,7 @@ from equipix.experiment.image_files import origin_of, refuse_repeated_files
 from equipix.io.formats import SUFFIXES
 from equipix.io.frames import read_mask
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.loading import load
+from equipix.loading import load_correction
 from equipix.measured.average import average as average_frames
 from equipix.measured.statistics import (
     STRAY,
@@ -143,7 +143,7 @@ def correct(
     refuse_inputs([output], [correction])
     with progress_bars() as progress:
         done = correct_files(
-            load(correction),
+            load_correction(correction),
             frames,
             output,
             dark=dark,

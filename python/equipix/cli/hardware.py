@@ -18,7 +18,7 @@ from equipix.hardware.table import SUFFIXES, Table
 from equipix.io.formats import refuse_saved
 from equipix.io.frames import read_frames
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.loading import load
+from equipix.loading import load_correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""
@@ -76,7 +76,7 @@ def hardware(
     """Write a correction as words for a camera's electronics."""
     check_output(output, force=force, suffixes=SUFFIXES)
     refuse_inputs([output], [result])
-    correction = load(result)
+    correction = load_correction(result)
     check_sensor(correction, sensor)
     options: dict[str, Any] = {
         "adc_bits": adc_bits,

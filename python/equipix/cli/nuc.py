@@ -31,13 +31,15 @@ from equipix.experiment.level_experiment import LevelExperiment
 from equipix.io.formats import SUFFIXES, refuse_saved
 from equipix.io.frames import read_frames, read_mask
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.loading import load, load_response
+from equipix.io.record import read_record
+from equipix.loading import load_correction
 from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
 from equipix.metrics.correctability import correctability
 from equipix.metrics.frame_noise import three_d_noise
 from equipix.metrics.maps import planes, roughness
 from equipix.nuc.bad_pixels import find_defects
+from equipix.nuc.response import Response
 
 commands = typer.Typer()
 
@@ -137,7 +139,7 @@ def defects(
         range=range_limit,
         misfit=misfit_limit,
     )
-    curves = load_response(response)
+    curves = read_record(response, Response)
     check_sensor(curves, sensor)
     with naming_memory("finding bad pixels"):
         raw = None if not frames else _raw(frames, response)
@@ -166,7 +168,7 @@ def quality(
 
     Behind colour filters that of each plane: of the correction's, or of --cfa, where it names none.
     """
-    loaded = load(correction)
+    loaded = load_correction(correction)
     check_sensor(loaded, sensor)
     colours = named_cfa(loaded, cfa)
     with naming_memory("measuring quality"):

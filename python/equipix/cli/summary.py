@@ -14,9 +14,12 @@ from equipix.correction.protocol import Correction, sensor_of
 from equipix.findings import Flag, usable
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
+from equipix.scene.scene_correction import SceneCorrection
 
 
-def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[str, Any]:
+def summary(
+    content: Correction | DynamicCorrection | FrameStatistics | SceneCorrection,
+) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     if isinstance(content, FrameStatistics):
         return of_statistics(content)
@@ -26,6 +29,8 @@ def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[s
         return of_response(content)
     if isinstance(content, DynamicCorrection):
         return of_dynamic(content)
+    if isinstance(content, SceneCorrection):
+        return of_scene(content)
     return {
         **_sensor(content),
         "shape": list(content.shape),
@@ -112,6 +117,21 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_order": correction.axes.bias_order,
         "gain_order": None if correction.gain is None else correction.gain_axes.order,
         "flagged_pixels": flagged(correction),
+    }
+
+
+def of_scene(method: SceneCorrection) -> dict[str, Any]:
+    """Collect the main figures of a correction that learns from the scene."""
+    return {
+        "shape": list(method.shape),
+        "scene_method": method.method,
+        "scene_data_range": list(method.data_range),
+        "usable_frames": method.frames_taken,
+        "frames_that_counted": method.frames,
+        "frames_foreign": method.frames_foreign,
+        "floor_dn": method.floor,
+        "gain_rms": float(np.std(method.gain)),
+        "offset_rms": float(np.std(method.offset)),
     }
 
 

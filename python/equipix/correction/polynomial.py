@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from os import PathLike
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Flagged, ReadOnly, check_type
+from equipix._check import Array, Flagged, check_type
 from equipix.correction.apply import apply_polynomial
 from equipix.correction.protocol import Correction, cfa_of, check_correction, depth_of
 from equipix.errors import InputError
-from equipix.io.formats import save_pages
-from equipix.io.record import check_format, check_pages
-
-_KIND, _FORMAT = "polynomial", 1
+from equipix.io.record import Counts, Record
 
 _MOST = 4
 """Most coefficients that the compiled part applies."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Polynomial(ReadOnly):
+class Polynomial(Record, kind="polynomial", version=2):
     """A correction Σ c_j y^j of raw values y, such as two corrections combined.
 
     Attributes
@@ -47,8 +42,8 @@ class Polynomial(ReadOnly):
         If the shapes do not fit.
     """
 
-    coefficients: Array
-    flags: Array
+    coefficients: Annotated[Array, "float32|float64", "terms rows cols"]
+    flags: Counts
     metadata: dict[str, Any] = field(default_factory=dict)
     saturation: float | None = None
     leaves_offset: bool = False
@@ -57,7 +52,7 @@ class Polynomial(ReadOnly):
         """Refuse arrays that do not fit together."""
         for name in ("coefficients", "flags"):
             check_type(name, getattr(self, name), np.ndarray, "an array")
-        ReadOnly.__post_init__(self)
+        super().__post_init__()
         planes, shape = self.coefficients.shape[:1], self.coefficients.shape[1:]
         if shape != self.flags.shape or not 2 <= planes[0] <= _MOST or len(shape) != 2:
             raise InputError(
@@ -112,47 +107,6 @@ class Polynomial(ReadOnly):
             depth=depth_of(self),
             cfa=cfa_of(self),
         )
-
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.load` reads.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        """
-        pages = {"coefficients": self.coefficients, "flags": self.flags}
-        content = {
-            "format": _FORMAT,
-            "kind": _KIND,
-            "saturation": self.saturation,
-            "leaves_offset": self.leaves_offset,
-            "metadata": self.metadata,
-        }
-        save_pages(path, pages, content, force=force)
-
-
-def read_polynomial(
-    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
-) -> Polynomial:
-    """Make a correction of the arrays and metadata of the file that `Polynomial.save` wrote."""
-    check_format(path, content, _KIND, _FORMAT)
-    check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
-    level = content.get("saturation")
-    return Polynomial(
-        pages["coefficients"],
-        pages["flags"],
-        content["metadata"],
-        None if level is None else float(level),
-        bool(content.get("leaves_offset", False)),
-    )
 
 
 def combine(first: Correction, then: Correction) -> Polynomial:

@@ -19,13 +19,13 @@ from equipix._check import Progress, as_array, as_floats, as_level, naming_memor
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
+from equipix.io.record import read_record
 from equipix.measured.statistics import (
     FrameStatistics,
     _check_mask,
     _masked,
     _step,
     _subtract,
-    load_statistics,
     saved_shape,
 )
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
@@ -191,7 +191,7 @@ def _saved(
         )
     if rejection is not None:
         raise InputError(f"{path}: holds averaged frames, from which 'reject' cannot leave out any")
-    statistics = load_statistics(path)
+    statistics = read_record(path, FrameStatistics)
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "

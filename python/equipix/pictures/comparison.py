@@ -204,7 +204,7 @@ def _distributions(axes: Axes, title: str, errors: list[NDArray[Any]], predicted
 def _history(axes: Axes, calibration: Calibration) -> None:
     """Draw the estimated largest error of the sensitivity by sweep."""
     history = calibration.history
-    axes.semilogy(history.sweep, 100 * history.error_estimate, marker="o", color=CALIBRATION)
+    axes.semilogy(history["sweep"], 100 * history["error_estimate"], marker="o", color=CALIBRATION)
     axes.set(title="Estimated distance from the optimum, %", xlabel="sweep", ylabel="%")
     axes.grid(alpha=0.3)
 
