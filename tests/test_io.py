@@ -23,10 +23,13 @@ import tifffile
 from PIL import Image
 
 import equipix
-from equipix import FrameStatistics, io, simulate
+from equipix import FrameStatistics, simulate
 from equipix.errors import FileError, InputError
-from equipix.io.record import checksum
-from equipix.measured.statistics import load_statistics, save_statistics
+from equipix.io.formats import load_pages, save_pages, saved_kind
+from equipix.io.frames import read_frames
+from equipix.io.paths import find_files
+from equipix.io.tiff import stream_frames as tiff_frames
+from records import rewrite
 
 RNG = np.random.default_rng(20)
 WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)
@@ -67,7 +70,7 @@ def test_tiff(
     )
     assert_averages(path, frames)
     np.testing.assert_array_equal(equipix._native.read_file(path, None), frames)
-    np.testing.assert_array_equal(np.concatenate(list(io.tiff.stream_frames(path))), frames)
+    np.testing.assert_array_equal(np.concatenate(list(tiff_frames(path))), frames)
 
 
 @pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
@@ -93,7 +96,7 @@ def test_plain_pgm_and_12_bits_keep_their_numbers(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "t.tif", frame)
     Image.fromarray(frame).save(tmp_path / "p.png")
     for path in tmp_path.iterdir():
-        np.testing.assert_array_equal(io.read_frames(path)[0], frame)
+        np.testing.assert_array_equal(read_frames(path)[0], frame)
     assert_averages(sorted(tmp_path.iterdir()), np.stack([frame] * 4))
 
 
@@ -278,7 +281,7 @@ def average_or_error(path: Path) -> FrameStatistics | None:
 def test_truncated_files_never_lose_a_page(tmp_path: Path, name: str) -> None:
     whole, path = HOSTILE[name], tmp_path / name
     path.write_bytes(whole)
-    frames = io.read_frames(path)
+    frames = read_frames(path)
     for size in sorted({*range(1, 300, 7), *range(1, len(whole), len(whole) // 60)}):
         path.write_bytes(whole[:size])
         result = average_or_error(path)
@@ -363,16 +366,16 @@ def test_ctrl_c_stops_within_half_a_second(
 def test_globs_are_in_natural_order(tmp_path: Path) -> None:
     for name in ("f10.png", "f9.png", "f1.png", "g.txt", ".f2.png"):
         (tmp_path / name).touch()
-    found = io.find_files(tmp_path / "*.png")
+    found = find_files(tmp_path / "*.png")
     assert [path.name for path in found] == ["f1.png", "f9.png", "f10.png"]
     literal = tmp_path / "a[1].png"
     literal.touch()
-    assert io.find_files(str(literal)) == [literal]
-    assert io.find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
+    assert find_files(str(literal)) == [literal]
+    assert find_files([literal, tmp_path / "f?.png"]) == [literal, *found[:2]]
     with pytest.raises(InputError, match="'frames' holds 3, expected a path"):
         equipix.average([literal, 3])  # type: ignore[list-item]
     with pytest.raises(InputError, match="'frames' names no file"):
-        io.read_frames([])
+        read_frames([])
 
 
 PAGES = {
@@ -390,10 +393,10 @@ PAGES = {
 def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"pages{suffix}"
     metadata = {"format": 1, "name": "Müller", "list": [1, 2.5, None]}
-    io.save_pages(path, PAGES, metadata)
-    pages, found = io.load_pages(path)
+    save_pages(path, PAGES, metadata)
+    pages, found = load_pages(path)
     assert found == metadata
-    assert list(pages) == list(PAGES)
+    assert pages.keys() == PAGES.keys()
     for name, array in PAGES.items():
         assert (pages[name].dtype, pages[name].shape) == (array.dtype, array.shape)
         np.testing.assert_array_equal(pages[name], array)
@@ -401,20 +404,15 @@ def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: st
         with tifffile.TiffFile(path) as file:
             assert file.pages[1].tags["PageName"].value == "labels"
             described = json.loads(file.pages[0].description)
-            assert described.pop("crc32") == checksum(PAGES, metadata)
+            assert described.pop("crc32") == zlib.crc32(json.dumps(metadata).encode())
             assert described == metadata
             # Any viewer shows the images of a stack one by one.
             stack = [page for page in file.pages if page.tags["PageName"].value == "stack"]
             assert [page.tags["PageNumber"].value for page in stack] == [(0, 3), (1, 3), (2, 3)]
-            assert not any("PageNumber" in page.tags for page in file.pages[:4])
-
-
-@pytest.mark.parametrize("shape", [(4,), (0, 5), (0, 4, 5), (2, 0, 5), (1, 2, 4, 5)])
-def test_pages_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    for suffix in (".tif", ".npz"):
-        with pytest.raises(InputError, match="page 'bad' is float64 of shape .* a stack"):
-            io.save_pages(tmp_path / f"a{suffix}", {"bad": np.zeros(shape)}, {})
-    assert list(tmp_path.iterdir()) == []
+            named = [page for page in file.pages if "stack" not in page.tags["PageName"].value]
+            assert not any("PageNumber" in page.tags for page in named)
+            # Sizes that differ come last: tifffile compares the first pages with the last one.
+            assert [page.shape for page in file.pages].index((2, 3)) == len(file.pages) - 1
 
 
 @pytest.mark.parametrize(
@@ -431,44 +429,33 @@ def test_a_stack_that_lacks_an_image_is_refused(
             tags += [] if number is None else [(297, "H", 2, number, True)]
             file.write(np.ones((4, 5)), metadata=None, description="{}", extratags=tags)
     with pytest.raises(FileError, match="is damaged: the pages named 'stack' are numbered"):
-        io.load_pages(path)
-
-
-def test_stacks_are_checked_against_the_maps() -> None:
-    pages = {"map": np.ones((4, 5)), "stack": np.ones((3, 4, 5))}
-    io.check_pages("a.tif", pages, {"map": np.floating}, {"stack": np.floating})
-    for stack in (np.ones((3, 4, 6)), np.ones((4, 5)), np.ones((3, 4, 5), np.uint8)):
-        changed = pages | {"stack": stack}
-        with pytest.raises(FileError, match=r"'stack' is .* in three dimensions, as large as 'm"):
-            io.check_pages("a.tif", changed, {"map": np.floating}, {"stack": np.floating})
-    with pytest.raises(FileError, match="lacks the page 'other'"):
-        io.check_pages("a.tif", pages, {"map": np.floating}, {"other": np.floating})
+        load_pages(path)
 
 
 def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "out.tif"
-    io.save_pages(path, PAGES, {})
+    save_pages(path, PAGES, {})
     before = path.read_bytes()
     with pytest.raises(FileError, match=r"out\.tif: exists already; force=True"):
-        io.save_pages(path, PAGES, {})
+        save_pages(path, PAGES, {})
     broken = {**PAGES, "bad": np.array([object()])}
-    for target in (path, tmp_path / "new.tif"):
-        with pytest.raises(InputError, match="page 'bad' is object"):
-            io.save_pages(target, broken, {}, force=True)
+    for target in (path, tmp_path / "new.tif", tmp_path / "new.npz"):
+        with pytest.raises((TypeError, ValueError)):
+            save_pages(target, broken, {}, force=True)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-    io.save_pages(path, {"mean": PAGES["mean"]}, {}, force=True)
-    assert list(io.load_pages(path)[0]) == ["mean"]
+    save_pages(path, {"mean": PAGES["mean"]}, {}, force=True)
+    assert list(load_pages(path)[0]) == ["mean"]
     with pytest.raises(FileError, match=r"there is no folder .*none.: make it first"):
-        io.save_pages(tmp_path / "none" / "out.tif", PAGES, {})
+        save_pages(tmp_path / "none" / "out.tif", PAGES, {})
     with pytest.raises(InputError, match=r"expected the suffix \.tif or \.npz"):
-        io.save_pages(tmp_path / "out.jpg", PAGES, {})
+        save_pages(tmp_path / "out.jpg", PAGES, {})
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("path", [3, None, b"out.tif", "out\0.tif"])
 def test_what_is_no_name_is_refused(path: object) -> None:
-    for call in (lambda: io.save_pages(path, PAGES, {}), lambda: io.load_pages(path)):  # type: ignore[arg-type]
+    for call in (lambda: save_pages(path, PAGES, {}), lambda: load_pages(path)):  # type: ignore[arg-type]
         with pytest.raises(InputError, match="'path' holds .*, expected a path"):
             call()
 
@@ -477,46 +464,35 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
     (tmp_path / "a.tif").mkdir()
     for target in ("a.tif", f"{'n' * 300}.tif"):
         with pytest.raises(FileError, match=r"\.tif: (is a folder|cannot be written)"):
-            io.save_pages(tmp_path / target, PAGES, {}, force=True)
+            save_pages(tmp_path / target, PAGES, {}, force=True)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
 
 
 def test_the_longest_name_can_be_written_by_many_at_once(tmp_path: Path) -> None:
     path = tmp_path / f"{'n' * 250}.tif"
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda _: io.save_pages(path, PAGES, {}, force=True), range(40)))
-    assert list(io.load_pages(path)[0]) == list(PAGES)
+        list(pool.map(lambda _: save_pages(path, PAGES, {}, force=True), range(40)))
+    assert load_pages(path)[0].keys() == PAGES.keys()
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
-def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"dark{suffix}"
-    wanted = equipix.average(WIDE)
-    save_statistics(path, wanted)
-    for name, values in load_statistics(path).maps.items():
-        np.testing.assert_array_equal(values, getattr(wanted, name))
-        assert values.dtype == getattr(wanted, name).dtype
-
-
-@pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    pages = equipix.average(WIDE).maps
-    good = {"kind": "frame statistics", "format": 1}
-    for changed, metadata, message in (
-        ({}, good | {"format": "2"}, "format is '2'"),
-        ({}, good | {"format": None}, "format is None"),
-        ({"mean": pages["mean"].astype(np.int64)}, good, "'mean' is int64"),
-        ({"count": pages["count"][1:]}, good, r"'count' is uint32 of shape \(22, 37\)"),
+    path, average = tmp_path / f"a{suffix}", equipix.average(WIDE)
+    for changed, message in (
+        ({"version": "2"}, "of version 2, this version of equipix reads version 2: make"),
+        ({"version": None}, "of version None"),
+        ({"arrays": {"mean": average.mean.astype(np.int64)}}, "damaged: array 'mean' is int64"),
+        (
+            {"arrays": {"count": average.count[1:]}},
+            r"damaged: array 'count' is uint32 of shape \(22, 37\)",
+        ),
+        ({"arrays": {"saturated": None}}, "damaged: array 'saturated' is missing"),
     ):
-        io.save_pages(path, pages | changed, metadata, force=True)
-        with pytest.raises(FileError, match=f"is damaged: .*{message}"):
-            load_statistics(path)
-    del pages["saturated"]
-    io.save_pages(path, pages, good, force=True)
-    with pytest.raises(FileError, match="is damaged: lacks the page 'saturated'"):
-        load_statistics(path)
+        average.save(path, force=True)
+        rewrite(path, **changed)  # type: ignore[arg-type]
+        with pytest.raises(FileError, match=rf"a\{suffix}: .*{message}"):
+            equipix.load(path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
@@ -526,111 +502,77 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
     frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), shifts)
     cal = equipix.calibrate(frames, shifts)
     left_out = np.zeros((4, 8, 9), bool)
-    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out).save(path)
-    pages, content = io.load_pages(path)
+    whole = dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out)
     for name, page in (
-        ("sensitivity", pages["sensitivity"].astype(np.int32)),
-        ("flags", pages["flags"].astype(np.int32)),
-        ("flags", pages["flags"][1:]),
-        ("component_labels", pages["component_labels"][:, 1:]),
-        ("dark", pages["dark"][1:]),
-        ("rejected", pages["rejected"][:, 1:]),
-        ("rejected", pages["rejected"][0]),
-        ("rejected", pages["rejected"].astype(np.int8)),
+        ("sensitivity", whole.sensitivity.astype(np.int32)),
+        ("flags", whole.flags.astype(np.int32)),
+        ("flags", whole.flags[1:]),
+        ("component_labels", whole.component_labels[:, 1:]),
+        ("dark", whole.dark[1:]),
+        ("rejected", left_out[:, 1:]),
+        ("rejected", left_out[0]),
+        ("rejected", left_out.astype(np.int8)),
     ):
-        io.save_pages(path, pages | {name: page}, content, force=True)
-        with pytest.raises(FileError, match=f"is damaged: page '{name}' is"):
+        whole.save(path, force=True)
+        rewrite(path, arrays={name: page})
+        with pytest.raises(FileError, match=f"is damaged: array '{name}' is"):
             equipix.load(path)
-    for number in ("2", None, True):
-        io.save_pages(path, pages, content | {"format": number}, force=True)
-        with pytest.raises(FileError, match="is damaged: its format is"):
-            equipix.load(path)
-    io.save_pages(path, pages, content, force=True)
+    whole.save(path, force=True)
     assert equipix.load(path).dark is not None
-    # A page of format 1 whose height is no multiple of the sensor's.
-    odd = pages | {"rejected": np.zeros((31, 9), np.uint8)}
-    io.save_pages(path, odd, content | {"format": 1}, force=True)
-    with pytest.raises(FileError, match="damaged or incomplete calibration"):
-        equipix.load(path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with pytest.raises(FileError, match=f"a{suffix}"):
-        load_statistics(path)
-    io.save_pages(path, PAGES, {"kind": "something"})
-    with pytest.raises(FileError, match="holds something, expected frame statistics"):
-        load_statistics(path)
-    io.save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
-    with pytest.raises(FileError, match=r"has format 99.*install a newer one"):
-        load_statistics(path)
-    save_statistics(path, equipix.average(WIDE), force=True)
+        equipix.load(path)
+    save_pages(path, PAGES, {"kind": "something"})
+    with pytest.raises(FileError, match="holds something, expected .* or frame statistics or .*na"):
+        equipix.load(path)
+    save_pages(path, PAGES, {"kind": "frame statistics", "version": 99}, force=True)
+    with pytest.raises(FileError, match=r"of version 99, .* reads version 2: .* install"):
+        equipix.load(path)
+    equipix.average(WIDE).save(path, force=True)
     whole = path.read_bytes()
     for size in range(0, len(whole) - 1, len(whole) // 40):
         path.write_bytes(whole[:size])
         with pytest.raises(FileError, match=f"a{suffix}"):
-            load_statistics(path)
+            equipix.load(path)
     tifffile.imwrite(tmp_path / "plain.tif", WIDE[0])
     with pytest.raises(FileError, match=r"plain\.tif"):
-        io.load_pages(tmp_path / "plain.tif")
-
-
-def same_content(path: Path, wanted: tuple[dict[str, np.ndarray], dict[str, object]]) -> bool:
-    """Whether a file is refused by its name, or has the arrays and metadata that were written."""
-    try:
-        pages, metadata = io.load_pages(path)
-    except FileError as error:
-        return str(path) in str(error)
-    same = [
-        pages[name].tobytes() == array.tobytes() and pages[name].dtype == array.dtype
-        for name, array in wanted[0].items()
-    ]
-    # A flip in the name of the checksum leaves a number that nothing reads.
-    known = {key: metadata.get(key) for key in wanted[1]}
-    return all(same) and list(pages) == list(wanted[0]) and known == wanted[1]
+        load_pages(tmp_path / "plain.tif")
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
-def test_a_flipped_byte_is_refused_or_changes_nothing(tmp_path: Path, suffix: str) -> None:
+def test_changed_metadata_differ_from_their_checksum(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"kept{suffix}"
     metadata = {"format": 1, "kind": "response", "levels": [1.5, 2.25], "name": "Müller"}
-    io.save_pages(path, PAGES, metadata)
+    save_pages(path, PAGES, metadata)
     whole, rng = path.read_bytes(), np.random.default_rng(4)
-    text = whole.find(b'{"format"')
-    places = [*rng.integers(0, len(whole), 150), *range(text, text + len(json.dumps(metadata)))]
-    for place in places:
+    text = whole.find(b'{"format"') if suffix == ".tif" else whole.find("{".encode("utf-32-le"))
+    for place in range(text, text + len(json.dumps(metadata))):
         changed = bytearray(whole)
         changed[place] ^= 1 << rng.integers(8)
         path.write_bytes(changed)
-        assert same_content(path, (PAGES, metadata)), int(place)
+        try:
+            found = load_pages(path)[1]
+        except FileError as error:
+            assert str(path) in str(error)
+        else:
+            assert found == metadata, place
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".npz"])
-def test_changed_arrays_or_metadata_differ_from_the_checksum(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"kept{suffix}"
-    io.save_pages(path, PAGES, {"level": 1.5})
-    whole = path.read_bytes()
-    pixel = PAGES["mean"].tobytes()[:8]
-    for old, new in ((pixel, bytes(8)), (b"labels", b"labelz")):
-        assert whole.count(old) >= 1
-        path.write_bytes(whole.replace(old, new))
-        with pytest.raises(FileError, match=f"kept{suffix}: "):
-            io.load_pages(path)
-    path.write_bytes(whole)
-    assert io.load_pages(path)[1] == {"level": 1.5}
-
-
-def test_a_file_without_a_checksum_is_read(tmp_path: Path) -> None:
+def test_a_file_without_a_checksum_is_refused(tmp_path: Path) -> None:
     with tifffile.TiffWriter(tmp_path / "old.tif") as file:
         tags = [(285, "s", 0, "mean", True)]
         file.write(PAGES["mean"], metadata=None, description='{"format": 1}', extratags=tags)
-    assert io.load_pages(tmp_path / "old.tif")[1] == {"format": 1}
+    with pytest.raises(FileError, match=r"old\.tif: .*equipix did not write it"):
+        load_pages(tmp_path / "old.tif")
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_a_missing_file_is_said_to_be_missing(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(FileError, match=rf"none\{suffix}: .*(does not exist|No such file)"):
-        io.load_pages(tmp_path / f"none{suffix}")
+        load_pages(tmp_path / f"none{suffix}")
     with pytest.raises(FileError, match=rf"none\{suffix}: .*(does not exist|No such file)"):
-        io.saved_kind(tmp_path / f"none{suffix}")
+        saved_kind(tmp_path / f"none{suffix}")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, NoiseModel, errors, io, metrics, simulate
+from equipix import Flag, NoiseModel, errors, metrics, simulate
 from equipix.fitting import weighted as weights
 from equipix.fitting.outliers import rejected
 
@@ -225,13 +225,6 @@ def test_what_was_left_out_is_saved(tmp_path, suffix):
     np.testing.assert_array_equal(read.rejected, cal.rejected)
     assert read.rejected.dtype == np.bool_
     assert read.metadata["rejected"][2] >= 12
-    # In format 1 the images stood one below the other.
-    pages, content = io.load_pages(tmp_path / f"cal{suffix}")
-    assert pages["rejected"].shape == frames.shape
-    below = pages | {"rejected": pages["rejected"].reshape(-1, frames.shape[2])}
-    io.save_pages(tmp_path / f"old{suffix}", below, content | {"format": 1})
-    old = equipix.load(tmp_path / f"old{suffix}")
-    np.testing.assert_array_equal(old.rejected, cal.rejected)
     assert equipix.calibrate(frames, CROSS).rejected is None
 
 

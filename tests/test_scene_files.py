@@ -12,6 +12,7 @@ import equipix
 from equipix import scene
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
+from equipix.scene.methods import METHODS
 from equipix.simulate import MovingScene
 
 SHAPE = (48, 64)
@@ -35,14 +36,14 @@ def recorded(tmp_path_factory):
 RANGE = ("--data-range", "4000", "12000")
 
 
-@pytest.mark.parametrize("name", [name for name in scene.METHODS if name != "kalman"])
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "kalman"])
 def test_a_sequence_gives_what_the_methods_give(run, recorded, tmp_path, name):
     folder, frames = recorded
     output, corrected = tmp_path / "nuc.tif", tmp_path / "corrected.tif"
     options = ("--method", name, *RANGE, "--corrected", corrected, "--json")
     status, out, err = run("scene", folder / "all.tif", "-o", output, *options)
     assert (status, err) == (0, "")
-    method = scene.METHODS[name](SHAPE, (4000, 12_000))
+    method = METHODS[name](SHAPE, (4000, 12_000))
     wanted = [method.update(frame) for frame in frames]
     np.testing.assert_array_equal(read_frames(corrected), wanted)
     loaded = equipix.load(output)

@@ -322,8 +322,8 @@ class Table(ReadOnly):
 
 _FORMATS = {
     ".bin": (to_binary, from_binary),
-    ".h": (to_c_header, from_c_header),
     ".hex": (to_memory_image, from_memory_image),
+    ".h": (to_c_header, from_c_header),
 }
 
 SUFFIXES = tuple(_FORMATS)

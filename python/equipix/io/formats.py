@@ -22,6 +22,9 @@ _FORMATS = {".tif": tiff, ".tiff": tiff, ".npz": npz}
 
 SUFFIXES = tuple(_FORMATS)
 
+_SEPARATORS = (", ", " : ")
+"""Of the JSON text: tifffile takes one that holds ``"shape":`` for its own."""
+
 _CRC = "crc32"
 """Key of the checksum of the metadata."""
 
@@ -57,7 +60,7 @@ def save_pages(
     kind = _FORMATS.get(as_path("path", path).suffix.lower())
     if kind is None:
         raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
-    text = json.dumps({**metadata, _CRC: _checksum(metadata)})
+    text = json.dumps({**metadata, _CRC: _checksum(metadata)}, separators=_SEPARATORS)
     with write_whole(path, force=force) as temporary:
         kind.write_pages(temporary, pages, text)
 
