@@ -26,16 +26,12 @@ BYTES = {2: 12, 4: 20}
 """Bytes that a pixel moves: frame and result of 16 bits, and so many float32 coefficients."""
 
 
-class Polynomial:
+def polynomial(shape: tuple[int, int], planes: int) -> equipix.Polynomial:
     """A correction of so many coefficients without bad pixels."""
-
-    def __init__(self, shape: tuple[int, int], planes: int) -> None:
-        rng = np.random.default_rng(1)
-        spread = rng.uniform(0.9, 1.1, (planes, *shape)).astype(np.float32)
-        self.coefficients = np.array(TYPICAL[:planes], np.float32)[:, None, None] * spread
-        self.flags = np.zeros(shape, np.uint32)
-        self.shape = shape
-        self.metadata: dict[str, Any] = {}
+    rng = np.random.default_rng(1)
+    spread = rng.uniform(0.9, 1.1, (planes, *shape)).astype(np.float32)
+    coefficients = np.array(TYPICAL[:planes], np.float32)[:, None, None] * spread
+    return equipix.Polynomial(coefficients, np.zeros(shape, np.uint32))
 
 
 def rows(
@@ -133,7 +129,7 @@ def _frame(shape: tuple[int, int]) -> NDArray[np.uint16]:
 
 
 def _equipix(shape: tuple[int, int], planes: int, workers: int | None) -> Work:
-    corrector = equipix.Corrector(Polynomial(shape, planes), workers=workers)  # type: ignore[arg-type]
+    corrector = equipix.Corrector(polynomial(shape, planes), workers=workers)
     frame, out = _frame(shape), np.empty(shape, np.uint16)
     return lambda: corrector.apply(frame, out)
 
@@ -147,7 +143,7 @@ def _copy(shape: tuple[int, int], nbytes: int, threads: int) -> Work:
 
 
 def _numpy(shape: tuple[int, int]) -> Work:
-    offset, gain = Polynomial(shape, 2).coefficients
+    offset, gain = polynomial(shape, 2).coefficients
     frame, out, values = _frame(shape), np.empty(shape, np.uint16), np.empty(shape, np.float32)
 
     def work() -> None:
@@ -172,7 +168,7 @@ def _numba(shape: tuple[int, int]) -> Work | None:
                 value = np.rint(frame[row, col] * gain[row, col] + offset[row, col])
                 out[row, col] = np.uint16(min(max(value, 0.0), 65535.0))
 
-    offset, gain = Polynomial(shape, 2).coefficients
+    offset, gain = polynomial(shape, 2).coefficients
     frame, out = _frame(shape), np.empty(shape, np.uint16)
     return lambda: correct(frame, offset, gain, out)
 
@@ -182,7 +178,7 @@ def _opencv(shape: tuple[int, int]) -> Work | None:
         return None
     import cv2
 
-    offset, gain = Polynomial(shape, 2).coefficients
+    offset, gain = polynomial(shape, 2).coefficients
     frame, out, values = _frame(shape), np.empty(shape, np.uint16), np.empty(shape, np.float32)
 
     def work() -> None:

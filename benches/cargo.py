@@ -14,7 +14,7 @@ def bench(name: str, *, smoke: bool) -> list[dict[str, Any]]:
     """Run a bench and read what it prints."""
     command = ["cargo", "bench", "--quiet", "--locked", "-p", "equipix-core", "--bench", name]
     if smoke:
-        # Of what runs once no time is taken: the profile of the tests, which is built already.
+        # No time is measured then, so the build of the tests serves, which is there already.
         command += ["--profile", "test", "--", "--test"]
     output = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
     return [json.loads(line) for line in output.stdout.splitlines() if line.startswith("{")]

@@ -7,7 +7,8 @@ import time
 
 import numpy as np
 
-from equipix import scene
+from equipix.scene.methods import METHODS
+from equipix.scene.scene_correction import SceneCorrection
 from equipix.simulate import MovingScene
 
 SHAPE, FRAMES, PASSES = (512, 640), 24, 8
@@ -26,7 +27,7 @@ def rows(
     ]
     threads = len(os.sched_getaffinity(0))
     found = []
-    for name, method in scene.METHODS.items():
+    for name, method in METHODS.items():
         made = method(shape, data_range=(2**14, 2**14 + 2**13))
         seconds = [_seconds(made, frame) for _ in range(passes) for frame in values]
         median = float(np.median(seconds))
@@ -41,7 +42,7 @@ def rows(
     return found
 
 
-def _seconds(method: scene.SceneCorrection, frame: np.ndarray) -> float:
+def _seconds(method: SceneCorrection, frame: np.ndarray) -> float:
     start = time.perf_counter()
     method.update(frame)
     return time.perf_counter() - start

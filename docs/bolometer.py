@@ -65,7 +65,7 @@ class Tested:
     ) -> float:
         """Non-uniformity relative to the range, with an error of the thermometer."""
         raw = self.frames(scene_c)
-        at = partial(correction.at, extrapolate=True)
+        at = partial(correction.correction, extrapolate=True)
         frames = [
             at(celsius + error_k, bias).correct(frame)
             for (celsius, bias), frame in zip(self.at, raw, strict=True)

@@ -20,11 +20,14 @@ import numpy as np
 import equipix
 from equipix import simulate
 from equipix.diagnosis.lamp_drift import lamp_drift
-from equipix.exposures.exposures import exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.residuals import sampled
 from equipix.fitting.weighted import Options, weighted_fit
+from equipix.measured.measured import measured_of
 from equipix.metrics.maps import tilt, tilt_weights
 
 SENSOR, NOISE, EXPERIMENTS = (64, 96), 1e-3, 200
@@ -47,7 +50,9 @@ def experiment(count, drift, seed):
     beam = simulate.gaussian_beam(SENSOR, width=150)
     frames = simulate.exposures(truth, beam, shifts, flux=flux)
     frames += NOISE * rng.standard_normal(frames.shape)
-    exposures = exposures_of(frames, shifts, variance=np.full(count, NOISE**2))
+    measured = measured_of(frames, np.full(count, NOISE**2))
+    fluxes = Flux.of(None, None, None, count)
+    exposures = Exposures.of(measured, Positions.of(shifts), fluxes)
     weighted = weighted_fit(exposures, Options(FitOptions(tolerance=1e-5)))
     drift = lamp_drift(weighted, sampled(weighted))
     # Positions at random may leave a corner unconnected.

@@ -6,15 +6,20 @@ which the adaptive loop stops converging, on the standard scene of `simulate.Mov
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import equipix
-from equipix import hardware, nuc, reference
-from equipix.reference.scene import LocalMean, neighbours
+from equipix import hardware, nuc
 from equipix.simulate import MovingScene, StaringArray
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+import reference
+from reference.scene import LocalMean, neighbours
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

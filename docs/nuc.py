@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-    from equipix.metrics import Correctability as Quality
+from equipix.metrics.correctability import Correctability as Quality
 
 FILE = Path(__file__).parent / "nuc.png"
 SHAPE = (96, 128)

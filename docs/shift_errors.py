@@ -13,13 +13,14 @@ import numpy as np
 import equipix
 from equipix import simulate
 from equipix.errors import EquipixWarning
+from equipix.simulate.beams import Beam
 
 SHAPE = (96, 128)
 CROSS = equipix.cross_pattern(11, 19).astype(float)
 NOISE, STD, PERIOD, EXPERIMENTS = 1e-3, 0.03, 30, 100
 
 
-def fringes(contrast: float, *, crossed: bool) -> simulate.Beam:
+def fringes(contrast: float, *, crossed: bool) -> Beam:
     """An even beam with fringes across columns, or across rows too."""
 
     def beam(rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
@@ -29,7 +30,7 @@ def fringes(contrast: float, *, crossed: bool) -> simulate.Beam:
     return beam
 
 
-def one(beam: simulate.Beam, seed: int) -> tuple[float, float, str]:
+def one(beam: Beam, seed: int) -> tuple[float, float, str]:
     """Give mean squares of z of M and of shifts less their mean, and whether these are refined."""
     rng = np.random.default_rng(seed)
     measured = CROSS + STD * rng.standard_normal(CROSS.shape)

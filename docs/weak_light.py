@@ -12,13 +12,14 @@ import numpy as np
 import equipix
 from equipix import Flag, simulate
 from equipix.errors import EquipixWarning
+from equipix.simulate.beams import Beam
 
 NOISE = 1e-3
 CROSS = equipix.cross_pattern(11, 19).astype(float)
 BETWEEN = CROSS + np.array([(0, 0), (0.3, 0.1), (0.2, 0.4), (0.45, 0.3), (0.1, 0.2)])
 
 
-def narrow(shape: tuple[int, int], width: float) -> simulate.Beam:
+def narrow(shape: tuple[int, int], width: float) -> Beam:
     """Give a beam that leaves the edges of the sensor in the dark."""
     return simulate.gaussian_beam(shape, width=width)
 
@@ -29,7 +30,7 @@ def dark_corner(rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
     return light * np.where((rows < 50) & (cols < 60), 1e-5, 1)
 
 
-def measure(name: str, shape: tuple[int, int], beam: simulate.Beam, shifts: np.ndarray) -> str:
+def measure(name: str, shape: tuple[int, int], beam: Beam, shifts: np.ndarray) -> str:
     """Calibrate once; give a row of the table."""
     rng = np.random.default_rng(0)
     truth = 1 + rng.uniform(-0.05, 0.05, shape)

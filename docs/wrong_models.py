@@ -3,7 +3,7 @@
 Prints how often a finding falls on right models of each kind, and for each wrong model how often it
 is noticed and how often its true cause is the first that is named.
 
-    python docs/findings.py [RIGHT [WRONG]]
+    python docs/wrong_models.py [RIGHT [WRONG]]
 
 RIGHT is the number of right models in all (2000), WRONG that of each wrong model (20).
 """

@@ -13,6 +13,7 @@ import numpy as np
 import equipix
 from equipix import metrics, plan, simulate
 from equipix.errors import MisfitWarning
+from equipix.plan.budget import ErrorBudget
 
 SENSOR = (582, 782)
 SIGNAL, READ_NOISE = 16_000, 10
@@ -55,7 +56,7 @@ def even_beam(rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
     return np.ones(np.broadcast_shapes(rows.shape, cols.shape))
 
 
-def budget(exposures: int, noise: float, drift: float = 0.0) -> plan.ErrorBudget:
+def budget(exposures: int, noise: float, drift: float = 0.0) -> ErrorBudget:
     """Error budget of the pattern with so many exposures."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MisfitWarning)

@@ -11,11 +11,11 @@ import equipix
 from equipix import simulate
 from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation
-from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.spots import Spot
 from equipix.findings import Flag
 from equipix.fitting.weighted import Weighted
+from given import exposures_of
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(3, 5)
 LARGEST = 0.008**2

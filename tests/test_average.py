@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import equipix
 from equipix.errors import FileError, InputError
-from equipix.reference.average import average as reference
+from reference.average import average as reference
 
 if TYPE_CHECKING:
     from pathlib import Path

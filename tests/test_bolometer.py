@@ -198,9 +198,27 @@ class TestBadPixels:
         assert np.isnan(corrected).sum() == 3
         assert np.nanstd(corrected) < LIMIT * simulated.span
 
+    def test_dead_and_hot_pixels_are_told_by_their_neighbours(self):
+        """Towards the edge light is weak: 122 good ones are below half of the mean of all."""
+        rows, cols = np.mgrid[-1:1:96j, -1:1:128j]
+        light = 1 - 0.35 * (rows**2 + cols**2)
+        light[20, 30], light[3, 4], light[30:33, 40:43], light[10, 50] = 0, 0.1, 0.1, 2.5
+        array = simulate.BolometerArray.of(light.shape, rng=1)
+        at = [0.0, 20.0, 40.0]
+        cold, warm = ([array.mean(c, scene_c=scene_c) for c in at] for scene_c in (20.0, 60.0))
+        hot = [one + (other - one) * light for one, other in zip(cold, warm, strict=True)]
+        shutter = [array.mean(c) for c in at]
+        found = bolometer.fit(shutter, at, 2.0, order=1, black_bodies=(cold, hot))
+        wanted = np.zeros(light.shape, np.uint32)
+        wanted[light <= 0.1] = Flag.DEAD | Flag.DO_NOT_USE
+        wanted[10, 50] = Flag.HOT | Flag.DO_NOT_USE
+        np.testing.assert_array_equal(found.flags, wanted)
+
     def test_no_good_pixel_is_refused(self, simulated):
+        shutter, mask = np.array(simulated.shutter), np.ones(SHAPE, bool)
+        shutter[0, 0, 0], mask[0, 0] = np.nan, False
         with pytest.raises(errors.InputError, match="no pixel with a value at every state"):
-            bolometer.fit(simulated.shutter, *simulated.at.T, mask=np.ones(SHAPE, bool))
+            bolometer.fit(shutter, *simulated.at.T, mask=mask)
 
 
 class TestCorrectionAtAState:
@@ -324,12 +342,15 @@ class TestRefusals:
             ({"order": "best"}, "'order' is 'best'"),
             ({"bias_order": -1}, "'bias_order' is -1"),
             ({"regressor": "square"}, "'regressor' is 'square'"),
-            ({"mask": np.zeros((2, 3))}, "'mask' is float64"),
-            ({"mask": np.zeros((3, 3), bool)}, r"'mask' is bool of shape \(3, 3\)"),
+            ({"mask": np.zeros((2, 3))}, "'mask' has dtype float64"),
+            ({"mask": np.zeros((3, 3), bool)}, r"'mask' has shape \(3, 3\)"),
             ({"shutter": FRAMES[0]}, r"'shutter' has shape \(2, 3\)"),
-            ({"shutter": [FRAMES[0], FRAMES[0][:1]]}, "'shutter' has frames of"),
+            ({"shutter": [FRAMES[0], FRAMES[0][:1]]}, "'shutter' holds arrays of shapes"),
             ({"shutter": equipix.average(FRAMES)}, "'shutter' is one FrameStatistics"),
-            ({"shutter": np.empty((0, 2, 3))}, "'shutter' has no frames"),
+            (
+                {"shutter": np.empty((0, 2, 3))},
+                "'shutter' has shape .* expected at least one state",
+            ),
             ({"black_bodies": FRAMES}, "'black_bodies' is no pair"),
             ({"black_bodies": (FRAMES, FRAMES[:2])}, r"'black_bodies\[1\]' has shape \(2, 2, 3\)"),
             ({"black_bodies": (FRAMES, FRAMES)}, "'black_bodies' at state 0 differ by 0 DN"),
@@ -509,7 +530,7 @@ class TestSaturatedReferences:
             bolometer.fit(shutter, [0, 10, 20, 30, 40], 2.0, order=1)
 
     def test_nothing_else_than_saturated_pixels_is_refused(self):
-        with pytest.raises(errors.InputError, match="below saturation"):
+        with pytest.raises(errors.InputError, match="reach the saturation level of 255"):
             bolometer.fit(np.full((2, *SHAPE), 255, np.uint8), [0, 40], 2.0, order=1)
 
 

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import equipix
-from equipix import Flag, errors, metrics, reference, simulate
-from equipix.reference import descent as reference_descent
-from equipix.reference import model as reference_model
+import reference
+from equipix import Flag, errors, metrics, simulate
+from reference import descent as reference_descent
+from reference import model as reference_model
 
 CROSS = equipix.cross_pattern(5, 7)
 EPS = np.finfo(np.float64).eps

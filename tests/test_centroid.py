@@ -10,7 +10,7 @@ import tifffile
 
 import equipix
 from equipix.errors import InputError, SpotError
-from equipix.reference import centroid as reference
+from reference import centroid as reference
 
 if TYPE_CHECKING:
     from collections.abc import Callable

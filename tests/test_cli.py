@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pty
@@ -116,7 +117,7 @@ def test_findings_and_rejected_values_are_reported(run, experiment, tmp_path):
     inspected = json.loads(run("inspect", output, "--json")[1])
     calibrated = json.loads(run(*command, "--force", "--json")[1])
     for told in (inspected, calibrated):
-        assert told["findings"] == [{"kind": "convergence", "message": finding.message}]
+        assert told["findings"] == [dataclasses.asdict(finding)]
         assert told["is_partial"] is False
         assert list(told["rejected_values"]) == ["p0", "p1", "p2", "p3", "p4"]
         assert list(told["rejected_values"].values()) == saved.metadata["rejected"]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import cross_pattern, errors, io, metrics, nuc, plan, simulate
+from equipix import cross_pattern, errors, metrics, nuc, plan, simulate
+from equipix.io.tiff import write_frames
 from equipix.lens import cos4
 from equipix.measured.colour import Colours
 from equipix.measured.filters import pattern_of
@@ -299,7 +300,7 @@ class TestUniformSource:
         assert not response.flags.any()
         response.save(tmp_path / "response.npz")
         frames = np.stack(list(array.frames(6e6, 8, rng=9)))
-        io.write_frames(tmp_path / "level.tif", iter(frames), nbytes=1)
+        write_frames(tmp_path / "level.tif", iter(frames), nbytes=1)
         given = ("nuc", "quality", tmp_path / "response.npz", tmp_path / "level.tif", "--json")
         status, out, _ = run(*given)
         found = json.loads(out)
@@ -338,7 +339,7 @@ class TestReplacement:
         # Float32, and sums of up to some tens of values in it.
         np.testing.assert_allclose(fast, slow, rtol=1e-5)
         for label, plane in planes(cfa).items():
-            response = simulate.signal.COLOUR_RESPONSE[label]
+            response = simulate.beams.COLOUR_RESPONSE[label]
             assert 900 * response <= slow[plane].min()
             assert slow[plane].max() <= 1100 * response
 

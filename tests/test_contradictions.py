@@ -50,8 +50,8 @@ class TestFluxPriors:
             cal, kinds, truth = self.experiment(seed, 1e-2)
             assert "prior" in kinds
             valid = np.ones(SENSOR, bool)
-            std = cal.std_of(equipix.metrics.mapsics.maps.tilt_weights(valid))
-            z.append((cal.tilt - equipix.metrics.mapsics.maps.tilt(truth, valid)) / std)
+            std = cal.std_of(equipix.metrics.maps.tilt_weights(valid))
+            z.append((cal.tilt - equipix.metrics.maps.tilt(truth, valid)) / std)
         # 12 values of Student's t with 7 degrees of freedom: 4.8 in one of 1000 such sets.
         assert np.abs(z).max() < 4.8
 

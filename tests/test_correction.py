@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import pickle
-from dataclasses import dataclass
-from typing import Annotated, Any
+import pkgutil
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, loading, simulate
+from equipix import Flag, bolometer, hardware, lens, loading, nuc, scene, simulate
 from equipix.correction.apply import apply
 from equipix.correction.correct_files import correct_files
+from equipix.correction.protocol import MEMBERS, check_correction
 from equipix.errors import FileError, InputError
+from equipix.findings import Finding
 from equipix.io.formats import load_pages, save_pages
 from equipix.io.frames import read_frames
 from equipix.io.record import Counts, Record
 from equipix.io.tiff import write_frames
 from equipix.loading import load_correction
+from equipix.measured.colour import Colours
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -32,18 +39,22 @@ class Bent(Record, kind="bent response", version=2):
     coefficients: Annotated[np.ndarray, "float32", "3 rows cols"]
     flags: Counts
     metadata: dict[str, Any]
+    findings: ClassVar[tuple[Finding, ...]] = ()
+    dark = limits = saturation = colours = None
+    bits = 0
+    takes_dark = needs_dark = leaves_offset = False
 
     @property
     def shape(self):
         return self.flags.shape
 
-    def correct(self, frames, *, flagged="nan", out=None):
-        def formula(frame, corrected):
-            corrected[...] = np.polynomial.polynomial.polyval(
+    def correct(self, frames, *, dark="stored", flagged="nan", out=None):
+        def formula(frame):
+            return np.polynomial.polynomial.polyval(
                 frame.astype(np.float64), self.coefficients, tensor=False
             )
 
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out)
+        return apply(self, frames, dark, flagged, out, formula)
 
 
 @pytest.fixture
@@ -126,6 +137,153 @@ class TestProtocol:
         assert replaced[3, 4] == pytest.approx(np.mean(around), rel=1e-6)
         with pytest.raises(InputError, match="'frames' has shape"):
             bent.correct(frames[:, 1:])
+
+
+def learned(name):
+    """What a scene method gives of a scene that moves."""
+    options = {"block": 10} if name == "Kalman" else {}
+    method = getattr(scene, name)((48, 64), (0.0, 16383.0), saturation=16000.0, **options)
+    for frame in simulate.MovingScene(seed=4, shape=(48, 64)).frames(60):
+        method.update(np.rint(4000 + 8000 * frame.values).astype(np.uint16))
+    return method.correction()
+
+
+def levels(*, dark=False):
+    array = simulate.StaringArray.of("InSb", SHAPE, rng=1)
+    off = equipix.average(array.frames(0, 4, rng=9)) if dark else None
+    return [
+        equipix.average(array.frames(e, 4, rng=k), dark=off, saturation=16000.0)
+        for k, e in enumerate((4e6, 8e6, 12e6))
+    ]
+
+
+def of_bolometers():
+    array = simulate.BolometerArray.of(SHAPE, rng=5)
+    frames = np.stack([array.mean(t) for t in (0.0, 20.0, 40.0)])
+    return bolometer.fit(frames, [0.0, 20.0, 40.0], [2.0] * 3, order=2, bias_order=0).correction(10)
+
+
+def falloff():
+    rows, cols = np.mgrid[:120, :160]
+    return lens.fit(1000 / (1 + ((rows - 62) ** 2 + (cols - 75) ** 2) / 300**2) ** 2)
+
+
+NOTHING = {"takes_dark": False, "needs_dark": False, "dark": False, "limits": False}
+RAW = {"leaves_offset": True}
+PRODUCERS = {
+    "Calibration": lambda cal: (cal, {"takes_dark": True, "needs_dark": True}),
+    "Calibration with a dark": lambda cal: (
+        equipix.Calibration(**vars(cal) | {"dark": np.full(SHAPE, 60.0)}),
+        {"takes_dark": True, "dark": True},
+    ),
+    "Response": lambda _: (
+        nuc.fit(levels(), order=2),
+        RAW | {"takes_dark": True, "limits": True, "saturation": 16000.0, "bits": 14},
+    ),
+    "Response with a dark": lambda _: (
+        nuc.fit(levels(dark=True), order=1),
+        {"takes_dark": True, "dark": True, "limits": True, "saturation": 16000.0, "bits": 14},
+    ),
+    "Polynomial": lambda _: (equipix.combine(falloff().correction(), falloff().correction()), {}),
+    "Polynomial of raw levels": lambda _: (
+        equipix.combine(first := nuc.fit(levels(), order=1), ones(first)),
+        RAW | {"saturation": 16000.0, "bits": 14},
+    ),
+    "Table": lambda cal: (hardware.Table.of(cal), {}),
+    "Table of raw levels": lambda _: (hardware.Table.of(nuc.fit(levels(), order=1)), RAW),
+    "AdaptiveLoop": lambda _: (hardware.AdaptiveLoop(SHAPE).correction(), RAW),
+    "DynamicCorrection": lambda _: (of_bolometers(), RAW),
+    "LensFalloff": lambda _: (falloff().correction(), {}),
+    **{
+        name: lambda _, name=name: (learned(name), RAW | {"saturation": 16000.0, "bits": 14})
+        for name in scene.__all__
+    },
+}
+"""Every way to a correction, and what its members say."""
+
+
+def ones(like):
+    return equipix.Polynomial(
+        np.stack([np.zeros(like.shape), np.ones(like.shape)]), np.zeros(like.shape, np.uint32)
+    )
+
+
+def check_members(correction):
+    """Every member has the type and the shape that the protocol declares."""
+    shape = correction.shape
+    check_correction("correction", correction)
+    assert [type(each) for each in shape] == [int, int]
+    assert (correction.flags.dtype, correction.flags.shape) == (np.uint32, shape)
+    planes = correction.coefficients
+    assert planes.dtype in (np.float32, np.float64)
+    assert len(planes) in (2, 3, 4)
+    assert planes.shape[1:] == shape
+    json.dumps(correction.metadata)
+    assert isinstance(correction.findings, tuple)
+    assert all(isinstance(each, Finding) for each in correction.findings)
+    assert correction.dark is None or correction.dark.shape == shape
+    assert correction.limits is None or correction.limits.shape == (2, *shape)
+    assert correction.saturation is None or type(correction.saturation) is float
+    assert type(correction.bits) is int
+    assert isinstance(correction.colours, Colours | None)
+    for name in ("takes_dark", "needs_dark", "leaves_offset"):
+        assert type(getattr(correction, name)) is bool, name
+    for name, wanted in (("correct", ["dark", "flagged", "out"]), ("save", ["force"])):
+        keywords = inspect.signature(getattr(correction, name)).parameters
+        assert set(wanted) <= set(keywords), name
+
+
+@pytest.fixture(scope="module", params=PRODUCERS)
+def produced(request, calibration):
+    return PRODUCERS[request.param](calibration)
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+class TestProducers:
+    def test_every_member_is_given_and_true(self, produced):
+        correction, wanted = produced
+        check_members(correction)
+        wanted = {"leaves_offset": False, "saturation": None, "bits": 0} | NOTHING | wanted
+        for name, value in wanted.items():
+            found = getattr(correction, name)
+            assert (found is not None if name in ("dark", "limits") else found) == value, name
+
+    def test_colours_of_the_sensor_are_known(self, produced):
+        correction, _ = produced
+        if isinstance(correction, hardware.Table):
+            metadata = {**correction.metadata, "cfa": [["R", "G"], ["G", "B"]]}
+        else:
+            metadata = {**correction.metadata, "sensor": {"cfa": "RGGB"}}
+        assert str(replace(correction, metadata=metadata).colours) == "RGGB"
+
+    def test_those_that_leave_an_offset_take_no_gain(self, produced):
+        correction, _ = produced
+        gain = replace(ones(correction), coefficients=1.1 * ones(correction).coefficients)
+        if correction.leaves_offset:
+            with pytest.raises(InputError, match="'first' leaves an offset"):
+                equipix.combine(correction, gain)
+        else:
+            equipix.combine(correction, gain)
+
+    @pytest.mark.parametrize("member", MEMBERS)
+    def test_one_that_is_forgotten_is_noticed(self, bent, member):
+        check_members(bent)
+        kept = {name: getattr(bent, name) for name in MEMBERS if name != member}
+        with pytest.raises((InputError, AttributeError)):
+            check_members(SimpleNamespace(**kept))
+
+    def test_these_are_all(self):
+        """No class of the package corrects, or gives a correction, that is not in the table."""
+        found = set()
+        for module in pkgutil.walk_packages(equipix.__path__, "equipix."):
+            if module.name.endswith(("__main__", "_native")):
+                continue
+            for name, kind in vars(importlib.import_module(module.name)).items():
+                gives = inspect.isclass(kind) and {"correct", "correction"} & set(dir(kind))
+                if gives and kind.__module__ == module.name:
+                    found.add(name)
+        bases = {"Correction", "CorrectionBase", "SceneCorrection"}
+        assert found - bases == {name.split(" ")[0] for name in PRODUCERS}
 
 
 class TestFiles:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import pickle
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,14 +17,18 @@ import pytest
 import equipix
 from equipix import Corrector, Flag, errors, nuc, simulate
 from equipix.correction import apply as kernel
-from equipix.correction.apply import replace_bad
 
 SHAPE = (37, 53)
 TYPES = (np.uint8, np.uint16, np.float32)
+RNG = np.random.default_rng(7)
 
 
 class Given:
     """A correction whose coefficients and flags are given."""
+
+    findings, dark, limits, saturation, colours = (), None, None, None, None
+    takes_dark = needs_dark = leaves_offset = False
+    bits = 0
 
     def __init__(self, coefficients, bad=()):
         self.coefficients = np.asarray(coefficients)
@@ -33,7 +40,7 @@ class Given:
     def shape(self):
         return self.flags.shape
 
-    def correct(self, frames, *, flagged="nan", out=None):
+    def correct(self, frames, *, dark="stored", flagged="nan", out=None):
         raise NotImplementedError
 
     def save(self, path, *, force=False):
@@ -52,13 +59,42 @@ def frames(dtype=np.uint16, count=3):
     return rng.integers(0, largest + 1, (count, *SHAPE)).astype(dtype)
 
 
-def horner(planes, raw):
-    """Σ c_j y^j in float32, every operation rounded."""
-    values = raw.astype(np.float32)
-    total = np.zeros(raw.shape, np.float32)
+def horner(planes, raw, dtype=np.float32):
+    """Σ c_j y^j, every operation rounded."""
+    values = raw.astype(dtype)
+    total = np.zeros(raw.shape, dtype)
     for plane in planes[::-1]:
         total = total * values + plane
     return total
+
+
+def replaced(image, bad, colours=None, reach=1):
+    """The mean of the nearest good pixels in place of bad ones, pixel by pixel.
+
+    Those of the smallest square count that holds good ones of the pixel's colour, first in the
+    image, then, round by round, those replaced in a round before. NaN counts in no mean.
+    """
+    values, known = image.astype(np.float64), ~bad
+    colours = np.zeros(image.shape) if colours is None else colours
+    rows, cols = np.indices(image.shape)
+    while not known.all():
+        found = {}
+        for pixel in zip(*np.nonzero(~known), strict=True):
+            far = np.maximum(abs(rows - pixel[0]), abs(cols - pixel[1]))
+            for side in range(1, reach + 1):
+                around = (far == side) & known & (colours == colours[pixel])
+                if around.any():
+                    near = values[around]
+                    found[pixel] = (
+                        near[~np.isnan(near)].mean() if np.isfinite(near).any() else np.nan
+                    )
+                    break
+        if not found:
+            values[~known] = np.nan
+            break
+        for pixel, value in found.items():
+            values[pixel], known[pixel] = value, True
+    return values
 
 
 class TestAgainstNumPy:
@@ -105,12 +141,66 @@ class TestAgainstNumPy:
         for each, raw in zip(got, frames(), strict=True):
             wanted = horner(given.coefficients, raw)
             if flagged == "replace":
-                replace_bad(wanted, mask)
+                wanted = replaced(wanted, mask)
             elif flagged == "nan":
                 wanted[mask] = np.nan
             np.testing.assert_array_equal(each[~mask], wanted[~mask])
             # A sum of eight values in float32: some roundings of it.
             np.testing.assert_allclose(each[mask], wanted[mask], rtol=1e-6)
+
+    @pytest.mark.parametrize("planes", [2, 3, 4])
+    @pytest.mark.parametrize(
+        ("raw", "out"),
+        [
+            (np.float64, np.float64),
+            (np.float64, np.float32),
+            (np.int32, np.float64),
+            (np.int32, np.float32),
+            (np.uint16, np.float64),
+            (np.float32, np.float64),
+        ],
+    )
+    def test_double_precision(self, planes, raw, out):
+        bad = [0, 60, *(r * SHAPE[1] + c for r in range(10, 14) for c in range(20, 25))]
+        given = Given(coefficients(planes).astype(np.float64), bad)
+        correction = equipix.Polynomial(given.coefficients, given.flags)
+        mask = given.flags != 0
+        exact = horner(given.coefficients, frames(raw), np.float64)
+        for flagged in ("keep", "nan", "replace"):
+            result = np.empty((3, *SHAPE), out)
+            assert correction.correct(frames(raw), flagged=flagged, out=result) is result
+            for got, kept in zip(result, exact, strict=True):
+                wanted = kept.copy()
+                if flagged == "replace":
+                    wanted = replaced(kept, mask)
+                elif flagged == "nan":
+                    wanted[mask] = np.nan
+                # Products and sums are not fused: the same bytes, before float32 rounds them.
+                assert got[~mask].tobytes() == wanted[~mask].astype(out).tobytes()
+                # A mean of eight values: some roundings of it.
+                np.testing.assert_allclose(got[mask], wanted[mask], rtol=8 * np.finfo(out).eps)
+
+    @pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
+    def test_colours_are_replaced_by_their_own(self, dtype):
+        planes, flags = identity()
+        flags[RNG.random(SHAPE) < 0.4] = Flag.DO_NOT_USE
+        sensor = {"sensor": {"cfa": ["RGG", "GBW", "GWB"]}}
+        correction, raw = equipix.Polynomial(planes, flags, sensor), frames(dtype)[0]
+        colours = np.tile([[0, 1, 1], [1, 2, 3], [1, 3, 2]], (13, 18))[: SHAPE[0], : SHAPE[1]]
+        wanted = replaced(raw, flags != 0, colours, reach=3)
+        found = correction.correct(raw, flagged="replace")
+        np.testing.assert_allclose(found, wanted, rtol=24 * np.finfo(found.dtype).eps)
+
+    def test_an_array_that_is_no_plain_buffer(self):
+        correction = equipix.Polynomial(coefficients(3), np.zeros(SHAPE, np.uint32))
+        for dtype in (np.float32, np.float64):
+            raw = frames(dtype)
+            wanted = correction.correct(raw)
+            wide = np.empty((3, SHAPE[0], 2 * SHAPE[1]), dtype)
+            assert correction.correct(raw, out=wide[..., ::2]).base is wide
+            np.testing.assert_array_equal(wide[..., ::2], wanted)
+            assert correction.correct(raw, out=raw) is raw
+            np.testing.assert_array_equal(raw, wanted)
 
     @pytest.mark.parametrize("dtype", TYPES)
     def test_the_treatment_follows_from_the_type_unless_it_is_named(self, dtype):
@@ -189,14 +279,15 @@ class TestNotANumber:
         got = Corrector(Given(planes, [60])).apply(frames())
         np.testing.assert_array_equal(got, wanted)
 
-    def test_a_nan_image_value_is_no_neighbour_in_numpy_either(self):
-        image = np.ones((5, 5))
+    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    def test_a_corrected_value_is_no_neighbour(self, dtype):
+        planes, flags = np.stack([np.zeros((5, 5)), np.ones((5, 5))]), np.zeros((5, 5), np.uint32)
+        flags[2, 2] = Flag.DO_NOT_USE
+        image = np.ones((5, 5), dtype)
         image[2, 2], image[1, 1] = 7, np.nan
-        bad = np.zeros((5, 5), bool)
-        bad[2, 2] = True
-        replace_bad(image, bad)
-        assert image[2, 2] == 1
-        assert np.flatnonzero(np.isnan(image)).tolist() == [6]
+        found = equipix.Polynomial(planes, flags).correct(image, flagged="replace")
+        assert found[2, 2] == 1
+        assert np.flatnonzero(np.isnan(found)).tolist() == [6]
 
 
 class TestBuffers:
@@ -511,8 +602,10 @@ class TestResults:
 
     def test_coefficients_are_prepared_once(self, result, monkeypatch):
         made = []
-        real = kernel.native
-        monkeypatch.setattr(kernel, "native", lambda *given: made.append(1) or real(*given))
+        real = kernel.Prepared
+        monkeypatch.setattr(
+            kernel, "Prepared", lambda *given, **more: made.append(1) or real(*given, **more)
+        )
         first = result.correct(frames(), flagged="replace")
         for _ in range(3):
             again = result.correct(frames(), flagged="replace")
@@ -541,15 +634,30 @@ class TestResults:
         np.testing.assert_array_equal(again, wanted)
         assert (again < first).all()
 
-    def test_prepared_coefficients_end_with_their_result(self):
+    def test_prepared_coefficients_end_with_their_result(self, monkeypatch):
+        made = []
+        real = kernel.Prepared
+
+        def prepared(*given, **more):
+            found = real(*given, **more)
+            made.append(weakref.ref(found))
+            return found
+
+        monkeypatch.setattr(kernel, "Prepared", prepared)
         polynomial = equipix.Polynomial(*identity())
-        gc.collect()  # results of tests before
-        before = len(kernel._KEPT)
         polynomial.correct(frames())
-        assert len(kernel._KEPT) == before + 1
+        gc.collect()
+        assert [each() is None for each in made] == [False]
         del polynomial
         gc.collect()
-        assert len(kernel._KEPT) == before
+        assert [each() is None for each in made] == [True]
+
+    def test_prepared_coefficients_are_no_part_of_a_copy_or_a_file(self, result):
+        for dtype in (np.uint16, np.float64):
+            wanted = result.correct(frames(dtype))
+            for again in (pickle.loads(pickle.dumps(result)), copy.copy(result)):
+                np.testing.assert_array_equal(again.correct(frames(dtype)), wanted)
+        assert "_last" not in vars(result)
 
     def test_close_to_double_precision(self, result):
         single = result.correct(frames(), flagged="keep")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import equipix
 from equipix import cli, errors, simulate
+from equipix.calibration import coverage
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)
 
@@ -143,3 +145,18 @@ def test_a_fit_far_from_its_minimum_is_written_only_if_asked(manifest, tmp_path,
     found = equipix.load(output)
     assert found.is_partial
     assert found.error_estimate > 1
+
+
+@pytest.mark.parametrize(
+    ("ended", "remedy"),
+    [
+        ("stalled", "use more light or more frames"),
+        ("sweeps used", "allow more sweeps, or use larger shifts"),
+    ],
+)
+def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended, remedy):
+    fit = SimpleNamespace(ended=ended, error_estimate=np.array([2.0]), lost=[])
+    plain = coverage._far(fit)
+    assert remedy in plain
+    fit.lost = [[3], [1, 4]]
+    assert coverage._far(fit).startswith(f"{plain}. Besides, 3 measurements along ragged edges")

@@ -38,7 +38,7 @@ class Camera:
         self.rng = np.random.default_rng([seed, dark_frames])
         self.truth = sensitivity(SHAPE)
         self.offset = 100 + self.rng.normal(0, 3, SHAPE)
-        signals = [self.truth * simulate.signal.window(beam, SHAPE, d) for d in shifts]
+        signals = [self.truth * simulate.beams.window(beam, SHAPE, d) for d in shifts]
         self.dark = self.take(np.zeros(SHAPE), dark_frames)
         self.exposures = [self.take(signal, FRAMES) for signal in signals]
 
@@ -144,7 +144,7 @@ def test_functionals_of_a_noisy_dark():
     """The mean of ln M over a quarter of the sensor, and the tilt, over 50 experiments."""
     shape, shifts, beam = (16, 20), equipix.cross_pattern(2, 3), smooth
     truth = sensitivity(shape)
-    clean = np.array([truth * simulate.signal.window(beam, shape, d) for d in shifts])
+    clean = np.array([truth * simulate.beams.window(beam, shape, d) for d in shifts])
     weights = np.zeros(shape)
     weights[:8, :10] = 1 / 80
     rng = np.random.default_rng(5)
@@ -161,7 +161,7 @@ def test_functionals_of_a_noisy_dark():
 
 
 def tilt(image):
-    return equipix.metrics.mapsics.maps.tilt(image, np.ones(image.shape, bool))
+    return equipix.metrics.maps.tilt(image, np.ones(image.shape, bool))
 
 
 def test_the_dark_has_no_part_in_the_weights():

@@ -54,7 +54,7 @@ def test_picture_shows_all(result):
     shown = figure.axes[0].images[0].get_array()
     np.testing.assert_array_equal(shown, result.truth)
     block_rms = 100 * result.figures()["block_rms"]
-    assert f"rms {block_rms:.1g}" in figure.axes[3].get_title()
+    assert f"rms {block_rms:.2g}" in figure.axes[3].get_title()
     for axes in figure.axes[6:8]:
         assert axes.get_xlabel() == "error, %"
         # Every error has a place in its histogram: the area is 1.

@@ -219,7 +219,10 @@ class TestComposition:
         (lambda: detector.ShortPass(edge_um=np.nan), "'edge_um' is nan"),
         (lambda: spread(MIDDLE, references_k=(1.0, 2.0, 3.0)), r"'references_k' is \[1.0, 2.0"),
         (lambda: spread(MIDDLE, references_k=(290.0, 290.0)), "up to two that differ"),
-        (lambda: spread(MIDDLE, references_k=(-5.0,)), "expected temperatures above 0 K"),
+        (
+            lambda: spread(MIDDLE, references_k=(-5.0,)),
+            "'references_k' is -5.0, expected a finite",
+        ),
         (lambda: spread(MIDDLE, scene_k=np.nan), "'scene_k' is nan"),
         (lambda: spread(MIDDLE, charge_e=0), "'charge_e' is 0"),
         (lambda: spread(MIDDLE, by="noise"), "'by' is 'noise'"),

@@ -1,4 +1,4 @@
-"""What the words say holds: README, docstrings and examples run."""
+"""What the words say holds: README, the pages of docs, docstrings and examples run."""
 
 from __future__ import annotations
 
@@ -24,46 +24,50 @@ from pydantic import BaseModel
 import equipix
 from equipix import metrics
 from equipix.cli.app import app
-from equipix.experiment.manifest import Manifest, Sensor
-from equipix.findings import _CATEGORIES as CATEGORIES
+from equipix.diagnosis.inputs import BEFORE
+from equipix.diagnosis.rules import AFTER, LAST
+from equipix.experiment.manifest import LevelManifest, Manifest, Sensor
+from equipix.findings import WARNINGS
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
-PAGES = (
-    "README.md",
-    "ARCHITECTURE.md",
-    "CONTRIBUTING.md",
-    "CHANGELOG.md",
-    "docs/colour.md",
-    "docs/glossary.md",
-    "docs/hardware.md",
-    "docs/infrared.md",
-    "docs/method.md",
-    "docs/nuc.md",
-    "docs/scene.md",
+PAGES = sorted(
+    str(page.relative_to(ROOT)) for folder in ("", "docs") for page in (ROOT / folder).glob("*.md")
 )
+TEXTS = {page: (ROOT / page).read_text() for page in PAGES}
+README = TEXTS["README.md"]
+GUIDE = (
+    "README.md",
+    *(f"docs/{page}.md" for page in ("averages", "calibration", "correcting", "shifts")),
+)
+"""README, and the pages whose blocks go on where those of README end."""
 MODULES = [module.name for module in pkgutil.walk_packages(equipix.__path__, "equipix.")]
 
 
-def blocks(language: str) -> list[str]:
-    """The code blocks of the README in a language."""
-    return re.findall(rf"^ *```{language}\n(.*?)^ *```", README, re.DOTALL | re.MULTILINE)
+def blocks(language: str, *pages: str) -> list[str]:
+    """The code blocks of pages in a language."""
+    block = re.compile(rf"^ *```{language}\n(.*?)^ *```", re.DOTALL | re.MULTILINE)
+    return [found for page in pages for found in block.findall(TEXTS[page])]
 
 
-def table(header: str) -> list[list[str]]:
-    """The cells of the table of the README whose first line begins with these cells."""
-    (body,) = re.findall(rf"^\| {re.escape(header)} \|.*\n\|[-|]+\n((?:\|.*\n)+)", README, re.M)
-    rows = [line.strip("| ").split(" | ") for line in body.splitlines()]
+def table(header: str, page: str) -> list[list[str]]:
+    """The cells of the tables of a page whose first line begins with these cells."""
+    table = re.compile(rf"^\| {re.escape(header)} \|.*\n\|[-|]+\n((?:\|.*\n)+)", re.MULTILINE)
+    rows = [
+        line.strip("| ").split(" | ")
+        for body in table.findall(TEXTS[page])
+        for line in body.splitlines()
+    ]
+    assert rows
     return [[cell.strip() for cell in row] for row in rows]
 
 
-def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+def test_the_python_of_readme_and_pages_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec("\n".join(blocks("python")), names)
+    exec("\n".join(blocks("python", *GUIDE)), names)
     cal, truth = equipix.load("first.tif"), names["truth"]
     error = metrics.relative_error(cal.sensitivity, truth)
     # The largest of 19 200 normal values of this rms stays below 6 of them.
@@ -72,8 +76,9 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     assert names["usable"].all()
 
 
-def test_the_commands_of_the_readme_run(tmp_path):
-    script = "\n".join(block for block in blocks("sh") if block.startswith("equipix"))
+def test_the_commands_of_readme_and_pages_run(tmp_path):
+    commands = [block for block in blocks("sh", *GUIDE) if block.startswith("equipix")]
+    script = "\n".join(commands)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     subprocess.run(
         ["bash", "-euc", script],
@@ -88,14 +93,16 @@ def test_the_commands_of_the_readme_run(tmp_path):
     assert (tmp_path / "plan.png").exists()
 
 
-def test_the_experiment_of_the_readme_is_one():
-    text, region = blocks("toml")
+def test_the_manifests_of_the_pages_are_valid():
+    text, region = blocks("toml", "docs/experiment.md")
     assert len(Manifest.model_validate(tomllib.loads(text)).exposure) == 3
     assert len(Sensor.model_validate(tomllib.loads(region)["sensor"]).region) == 1
+    (levels,) = blocks("toml", "docs/nuc.md")
+    assert len(LevelManifest.model_validate(tomllib.loads(levels)).level) == 1
 
 
 def manifest_keys(model: type[BaseModel] = Manifest, within: str = "") -> dict[str, str]:
-    """The default of every key of an experiment.toml, as the README writes it."""
+    """The default of every key of an experiment.toml, as the page writes it."""
     keys = {}
     for name, field in model.model_fields.items():
         tables = tables_in(field.annotation)
@@ -124,17 +131,19 @@ def default(field: FieldInfo) -> str:
     return text.lower() if isinstance(field.default, bool) else text
 
 
-def test_the_readme_describes_every_key_of_an_experiment_and_its_default():
-    described = {key.split("`")[1]: given for key, _, given, _ in table("key")}
+def test_the_page_describes_every_key_of_an_experiment_and_its_default():
+    rows = table("key", "docs/experiment.md")
+    described = {key.split("`")[1]: given for key, _, given, _ in rows}
     assert described == manifest_keys()
 
 
-def test_the_errors_of_the_readme_are_those_of_the_example(capsys):
+def test_the_errors_of_the_page_are_those_of_the_example(capsys):
     runpy.run_path(str(ROOT / "examples/precision.py"), run_name="__main__")
     _, *lines = capsys.readouterr().out.splitlines()
     lines.remove("lamp drift, error of M that it adds for 5 and for 9 exposures:")
     rows = [line.replace("e-0", "e-").split() for line in lines[:6]]
-    assert rows == table("frames N") + table("change of the flux, rms")
+    page = "docs/calibration.md"
+    assert rows == table("frames N", page) + table("change of the flux, rms", page)
     simulated, predicted = (float(line.rsplit(" ", 1)[1]) for line in lines[6:])
     # 455 124 errors scatter by 0.1 %; the prediction is an approximation good to some per cent.
     assert simulated == pytest.approx(predicted, rel=0.05)
@@ -143,12 +152,12 @@ def test_the_errors_of_the_readme_are_those_of_the_example(capsys):
 def test_the_picture_of_the_readme_shows_what_it_says(capsys):
     before_after.photograph()
     printed = re.findall(r"\d\.\d%", capsys.readouterr().out)
-    said = [value for _, value in table("one frame, good pixels")]
+    said = [value for _, value in table("one frame, good pixels", "README.md")]
     assert said == [value.replace("%", " %") for value in printed]
 
 
 def test_the_make_targets_of_the_readme_exist():
-    targets = re.findall(r"^make (\w+)", "\n".join(blocks("sh")), re.MULTILINE)
+    targets = re.findall(r"^make (\w+)", "\n".join(blocks("sh", "README.md")), re.MULTILINE)
     makefile = (ROOT / "Makefile").read_text()
     assert targets == ["demo", "test"]
     assert all(f"\n{target}:" in makefile for target in targets)
@@ -159,29 +168,43 @@ def test_the_readme_names_every_command():
     assert sorted(named) == sorted(typer.main.get_command(app).commands)
 
 
-def test_the_readme_names_attributes_that_exist():
-    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, re.MULTILINE)
-    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
-    assert "sensitivity" in named
-    results = (equipix.Calibration, equipix.nuc.Response)
-    assert named <= {name for each in results for name in (*each.__dataclass_fields__, *dir(each))}
+@pytest.mark.parametrize(
+    ("header", "page", "result"),
+    [
+        ("`cal.`", "docs/calibration.md", equipix.Calibration),
+        ("`response.`", "docs/nuc.md", equipix.nuc.Response),
+    ],
+)
+def test_the_pages_name_attributes_that_exist(header, page, result):
+    named = {name for row in table(header, page) for name in re.findall(r"`(\w+)", row[0])}
+    assert len(named) > 5
+    assert named <= {*result.__dataclass_fields__, *dir(result)}
 
 
-def test_the_readme_describes_every_finding_and_its_warning():
-    described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in table("finding")}
-    assert described == {kind: warning.__name__ for kind, warning in CATEGORIES.items()}
+def test_the_page_describes_every_finding_and_its_warning():
+    rows = table("finding", "docs/calibration.md")
+    described = {kind.strip('`"'): warning.strip("`") for kind, warning, _ in rows}
+    rules = [*BEFORE, *AFTER, *LAST]
+    assert described == {rule.kind: WARNINGS[rule.concern].__name__ for rule in rules}
 
 
-def test_the_readme_describes_every_flag():
-    described = {name.strip("`").removeprefix("Flag.") for name, *_ in table("flag")}
+def test_the_page_describes_every_flag():
+    rows = table("flag", "docs/calibration.md")
+    described = {name.strip("`").removeprefix("Flag.") for name, *_ in rows}
     assert described == {flag.name for flag in equipix.Flag} - {"DO_NOT_USE"}
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page):
     path = ROOT / page
-    links = re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text())
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", TEXTS[page])
     assert [link for link in links if not (path.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", sorted({*PAGES} - {"CHANGELOG.md", "docs/studies.md"}))
+def test_scripts_and_tests_that_pages_name_exist(page):
+    named = r"(?:(?:benches|docs|examples|tools)/\w+|tests/(?:\w+/)*test_\w+)\.(?:py|rs)"
+    assert [each for each in re.findall(named, TEXTS[page]) if not (ROOT / each).exists()] == []
 
 
 @pytest.mark.parametrize("page", PAGES)

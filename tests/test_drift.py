@@ -7,9 +7,10 @@ import pytest
 
 import equipix
 from equipix import plan, simulate
-from equipix.diagnosis import rules as findings
-from equipix.exposures.exposures import exposures_of
+from equipix.diagnosis.inputs import BEFORE
+from equipix.findings import ask
 from equipix.plan import drift
+from given import exposures_of
 
 CROSS = equipix.cross_pattern(11, 19).astype(float)
 CCD = (582, 782)
@@ -126,9 +127,9 @@ class TestTrend:
         assert drift.distinct_trend(CROSS, np.arange(5)) == told
         frames = simulate.exposures(np.ones((24, 32)), simulate.gaussian_beam((24, 32)), CROSS)
         times = {"flux": "linear", "time": [0.0, 10.0, 20.0, 30.0, 40.0]}
-        advised = findings.on_plan(exposures_of(frames, CROSS, **times))
+        advised = ask(BEFORE, exposures_of(frames, CROSS, **times))
         assert [finding.kind for finding in advised] == ["order"]
         assert f"only {told:.1%} of the variance" in advised[0].message
         order = plan.advise_order(CROSS)
-        assert findings.on_plan(exposures_of(frames, CROSS[order], **times)) == []
-        assert findings.on_plan(exposures_of(frames, CROSS, flux="fit")) == []
+        assert ask(BEFORE, exposures_of(frames, CROSS[order], **times)) == ()
+        assert ask(BEFORE, exposures_of(frames, CROSS, flux="fit")) == ()

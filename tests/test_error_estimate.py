@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import metrics, reference, simulate
+import reference
+from equipix import metrics, simulate
 
 CROSS = equipix.cross_pattern(5, 7)
 MOST_SWEEPS = {"multiscale": 60, "coordinate-descent": 1000}
@@ -112,6 +113,21 @@ def test_it_is_honest_wherever_a_run_is_stopped(draws, figure):
         assert (each < 3).mean() >= 0.95
         assert each.max() <= 10
         assert 1 / np.median(each) <= 10
+
+
+@pytest.mark.study
+def test_it_is_one_of_order_on_small_sensors_stopped_early(draws, figure):
+    ratios = []
+    for seed in draws(150):
+        frames, shifts, mask = random_experiment(2000 + seed, smallest=12, largest=24)
+        best = minimiser(frames, shifts, mask)
+        most = int(np.random.default_rng(seed).integers(10, 25))
+        stopped = equipix.calibrate(frames, shifts, mask=mask, max_sweeps=most, tolerance=1e-9)
+        true = np.nanmax(abs(stopped.sensitivity - best.sensitivity)) - best.error_estimate
+        ratios.append(max(true, 0) / stopped.error_estimate)
+    figure("true error over the estimate, largest", max(ratios), "at most 10")
+    assert np.mean(np.array(ratios) < 3) >= 0.95
+    assert max(ratios) <= 10
 
 
 def dark_stripe(rows, cols):

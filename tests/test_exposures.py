@@ -13,13 +13,14 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.errors import InputError
-from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions, in_beam, variance_in_beam
 from equipix.fitting import outliers as robust
 from equipix.fitting.weighted import expected
 from equipix.measured.noise import NoiseModel
+from given import exposures_of
 
 SHAPE = (9, 14)
 TURNS = (0, 90, 180, 270)

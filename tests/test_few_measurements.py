@@ -11,6 +11,10 @@ from equipix import simulate
 SIDE = 64
 NOISE = 0.01
 
+KEPT = 243
+"""Most passes of discs of 512×512 pixels while pixels with few measurements stayed in the search;
+see docs/method.md."""
+
 
 def discs(seed, *, limb=0.9, side=SIDE, flux=None, noise=NOISE):
     """Nine pictures of a disc that is darker at its limb, with spots, and their masks."""
@@ -84,7 +88,7 @@ def test_free_fluxes_and_refined_shifts_converge():
         frames, measured, mask=mask, variance=np.full(9, NOISE**2), flux="fit", shift_std=0.1
     )
     assert cal.converged
-    assert cal.sweeps <= 200
+    assert cal.sweeps < KEPT
 
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
@@ -123,7 +127,7 @@ def frayed(seed=0):
 
 def lost_by_the_rule(used, shifts, rotation, *, fitted):
     """What is lost by the words of lost.rs, where no part of the sensor is wide or sparse."""
-    margin, (rows, cols) = int(fitted), SMALL
+    margin, (rows, cols) = int(fitted), used.shape[1:]
     block = in_blocks(used)
 
     def cells(k, row, col):
@@ -163,19 +167,33 @@ def test_what_is_lost_is_lost_by_the_rule(shifts, rotation, std, missing):
 
 
 @pytest.mark.parametrize("std", [None, 0.05])
-def test_lost_measurements_tell_nothing_of_pixels(std):
-    """D, residuals and standard deviations are without them."""
+def test_lost_measurements_count_neither_in_d_nor_in_residuals(std):
     cal = fitted(APART, frayed(), std=std)
     exposures, fit = cal.weighted.exposures, cal.weighted.fit
+    assert sum(map(len, fit.lost)) > 20
     squares = [exposures.light(fit, k, None) ** 2 / 1e-6 for k in range(5)]
     used = counted(cal)
     known = np.isfinite(cal.sensitivity)
     total = np.sum(np.where(used, squares, 0), axis=0)
     information = fit.information(workers=1)
-    np.testing.assert_allclose(information[known], total[known], rtol=1e-12)
+    # Each of five terms is rounded some five times at either side, and their sums four times.
+    rtol = 20 * np.finfo(float).eps
+    np.testing.assert_allclose(information[known], total[known], rtol=rtol)
     assert not information[~np.any(used, axis=0)].any()
-    times = np.sum(used, axis=0)
-    np.testing.assert_array_equal(known, times > 0)
+    np.testing.assert_array_equal(known, np.any(used, axis=0))
+    residuals = exposures.residuals(fit, None)
+    assert np.isnan(residuals[~frayed() & ~used]).all()
+    assert np.isfinite(residuals[used]).all()
+
+
+def most_passes(shifts):
+    """Twice those of the same sensor without a mask: the edge of a mask hardly slows a search.
+
+    Cells that nothing determines slow it by a factor of ten and more.
+    """
+    whole = fitted(shifts, np.zeros((5, *SMALL), bool))
+    assert whole.converged
+    return 2 * whole.sweeps
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 3), (24, 3), (4, 4)])
@@ -186,7 +204,7 @@ def test_islands_and_strips_in_the_dark_do_no_harm(size):
     mask[2, row : row + size[0], 36 : 36 + size[1]] = False
     cal = fitted(APART, mask)
     assert cal.converged
-    assert cal.sweeps <= 100
+    assert cal.sweeps <= most_passes(APART)
     assert cal.findings == ()
 
 
@@ -194,7 +212,7 @@ def test_islands_and_strips_in_the_dark_do_no_harm(size):
 def test_ragged_edges_at_mostly_whole_shifts_converge(seed):
     cal = fitted(MIXED, frayed(seed))
     assert cal.converged
-    assert cal.sweeps <= 100
+    assert cal.sweeps <= most_passes(MIXED)
 
 
 def with_edge(edge, rng, clean, mask):
@@ -212,11 +230,25 @@ def with_edge(edge, rng, clean, mask):
     return mask | (grown & missing)
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+@pytest.mark.parametrize("edge", ["circle", "threshold", "frayed"])
+@pytest.mark.parametrize("std", [None, 0.3])
+def test_what_discs_lose_is_lost_by_the_rule(edge, std):
+    frames, shifts, mask, _ = discs(0)
+    clean, *_ = discs(0, noise=0)
+    mask = with_edge(edge, np.random.default_rng(1000), clean, mask)
+    variance = np.full(9, NOISE**2)
+    cal = equipix.calibrate(frames, shifts, mask=mask, variance=variance, shift_std=std)
+    wanted = lost_by_the_rule(~mask, shifts + 60, [0] * 9, fitted=std is not None)
+    assert wanted.any()
+    np.testing.assert_array_equal(~mask & ~counted(cal), wanted)
+
+
 @pytest.mark.study
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 @pytest.mark.parametrize("edge", ["circle", "threshold", "frayed"])
 def test_large_discs_converge_and_raise_no_alarm(edge, draws, figure):
-    passes, lost = [], []
+    passes, lost, most = [], [], []
     for seed in draws(20):
         rng = np.random.default_rng(1000 + seed)
         limb, flux = rng.uniform(0.8, 1.02), rng.uniform(0.95, 1.05, 9)
@@ -228,16 +260,17 @@ def test_large_discs_converge_and_raise_no_alarm(edge, draws, figure):
             frames, measured, mask=mask, variance=np.full(9, NOISE**2), flux="fit", shift_std=0.3
         )
         assert cal.converged
-        left = counted(cal)
-        # Nothing is lost but what is in no block or of a pixel with few measurements.
-        assert not (~mask & ~left & in_blocks(~mask) & (left.sum(axis=0) > 2)).any()
-        lost.append(1 - np.count_nonzero(left) / np.count_nonzero(~mask))
+        left, used = counted(cal), ~mask
+        # Nothing is lost but what is in no block, or of a pixel with few measurements.
+        may_be_lost = used & (~in_blocks(used) | (left.sum(axis=0) <= 2))
+        assert not (used & ~left & ~may_be_lost).any()
+        lost.append(1 - np.count_nonzero(left) / np.count_nonzero(used))
+        most.append(np.count_nonzero(may_be_lost) / np.count_nonzero(used))
         # That free fluxes leave the tilt open is no alarm.
         assert {finding.kind for finding in cal.findings} == {"tilt"}
         passes.append(cal.sweeps)
     of_discs = f"of discs of 512×512 pixels, edge of masks: {edge}"
-    figure(f"most passes {of_discs}", max(passes), "at most 100")
-    figure(f"median of passes {of_discs}", float(np.median(passes)), "at most 100")
-    figure(f"largest share of measurements lost {of_discs}", max(lost), "as told by the fit")
-    # A ragged edge may take one more step of Gauss and Newton, from a start that is further away.
-    assert (max(passes) if edge == "circle" else np.median(passes)) <= 100
+    figure(f"most passes {of_discs}", max(passes), f"below {KEPT}")
+    figure(f"median of passes {of_discs}", float(np.median(passes)), "none")
+    figure(f"largest share of measurements lost {of_discs}", max(lost), f"at most {max(most):.3g}")
+    assert max(passes) < KEPT

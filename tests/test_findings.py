@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,43 +10,80 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.diagnosis import rules as findings
-from equipix.diagnosis.orientation import OrientationTest
-from equipix.errors import ConvergenceWarning, MisfitWarning
+from equipix.diagnosis.evidence import Evidence
+from equipix.diagnosis.rules import AFTER
+from equipix.errors import ConvergenceWarning, InputWarning, MisfitWarning
+from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
+from equipix.findings import Finding, Rule, ask, say
 from equipix.fitting import windows
-from equipix.fitting.weighted import Options, Weighted
+from equipix.fitting.weighted import Options, weighted_fit
 from equipix.fitting.windows import WindowFit
-from equipix.measured.defects import BadPixels
 
 CROSS = equipix.cross_pattern(3, 5)
-GOOD = {
-    "ended": "converged",
-    "components": 1,
-    "smallest_ritz": None,
-    "leaves_tilt": False,
-    "is_joint": True,
-    "error_estimate": np.array([1e-7]),
-    "misfit": 1000.0,
-    "degrees_of_freedom": 1000,
-}
-"""What findings read of a fit with which nothing is wrong."""
 
 
-def findings_on(*, variance=True, uncertainty=True, **found):
+class Changed:
+    """A fit that differs in what is given."""
+
+    def __init__(self, fit, **found):
+        self.__dict__.update(found, _fit=fit)
+
+    def __getattr__(self, name):
+        return getattr(self._fit, name)
+
+
+@pytest.fixture(scope="module")
+def evidence():
+    """Evidence of a small joint fit with which nothing is wrong."""
+    frames = experiment()
+    exposures = exposures_of(frames, CROSS, variance=np.full(5, 1e-6), shift_std=0.01)
+    options = Options(FitOptions(), uncertainty=True)
+    weighted = weighted_fit(exposures, options)
+    assert weighted.fit.is_joint
+    return Evidence.of(weighted, options, exposures.flux)
+
+
+def findings_on(evidence, *, uncertainty=True, **found):
     """Findings on a fit that differs from a good one in what is given."""
-    exposures = SimpleNamespace(variance=np.ones(5) if variance else None, bad_pixels=BadPixels())
-    weighted = Weighted(exposures, SimpleNamespace(**GOOD | found), None)
-    options = Options(FitOptions(), uncertainty=uncertainty)
-    return findings.on_fit(weighted, options, OrientationTest(), None, None)
+    weighted = evidence.weighted._replace(fit=Changed(evidence.fit, **found))
+    options = dataclasses.replace(evidence.options, uncertainty=uncertainty)
+    # The last question fits again, from this fit.
+    return ask(AFTER[:-1], dataclasses.replace(evidence, weighted=weighted, options=options))
 
 
-def kinds(**found):
-    return [finding.kind for finding in findings_on(**found)]
+def kinds(evidence, **found):
+    return [finding.kind for finding in findings_on(evidence, **found)]
 
 
-def test_a_good_fit_has_no_finding():
-    assert kinds() == []
+def test_a_good_fit_has_no_finding(evidence):
+    assert kinds(evidence) == []
+    assert ask(AFTER, evidence) == ()
+
+
+def test_a_finding_explains_others_and_stands_in_the_place_of_others():
+    rules = [
+        Rule("first", "input", lambda e: e.get("first")),
+        Rule("explained", "misfit", lambda e: e.get("explained"), unless=frozenset({"first", "x"})),
+        Rule("better", "misfit", lambda e: e.get("better"), instead=frozenset({"explained"})),
+    ]
+
+    def told(before=(), **evidence):
+        return [each.kind for each in ask(rules, evidence, before)]
+
+    assert told(first="a", explained="b") == ["first"]
+    assert told(explained="b") == ["explained"]
+    assert told([Finding("x", "", "input")], explained="b") == []
+    assert told(explained="b", better="c") == ["better"]
+    assert told(first="") == []
+
+
+def test_a_warning_has_the_kind_of_its_finding_and_the_line_of_the_caller():
+    finding = Finding("range", "too wide", "input")
+    with pytest.warns(InputWarning, match="too wide") as caught:
+        assert say(finding) == (finding,)
+    assert caught[0].message.kind == "range"
+    assert caught[0].filename == __file__
 
 
 @pytest.mark.parametrize(
@@ -59,25 +97,53 @@ def test_a_good_fit_has_no_finding():
         ),
     ],
 )
-def test_a_limit_at_both_sides(kind, within, beyond):
-    assert kinds(**within) == []
-    assert kinds(**beyond) == [kind]
+def test_a_limit_at_both_sides(evidence, kind, within, beyond):
+    assert kinds(evidence, **within) == []
+    assert kinds(evidence, **beyond) == [kind]
 
 
-def test_messages_contain_the_value_and_the_limit():
+def test_messages_contain_the_value_and_the_limit(evidence):
     for found, value, limit in (
         ({"smallest_ritz": 2e-5}, "2.0e-05", "limit 0.0001"),
         ({"error_estimate": np.array([0.3])}, "3.0e-01", "limit 0.1"),
     ):
-        (finding,) = findings_on(**found)
+        (finding,) = findings_on(evidence, **found)
         assert value in finding.message
         assert limit in finding.message
 
 
-def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit():
+def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit(
+    evidence,
+):
     far = {"error_estimate": np.array([0.3])}
-    assert kinds(**far, uncertainty=False) == []
-    assert kinds(**far, is_joint=False) == []
+    assert kinds(evidence, **far) == ["uncertainty"]
+    assert kinds(evidence, **far, uncertainty=False) == []
+    assert kinds(evidence, **far, is_joint=False) == []
+
+
+@pytest.mark.parametrize(
+    ("found", "remedy"),
+    [
+        ({"ended": "stalled"}, "use a larger 'tolerance', or mask pixels that receive almost no"),
+        ({"ended": "stalled", "error_estimate": np.array([2.0])}, "use more light or more frames"),
+        ({"ended": "sweeps used"}, "allow more sweeps"),
+    ],
+)
+def test_measurements_left_out_add_a_remedy_and_take_none(evidence, found, remedy):
+    """Whatever their number: one of a million says little of why a search did not end."""
+    found = {"error_estimate": np.array([1e-3]), "lost": []} | found
+    plain = findings_on(evidence, **found, uncertainty=False)[-1].message
+    assert remedy in plain
+    assert "left out" not in plain
+    one, many = (
+        findings_on(evidence, **found | {"lost": lost}, uncertainty=False)[-1].message
+        for lost in ([[], [7]], [[1, 2], [7]])
+    )
+    assert one == (
+        f"{plain}. Besides, 1 measurement along ragged edges of masks was left out: where that is "
+        "many, use masks with smooth edges"
+    )
+    assert many.startswith(f"{plain}. Besides, 3 measurements along ragged edges of masks were ")
 
 
 def experiment(noise=1e-3, contrast=0.0, shifts=CROSS + 0.25):

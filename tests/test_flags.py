@@ -9,12 +9,12 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from equipix.findings import BITS, Flag
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, Weighted, contradictory_found, weighted_fit
 from equipix.measured.defects import BadPixels
+from given import exposures_of
 
 CROSS = equipix.cross_pattern(2, 3)
 FINDINGS = [field.name for field in dataclasses.fields(BadPixels)]

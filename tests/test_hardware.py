@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, Polynomial, errors, hardware, nuc, reference
+import reference
+from equipix import Flag, Polynomial, errors, hardware, nuc
 from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 

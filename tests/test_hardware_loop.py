@@ -6,7 +6,8 @@ import hardware as docs
 import numpy as np
 import pytest
 
-from equipix import errors, hardware, reference
+import reference
+from equipix import errors, hardware
 
 SHAPE = (17, 23)
 

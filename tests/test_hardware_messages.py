@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from equipix import Flag, Polynomial, errors, hardware
-from equipix.bolometer import BolometerArray
+from equipix.simulate import BolometerArray
 
 SHAPE = (4, 5)
 

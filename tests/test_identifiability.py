@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, reference, simulate
+import reference
+from equipix import Flag, simulate
 
 CROSS = equipix.cross_pattern(2, 3)
 

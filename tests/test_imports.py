@@ -29,8 +29,9 @@ CHAIN = (
     {"gauge"},
     {"fit"},
     {"joint", "reduced"},
-    {"beam", "coarse", "convergence", "ritz", "sweep"},
-    {"prior"},
+    {"beam", "convergence", "ritz", "sweep"},
+    {"weak_light"},
+    {"coarse"},
     {"connectivity", "information"},
     {"exposures"},
     {"padded"},
@@ -45,17 +46,16 @@ CHAIN = (
 BESIDE = {
     "apply": set[str](),
     "centroid": {"connectivity"},
+    "curves": set[str](),
     "fixed_point": set[str](),
     "io": {"statistics"},
     "parts": {"convergence", "exposures", "reduced", "solve", "sweep"},
-    "response": set[str](),
     "scene": {"geometry"},
     "statistics": set[str](),
 }
 """Core modules beside the chain: they use these, and what is right of `geometry`."""
 
 SHARED = {
-    "centroid": {"Image"},
     "io": {"Depth", "Format", "Outcome", "Picture", "Problem"},
 }
 """What files of a core folder take from the folder's own file, though that uses them: circles that

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, metrics, reference, simulate
+import reference
+from equipix import Flag, metrics, simulate
 from equipix.errors import (
     ConvergenceWarning,
     IdentifiabilityWarning,

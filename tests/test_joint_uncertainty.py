@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import reference, simulate
+import reference
+from equipix import simulate
 from equipix.errors import IdentifiabilityWarning
 from test_joint import CROSS, SMALL, SMALL_CROSS, TURNED, between, small, used
 from test_uncertainty import (

@@ -11,13 +11,13 @@ import equipix
 from equipix import simulate
 from equipix.diagnosis.lamp_drift import lamp_drift
 from equipix.errors import MisfitWarning
-from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from equipix.fitting.residuals import sampled
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.noise import chi2_tail
 from equipix.metrics.maps import tilt, tilt_weights
 from equipix.plan.drift import distinct_trend, slope_covariance, slope_std
+from given import exposures_of
 
 SENSOR, NOISE = (48, 64), 1e-3
 SEVEN = np.array([(0, 0), (3, 9), (9, 2), (-7, 8), (5, -9), (-3, -8), (-9, 1)], float)

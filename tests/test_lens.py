@@ -100,7 +100,8 @@ class TestFit:
         [
             ({"law": "cos3"}, "'law' is 'cos3'"),
             ({"sensitivity": np.ones((2, 2))}, "'sensitivity' has shape"),
-            ({"mask": np.ones(SHAPE, bool)}, "fewer than 100 finite"),
+            ({"mask": np.arange(np.prod(SHAPE)).reshape(SHAPE) > 50}, "fewer than 100 finite"),
+            ({"mask": np.ones(SHAPE, bool)}, "'mask' excludes all pixels"),
             ({"mask": np.full(SHAPE, np.nan)}, "'mask' has dtype float64, expected bool"),
             ({"mask": np.zeros(SHAPE, np.uint8)}, "'mask' has dtype uint8, expected bool"),
         ],
@@ -128,7 +129,7 @@ class TestFit:
     @pytest.mark.parametrize("law", ["cos4", "radial"])
     def test_a_dark_less_the_flat_is_refused(self, law):
         with pytest.raises(
-            errors.InputError, match=r"'flat' has the median -\d+\.\d+, expected light"
+            errors.InputError, match=r"'frame' has the median -\d+\.\d+, expected light"
         ):
             lens.fit(20 - flat(1), law=law)
 

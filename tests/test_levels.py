@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, LevelExperiment, errors, io, metrics, nuc
+from equipix import Flag, LevelExperiment, errors, metrics, nuc
 from equipix.correction.correct_files import correct_files, picture
+from equipix.io import frames as images
+from equipix.io import tiff
+from equipix.io.frames import description, read_frames
+from equipix.io.png import write_png
+from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 
 SHAPE = (24, 32)
@@ -29,7 +34,7 @@ def folder(array, tmp_path_factory):
     for number, light in enumerate((0.0, *LIGHT)):
         frames = list(array.frames(light, 16, rng=number))
         name = f"level{number}.tif" if number else "dark.tif"
-        io.write_frames(folder / name, iter(frames), nbytes=1)
+        write_frames(folder / name, iter(frames), nbytes=1)
     levels = "".join(
         f'[[level]]\nframes = "level{number}.tif"\nvalue = {10 * number}\nunit = " °C"\n'
         for number in range(1, 5)
@@ -145,7 +150,7 @@ class TestLevelExperiment:
 
     def test_a_level_that_saturates_is_named(self, folder, array):
         frames = list(array.frames(3e7, 4, rng=9))
-        io.write_frames(folder / "bright.tif", iter(frames), nbytes=1)
+        write_frames(folder / "bright.tif", iter(frames), nbytes=1)
         text = (folder / "raw.toml").read_text(encoding="utf-8").replace("level4", "bright")
         level = min(int(frame.min()) for frame in frames)
         text = text.replace("bit_depth = 14", f"bit_depth = 14\nsaturation = {level}")
@@ -225,7 +230,7 @@ class TestCommands:
 
     def test_a_level_that_saturates_without_a_level_given_is_refused(self, run, folder, tmp_path):
         frames = np.full((4, *SHAPE), 16383, np.uint16)
-        io.write_frames(tmp_path / "bright.tif", iter(frames), nbytes=1)
+        write_frames(tmp_path / "bright.tif", iter(frames), nbytes=1)
         levels = "".join(f'[[level]]\nframes = "{folder}/level{k}.tif"\n' for k in (1, 2))
         levels += '[[level]]\nframes = "bright.tif"\n'
         (tmp_path / "levels.toml").write_text(levels, encoding="utf-8")
@@ -238,7 +243,7 @@ class TestCommands:
         array = StaringArray.of("HgCdTe", SHAPE, rng=1)
         text = ""
         for k, light in enumerate((2e6, 5e6, 8e6, 11e6, 14e6)):
-            io.write_frames(tmp_path / f"{k}.tif", array.frames(light, 8, rng=k), nbytes=1)
+            write_frames(tmp_path / f"{k}.tif", array.frames(light, 8, rng=k), nbytes=1)
             text += f'[[level]]\nframes = "{k}.tif"\n'
         (tmp_path / "levels.toml").write_text(text, encoding="utf-8")
         given = ("nuc", "fit", tmp_path / "levels.toml", "-o", tmp_path / "response.tif", "--force")
@@ -286,10 +291,10 @@ class TestDefectsAndQuality:
         }
         given = [text for name, each in limits.items() for text in (f"--{name}-limit", str(each))]
         options = ("-o", output, *given, "--json")
-        raw = io.read_frames(folder / "level2.tif")
+        raw = read_frames(folder / "level2.tif")
         raw[::2, 3, 4] += 300  # noise
         raw[:8, 5, 6] += 300  # flicker
-        io.write_frames(folder / "noisy.tif", iter(raw), nbytes=1)
+        write_frames(folder / "noisy.tif", iter(raw), nbytes=1)
         status, out, _ = run("nuc", "defects", path, folder / "noisy.tif", *options)
         assert status == 0
         wanted = nuc.find_defects(response, raw, limits=nuc.DefectLimits(**limits))
@@ -309,7 +314,7 @@ class TestDefectsAndQuality:
         response, path = saved
         status, out, _ = run("nuc", "quality", path, folder / "level2.tif", "--json")
         assert status == 0
-        raw, told = io.read_frames(folder / "level2.tif"), json.loads(out)
+        raw, told = read_frames(folder / "level2.tif"), json.loads(out)
         wanted = metrics.correctability(response.correct(raw))
         assert (told["C"], told["C_from"], told["C_to"]) == pytest.approx(
             (wanted.ratio, wanted.low, wanted.high)
@@ -365,10 +370,10 @@ def corrected(run, folder, tmp_path):
 class TestCorrectedFiles:
     def test_whole_numbers_are_rounded_and_limited_and_counted(self, corrected, folder):
         response, call = corrected
-        values = response.correct(io.read_frames(folder / "level2.tif"), flagged="replace")
+        values = response.correct(read_frames(folder / "level2.tif"), flagged="replace")
         options = ("--dtype", "uint16", "--bit-depth", "12", "--flagged", "replace")
         path, told = call("out.tif", *options)
-        found = io.read_frames(path)
+        found = read_frames(path)
         assert found.dtype == np.uint16
         np.testing.assert_array_equal(found, np.clip(np.rint(values), 0, 4095))
         wanted = np.count_nonzero((np.rint(values) < 0) | (np.rint(values) > 4095))
@@ -379,29 +384,27 @@ class TestCorrectedFiles:
         _, call = corrected
         whole, _ = call("whole.tif")
         read = []
-        monkeypatch.setattr(io.images, "_AT_ONCE", 1)
-        stream = io.tiff.stream_frames
-        monkeypatch.setattr(
-            io.tiff, "stream_frames", lambda path: read.append(path) or stream(path)
-        )
+        monkeypatch.setattr(images, "_AT_ONCE", 1)
+        stream = tiff.stream_frames
+        monkeypatch.setattr(tiff, "stream_frames", lambda path: read.append(path) or stream(path))
         single, _ = call("single.tif")
         assert len(read) == 1
-        np.testing.assert_array_equal(io.read_frames(single), io.read_frames(whole))
+        np.testing.assert_array_equal(read_frames(single), read_frames(whole))
 
     def test_the_corrector_gives_the_same(self, corrected, folder):
         response, call = corrected
         path, _ = call("out.tif", "--dtype", "uint16", "--flagged", "replace")
         corrector = equipix.Corrector(response)
-        raw = io.read_frames(folder / "level2.tif")
-        np.testing.assert_array_equal(io.read_frames(path), corrector.apply(raw))
+        raw = read_frames(folder / "level2.tif")
+        np.testing.assert_array_equal(read_frames(path), corrector.apply(raw))
 
     @pytest.mark.parametrize(("dtype", "largest"), [("uint8", 255), ("uint16", 65535)])
     def test_a_png_of_one_frame(self, corrected, folder, dtype, largest):
         response, call = corrected
-        frame = io.read_frames(folder / "level1.tif")[0]
-        io.write_frames(folder / "one.tif", iter([frame]), nbytes=1)
+        frame = read_frames(folder / "level1.tif")[0]
+        write_frames(folder / "one.tif", iter([frame]), nbytes=1)
         path, told = call("out.png", "--dtype", dtype, "--flagged", "replace", source="one.tif")
-        found = io.read_frames(path)[0]
+        found = read_frames(path)[0]
         assert found.dtype == dtype
         wanted = np.clip(np.rint(response.correct(frame, flagged="replace")), 0, largest)
         np.testing.assert_array_equal(found, wanted)
@@ -413,8 +416,8 @@ class TestCorrectedFiles:
         status, _, err = run(*arguments, "-o", tmp_path / "out.png")
         assert status == 1
         assert "holds one frame, but 16" in err
-        frame = io.read_frames(folder / "level1.tif")[:1]
-        io.write_frames(tmp_path / "one.tif", iter(frame), nbytes=1)
+        frame = read_frames(folder / "level1.tif")[:1]
+        write_frames(tmp_path / "one.tif", iter(frame), nbytes=1)
         arguments = ("correct", tmp_path / "response.tif", tmp_path / "one.tif")
         status, _, err = run(*arguments, "-o", tmp_path / "out.png", "--dtype", "float32")
         assert status == 1
@@ -426,7 +429,7 @@ class TestCorrectedFiles:
         _, call = corrected
         path, _ = call("out.tif", "--dtype", "uint16")
         digest = hashlib.sha256((tmp_path / "response.tif").read_bytes()).hexdigest()
-        assert io.description(path) == f"corrected by equipix, correction sha256 {digest}"
+        assert description(path) == f"corrected by equipix, correction sha256 {digest}"
         arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.tif")
         assert "corrected already" in run(*arguments)[2]
 
@@ -434,9 +437,9 @@ class TestCorrectedFiles:
     def test_pictures(self, corrected, folder, display):
         response, call = corrected
         path, _ = call("out.tif", "--display", display, "--flagged", "replace")
-        found = io.read_frames(path)
+        found = read_frames(path)
         assert found.dtype == np.uint8
-        values = response.correct(io.read_frames(folder / "level2.tif"), flagged="replace")
+        values = response.correct(read_frames(folder / "level2.tif"), flagged="replace")
         np.testing.assert_array_equal(found[3], picture(values[3], display))
 
     def test_a_picture_has_no_other_type(self, corrected, folder, tmp_path):
@@ -461,7 +464,7 @@ class TestCorrectedFiles:
 
     def test_values_beyond_the_levels_and_replaced_pixels_are_counted(self, corrected, folder):
         response, call = corrected
-        raw = io.read_frames(folder / "level4.tif")
+        raw = read_frames(folder / "level4.tif")
         good = (response.flags & Flag.DO_NOT_USE) == 0
         _, told = call("out.tif", "--flagged", "nan", source="level4.tif")
         wanted = np.count_nonzero(response.extrapolated(raw) & good)
@@ -491,7 +494,7 @@ class TestCorrectedFiles:
         source, path = [str(folder / "level2.tif")], tmp_path / "out.tif"
         done = correct_files(two, source, path, dtype="float32", force=True)
         assert (done.limited, done.flagged, done.replaced) == (0, bad, 0)
-        assert np.count_nonzero(np.isnan(io.read_frames(path))) == 16 * bad
+        assert np.count_nonzero(np.isnan(read_frames(path))) == 16 * bad
         done = correct_files(two, source, path, dtype="uint16", force=True)
         assert (done.limited, done.flagged, done.replaced) == (0, 0, bad)
         with pytest.warns(errors.InputWarning, match="100% of the .* of uint8: .* uint16; or"):
@@ -505,10 +508,10 @@ class TestCorrectedFiles:
         assert (told["limited_values"], told["replaced_pixels"]) == (0, bad)
         status, _, err = run(*arguments, "--dtype", "uint16", "--flagged", "nan")
         assert (status, "which uint16 does not hold: take 'replace'" in err) == (1, True)
-        values, black = io.read_frames(folder / "level2.tif"), 0
+        values, black = read_frames(folder / "level2.tif"), 0
         for options in ((), ("--flagged", "nan")):
             assert run(*arguments, "--display", "linear", *options)[0] == 0
-            shown = io.read_frames(path)[0, 3, 4:6]
+            shown = read_frames(path)[0, 3, 4:6]
             wanted = "nan" if options else "replace"
             whole = picture(two.correct(values[0], flagged=wanted), "linear")
             np.testing.assert_array_equal(shown, whole[3, 4:6])
@@ -530,11 +533,13 @@ class TestCorrectedFiles:
         assert call("16.tif", "--dtype", "uint16")[1]["limited_values"] == 0
 
     def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
-        from equipix.correction import corrector as module
+        from equipix.correction import apply as module
 
         response, _ = corrected
-        made, real = [], module.native
-        monkeypatch.setattr(module, "native", lambda *given: made.append(1) or real(*given))
+        made, real = [], module.Prepared
+        monkeypatch.setattr(
+            module, "Prepared", lambda *given, **more: made.append(1) or real(*given, **more)
+        )
         source = [str(folder / "level?.tif")]
         done = correct_files(response, source, tmp_path / "all", dtype="uint16")
         assert (done.frames, len(made)) == (64, 1)
@@ -551,7 +556,7 @@ class TestCorrectedFiles:
         """They came out as -1503 DN, with status 0."""
         response = LevelExperiment.load(folder / name).run(order=2)
         response.save(tmp_path / "r.npz")
-        scaled = io.read_frames([folder / "level2.tif"]) / 16383
+        scaled = read_frames([folder / "level2.tif"]) / 16383
         for dtype in (np.float32, np.float64):
             corrects = [response.correct]
             if dtype is np.float32:
@@ -559,7 +564,7 @@ class TestCorrectedFiles:
             for correct in corrects:
                 with pytest.raises(errors.InputError, match="scaled to 0 to 1, multiply by 16383"):
                     correct(scaled.astype(dtype))
-        io.write_frames(tmp_path / "scaled.tif", iter(scaled.astype(np.float32)), nbytes=1)
+        write_frames(tmp_path / "scaled.tif", iter(scaled.astype(np.float32)), nbytes=1)
         status, _, err = run(
             "correct", tmp_path / "r.npz", tmp_path / "scaled.tif", "-o", tmp_path / "out.tif"
         )
@@ -569,9 +574,9 @@ class TestCorrectedFiles:
 
     def test_a_dark_subtracted_before_is_told(self, run, folder, tmp_path):
         LevelExperiment.load(folder / "levels.toml").run().save(tmp_path / "r.npz")
-        dark = io.read_frames([folder / "dark.tif"]).mean(axis=0)
-        once = (io.read_frames([folder / "dark.tif"])[:2] - dark).astype(np.float32)
-        io.write_frames(tmp_path / "once.tif", iter(once), nbytes=1)
+        dark = read_frames([folder / "dark.tif"]).mean(axis=0)
+        once = (read_frames([folder / "dark.tif"])[:2] - dark).astype(np.float32)
+        write_frames(tmp_path / "once.tif", iter(once), nbytes=1)
         for options, told in (((), True), (("--dark", "none"), False)):
             arguments = (tmp_path / "r.npz", tmp_path / "once.tif", *options, "--force")
             status, _, err = run("correct", *arguments, "-o", tmp_path / "out.tif")
@@ -585,7 +590,7 @@ class TestCorrectedFiles:
     @pytest.mark.usefixtures("corrected")
     def test_frames_of_more_bits_are_refused(self, run, folder, tmp_path):
         frame = np.full((1, *SHAPE), 40000, np.uint16)
-        io.write_frames(folder / "deep.tif", frame, nbytes=1)
+        write_frames(folder / "deep.tif", frame, nbytes=1)
         arguments = ("correct", tmp_path / "response.tif", folder / "deep.tif", "-o")
         status, _, err = run(*arguments, tmp_path / "no.tif")
         assert (status, "holds 40000, above 16383, the largest" in err) == (1, True)
@@ -593,9 +598,9 @@ class TestCorrectedFiles:
 
     def test_a_png_given_again_is_noticed(self, corrected, run, folder, tmp_path):
         _, call = corrected
-        io.write_frames(folder / "single.tif", io.read_frames(folder / "level1.tif")[:1], nbytes=1)
+        write_frames(folder / "single.tif", read_frames(folder / "level1.tif")[:1], nbytes=1)
         path, _ = call("out.png", source="single.tif")
-        assert io.description(path).startswith("corrected by equipix, correction sha256")
+        assert description(path).startswith("corrected by equipix, correction sha256")
         arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.png")
         status, _, err = run(*arguments)
         assert status == 0
@@ -603,9 +608,9 @@ class TestCorrectedFiles:
 
     @pytest.mark.usefixtures("corrected")
     def test_pngs_of_others_have_no_mark(self, run, folder, tmp_path):
-        frame = io.read_frames(folder / "level1.tif")[0]
-        io.write_png(tmp_path / "raw.png", frame, description="of a camera")
-        assert io.description(tmp_path / "raw.png") == "of a camera"
+        frame = read_frames(folder / "level1.tif")[0]
+        write_png(tmp_path / "raw.png", frame, description="of a camera")
+        assert description(tmp_path / "raw.png") == "of a camera"
         arguments = ("correct", tmp_path / "response.tif", tmp_path / "raw.png")
         status, _, err = run(*arguments, "-o", tmp_path / "out.png")
         assert (status, "corrected already" in err) == (0, False)

@@ -142,7 +142,7 @@ def test_a_mask_of_another_shape_is_named_by_its_file(manifest, tmp_path, capsys
 
 
 def test_a_mask_of_whole_numbers_is_refused_with_the_remedy():
-    frames, mask = np.ones((3, 4, 5)), np.zeros((4, 5), int)
+    frames, mask = np.ones((3, 24, 25)), np.zeros((24, 25), int)
     with pytest.raises(errors.InputError, match="'mask' .* give mask != 0"):
         equipix.calibrate(frames, SHIFTS[:3], mask=mask)
     with pytest.raises(errors.InputError, match="'mask' .* give mask != 0"):

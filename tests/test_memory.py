@@ -15,6 +15,7 @@ import pytest
 import equipix
 from equipix import cli
 from equipix.errors import EquipixError, InsufficientMemoryError
+from equipix.io.frames import frame_format
 from equipix.io.tiff import write_frames
 
 CROSS = equipix.cross_pattern(2, 3)
@@ -314,4 +315,4 @@ def test_files_are_corrected_in_constant_memory(tmp_path):
     source = write_files(tmp_path, shape)
     said = run(CORRECT, tmp_path / "correction.tif", *source, "-o", output)
     assert said.returncode == 0, said.stderr
-    assert equipix.io.frame_format(output)[0] == (800, *shape)
+    assert frame_format(output)[0] == (800, *shape)

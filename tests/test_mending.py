@@ -10,7 +10,7 @@ import tifffile
 
 import equipix
 from equipix import Experiment, errors, simulate
-from equipix.reference import centroid as reference
+from reference import centroid as reference
 
 SHAPE, LEVEL, CENTRE, RADIUS = (80, 96), 4095, (40.3, 47.6), 8.0
 SIGMA = 1.2

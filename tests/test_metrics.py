@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import errors, io, metrics, nuc
+from equipix import errors, metrics, nuc
+from equipix.io.frames import read_frames
 from equipix.metrics.correctability import _fisher_quantile
 from equipix.metrics.emva import high_passed, split_variances
 from equipix.metrics.frame_noise import Moments, temporal_of
@@ -169,7 +170,7 @@ class TestCorrectability:
             ({"frames": np.ones((3, 4, 4))}, "are all equal"),
             ({"frames": np.full((3, 4, 4), np.nan)}, "has 0 pixels"),
             ({"frames": np.eye(4)[None] * [[[1]], [[2]]], "confidence": 1.0}, "'confidence'"),
-            ({"frames": np.ones((3, 4, 4)), "mask": np.ones((2, 2), bool)}, "'mask' is bool"),
+            ({"frames": np.ones((3, 4, 4)), "mask": np.ones((2, 2), bool)}, "'mask' has shape"),
         ],
     )
     def test_refusals(self, given, message):
@@ -336,7 +337,7 @@ class TestEmvaSpatial:
         dark = rng.integers(40, 60, (8, *SHAPE), dtype=np.uint16)
         bright = rng.integers(900, 1100, (8, *SHAPE), dtype=np.uint16)
         of_frames = metrics.emva_spatial(bright, dark)
-        averages = [equipix.average(each) for each in (dark, bright)]
+        averages = [equipix.average(each) for each in (bright, dark)]
         of_averages = metrics.emva_spatial(*averages)
         # Here the means of the frames scatter by the noise over √3072 alone.
         np.testing.assert_allclose(of_averages.prnu, of_frames.prnu, rtol=0.01)
@@ -345,7 +346,7 @@ class TestEmvaSpatial:
         dark = np.random.default_rng(1).random((4, 8, 9))
         with pytest.raises(errors.InputError, match="expected more light"):
             metrics.emva_spatial(dark, dark)
-        with pytest.raises(errors.InputError, match="'bright' has frames of"):
+        with pytest.raises(errors.InputError, match="'frames' are of"):
             metrics.emva_spatial(dark[:, :4], dark)
         with pytest.raises(errors.InputError, match="1 values that are not finite"):
             metrics.emva_spatial(np.where(dark == dark.max(), np.nan, dark + 9), dark)
@@ -366,7 +367,7 @@ class TestEmvaTransfer:
             photons = mean + np.sqrt(mean) * rng.standard_normal((2, *SHAPE))
             noise = gain * read * rng.standard_normal((2, *SHAPE))
             bright.append(np.rint(50 + np.minimum(gain * photons + noise, gain * 9500)))
-        return [np.rint(each) for each in dark], bright, light
+        return bright, [np.rint(each) for each in dark], light
 
     def test_known_values_come_back(self):
         found = metrics.emva_transfer(*self.levels(np.random.default_rng(11)))
@@ -411,7 +412,7 @@ class TestEmvaTransfer:
         ],
     )
     def test_light_that_gives_no_line_is_refused(self, change, message):
-        dark, bright, light = self.levels(np.random.default_rng(15))
+        bright, dark, light = self.levels(np.random.default_rng(15))
         with pytest.raises(errors.InputError, match=message):
             metrics.emva_transfer(bright, dark, change(light))
 
@@ -420,27 +421,27 @@ class TestEmvaTransfer:
         [lambda light: light[::-1], lambda light: np.where(light > 9000, 20_000 - light, light)],
     )
     def test_light_that_falls_where_the_signal_rises_is_refused(self, change):
-        dark, bright, light = self.levels(np.random.default_rng(11))
+        bright, dark, light = self.levels(np.random.default_rng(11))
         with pytest.raises(
             errors.InputError, match=r"'light' is .* at level .* one value for each"
         ):
             metrics.emva_transfer(bright, dark, change(light))
 
     def test_exchanged_darks_are_refused(self):
-        dark, bright, light = self.levels(np.random.default_rng(11))
+        bright, dark, light = self.levels(np.random.default_rng(11))
         with pytest.raises(errors.InputError, match="no level is brighter .* not exchanged"):
             metrics.emva_transfer(dark, bright, light)
 
     def test_light_in_another_unit_gives_no_quantum_efficiency(self):
-        dark, bright, light = self.levels(np.random.default_rng(11))
+        bright, dark, light = self.levels(np.random.default_rng(11))
         with pytest.warns(errors.EquipixWarning, match=r"efficiency of 50.* .*limit 1\.1.*photons"):
             found = metrics.emva_transfer(bright, dark, light / 1000)
         assert np.isnan(found.quantum_efficiency)
         assert found.responsivity == pytest.approx(125, rel=1e-3)
 
     def test_counts_that_do_not_fit_are_refused(self):
-        dark, bright, light = self.levels(np.random.default_rng(13))
-        with pytest.raises(errors.InputError, match="'bright' has 19 levels, 'dark' .* one 'dark'"):
+        bright, dark, light = self.levels(np.random.default_rng(13))
+        with pytest.raises(errors.InputError, match="'frames' has 19 levels, 'dark' .* one 'dark'"):
             metrics.emva_transfer(bright[:19], dark, light)
         with pytest.raises(errors.InputError, match="expected three or more"):
             metrics.emva_transfer(bright[:2], dark[:2], light[:2])
@@ -504,8 +505,8 @@ def set_001(data_dir):
         kind: sorted(each for each in groups if each[0] == kind and len(each[2]) == 2)
         for kind in "bd"
     }
-    bright, dark = ([io.read_frames(each[2]) for each in pairs[kind]] for kind in "bd")
-    many = {each[0]: io.read_frames(each[2]) for each in groups if len(each[2]) == 50}
+    bright, dark = ([read_frames(each[2]) for each in pairs[kind]] for kind in "bd")
+    many = {each[0]: read_frames(each[2]) for each in groups if len(each[2]) == 50}
     return dark, bright, [each[1][1] for each in pairs["b"]], many
 
 

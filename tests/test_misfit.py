@@ -224,7 +224,7 @@ def test_error_bars_in_speckle_of_three_pixels_are_refused():
     assert cal.sensitivity_std is None
     assert "finer than a spline" in cal.findings[-1].message
     with pytest.raises(equipix.errors.InputError, match="move by whole pixels"):
-        cal.std_of(equipix.metrics.mapsics.maps.tilt_weights(np.ones(SENSOR, bool)))
+        cal.std_of(equipix.metrics.maps.tilt_weights(np.ones(SENSOR, bool)))
 
 
 @pytest.mark.study

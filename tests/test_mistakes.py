@@ -10,8 +10,9 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
-from equipix.diagnosis.inputs import on_brightness, on_input
-from equipix.exposures.exposures import exposures_of
+from equipix.diagnosis.inputs import BEFORE, on_brightness
+from equipix.findings import ask
+from given import exposures_of
 
 SHAPE, SHIFTS = (60, 80), equipix.cross_pattern(5, 7)
 
@@ -23,7 +24,7 @@ class Bench:
         self.rng = np.random.default_rng(seed)
         truth = simulate.paper_sensitivity(SHAPE, rng=self.rng)
         self.offset = 200 + 10 * self.rng.standard_normal(SHAPE)
-        self.signals = [truth * simulate.signal.window(_beam, SHAPE, shift) for shift in SHIFTS]
+        self.signals = [truth * simulate.beams.window(_beam, SHAPE, shift) for shift in SHIFTS]
         self.dark = self.take(0 * truth)
         self.frames = [self.take(signal) for signal in self.signals]
 
@@ -273,7 +274,7 @@ def test_a_finding_calls_an_exposure_by_its_name(bench):
     values[3] *= 0.5
     names = [f"position {k}" for k in range(5)]
     exposures = exposures_of(values, SHIFTS)
-    (found,) = on_input(dataclasses.replace(exposures, names=tuple(names)))
+    (found,) = ask(BEFORE, dataclasses.replace(exposures, names=tuple(names)))
     assert "exposure 3 ('position 3') has 0.5 times the light" in found.message
 
 

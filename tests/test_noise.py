@@ -7,10 +7,10 @@ import pytest
 
 import equipix
 from equipix import errors, simulate
-from equipix.exposures.exposures import exposures_of
 from equipix.measured.defects import dead_pixels, hot_pixels
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
+from given import exposures_of
 
 CROSS = equipix.cross_pattern(5, 7)
 EPS = np.finfo(np.float64).eps

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, NoiseModel, errors, nuc, reference
+import reference
+from equipix import Flag, NoiseModel, errors, nuc
 from equipix.measured.means import Averaged
 from equipix.simulate import StaringArray
 
@@ -559,7 +560,10 @@ class TestRefusals:
             ({"variance": [np.nan] * 8}, "'variance' holds nan, expected .* above 0"),
             ({"variance": [1, 2]}, "'variance' has 2 entries, expected 8: one a level"),
             ({"variance": [NOISE] * 2}, "'variance' has 2 entries, expected 8: one a level"),
-            ({"variance": 4.0}, r"'variance' has shape \(\), expected \(8,\), one number a level"),
+            (
+                {"variance": 4.0},
+                r"'variance' has shape \(\), expected \(8,\), one number for each level",
+            ),
             ({"variance": np.ones(SHAPE)}, r"'variance' has shape \(48, 64\), expected \(8,\)"),
             ({"workers": 0}, "'workers'"),
             ({"saturation": -1}, "'saturation'"),

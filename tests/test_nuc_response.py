@@ -12,6 +12,8 @@ import pytest
 
 import equipix
 from equipix import Flag, cli, errors, nuc
+from equipix.io.frames import read_frames, stream_frames
+from equipix.io.tiff import write_frames
 from records import rewrite
 
 SHAPE = (24, 32)
@@ -166,11 +168,9 @@ class TestCommandLine:
 
     def test_correct_applies_a_response(self, response, tmp_path):
         response.save(tmp_path / "r.tif")
-        equipix.io.write_frames(tmp_path / "raw.tif", iter(frames()), nbytes=1)
+        write_frames(tmp_path / "raw.tif", iter(frames()), nbytes=1)
         self.run("correct", tmp_path / "r.tif", tmp_path / "raw.tif", "-o", tmp_path / "c.tif")
-        corrected = np.concatenate(
-            [each for _, each in equipix.io.stream_frames([tmp_path / "c.tif"])]
-        )
+        corrected = np.concatenate([each for _, each in stream_frames([tmp_path / "c.tif"])])
         np.testing.assert_array_equal(corrected, response.correct(frames()))
 
 
@@ -215,7 +215,7 @@ class TestRealCamera:
         for order in (1, 2, 3):
             response = nuc.fit(rest, order=order)
             for level in held:
-                frames = equipix.io.read_frames(sorted(folder.glob(f"b_{level:03}_snap_*.png")))
+                frames = read_frames(sorted(folder.glob(f"b_{level:03}_snap_*.png")))
                 ratios[level, order] = equipix.metrics.correctability(response.correct(frames))
                 ratios[level, 0] = equipix.metrics.correctability(frames)
             # Few of the 307 200 pixels are inverted worse than noise.

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import equipix
-from equipix import metrics, plan, reference, simulate
+import reference
+from equipix import metrics, plan, simulate
 from equipix.errors import (
     IdentifiabilityWarning,
     InputError,
@@ -57,7 +58,7 @@ def beam_of(shape, width):
 def solved(frames, shifts, tolerance):
     """The relative error of M, the truth being 1, where drifts and shifts are wrong on purpose."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", (MisfitWarning, MisfitWarning))
+        warnings.simplefilter("ignore", MisfitWarning)
         found = equipix.calibrate(frames, shifts, tolerance=tolerance, workers=1).sensitivity
     return metrics.relative_error(found, np.ones(found.shape))
 

@@ -11,9 +11,9 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.exposures.exposures import exposures_of
 from equipix.exposures.positions import Orientation
 from equipix.measured.statistics import FrameStatistics
+from given import exposures_of
 
 SHAPE, CROSS = (24, 32), equipix.cross_pattern(3, 5)
 
@@ -111,7 +111,9 @@ def test_frame_statistics_are_read_only(tmp_path):
 def test_exposures_are_read_only_views_of_the_callers_arrays():
     values, variance, mask = frames(), np.ones((5, *SHAPE)), np.zeros(SHAPE, bool)
     given = {"variance": variance, "mask": mask}
-    exposures = exposures_of(values, CROSS, flux_std=1e-3, shift_std=0.1, saturation=9.0, **given)
+    exposures = exposures_of(
+        values, CROSS, flux_std=1e-3, shift_std=0.1, saturation=values.max(), **given
+    )
     assert {"values", "positions.std", "flux.std", "bad_pixels.saturated"} <= set(arrays(exposures))
     assert writeable(exposures) == []
     assert np.shares_memory(exposures.values, values)

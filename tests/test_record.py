@@ -62,7 +62,10 @@ def made():
         calibration(cfa="RGGB"),
         colour_response={"R": float("nan"), "G": 1.0, "B": float("inf")},
         tilt_std=np.array([np.inf, 0.1]),
-        findings=(Finding("sign", "what, value, limit, remedy"), Finding("drift", "é")),
+        findings=(
+            Finding("sign", "what, value, limit, remedy", "misfit"),
+            Finding("drift", "é", "input", "note"),
+        ),
     )
     first = calibration(shift_std=0.01, robust=True, uncertainty=True)
     turned = dataclasses.replace(first.orientation, hidden=Orientation(rows=True), ratio=None)

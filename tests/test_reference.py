@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from equipix import metrics, reference, simulate
+import reference
+from equipix import metrics, simulate
 
 CROSS = [(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)]
 
@@ -17,6 +22,28 @@ def measured(shape, shifts, *, noise=1e-3, seed=1, **options):
     beam = simulate.gaussian_beam(shape, width=20)
     frames = simulate.exposures(sensitivity, beam, shifts, **options)
     return sensitivity, frames + noise * rng.standard_normal(frames.shape)
+
+
+def imported(source):
+    """First names of the modules that a source imports."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield (node.module or "reference").split(".")[0]
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path(reference.__file__).parent.glob("*.py")), ids=lambda path: path.stem
+)
+def test_the_reference_imports_numpy_alone(path):
+    allowed = {"numpy", "reference"} | sys.stdlib_module_names
+    assert set(imported(path.read_text())) <= allowed
+
+
+def test_imports_are_found_wherever_they_stand():
+    source = "import a.b as c, d\ndef f():\n    from e.f import g\n    from . import h"
+    assert list(imported(source)) == ["a", "d", "e", "reference"]
 
 
 class TestGrid:
@@ -107,141 +134,6 @@ class TestCoordinateDescent:
         assert np.isnan(solution.sensitivity[0, 1::2]).all()
         model = solution.beam[0, 0:6:2] * solution.sensitivity[first]
         np.testing.assert_allclose(model, frames[0, 0, ::2], rtol=1e-12)
-
-
-def a_fifth_missing():
-    """Measurements of which a fifth is missing at random."""
-    return np.random.default_rng(5).random((5, 9, 11)) < 0.2
-
-
-HARD = {
-    "cross": ((7, 9), CROSS, {}),
-    "turned": ((9, 6), CROSS, {"rotation": [0, 0, 90, 180, 270]}),
-    "one axis": ((5, 12), [(0, 0), (0, 2), (0, 3)], {}),
-    "one diagonal": ((8, 10), [(0, 0), (1, 1), (3, 3)], {}),
-    "four components": ((9, 11), [(0, 0), (0, 4), (0, 6), (4, 0), (6, 0)], {}),
-    "masked components": (
-        (9, 11),
-        [(0, 0), (0, 4), (0, 6), (4, 0), (6, 0)],
-        {"mask": a_fifth_missing()},
-    ),
-    "eight components of three": ((4, 6), [(0, 0), (0, 2)], {}),
-}
-"""Sensors, shifts and options that a coarse space or a gauge could trip over."""
-
-
-class TestMultiscale:
-    @staticmethod
-    def compare(frames, shifts, **options):
-        """Solve by dense algebra and by `multiscale`, who must agree; return the latter's."""
-        dense = reference.solve_dense(frames, shifts, **options)
-        solution = reference.multiscale(frames, shifts, tolerance=1e-11, **options)
-        assert solution.converged
-        # M to a hundred times the tolerance: the estimate is one of order. F is stationary, so
-        # that an error of 1e-10 of the values costs no more than its square.
-        np.testing.assert_allclose(solution.sensitivity, dense.sensitivity, atol=1e-9)
-        np.testing.assert_allclose(solution.beam, dense.beam, atol=1e-9)
-        power = np.nansum(frames**2)
-        floor = 1e-20 * power
-        assert solution.objective[-1] == pytest.approx(dense.objective[-1], rel=1e-11, abs=floor)
-        # F may rise by rounding of the values alone.
-        roots = np.sqrt(solution.objective)
-        assert (np.diff(roots) <= 1e-14 * np.sqrt(power)).all()
-        return solution
-
-    @pytest.mark.parametrize("noise", [0, 1e-3, 1e-2])
-    @pytest.mark.parametrize("case", HARD)
-    def test_reaches_the_dense_minimum(self, case, noise):
-        shape, shifts, options = HARD[case]
-        rotation = options.get("rotation")
-        _, frames = measured(shape, shifts, noise=noise, rotation=rotation)
-        self.compare(frames, shifts, **options)
-
-    @pytest.mark.parametrize("rotation", [None, [0, 0, 90, 180, 270]])
-    def test_takes_weights_masks_and_fluxes(self, rotation):
-        rng = np.random.default_rng(4)
-        flux = rng.uniform(0.9, 1.1, 5)
-        _, frames = measured((7, 9), CROSS, flux=flux, rotation=rotation)
-        variance = rng.uniform(1, 2, frames.shape)
-        mask = rng.random(frames.shape) < 0.1
-        self.compare(frames, CROSS, flux=flux, rotation=rotation, variance=variance, mask=mask)
-
-    @pytest.mark.parametrize("value", [0, -0.05])
-    @pytest.mark.parametrize("noise", [0, 1e-3, 1e-2])
-    def test_takes_dead_and_negative_pixels(self, value, noise):
-        _, frames = measured((7, 9), CROSS, noise=noise)
-        rng = np.random.default_rng(3)
-        for row, col in ((3, 4), (0, 0), (6, 8)):
-            frames[:, row, col] = value + noise * rng.standard_normal(5)
-        solution = self.compare(frames, CROSS)
-        assert not solution.unreliable.any()
-
-    def test_a_pixel_of_no_weight_has_no_say_but_its_closed_form(self):
-        _, frames = measured((8, 11), CROSS)
-        variance = np.ones(frames.shape)
-        # Weights of 1e-10 draw on M by that share of the noise: less than the tolerance.
-        variance[:, 2, 5] = 1e10
-        frames[:, 2, 5] *= 1.5
-        solution = self.compare(frames, CROSS, variance=variance)
-        assert np.argwhere(solution.unreliable).tolist() == [[2, 5]]
-        seen = np.array([solution.beam[2 + row, 5 + col] for row, col in CROSS])
-        expected = (seen @ frames[:, 2, 5]) / (seen @ seen)
-        assert solution.sensitivity[2, 5] == pytest.approx(expected, rel=1e-9)
-
-    def test_one_exposure_leaves_nothing_to_find(self):
-        _, frames = measured((4, 5), [(0, 0)])
-        solution = reference.multiscale(frames, [(0, 0)])
-        assert solution.converged
-        assert solution.error_estimate < 1e-12
-        assert solution.component_labels.max() == 4 * 5 - 1
-
-    def test_products_do_not_grow_with_the_sensor(self):
-        counts = []
-        for shape in ((24, 32), (48, 64)):
-            sensitivity = simulate.paper_sensitivity(shape, rng=1)
-            beam = simulate.gaussian_beam(shape, width=2 * shape[1])
-            frames = simulate.exposures(sensitivity, beam, CROSS)
-            solution = reference.multiscale(frames, CROSS)
-            assert solution.converged
-            counts.append(solution.products)
-        # The ratio that a fast solver has to keep; sweeps would take four times as many.
-        assert counts[1] <= 1.2 * counts[0]
-
-    def test_f_never_rises_though_full_steps_would_raise_it(self):
-        # Values that no sensitivity and no beam explain: a linearised step is far off.
-        frames = np.exp(2 * np.random.default_rng(1).standard_normal((5, 8, 9)))
-        solution = reference.multiscale(frames, CROSS, products=200)
-        roots = np.sqrt(solution.objective)
-        assert len(roots) > 5
-        assert (np.diff(roots) <= 1e-14 * np.sqrt((frames**2).sum())).all()
-
-    def test_a_limit_of_products_holds_and_is_told(self):
-        _, frames = measured((8, 11), CROSS)
-        solution = reference.multiscale(frames, CROSS, products=8)
-        assert solution.products <= 8
-        assert not solution.converged
-        assert solution.error_estimate > 1e-6
-
-    def test_the_estimate_is_one_of_order_wherever_it_stops(self):
-        ratios = []
-        rng = np.random.default_rng(11)
-        for seed in range(40):
-            shape = tuple(rng.integers(12, 25, 2))
-            shifts = np.vstack([(0, 0), rng.integers(0, 7, (rng.integers(3, 7), 2))])
-            noise = rng.choice([0, 1e-3, 1e-2])
-            _, frames = measured(shape, shifts, noise=noise, seed=seed)
-            options = {"mask": rng.random(frames.shape) < rng.choice([0, 0.1])}
-            best = reference.multiscale(frames, shifts, tolerance=1e-10, **options)
-            assert best.converged
-            stopped = reference.multiscale(
-                frames, shifts, products=int(rng.integers(10, 25)), tolerance=1e-9, **options
-            )
-            true = np.nanmax(abs(stopped.sensitivity - best.sensitivity))
-            ratios.append(true / stopped.error_estimate)
-        # What is asked of an estimate that is no bound: hardly ever too small, never far off.
-        assert np.mean(np.array(ratios) < 3) >= 0.95
-        assert max(ratios) < 10
-        assert np.median(ratios) > 0.1
 
 
 class TestComponents:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import cli, errors, io
+from equipix import cli, errors
+from equipix.io.tiff import write_frames
 
 SHAPE, SIGMA = (80, 100), 5.0
 
@@ -140,7 +141,7 @@ def test_an_iterator_and_files_give_the_same(tmp_path):
     _, frames = clean_frames(20, rng, (24, 32))
     whole = np.rint(with_rays(frames, rng)[0]).astype(np.uint16)
     wanted = equipix.average(whole, reject=5)
-    io.write_frames(tmp_path / "frames.tif", iter(whole), nbytes=whole.nbytes)
+    write_frames(tmp_path / "frames.tif", iter(whole), nbytes=whole.nbytes)
     for source in (iter(whole), tmp_path / "frames.tif"):
         found = equipix.average(source, reject=5)
         for name, values in wanted.maps.items():
@@ -169,7 +170,7 @@ def test_wrong_limits_are_refused(reject):
 def test_few_frames_and_other_scenes_are_refused():
     rng = np.random.default_rng(11)
     _, frames = clean_frames(12, rng)
-    with pytest.raises(errors.InputError, match="holds 8 frames, expected 9"):
+    with pytest.raises(errors.InputError, match="holds 8, expected 9"):
         equipix.average(frames[:8], reject=5)
     frames[10] = frames[10, :, ::-1]
     with pytest.raises(errors.InputError, match=r"% of frame 10 deviate .* another scene"):

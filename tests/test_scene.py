@@ -10,11 +10,11 @@ from equipix import Flag, errors
 from equipix.io.formats import load_pages
 from equipix.io.record import read_record
 from equipix.loading import load_correction
-from equipix.reference import scene as reference
 from equipix.scene.methods import METHODS, resumed
 from equipix.scene.scene_correction import SceneState
 from equipix.simulate import MovingScene
 from records import rewrite
+from reference import scene as reference
 
 SHAPE = (48, 64)
 NAMES = tuple(METHODS)

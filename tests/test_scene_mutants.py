@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from equipix.reference import scene as reference
 from equipix.simulate import MovingScene
+from reference import scene as reference
 
 SHAPE, FRAMES = (64, 64), 500
 FALL, GAIN_FALL = 18, 1.15

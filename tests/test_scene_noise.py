@@ -9,9 +9,10 @@ import pytest
 
 import equipix
 from equipix import errors, scene
+from equipix.findings import ask, say
 from equipix.io.formats import load_pages, save_pages
 from equipix.scene.methods import METHODS
-from equipix.scene.scene_correction import _warn_of_spread
+from equipix.scene.scene_correction import _RULES, _Learned
 from equipix.simulate import MovingScene
 
 SHAPE = (64, 64)
@@ -245,8 +246,9 @@ def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_
 
 
 def test_gains_that_spread_are_named():
+    gains = np.array([-0.04, 1.0, 50.0])
     with pytest.warns(errors.InputWarning, match=r"the gains spread by 23 \(limit 0.3\)"):
-        _warn_of_spread(np.array([-0.04, 1.0, 50.0]))
+        say(*ask(_RULES, _Learned(100, 100, None, (0, 1), None, gains)))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from equipix import metrics, reference, simulate
+import reference
+from equipix import metrics, simulate
 from equipix.errors import FileError, InputError
 
 CROSS = [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, reference, simulate
+import reference
+from equipix import Flag, simulate
 from equipix.cli import main
 from equipix.errors import IdentifiabilityWarning, InputError
 from equipix.plan import tilt_std

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, reference, simulate
+import reference
+from equipix import Flag, simulate
 from equipix.errors import ConvergenceWarning
 
 CROSS = equipix.cross_pattern(11, 19)

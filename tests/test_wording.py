@@ -12,8 +12,7 @@ import pytest
 
 import equipix
 from equipix import cli, simulate
-from equipix.cli.app import COMMANDS, command
-from equipix.cli.terminal import in_options
+from equipix.cli.app import COMMANDS, command, in_options
 
 PACKAGE = Path(equipix.__file__).parent
 NAMED = re.compile(r"'([a-z_]+)'|\b([a-z_]+)=(?=['A-Z0-9])")

@@ -42,7 +42,7 @@ from byte_scenes import (
 )
 from equipix import detector, metrics, plan, simulate
 from equipix.detector import photons
-from equipix.plan.drift import distinct_trend, tilt_std
+from equipix.plan.drift import distinct_trend
 from same_bytes import COMPARED, REPORTED, collected, parts
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def plans() -> Any:
         "masked": plan.identify(SHAPE, CROSS, mask(), cfa="RGGB"),
         "turned": plan.identify(SHAPE, CROSS, rotation=[0, 90, 0, 180, 0]),
         "order": [plan.advise_order(CROSS), distinct_trend(CROSS)],
-        "tilt": [tilt_std(SHAPE, CROSS, flux_std=1e-4), tilt_std(SHAPE, CROSS, **known)],
+        "tilt": [plan.tilt_std(SHAPE, CROSS, **each) for each in ({"flux_std": 1e-4}, known)],
     }
 
 

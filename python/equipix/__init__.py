@@ -9,7 +9,7 @@ from importlib import import_module
 _HOMES = {
     "Calibration": "calibration.result",
     "Correction": "correction.protocol",
-    "Corrector": "correction.corrector",
+    "Corrector": "correction.apply",
     "Experiment": "experiment.experiment",
     "Finding": "findings",
     "Flag": "findings",

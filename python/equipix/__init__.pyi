@@ -12,7 +12,7 @@ from equipix._native import __version__ as __version__
 from equipix.calibration.calibrate import calibrate as calibrate
 from equipix.calibration.result import Calibration as Calibration
 from equipix.comparison import compare as compare
-from equipix.correction.corrector import Corrector as Corrector
+from equipix.correction.apply import Corrector as Corrector
 from equipix.correction.polynomial import Polynomial as Polynomial
 from equipix.correction.polynomial import combine as combine
 from equipix.correction.protocol import Correction as Correction

@@ -9,13 +9,18 @@ from os import PathLike
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import numpy.typing as npt
+from numpy.typing import NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
+
+ArrayLike: TypeAlias = npt.ArrayLike
 
 Array: TypeAlias = NDArray[Any]
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Ints: TypeAlias = NDArray[np.int64]
 
 Bools: TypeAlias = NDArray[np.bool_]
 
@@ -179,7 +184,7 @@ def _refuse_units(shifts: object) -> None:
         if unit is not None and str(unit) not in _PIXELS:
             raise InputError(
                 f"'shifts' has the unit {unit}, expected plain numbers of pixels: divide by the "
-                "pixel pitch, see 'From micrometres to pixels' in README"
+                "pixel pitch, see 'From micrometres to pixels' in docs/shifts.md"
             )
     if isinstance(first, str):
         raise InputError(
@@ -215,12 +220,17 @@ def check_bit_depth(bits: int) -> None:
         raise InputError(f"'bit_depth' is {bits!r}, expected 8 to 16")
 
 
+def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:
+    """Whether a value is a whole number, and no truth value, from `least` to `most`."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return whole and bool(least <= value <= most)
+
+
 def positive_workers(workers: int | None) -> int | None:
     """The number of worker threads, checked."""
     if workers is None:
         return None
-    whole = isinstance(workers, int | np.integer) and not isinstance(workers, bool)
-    if not whole or not 1 <= workers <= _MOST_WORKERS:
+    if not is_whole(workers, 1, _MOST_WORKERS):
         raise InputError(
             f"'workers' is {workers!r}, expected a whole number from 1 to {_MOST_WORKERS} or None"
         )
@@ -229,7 +239,7 @@ def positive_workers(workers: int | None) -> int | None:
 
 def positive_count(name: str, value: int) -> int:
     """A whole number above 0, checked; above 64 bits it becomes the largest of 64 bits."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not is_whole(value, 1):
         raise InputError(f"'{name}' is {value!r}, expected a positive whole number or None")
     return min(int(value), 2**63 - 1)
 
@@ -242,6 +252,14 @@ def number(name: str, value: float) -> float:
         return float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{name}' is {value!r}, expected a number") from error
+
+
+def positive(name: str, value: float, *, zero: bool = False) -> float:
+    """A finite number above 0, or 0 where that is allowed, checked."""
+    checked = number(name, value)
+    if not (0 < checked < np.inf or (zero and checked == 0)):
+        raise InputError(f"'{name}' is {value!r}, expected a finite number above 0{' or 0' * zero}")
+    return checked
 
 
 def as_level(saturation: float | None) -> float | None:
@@ -283,10 +301,11 @@ def per_exposure(
     return array
 
 
-def check_count(name: str, got: int, count: int) -> None:
-    """Refuse an argument that has not one entry for each exposure."""
+def check_count(name: str, got: int, count: int, one: str = "exposure") -> None:
+    """Refuse an argument that has not one entry for each exposure, or level."""
     if got != count:
-        raise InputError(f"'{name}' has {got} entries, expected {count}: one an exposure")
+        article = "an" if one[0] in "aeiou" else "a"
+        raise InputError(f"'{name}' has {got} entries, expected {count}: one {article} {one}")
 
 
 def union(*masks: Bools | None) -> Bools | None:
@@ -295,15 +314,21 @@ def union(*masks: Bools | None) -> Bools | None:
     return functools.reduce(np.logical_or, given) if given else None
 
 
-def as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
-    """Mask of one exposure or of all, of frames of that shape."""
-    array = as_array("mask", mask, ndim=(2, 3))
+def as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+    """Mask of frames of that shape (rows, cols), or (n, rows, cols): of each or of all of them."""
+    if mask is None:
+        return None
+    shapes = list(dict.fromkeys([shape[-2:], shape]))
+    array = as_array("mask", mask, ndim=tuple(map(len, shapes)))
     if array.dtype != np.bool_:
         raise InputError(
             f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
         )
-    if array.shape not in (shape[1:], shape):
-        raise InputError(f"'mask' has shape {array.shape}, expected {shape[1:]} or {shape}")
+    if array.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise InputError(f"'mask' has shape {array.shape}, expected {wanted}")
+    if array.all():
+        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     return array
 
 

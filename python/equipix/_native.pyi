@@ -78,7 +78,10 @@ def read_file(path: str | PathLike[str], workers: int | None) -> NDArray[Any]: .
 
 @final
 class Corrector:
-    """A correction prepared for many frames; it keeps a copy of the coefficients."""
+    """A correction prepared for many frames; it keeps a copy of the coefficients.
+
+    With coefficients of float32 it takes and gives uint8, uint16 and float32, of float64 float64.
+    """
 
     def __new__(
         cls,

@@ -1,16 +1,12 @@
 """How far several calibrations of one sensor agree, and how far they should."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import as_array, check_count
+from equipix._check import Array, ArrayLike, Bools, Ints, as_array, check_count
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError
 from equipix.findings import Flag, determined
@@ -46,17 +42,17 @@ class Comparison:
         What the uncertainties of two independent calibrations predict for `rms` and `block_rms`.
     """
 
-    sensitivities: NDArray[Any]
-    agreement: NDArray[Any]
-    pairs: NDArray[np.int64]
-    rms: NDArray[Any]
-    block_rms: NDArray[Any]
-    largest: NDArray[Any]
-    open_tilt: NDArray[np.bool_]
-    predicted_rms: NDArray[Any] | None = None
-    predicted_block_rms: NDArray[Any] | None = None
+    sensitivities: Array
+    agreement: Array
+    pairs: Ints
+    rms: Array
+    block_rms: Array
+    largest: Array
+    open_tilt: Bools
+    predicted_rms: Array | None = None
+    predicted_block_rms: Array | None = None
 
-    def difference(self, pair: int) -> NDArray[Any]:
+    def difference(self, pair: int) -> Array:
         """Relative difference of the sensitivities of a pair, (M₁ − M₂)/M₂, shape (rows, cols).
 
         Without its slope where `open_tilt` is true.
@@ -159,12 +155,12 @@ def _leaves_tilt(calibration: Calibration) -> bool:
     return any(finding.kind == "tilt" for finding in calibration.findings)
 
 
-def _difference(first: NDArray[Any], second: NDArray[Any], open_tilt: bool) -> NDArray[Any]:
+def _difference(first: Array, second: Array, open_tilt: bool) -> Array:
     """Relative difference of two sensitivities, without its slope where a tilt is open."""
     return relative_error(_levelled(first, second) if open_tilt else first, second)
 
 
-def _levelled(sensitivity: NDArray[Any], like: NDArray[Any]) -> NDArray[Any]:
+def _levelled(sensitivity: Array, like: Array) -> Array:
     """Sensitivity times the tilt that brings the slope of ln of the ratio to another to 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.log(sensitivity / like)
@@ -177,7 +173,7 @@ def _levelled(sensitivity: NDArray[Any], like: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(levelled * (np.nanmean(like) / np.nanmean(levelled)))
 
 
-def _in_one_gauge(calibrations: Sequence[Calibration]) -> NDArray[Any]:
+def _in_one_gauge(calibrations: Sequence[Calibration]) -> Array:
     """Sensitivities of mean 1 over the pixels that are good in all, NaN elsewhere."""
     maps = np.stack([each.sensitivity.astype(np.float64) for each in calibrations])
     good = np.isfinite(maps).all(axis=0)
@@ -186,11 +182,11 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> NDArray[Any]:
     if not good.any():
         raise InputError("'calibrations' have no pixel that is good in all of them")
     maps[:, ~good] = np.nan
-    gauged: NDArray[Any] = maps / np.nanmean(maps, axis=(1, 2), keepdims=True)
+    gauged: Array = maps / np.nanmean(maps, axis=(1, 2), keepdims=True)
     return gauged
 
 
-def _expected(calibrations: Sequence[Calibration]) -> NDArray[Any] | None:
+def _expected(calibrations: Sequence[Calibration]) -> Array | None:
     """Rms of the relative error in pixels and in block means, by the uncertainties, if known."""
     expected = []
     for each in calibrations:
@@ -206,7 +202,7 @@ def _expected(calibrations: Sequence[Calibration]) -> NDArray[Any] | None:
     return np.array(expected)
 
 
-def _some_blocks(calibration: Calibration) -> NDArray[Any]:
+def _some_blocks(calibration: Calibration) -> Array:
     """Weights of the means over some blocks, each less the mean over all: shape (m, rows, cols)."""
     good = determined(calibration.sensitivity, calibration.flags)
     rows, cols = (size // BLOCK for size in calibration.shape)
@@ -221,9 +217,7 @@ def _some_blocks(calibration: Calibration) -> NDArray[Any]:
     return np.array(weights)
 
 
-def _predictions(
-    predicted: ArrayLike | None, pairs: NDArray[np.int64], count: int
-) -> dict[str, NDArray[Any]]:
+def _predictions(predicted: ArrayLike | None, pairs: Ints, count: int) -> dict[str, Array]:
     """Errors of two calibrations in quadrature, in pixels and in blocks."""
     if predicted is None:
         return {}

@@ -1,15 +1,12 @@
 """A calibration with a virtual camera, compared with the truth and with a flat field."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from equipix._check import Progress
+from equipix._check import Array, Progress
 from equipix.calibration.result import Calibration
 from equipix.experiment.experiment import Experiment
 from equipix.exposures.spots import cross_pattern
@@ -52,17 +49,17 @@ class Demo:
     """
 
     calibration: Calibration
-    truth: NDArray[Any]
-    flat_field: NDArray[Any]
+    truth: Array
+    flat_field: Array
     predicted: tuple[float, float]
 
     @property
-    def error(self) -> NDArray[Any]:
+    def error(self) -> Array:
         """Relative error of the calibration, shape (rows, cols)."""
         return relative_error(self.calibration.sensitivity, self.truth)
 
     @property
-    def flat_field_error(self) -> NDArray[Any]:
+    def flat_field_error(self) -> Array:
         """Relative error of the flat field, shape (rows, cols)."""
         return relative_error(self.flat_field, self.truth)
 
@@ -137,11 +134,11 @@ def virtual_experiment(
     return replace(virtual, camera=replace(camera, dead=dead, hot=hot))
 
 
-def _under_hole(virtual: VirtualExperiment, pixels: NDArray[Any]) -> NDArray[Any]:
+def _under_hole(virtual: VirtualExperiment, pixels: Array) -> Array:
     """Whether the image of the hole falls on these pixels in any exposure."""
     rows, cols = np.divmod(pixels, virtual.camera.shape[1])
     light = [virtual.hole(rows + row, cols + col) for row, col in virtual.positions]
-    under: NDArray[Any] = np.max(light, axis=0) > UNDER_HOLE * EXPOSURE_E
+    under: Array = np.max(light, axis=0) > UNDER_HOLE * EXPOSURE_E
     return under
 
 
@@ -187,9 +184,10 @@ def run_demo(
     manifest = virtual.write(folder, force=force, progress=progress)
     experiment = Experiment.load(manifest)
     calibration = experiment.run(tolerance=tolerance, workers=workers, progress=progress)
-    _tell(progress, "flat field")
+    report: Progress = progress or (lambda *_: None)
+    report(0, 1, "flat field")
     flat_field = _flat_field(camera, virtual.truth.dark, frames, rng)
-    _tell(progress, "prediction")
+    report(0, 1, "prediction")
     return Demo(
         calibration=calibration,
         truth=np.where(camera.good, camera.response, np.nan),
@@ -198,17 +196,12 @@ def run_demo(
     )
 
 
-def _flat_field(camera: Camera, dark: NDArray[Any], frames: int, rng: int) -> NDArray[Any]:
+def _flat_field(camera: Camera, dark: Array, frames: int, rng: int) -> Array:
     """Sensitivity as the mean of frames of a source that is assumed uniform but is not."""
     rows, cols = camera.shape
     slope = np.add.outer(np.linspace(-0.25, 0.25, rows), np.linspace(-0.25, 0.25, cols))
     light = EXPOSURE_E * (1 + SOURCE_UNEVENNESS * slope)
     signal = average(camera.frames(light, frames, rng=rng)).mean - dark
     signal[~camera.good] = np.nan
-    normalised: NDArray[Any] = signal / np.nanmean(signal)
+    normalised: Array = signal / np.nanmean(signal)
     return normalised
-
-
-def _tell(progress: Progress | None, stage: str) -> None:
-    if progress is not None:
-        progress(0, 1, stage)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import warnings
-
 __all__ = [
     "ConvergenceWarning",
     "EquipixError",
@@ -45,7 +42,15 @@ class InsufficientMemoryError(EquipixError, MemoryError):
 
 
 class EquipixWarning(UserWarning):
-    """Base class of all warnings of this package."""
+    """Base class of all warnings of this package.
+
+    Attributes
+    ----------
+    kind : str
+        The kind of the finding that it tells.
+    """
+
+    kind: str = ""
 
 
 class ConvergenceWarning(EquipixWarning):
@@ -62,15 +67,3 @@ class InputWarning(EquipixWarning):
 
 class MisfitWarning(EquipixWarning):
     """The data contradict the model: residuals, shifts, fluxes, the dark or the curves."""
-
-
-def warn(message: str, category: type[EquipixWarning]) -> None:
-    """Warn, at the line outside of the package that called it."""
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and _is_own(frame.f_globals.get("__name__", "")):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(message, category, stacklevel=level)
-
-
-def _is_own(module: str) -> bool:
-    return module == "equipix" or module.startswith("equipix.")

@@ -1,10 +1,13 @@
-"""What limits a result, as bad_pixels; what limits a pixel, as flags."""
+"""What limits a result, as findings; what limits a pixel, as flags."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import sys
+import warnings
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -15,36 +18,23 @@ from equipix.errors import (
     IdentifiabilityWarning,
     InputWarning,
     MisfitWarning,
-    warn,
 )
 
-_CATEGORIES: dict[str, type[EquipixWarning]] = {
-    "rounding": InputWarning,
-    "order": IdentifiabilityWarning,
-    "saturation": InputWarning,
-    "unit": IdentifiabilityWarning,
-    "raw": InputWarning,
-    "light": MisfitWarning,
-    "flux": MisfitWarning,
-    "repeated": MisfitWarning,
-    "partial": IdentifiabilityWarning,
-    "sign": MisfitWarning,
-    "orientation": IdentifiabilityWarning,
-    "components": IdentifiabilityWarning,
-    "pattern": IdentifiabilityWarning,
-    "tilt": IdentifiabilityWarning,
-    "faint": IdentifiabilityWarning,
-    "dark": IdentifiabilityWarning,
+Concern = Literal["input", "identifiability", "misfit", "convergence"]
+"""What a finding concerns: the values given, what they determine, the model, or the solver."""
+
+Severity = Literal["note", "warning", "failure"]
+"""The result is right, may be wrong, or is none."""
+
+WARNINGS: dict[Concern, type[EquipixWarning]] = {
+    "input": InputWarning,
+    "identifiability": IdentifiabilityWarning,
     "misfit": MisfitWarning,
-    "cfa": MisfitWarning,
-    "colour": MisfitWarning,
-    "drift": MisfitWarning,
-    "prior": MisfitWarning,
-    "variance": MisfitWarning,
     "convergence": ConvergenceWarning,
-    "uncertainty": ConvergenceWarning,
 }
-"""The warning of each kind of finding."""
+"""The class of the warning of each concern."""
+
+_Evidence = TypeVar("_Evidence")
 
 
 @dataclass(frozen=True)
@@ -54,24 +44,75 @@ class Finding:
     Attributes
     ----------
     kind : str
-        Its subject: one of the keys above.
+        Its subject, such as "saturation" or "drift".
     message : str
         What is wrong, the value, the limit and the remedy.
+    concern : {"input", "identifiability", "misfit", "convergence"}
+        What it concerns: the values given, what they determine, the model, or the solver. It sets
+        the class of the warning.
+    severity : {"note", "warning", "failure"}
+        "note" where the result is right and the next measurement can be better, "failure" where
+        less than half of it is determined.
     """
 
     kind: str
     message: str
-
-    def __post_init__(self) -> None:
-        """Refuse a kind that there is not."""
-        if self.kind not in _CATEGORIES:
-            raise ValueError(f"finding of kind {self.kind!r}, expected one of {[*_CATEGORIES]}")
+    concern: Concern
+    severity: Severity = "warning"
 
 
-def say(findings: Iterable[Finding]) -> None:
-    """Raise the warning of each; no other function warns of a calibration."""
-    for finding in findings:
-        warn(finding.message, _CATEGORIES[finding.kind])
+@dataclass(frozen=True)
+class Rule(Generic[_Evidence]):
+    """A question that may give a finding: an entry in a table of them.
+
+    Attributes
+    ----------
+    kind, concern, severity : str
+        Those of the finding.
+    ask : callable
+        Answers from evidence with the message of the finding, or with nothing.
+    unless : frozenset of str
+        Kinds that explain the finding: beside one of them the question is not asked.
+    instead : frozenset of str
+        Kinds in whose place the finding stands.
+    """
+
+    kind: str
+    concern: Concern
+    ask: Callable[[_Evidence], str | None]
+    unless: frozenset[str] = frozenset()
+    instead: frozenset[str] = frozenset()
+    severity: Severity = "warning"
+
+
+def ask(
+    rules: Iterable[Rule[_Evidence]], evidence: _Evidence, before: Iterable[Finding] = ()
+) -> tuple[Finding, ...]:
+    """Ask the questions of a table in its order; `before` are findings that may explain others."""
+    explained, found = {each.kind for each in before}, list[Finding]()
+    for rule in rules:
+        if rule.unless & (explained | {each.kind for each in found}):
+            continue
+        if message := rule.ask(evidence):
+            found = [each for each in found if each.kind not in rule.instead]
+            found.append(Finding(rule.kind, message, rule.concern, rule.severity))
+    return tuple(found)
+
+
+def say(*findings: Finding) -> tuple[Finding, ...]:
+    """Warn of each finding, at the line outside of the package that called it; return all."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and _is_own(frame.f_globals.get("__name__", "")):
+        level, frame = level + 1, frame.f_back
+    for each in findings:
+        warning = WARNINGS[each.concern](each.message)
+        warning.kind = each.kind
+        warnings.warn(warning, stacklevel=level)
+    return findings
+
+
+def _is_own(module: str) -> bool:
+    return module == "equipix" or module.startswith("equipix.")
 
 
 class Flag(IntFlag):
@@ -107,7 +148,7 @@ BITS = {
     "out_of_range": Flag.OTHER_BAD_PIXEL | Flag.DO_NOT_USE,
 }
 """Bits that each finding sets; a saturated value is left out of its exposure, and the pixel keeps
-the sensitivity that the others determine. The last six are bad_pixels on response curves."""
+the sensitivity that the others determine. The last six are on response curves."""
 
 
 def set_bits(flags: Array, finding: str, pixels: Bools | None) -> None:

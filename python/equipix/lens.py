@@ -9,12 +9,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, ReadOnly, as_array, check_shape, check_word
+from equipix._check import Bools, Floats, ReadOnly, as_array, as_mask, check_shape, check_word
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import set_bits
 from equipix.measured.colour import Colours
 from equipix.measured.filters import responses
+from equipix.measured.noise import ROBUST
 from equipix.metrics.maps import block_means
 
 __all__ = ["LensFalloff", "fit"]
@@ -221,13 +222,13 @@ def _image(frame: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | No
     image = as_array("frame", frame, ndim=2).astype(np.float64)
     if sensitivity is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            image = image / _map("sensitivity", sensitivity, image.shape)
-    if mask is not None:
-        given = _map("mask", mask, image.shape)
-        if given.dtype != np.bool_:
-            raise InputError(f"'mask' has dtype {given.dtype}, expected bool: True = do not use")
-        image[given] = np.nan
+            gain = as_array("sensitivity", sensitivity, ndim=2)
+            if gain.shape != image.shape:
+                raise InputError(f"'sensitivity' has shape {gain.shape}, expected {image.shape}")
+            image = image / gain
     image[~np.isfinite(image)] = np.nan
+    if (excluded := as_mask(mask, image.shape)) is not None:
+        image[excluded] = np.nan
     if np.count_nonzero(np.isfinite(image)) < 100:
         raise InputError("'frame' has fewer than 100 finite values, expected those of a sensor")
     return image
@@ -241,14 +242,6 @@ def _refuse_negative(image: Floats) -> None:
             f"'frame' has the median {median:.6g}, expected light above 0: see that the dark was "
             "subtracted once, and from the flat"
         )
-
-
-def _map(name: str, given: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Refuse a map of another shape than the flat."""
-    array = as_array(name, given, ndim=2)
-    if array.shape != shape:
-        raise InputError(f"'{name}' has shape {array.shape}, expected {shape}")
-    return array
 
 
 def _blocks(image: Floats) -> tuple[Floats, Floats, Floats]:
@@ -269,7 +262,7 @@ def _fitted(
     for _ in range(3):
         found = _least_squares(model, values, used, found)
         residual = values - model(found)
-        spread = 1.4826 * np.median(np.abs(residual[used]))
+        spread = ROBUST * np.median(np.abs(residual[used]))
         used = np.abs(residual) <= max(_CLIP * spread, 1e-9 * abs(found[0]))
     found = _least_squares(model, values, used, found)
     jacobian = _jacobian(model, found)[used]

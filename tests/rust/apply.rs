@@ -32,7 +32,7 @@ fn corrector(planes: usize, bad: &[usize], then: Unusable) -> Corrector {
     .unwrap()
 }
 
-fn applied<I: Raw, O: Corrected>(
+fn applied<I: Raw<f32>, O: Corrected<f32>>(
     corrector: &Corrector,
     frame: &[I],
     zero: O,
@@ -43,7 +43,7 @@ fn applied<I: Raw, O: Corrected>(
     (out, counts.limited)
 }
 
-fn counted<I: Raw, O: Corrected>(
+fn counted<I: Raw<f32>, O: Corrected<f32>>(
     corrector: &Corrector,
     frames: &[I],
     zero: O,
@@ -295,4 +295,25 @@ fn a_pixel_behind_filters_is_replaced_by_the_nearest_of_its_colour() {
     // Five red ones two pixels away, and the four green ones on the diagonals.
     assert_eq!(out[red], (100 * 5 + 12 + 16 + 2 + 4) as f32 / 5.0 + 0.0);
     assert_eq!(out[green], (300 * 4 + 1 + 3 + 13 + 15) as f32 / 4.0);
+}
+
+#[test]
+fn double_precision_follows_the_formula_and_replaces_pixels() {
+    let values: Vec<f64> = coefficients(4).iter().map(|&value| f64::from(value) / 3.0).collect();
+    let raw: Vec<f64> = frame().iter().map(|&y| f64::from(y) / 7.0).collect();
+    let formula = |pixel: usize| {
+        (0..4).rev().fold(0.0, |sum, plane| sum * raw[pixel] + values[plane * SHAPE.len() + pixel])
+    };
+    let mut unusable = vec![false; SHAPE.len()];
+    unusable[0] = true;
+    let stack = Stack::new("coefficients", &values, 4, SHAPE).unwrap();
+    let corrector = Corrector::new(stack, &unusable, Unusable::Replaced, Alike::ALL).unwrap();
+    let (mut out, workers) = (vec![0_f64; SHAPE.len()], Workers::new(None).unwrap());
+    let counts = corrector.apply(&raw, &mut out, 0.0, &workers, &Control::new()).unwrap();
+    for (pixel, &got) in out.iter().enumerate().skip(1) {
+        assert_eq!(got.to_bits(), formula(pixel).to_bits());
+    }
+    assert_eq!(out[0], (formula(1) + formula(53) + formula(54)) / 3.0);
+    let highest = raw.iter().copied().fold(0.0, f64::max);
+    assert_eq!((counts.highest, counts.limited), (highest, 0));
 }

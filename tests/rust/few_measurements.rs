@@ -225,25 +225,82 @@ fn measurements_apart_are_lost_where_they_alone_see_cells() {
     }
 }
 
+/// What a fit finds where all exposures have the same mask.
+fn fit_without(is_out: &dyn Fn(usize) -> bool) -> Answer {
+    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 11);
+    let found = fit(&masked(&simulation, &|_, pixel| !is_out(pixel)), Options::to(1e-6)).unwrap();
+    assert!(found.converged);
+    found
+}
+
+const fn is_black(pixel: usize) -> bool {
+    (pixel / SHAPE[1] + pixel % SHAPE[1]).is_multiple_of(2)
+}
+
 #[test]
 fn none_is_lost_where_many_stand_apart() {
-    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 11);
-    let at = |pixel: usize| (pixel / SHAPE[1], pixel % SHAPE[1]);
-    let is_black = |pixel: usize| (at(pixel).0 + at(pixel).1).is_multiple_of(2);
-    let masks: [&dyn Fn(usize) -> bool; 4] = [
-        // Chessboards, every second column, and all colours but one.
+    let at = |pixel: usize| [pixel / SHAPE[1], pixel % SHAPE[1]];
+    let masks: [&dyn Fn(usize) -> bool; 3] = [
+        // A chessboard, every second column, and all colours but one.
         &is_black,
-        &|pixel| at(pixel).1 >= 16 && is_black(pixel),
-        &|pixel| at(pixel).1 >= 13 && at(pixel).1 % 2 == 1,
-        &|pixel| at(pixel).0 % 2 == 1 || at(pixel).1 % 2 == 1,
+        &|pixel| at(pixel)[1] % 2 == 1,
+        &|pixel| at(pixel).iter().any(|at| at % 2 == 1),
     ];
     for is_out in masks {
-        let experiment = masked(&simulation, &|_, pixel| !is_out(pixel));
-        let found = fit(&experiment, Options::to(1e-6)).unwrap();
-        assert!(found.converged);
+        let found = fit_without(is_out);
         assert!(found.lost.is_empty());
         assert!((0..PIXELS).all(|pixel| found.sensitivity[pixel].is_nan() == is_out(pixel)));
     }
+}
+
+#[test]
+fn many_stand_apart_in_three_tenths_of_a_part_or_half_of_an_exposure() {
+    let col = |pixel: usize| pixel % SHAPE[1];
+    // A chessboard of 8 measurements in each column behind others: 200 and 176 of 640 pixels, the part being the whole
+    // sensor. They are less than half of the measurements.
+    let board = |first: usize| move |pixel: usize| col(pixel) >= first && is_black(pixel);
+    assert!(fit_without(&board(15)).lost.is_empty());
+    assert!(!fit_without(&board(18)).lost.is_empty());
+    // Ten columns of 16 measurements apart beside 9 and 11 that are not: 160 of 640 pixels.
+    let comb = |first: usize| {
+        move |pixel: usize| {
+            col(pixel) >= first
+                && (col(pixel) >= first + 20 || (col(pixel) - first).is_multiple_of(2))
+        }
+    };
+    assert!(fit_without(&comb(9)).lost.is_empty());
+    assert!(!fit_without(&comb(11)).lost.is_empty());
+}
+
+#[test]
+fn an_exposure_that_would_lose_all_keeps_all() {
+    // The last one alone measures its pixels, and all of them see cells that no others see: a component of their own.
+    let used =
+        |k: usize, pixel: usize| if k < 4 { pixel % SHAPE[1] < 30 } else { pixel % SHAPE[1] >= 36 };
+    let gone = lost(&used, &[0; 5], 0);
+    let all: Vec<usize> = (0..PIXELS).filter(|&pixel| used(4, pixel)).collect();
+    assert_eq!(gone[4], all);
+    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 12);
+    // The penalty alone determines the light there, so the search is not asked to end.
+    let options = Options { most_passes: Some(20), ..Options::to(1e-6) };
+    let found = fit(&masked(&simulation, &used), options).unwrap();
+    assert!(found.lost.is_empty());
+    assert!(all.iter().all(|&pixel| found.labels[0][pixel] == 1));
+}
+
+#[test]
+fn lost_measurements_that_are_not_of_the_exposures_are_refused() {
+    let simulation = Simulation::seeing(even, SHAPE, &BETWEEN).with_noise(NOISE, 13);
+    let experiment = simulation.experiment();
+    let found = fit(&experiment, Options::to(1e-6)).unwrap();
+    let error_with = |lost: Vec<Vec<usize>>| {
+        let answer = Answer { lost, ..found.clone() };
+        error_map(&experiment, &answer, 1).err().unwrap().to_string()
+    };
+    let words = error_with(vec![Vec::new(); 4]);
+    assert_eq!(words, "'start' has lost measurements of 4 exposures, expected 5");
+    let words = error_with([vec![vec![PIXELS - 1]; 4], vec![vec![PIXELS]]].concat());
+    assert_eq!(words, "'start' has lost pixel 640, expected 0 to 639");
 }
 
 #[test]

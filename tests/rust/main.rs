@@ -5,6 +5,7 @@
 mod apply;
 mod choice;
 mod common;
+mod curves;
 mod dense;
 mod descent;
 mod estimate;
@@ -17,7 +18,6 @@ mod fraction;
 mod joint;
 mod laws;
 mod multiscale;
-mod response;
 mod scene;
 mod simulation;
 mod statistics;

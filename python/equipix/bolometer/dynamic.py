@@ -11,7 +11,7 @@ from equipix._check import Floats, number
 from equipix.bolometer.states import Axes
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
-from equipix.findings import set_bits
+from equipix.findings import Finding, set_bits
 from equipix.io.record import Counts, Record
 from equipix.measured.defects import DEAD_RESPONSE
 
@@ -39,6 +39,8 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
         Bits of `equipix.Flag`.
     metadata : dict
         Options and prediction errors, as JSON values.
+    findings : tuple of Finding
+        What limits the result, each also a warning of the fit.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
     gain_axes: Axes
     flags: Counts
     metadata: dict[str, Any] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -142,7 +145,7 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
         planes = np.stack([offset, gain])
         flags = self.flags.copy()
         set_bits(flags, "non_responding", response < DEAD_RESPONSE)
-        return Polynomial(planes, flags, metadata, leaves_offset=True)
+        return Polynomial(planes, flags, metadata, leaves_offset=True, findings=self.findings)
 
     def _middle_bias(self) -> float:
         low, high = self.axes.bias_v

@@ -10,7 +10,8 @@ import numpy as np
 
 from equipix._check import Bools, Floats
 from equipix.bolometer.states import Axes, Regressor, States, rank_of, solver_of
-from equipix.errors import InputError, MisfitWarning, warn
+from equipix.errors import InputError
+from equipix.findings import Rule
 
 HIGHEST = 8
 """Highest order in temperature."""
@@ -67,27 +68,25 @@ class HeldOut:
     largest: float
 
     def chosen(self) -> Chosen:
-        """Lowest order within 0.1 % of the smallest error, with a warning where that is large.
+        """Lowest order within 0.1 % of the smallest error; 0, without errors, of one temperature.
 
         Raises
         ------
         InputError
             If there are two temperatures, so that the others of one that is held out are one.
         """
+        if len(self.states.groups) == 1:
+            return Chosen(0, [])
         self._refuse_two()
         orders = range(1, min(HIGHEST, len(self.states.groups) - 2) + 1)
         possible = [0, *takewhile(self._is_possible, orders)]
         errors = [self._error(each) for each in possible]
-        enough = min(errors) * (1 + _BETTER) + self._rounding
+        enough = min(errors) * (1 + _BETTER) + self.rounding
         order = next(each for each, error in enumerate(errors) if error <= enough)
-        if len(errors) == 1:
-            self._warn_of_one()
-        else:
-            self._warn(order, errors[order])
         return Chosen(order, errors)
 
     @property
-    def _rounding(self) -> float:
+    def rounding(self) -> float:
         """Mean square error of exact data."""
         return (_ROUNDING * self.largest) ** 2
 
@@ -122,7 +121,7 @@ class HeldOut:
         one, solver = self.states.chosen(out), solver_of(axes, self.states.chosen(~out))
         return np.asarray(axes.basis(one.substrate_c, one.bias_v) @ solver)
 
-    def _error_of_noise(self, order: int, variance: Floats) -> float:
+    def error_of_noise(self, order: int, variance: Floats) -> float:
         """Mean square error of the predictions that noise alone makes."""
         axes, total, held = self.states.axes(order, *self.form), 0.0, self._held()
         for group in held:
@@ -131,32 +130,7 @@ class HeldOut:
             total += float(np.mean(variance[out] + of_prediction))
         return total / len(held)
 
-    def _warn(self, order: int, error: float) -> None:
-        """Warn of predictions that are worse than noise explains."""
-        noise = np.inf
-        if self.variance is not None:
-            noise = self._error_of_noise(order, self.variance) + self._rounding
-        if error <= _MANY_SIGMAS**2 * noise:
-            if order > 0:
-                self.warn_of_exchanged()
-            return
-        warn(
-            f"order {order} predicts temperatures that are held out best, yet with "
-            f"{np.sqrt(error / noise):.3g} times the error that noise explains: "
-            + (
-                self._turn()
-                or f"take references at more temperatures than {len(self.states.groups)}, and see "
-                "that each of 'substrate_c' is that of its reference"
-            ),
-            MisfitWarning,
-        )
-
-    def warn_of_exchanged(self) -> None:
-        """Warn of temperatures that are probably those of other references."""
-        if turn := self._turn():
-            warn(turn, MisfitWarning)
-
-    def _turn(self) -> str:
+    def turn(self) -> str:
         """Say where the pattern of the array turns back as the temperature rises, if it does.
 
         Its course is the score of the first principal component of the references of one bias,
@@ -192,50 +166,6 @@ class HeldOut:
             course = np.zeros_like(course)
         return celsius[order], course
 
-    def _warn_of_one(self) -> None:
-        """Warn where the states determine no order but 0."""
-        warn(
-            f"'order' is 'auto', but {len(self.states.groups)} temperatures with these biases "
-            "determine no order above 0 where one is held out: take references at more states, or "
-            "give 'order' and 'bias_order'",
-            MisfitWarning,
-        )
-
-    def warn_of_repeats(self) -> None:
-        """Warn of references at one temperature that differ by more than noise explains."""
-        axes = self.states.axes(0, *self.form)
-        freedom = len(self.deviation) - axes.terms
-        if self.variance is None or freedom < 1:
-            return
-        basis = axes.basis(self.states.substrate_c, self.states.bias_v)
-        left = self.deviation - basis @ (solver_of(axes, self.states) @ self.deviation)
-        error = float(np.median((left**2).sum(axis=0))) / freedom
-        noise = float(self.variance.mean()) + self._rounding
-        if error > _MANY_SIGMAS**2 * noise:
-            warn(
-                f"the references differ by {np.sqrt(error / noise):.3g} times their noise, but all "
-                f"of 'substrate_c' is {self.states.substrate_c[0]:g} °C: see that each is the "
-                "temperature of its reference",
-                MisfitWarning,
-            )
-
-    def warn_of_constant(self, chosen: Chosen) -> None:
-        """Warn where temperatures explain nothing, and no noise is known that hides it."""
-        if (
-            chosen.order > 0
-            or len(chosen.errors) == 1
-            or self.variance is not None
-            or chosen.errors[0] <= self._rounding
-        ):
-            return
-        warn(
-            "order 0 predicts temperatures that are held out best, with an error of "
-            f"{np.sqrt(chosen.errors[0]):.3g} DN rms, so 'substrate_c' explains nothing that the "
-            "references differ by: see that each is the temperature of its reference; averages in "
-            "their place tell how much of it is noise",
-            MisfitWarning,
-        )
-
     def _refuse_two(self) -> None:
         """Refuse to choose an order where one temperature would be predicted from one other."""
         groups = self.states.groups
@@ -244,3 +174,98 @@ class HeldOut:
                 "'order' is 'auto', which holds out a temperature, but 'substrate_c' has "
                 f"{[float(group[0]) for group in groups]} °C: give three, or an order"
             )
+
+
+class Judged(NamedTuple):
+    """Deviations, and the order that was chosen for them: by predictions, unless it was given.
+
+    The response of stable pixels may need order 0, their offset does not.
+    """
+
+    held_out: HeldOut
+    order: int
+    errors: list[float] | None
+    is_offset: bool
+
+
+def _on_prediction(e: Judged) -> str | None:
+    """Say that predictions are worse than noise explains."""
+    if not e.errors or len(e.errors) == 1:
+        return None
+    held_out, error, noise = e.held_out, e.errors[e.order], np.inf
+    if held_out.variance is not None:
+        noise = held_out.error_of_noise(e.order, held_out.variance) + held_out.rounding
+    if error <= _MANY_SIGMAS**2 * noise:
+        return None
+    return (
+        f"order {e.order} predicts temperatures that are held out best, yet with "
+        f"{np.sqrt(error / noise):.3g} times the error that noise explains: "
+        + (
+            held_out.turn()
+            or f"take references at more temperatures than {len(held_out.states.groups)}, and see "
+            "that each of 'substrate_c' is that of its reference"
+        )
+    )
+
+
+def _on_exchanged(e: Judged) -> str | None:
+    """Say that temperatures are probably those of other references."""
+    asked = e.is_offset if e.errors is None else e.order > 0
+    return e.held_out.turn() if asked else None
+
+
+def _on_one_order(e: Judged) -> str | None:
+    """Say that the states determine no order but 0."""
+    if e.errors is None or len(e.errors) != 1:
+        return None
+    return (
+        f"'order' is 'auto', but {len(e.held_out.states.groups)} temperatures with these biases "
+        "determine no order above 0 where one is held out: take references at more states, or "
+        "give 'order' and 'bias_order'"
+    )
+
+
+def _on_repeats(e: Judged) -> str | None:
+    """Say that references at one temperature differ by more than noise explains."""
+    held_out, states = e.held_out, e.held_out.states
+    axes = states.axes(0, *held_out.form)
+    freedom = len(held_out.deviation) - axes.terms
+    if e.errors != [] or held_out.variance is None or freedom < 1:
+        return None
+    basis = axes.basis(states.substrate_c, states.bias_v)
+    left = held_out.deviation - basis @ (solver_of(axes, states) @ held_out.deviation)
+    error = float(np.median((left**2).sum(axis=0))) / freedom
+    noise = float(held_out.variance.mean()) + held_out.rounding
+    if error <= _MANY_SIGMAS**2 * noise:
+        return None
+    return (
+        f"the references differ by {np.sqrt(error / noise):.3g} times their noise, but all "
+        f"of 'substrate_c' is {states.substrate_c[0]:g} °C: see that each is the "
+        "temperature of its reference"
+    )
+
+
+def _on_constant(e: Judged) -> str | None:
+    """Say that temperatures explain nothing, where no noise is known that hides it."""
+    if not e.errors or len(e.errors) == 1 or e.order > 0 or not e.is_offset:
+        return None
+    if e.held_out.variance is not None or e.errors[0] <= e.held_out.rounding:
+        return None
+    return (
+        "order 0 predicts temperatures that are held out best, with an error of "
+        f"{np.sqrt(e.errors[0]):.3g} DN rms, so 'substrate_c' explains nothing that the "
+        "references differ by: see that each is the temperature of its reference; averages in "
+        "their place tell how much of it is noise"
+    )
+
+
+_OTHER = frozenset({"states"})
+
+STATES: tuple[Rule[Judged], ...] = (
+    Rule("states", "misfit", _on_prediction),
+    Rule("states", "misfit", _on_exchanged, unless=_OTHER),
+    Rule("states", "misfit", _on_one_order),
+    Rule("states", "misfit", _on_repeats),
+    Rule("states", "misfit", _on_constant),
+)
+"""What is asked of references at several states."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -9,13 +10,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, as_array, check_shape, check_word, described
+from equipix._check import Array, Bools, Floats, Words, as_mask, check_word, is_whole, union
 from equipix.bolometer.dynamic import DynamicCorrection
-from equipix.bolometer.held_out import HIGHEST, Form, HeldOut
+from equipix.bolometer.held_out import HIGHEST, STATES, Form, HeldOut, Judged
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
-from equipix.errors import InputError, InputWarning, warn
-from equipix.findings import Flag, set_bits, usable
-from equipix.measured.defects import DEAD_RESPONSE, relative_response
+from equipix.errors import InputError
+from equipix.findings import Finding, Flag, ask, say, set_bits, usable
+from equipix.measured.defects import BadPixels, response_outliers
+from equipix.measured.measured import Measured, measured_of
 from equipix.measured.saturation import clipping
 from equipix.measured.statistics import FrameStatistics
 
@@ -93,10 +95,11 @@ def fit(
     the others. The lowest order within 0.1 % of the smallest error is taken; `metadata` has the
     errors.
 
-    Pixels with a missing value in a reference, and masked ones, are flagged ``NO_FLAT_FIELD``,
-    those with less than half of the mean response ``DEAD``, and those with a saturated sample in an
-    average, or the largest number of the type in an array of whole numbers, ``SATURATED``; they
-    count in no mean. Without black bodies no response is known, so no pixel is flagged ``DEAD``.
+    Pixels with a missing value in a reference, and masked ones, are flagged ``NO_FLAT_FIELD``, and
+    those with a saturated sample in an average, or the largest number of the type in an array of
+    whole numbers, ``SATURATED``. Those with less than half of the response of their neighbours are
+    flagged ``DEAD``, with more than twice of it ``HOT``, by the test of `equipix.nuc.fit`. They
+    count in no mean. Without black bodies no response is known, so neither is flagged.
 
     References
     ----------
@@ -106,7 +109,7 @@ def fit(
     Examples
     --------
     >>> import numpy as np
-    >>> from equipix import simulate
+    >>> from equipix import bolometer, simulate
     >>> array = simulate.BolometerArray.of((24, 32), rng=1)
     >>> celsius, volts = [-20, 0, 20, 40, 60], 2.0
     >>> shutter = [array.mean(each) for each in celsius]
@@ -115,18 +118,19 @@ def fit(
     >>> bool(np.std(left) < 1e-4 * np.std(array.mean(10.0)))
     True
     """
-    taken = References.of("shutter", shutter)
-    states = States.of(substrate_c, bias_v, len(taken.values))
+    taken = references_of("shutter", shutter)
+    states = States.of(substrate_c, bias_v, len(taken))
     powers = _bias_order(states, bias_order)
-    bodies = None if black_bodies is None else bodies_of(black_bodies, taken.values.shape)
+    bodies = [] if black_bodies is None else _bodies(black_bodies, taken.shape, len(taken))
     flags = flags_of(taken, bodies, mask)
     check_word("regressor", regressor, get_args(Regressor))
     good, form = usable(flags), Form(powers, regressor)
-    taken.warn_of_clipping("shutter", good)
-    for k, body in enumerate(bodies or ()):
-        body.warn_of_clipping(f"black_bodies[{k}]", good)
-    shown = Shown(taken.values, states, good, form, taken.noise(good))
-    chosen, errors = shown.order(order)
+    named = {"shutter": taken, **{f"black_bodies[{k}]": each for k, each in enumerate(bodies)}}
+    clipped = [_clipping(name, each, good) for name, each in named.items()]
+    said = say(*(Finding("saturation", words, "input") for words in clipped if words))
+    shown = Shown(taken.values, states, good, form, _noise(taken, good))
+    chosen, errors, more = shown.order(order)
+    said += more
     axes, offset = shown.coefficients(chosen)
     level = shown.coefficients_of_mean(chosen)
     metadata: dict[str, Any] = {
@@ -134,27 +138,17 @@ def fit(
             "order": chosen if errors is None else "auto",
             "bias_order": powers,
             "regressor": regressor,
-            "black_bodies": bodies is not None,
+            "black_bodies": bool(bodies),
         },
         "prediction_errors": errors,
     }
-    if bodies is None:
-        return DynamicCorrection(offset, None, level, axes, axes, flags, metadata)
-    rise = _response(bodies, states, good, form)
-    chosen, metadata["gain_prediction_errors"] = rise.order(order)
+    if not bodies:
+        return DynamicCorrection(offset, None, level, axes, axes, flags, metadata, said)
+    response, variance = response_of(bodies, good)
+    rise = Shown(response, states, good, form, variance, is_offset=False)
+    chosen, metadata["gain_prediction_errors"], more = rise.order(order)
     gain_axes, gain = rise.coefficients(chosen)
-    return DynamicCorrection(offset, gain, level, axes, gain_axes, flags, metadata)
-
-
-def _response(bodies: list[References], states: States, good: Bools, form: Form) -> Shown:
-    """Relative response of all pixels, and the noise of it."""
-    cold, hot = bodies
-    rise, noises = hot.values - cold.values, [each.noise(good) for each in bodies]
-    variance = None
-    if noises[0] is not None and noises[1] is not None:
-        variance = (noises[0] + noises[1]) / rise[:, good].mean(axis=1) ** 2
-    response = relative_response(rise, good)
-    return Shown(response, states, good, form, variance, is_offset=False)
+    return DynamicCorrection(offset, gain, level, axes, gain_axes, flags, metadata, said + more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,21 +188,17 @@ class Shown:
         axes = self.states.axes(order, *self.form)
         return np.asarray(solver_of(axes, self.states) @ self.mean)
 
-    def order(self, order: int | Literal["auto"]) -> tuple[int, list[float] | None]:
-        """Order that is given, or that which best predicts, and the prediction error of each."""
+    def order(
+        self, order: int | Literal["auto"]
+    ) -> tuple[int, list[float] | None, tuple[Finding, ...]]:
+        """Order that is given, or that which best predicts; prediction errors, and findings."""
+        given = None
         if not (isinstance(order, str) and order == "auto"):
             given = _checked_order(order)
-            if self.is_offset:
-                self._held_out().warn_of_exchanged()
-            return given, None
         held_out = self._held_out()
-        if len(self.states.groups) == 1:
-            held_out.warn_of_repeats()
-            return 0, None
-        chosen = held_out.chosen()
-        if self.is_offset:
-            held_out.warn_of_constant(chosen)
-        return chosen
+        chosen, errors = held_out.chosen() if given is None else (given, None)
+        said = say(*ask(STATES, Judged(held_out, chosen, errors, self.is_offset)))
+        return chosen, errors or None, said
 
     def _held_out(self) -> HeldOut:
         """Values of usable pixels, of which some are to be predicted."""
@@ -221,136 +211,113 @@ def _bias_order(states: States, given: int | None) -> int:
     """Highest power of V², checked."""
     if given is None:
         return min(1, len(states.biases) - 1)
-    if isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 0:
+    if not is_whole(given, 0):
         raise InputError(f"'bias_order' is {given!r}, expected a whole number from 0, or None")
     return int(given)
 
 
 def _checked_order(order: int | str) -> int:
-    whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if not whole or not 0 <= int(order) <= HIGHEST:
-        raise InputError(f"'order' is {described(order)}, expected 0 to {HIGHEST} or 'auto'")
+    if not is_whole(order, 0, HIGHEST):
+        raise InputError(f"'order' is {order!r}, expected 0 to {HIGHEST} or 'auto'")
     return int(order)
 
 
-@dataclass(frozen=True, eq=False)
-class References:
-    """Mean frames of all states, what is known of their noise, and where they saturate.
-
-    Attributes
-    ----------
-    values : ndarray, shape (n, rows, cols), float64
-        The mean frames in DN.
-    variance : tuple of ndarray, or None
-        Variances of the means, where all references are averages.
-    saturated : ndarray, shape (rows, cols), bool
-        Pixels that are known to saturate in a reference.
-    """
-
-    values: Floats
-    variance: tuple[Floats, ...] | None
-    saturated: Bools
-
-    @classmethod
-    def of(cls, name: str, given: ArrayLike | Sequence[FrameStatistics]) -> References:
-        """Check the frames of all states, and warn of values that probably saturate."""
-        if isinstance(given, FrameStatistics):
-            raise InputError(f"'{name}' is one FrameStatistics, expected a sequence: one a state")
-        listed: list[Any] = list(given) if isinstance(given, list | tuple) else []
-        averages = [each for each in listed if isinstance(each, FrameStatistics)]
-        variance = None
-        if averages and len(averages) == len(listed):
-            variance = tuple(each.variance_of_mean for each in averages)
-        values = _stack(name, listed or given)
-        found = cls(values.astype(np.float64), variance, np.zeros(values.shape[1:], bool))
-        for each in listed or values:
-            at_top = each.saturated > 0 if isinstance(each, FrameStatistics) else _at_the_top(each)
-            found.saturated[at_top] = True
-        return found
-
-    def noise(self, good: Bools) -> Floats | None:
-        """Mean variance of the means of usable pixels at each state, where it is known."""
-        if self.variance is None:
-            return None
-        noise = np.array([each[good].mean() for each in self.variance])
-        return noise if np.isfinite(noise).all() else None
-
-    def warn_of_clipping(self, name: str, good: Bools) -> None:
-        """Warn of values of usable pixels at exactly the highest one."""
-        for k, frame in enumerate(self.values):
-            found = clipping(np.where(good, frame, np.nan))
-            if found is not None:
-                warn(
-                    f"{found.values} values of '{name}' at state {k} are exactly "
-                    f"{found.level:.10g}, the highest one: they probably saturate and count as "
-                    "valid: exclude their pixels by 'mask', or give averages with a 'saturation'",
-                    InputWarning,
-                )
-                return
+def references_of(name: str, given: Any) -> Measured:
+    """Mean frames of all states; of averages with the variances of their means."""
+    if isinstance(given, FrameStatistics):
+        raise InputError(f"'{name}' is one FrameStatistics, expected a sequence: one a state")
+    listed: list[Any] = list(given) if isinstance(given, list | tuple) else []
+    averages = [each for each in listed if isinstance(each, FrameStatistics)]
+    means = [each.mean if isinstance(each, FrameStatistics) else each for each in listed]
+    measured = measured_of(means or given, words=Words(f"'{name}'", "state"))
+    saturated = [each.saturated > 0 for each in averages]
+    variance = None
+    if averages and len(averages) == len(listed):
+        variance = np.stack([each.variance_of_mean for each in averages])
+    return dataclasses.replace(
+        measured,
+        values=measured.values.astype(np.float64, copy=False),
+        variance=variance,
+        bad_pixels=BadPixels(saturated=union(measured.bad_pixels.saturated, *saturated)),
+    )
 
 
-def _stack(name: str, given: Any) -> Array:
-    """Mean frames of all states as one array (n, rows, cols), in the type of the frames."""
-    if isinstance(given, list | tuple):
-        given = [each.mean if isinstance(each, FrameStatistics) else each for each in given]
-        shapes = {np.shape(each) for each in given}
-        if len(shapes) > 1:
-            raise InputError(f"'{name}' has frames of {sorted(shapes)}, expected one shape")
-    values = as_array(name, given, ndim=3)
-    check_shape((values.shape[1], values.shape[2]))
-    if not len(values):
-        raise InputError(f"'{name}' has no frames, expected one for each state")
-    return values
-
-
-def _at_the_top(given: ArrayLike) -> Bools:
-    """Pixels of a frame at the largest number of its type of whole numbers."""
-    frame = np.asanyarray(given)
-    if frame.dtype.kind not in "iu":
-        return np.zeros(frame.shape, bool)
-    return np.asarray(frame == np.iinfo(frame.dtype).max)
-
-
-def bodies_of(given: Any, shape: tuple[int, ...]) -> list[References]:
+def _bodies(given: Any, shape: tuple[int, int], count: int) -> list[Measured]:
     """Frames of the cold and the hot black body."""
     if not isinstance(given, list | tuple) or len(given) != 2:
         raise InputError("'black_bodies' is no pair, expected (cold, hot), each like 'shutter'")
-    bodies = [References.of(f"black_bodies[{k}]", each) for k, each in enumerate(given)]
+    bodies = [references_of(f"black_bodies[{k}]", each) for k, each in enumerate(given)]
     for k, each in enumerate(bodies):
-        if each.values.shape != shape:
+        if each.values.shape != (count, *shape):
             raise InputError(
-                f"'black_bodies[{k}]' has shape {each.values.shape}, expected {shape} like "
-                "'shutter'"
+                f"'black_bodies[{k}]' has shape {each.values.shape}, expected {(count, *shape)} "
+                "like 'shutter'"
             )
     return bodies
 
 
-def flags_of(shutter: References, bodies: list[References] | None, mask: ArrayLike | None) -> Array:
-    """Flags of pixels without values, masked, saturated, or that do not respond."""
-    shape = shutter.saturated.shape
-    unknown: Bools = np.asarray(~np.isfinite(shutter.values).all(axis=0))
-    saturated = shutter.saturated.copy()
-    if mask is not None:
-        given = as_array("mask", mask, ndim=2)
-        if given.dtype != np.bool_ or given.shape != shape:
-            raise InputError(
-                f"'mask' is {given.dtype} of shape {given.shape}, expected bool of shape {shape}"
+def _noise(references: Measured, good: Bools) -> Floats | None:
+    """Mean variance of the means of usable pixels at each state, where it is known."""
+    if references.variance is None:
+        return None
+    noise = np.array([each[good].mean() for each in references.variance])
+    return noise if np.isfinite(noise).all() else None
+
+
+def _clipping(name: str, references: Measured, good: Bools) -> str | None:
+    """Say that values of usable pixels are at exactly the highest one."""
+    for k, frame in enumerate(references.values):
+        found = clipping(np.where(good, frame, np.nan))
+        if found is not None:
+            return (
+                f"{found.values} values of '{name}' at state {k} are exactly {found.level:.10g}, "
+                "the highest one: they probably saturate and count as valid: exclude their pixels "
+                "by 'mask', or give averages with a 'saturation'"
             )
+    return None
+
+
+def response_of(bodies: Sequence[Measured], good: Bools) -> tuple[Floats, Floats | None]:
+    """Response of each pixel over the array's at each state, and the variance of that by noise."""
+    cold, hot = bodies
+    rise = hot.values - cold.values
+    mean, scatter = rise[:, good].mean(axis=1), rise[:, good].std(axis=1)
+    weak = np.flatnonzero(~(np.abs(mean) > scatter))
+    if weak.size:
+        k = int(weak[0])
+        raise InputError(
+            f"'black_bodies' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
+            f"{scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels see: "
+            "take black bodies further apart"
+        )
+    of_cold, of_hot = (_noise(each, good) for each in bodies)
+    variance = None if of_cold is None or of_hot is None else (of_cold + of_hot) / mean**2
+    return rise / mean[:, None, None], variance
+
+
+def flags_of(shutter: Measured, bodies: Sequence[Measured], mask: ArrayLike | None) -> Array:
+    """Flags of pixels without values, masked, saturated, or of another response than others."""
+    unknown, saturated = np.zeros((2, *shutter.shape), bool)
+    for each in (shutter, *bodies):
+        unknown |= ~np.isfinite(each.values).all(axis=0)
+        if each.bad_pixels.saturated is not None:
+            saturated |= each.bad_pixels.saturated
+    if (given := as_mask(mask, shutter.shape)) is not None:
         unknown |= given
-    flags, dead = np.zeros(shape, np.uint32), np.zeros(shape, bool)
-    if bodies is not None:
-        cold, hot = bodies
-        unknown |= ~np.isfinite([cold.values, hot.values]).all(axis=(0, 1))
-        saturated |= cold.saturated | hot.saturated
-        good = ~(unknown | saturated)
-        if good.any():
-            response = relative_response(hot.values - cold.values, good).mean(axis=0)
-            dead = np.asarray(good & ~(response >= DEAD_RESPONSE))
-    if (unknown | dead | saturated).all():
+    good, dead, hot = ~(unknown | saturated), None, None
+    if bodies and good.any():
+        response, variance = response_of(bodies, good)
+        mean = np.where(good, response.mean(axis=0), np.nan)
+        error = 0.0 if variance is None else float(np.sqrt(variance.sum())) / len(variance)
+        dead, hot = response_outliers(mean, lambda: np.full(mean.shape, error))
+        good &= ~(dead | hot)
+    if not good.any():
         raise InputError(
             "'shutter' has no pixel with a value at every state below saturation, expected some"
         )
+    flags = np.zeros(shutter.shape, np.uint32)
     set_bits(flags, "undetermined", unknown)
-    set_bits(flags, "non_responding", dead)
+    set_bits(flags, "dead", dead)
+    set_bits(flags, "hot", hot)
     flags[saturated] |= np.uint32(Flag.SATURATED | Flag.DO_NOT_USE)
     return flags

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -10,39 +10,33 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import FluxModel, Method, Progress
+from equipix._check import FluxModel, Method, Progress, naming_memory
 from equipix._native import Fit
-from equipix.calibration.result import Calibration, with_hidden_tilt
-from equipix.diagnosis import rules
-from equipix.diagnosis.coverage import with_coverage
-from equipix.diagnosis.gauges import contradiction
-from equipix.diagnosis.inputs import on_input
-from equipix.diagnosis.lamp_drift import lamp_drift
-from equipix.diagnosis.misfit import misfit
-from equipix.diagnosis.orientation import orientation_test
-from equipix.diagnosis.small_errors import with_small_errors
-from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.calibration.result import Calibration
+from equipix.diagnosis.evidence import Evidence
+from equipix.diagnosis.inputs import BEFORE
+from equipix.diagnosis.rules import AFTER, LAST
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
-from equipix.findings import say
-from equipix.fitting.error_bars import (
-    DarkStd,
-    ErrorBars,
-    is_too_fine,
-    standard_deviations,
-    with_dark_misfit,
-)
-from equipix.fitting.pixels import pixel_flags, without_faint_pixels, without_false_pixels
-from equipix.fitting.residuals import sampled
-from equipix.fitting.stated_errors import steadied, widened
-from equipix.fitting.weighted import (
-    Options,
-    Weighted,
-    is_to_be_fitted,
-    sampled_arrays,
-    weighted_fit,
-)
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
+from equipix.findings import Finding, ask, say
+from equipix.fitting.error_bars import with_dark_misfit
+from equipix.fitting.pixels import without_faint_pixels, without_false_pixels
+from equipix.fitting.stated_errors import steady_fit, widened
+from equipix.fitting.weighted import Options, Weighted, is_to_be_fitted
+from equipix.measured.colour import Colours
+from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics
+
+STEPS: tuple[Callable[[Weighted, Options], Weighted], ...] = (
+    without_false_pixels,
+    without_faint_pixels,
+    widened,
+    with_dark_misfit,
+)
+"""What follows the first fit, until weights and priors are final."""
 
 
 def calibrate(
@@ -237,21 +231,16 @@ def calibrate(
     True
     """
     fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
-    exposures = exposures_of(
-        frames,
-        shifts,
-        variance=variance,
-        mask=mask,
-        saturation=saturation,
-        flux=flux,
-        flux_std=flux_std,
-        time=time,
-        rotation=rotation,
-        shift_std=shift_std,
-        offset=is_to_be_fitted(dark),
-        dark_variance=dark_variance,
-        cfa=cfa,
-    )
+    with naming_memory("calibrating"):
+        measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
+        exposures = Exposures.of(
+            measured,
+            Positions.of(shifts, rotation=rotation, std=shift_std, shape=measured.values.shape),
+            Flux.of(flux, flux_std, time, len(measured)),
+            mask=mask,
+            offset=is_to_be_fitted(dark),
+            dark_variance=dark_variance,
+        )
     if fit_options.whole_shifts:
         exposures = exposures.whole()
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
@@ -262,64 +251,31 @@ def calibrated(
     options: Options,
     *,
     start: Fit | None = None,
+    said: tuple[Finding, ...] = (),
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
     """Calibrate from exposures: weights, fit, orientation, flags, error bars, findings.
 
-    The fit starts from `start`; `provenance` is added to the metadata.
+    The fit starts from `start`; `said` are findings before, and `provenance` is added to the
+    metadata.
     """
     started = datetime.now(UTC)
-    advice = [*on_input(exposures), *rules.on_plan(exposures)]
-    say(advice)
-    weighted, frames = steadied(exposures, weighted_fit(exposures, options, start), options)
-    weighted = without_false_pixels(weighted, options)
-    weighted = without_faint_pixels(weighted, options.fit)
-    weighted, widths = widened(weighted, options)
-    weighted = with_dark_misfit(weighted, options.fit)
-    weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))
-    test = orientation_test(weighted.exposures, weighted.fit, options.fit, exposures.flux)
-    flags = pixel_flags(weighted, options.fit)
-    residuals = sampled(weighted, workers=options.fit.workers)
-    drift = lamp_drift(weighted, residuals)
-    contradicted = bool(widths) or (drift is not None and drift.is_certain)
-    test = test.among_fluxes(contradicted=contradicted)
-    misfits = misfit(weighted, flags, residuals, options.fit)
-    differ = contradiction(weighted, residuals, flags)
-    weighted = weighted if misfits is None else weighted._replace(excess=misfits.excess)
-    found = rules.on_fit(weighted, options, test, drift, misfits, widths, differ)
-    found = rules.unexplained(found, advice) + rules.on_noise(frames)
-    found = with_small_errors(found, weighted, flags, residuals, options.fit)
-    found = with_coverage(found, weighted, flags)
+    said += say(*ask(BEFORE, exposures))
+    weighted = steady_fit(exposures, options, start)
+    for step in STEPS:
+        weighted = step(weighted, options)
+    evidence = Evidence.of(weighted, options, exposures.flux)
     # Before the error bars, which may be refused or interrupted.
-    say(found)
-    has_none = rules.is_too_far(weighted.fit) or is_too_fine(weighted)
-    wanted = options.uncertainty and not has_none
-    bars, dark = standard_deviations(weighted, flags, options.fit, wanted=wanted)
-    if bars is not None and drift is not None:
-        bars = with_hidden_tilt(bars, drift, weighted.fit.sensitivity)
-    last = rules.on_standard_deviations(weighted, options, bars, dark)
-    say(last)
-    metadata = _metadata(weighted, options, started, dark, bars)
-    return Calibration.of(
-        weighted,
-        flags=flags,
-        orientation=test,
-        drift=drift,
-        findings=(*advice, *found, *last),
-        bars=bars,
-        metadata=metadata | (provenance or {}),
-    )
+    said += say(*ask(AFTER, evidence, said))
+    evidence = evidence.with_error_bars()
+    said += say(*ask(LAST, evidence))
+    return Calibration.of(evidence, said, _metadata(evidence, started) | (provenance or {}))
 
 
-def _metadata(
-    weighted: Weighted,
-    options: Options,
-    started: datetime,
-    dark: DarkStd | None,
-    bars: ErrorBars | None,
-) -> dict[str, Any]:
+def _metadata(evidence: Evidence, started: datetime) -> dict[str, Any]:
     """Versions, options and times, as JSON values."""
-    exposures, fit, rejected = weighted.exposures, weighted.fit, weighted.rejected
+    exposures, fit, options = evidence.exposures, evidence.fit, evidence.options
+    dark, bars, rejected = evidence.dark, evidence.bars, evidence.weighted.rejected
     chosen: dict[str, Any] = {
         "method": options.fit.method,
         "tolerance": options.fit.tolerance,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from equipix._check import (
     Array,
     Bools,
-    Flagged,
     Floats,
     Progress,
     ShiftSign,
@@ -23,16 +22,16 @@ from equipix._check import (
     per_exposure,
 )
 from equipix._native import Beam
-from equipix.correction.apply import apply_gain, dark_or_stored, gain_coefficients
-from equipix.correction.protocol import depth_of
+from equipix.correction.apply import CorrectionBase
+from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
 from equipix.exposures.positions import ROUNDING, Positions
 from equipix.findings import Finding, determined
-from equipix.fitting.error_bars import ErrorBars, functional_std
-from equipix.fitting.weighted import Weighted, check_unchanged
+from equipix.fitting.error_bars import functional_std
+from equipix.fitting.weighted import Weighted, check_unchanged, sampled_arrays
 from equipix.io.record import UNSAVED, Counts, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.measured import Measured, measured_of
@@ -48,7 +47,7 @@ Pair = Annotated[Floats, "float64", "2"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(Record, kind="calibration", version=3):
+class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     """Calibrated sensor, the result of `calibrate`; its arrays are read-only.
 
     Attributes
@@ -185,6 +184,10 @@ class Calibration(Record, kind="calibration", version=3):
     findings: tuple[Finding, ...] = ()
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
+    takes_dark: ClassVar[bool] = True
+    limits: ClassVar[None] = None
+    saturation: ClassVar[None] = None
+    leaves_offset: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Refuse places that cannot be those of a calibration, and filters that are none."""
@@ -201,17 +204,14 @@ class Calibration(Record, kind="calibration", version=3):
     @classmethod
     def of(
         cls,
-        weighted: Weighted,
-        *,
-        flags: NDArray[Any],
-        orientation: OrientationTest,
+        evidence: Evidence,
         findings: tuple[Finding, ...],
-        drift: Drift | None,
-        bars: ErrorBars | None,
         metadata: dict[str, Any],
     ) -> Self:
         """Make the result from a fit and what was derived from it."""
-        exposures, fit, dtype = weighted.exposures, weighted.fit, weighted.exposures.values.dtype
+        exposures, fit, bars = evidence.exposures, evidence.fit, evidence.bars
+        dtype, flags, orientation = exposures.values.dtype, evidence.flags, evidence.orientation
+        weighted = evidence.weighted._replace(sampled=sampled_arrays(exposures))
         filters, gauge = exposures.filters, gauge_of(weighted, flags)
         std, offset = None if bars is None else bars.sensitivity, fit.offset
         return cls(
@@ -246,17 +246,21 @@ class Calibration(Record, kind="calibration", version=3):
             rejected=weighted.rejected,
             shift_sign=orientation.sign,
             orientation=orientation,
-            drift=drift,
+            drift=evidence.drift,
             findings=findings,
             cfa=filters.colours if filters is not None and filters.given else None,
             colour_response=gauge.response,
         )
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.sensitivity.shape
-        return rows, cols
+    def needs_dark(self) -> bool:
+        """Whether frames are corrected less a dark, and none is stored."""
+        return self.dark is None
+
+    @property
+    def colours(self) -> Colours | None:
+        """Colour filters of the pixels, also where the sensor in `metadata` alone has them."""
+        return self.cfa or super().colours
 
     @property
     def is_partial(self) -> bool:
@@ -365,53 +369,6 @@ class Calibration(Record, kind="calibration", version=3):
             )
         return float(std[0]) if np.ndim(weights) == 2 else std
 
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
-        flagged: Flagged = "nan",
-        out: NDArray[Any] | None = None,
-    ) -> NDArray[Any]:
-        """Frames as a sensor of equal pixels would have given them: (frame − dark) / M.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Raw frames, in DN.
-        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the one that is part of the calibration, another
-            (of averaged frames the mean), or none where it is already subtracted.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
-            (NaN still where M is undetermined), or the mean of the nearest good pixels around.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`;
-            whole numbers hold no NaN, so they need another `flagged`.
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `dark` is "stored" and none is stored, `flagged` is unknown, or
-            frames are whole numbers of another bit depth than the sensor in `metadata`.
-        """
-        return apply_gain(
-            frames,
-            gain=self.sensitivity,
-            dark=dark_or_stored(dark, self.dark),
-            stored=self.dark,
-            flags=self.flags,
-            flagged=flagged,
-            out=out,
-            depth=depth_of(self),
-            cfa=self.cfa,
-        )
-
     @property
     def coefficients(self) -> NDArray[Any]:
         """Coefficients of the corrected frame Σ c_j y^j, shape (2, rows, cols).
@@ -419,7 +376,16 @@ class Calibration(Record, kind="calibration", version=3):
         c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
         Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
         """
-        return gain_coefficients(self.sensitivity, self.dark).astype(self.sensitivity.dtype)
+        return self._planes.astype(self.sensitivity.dtype)
+
+    @property
+    def _planes(self) -> NDArray[Any]:
+        """The coefficients in double precision."""
+        with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
+            inverse = 1 / self.sensitivity.astype(np.float64)
+            offset = np.zeros_like(inverse) if self.dark is None else -self.dark * inverse
+        offset[np.isnan(inverse)] = np.nan
+        return np.stack([offset, inverse])
 
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).
@@ -494,7 +460,8 @@ class Calibration(Record, kind="calibration", version=3):
         ndarray, shape (n, rows, cols)
             Residuals in the units of the frames; where variances are known, in standard
             deviations of a measurement. NaN where nothing is measured or predicted. Measurements
-            that the fit left out, along ragged edges of masks, have residuals beyond their noise.
+            that the fit left out, along ragged edges of masks, may have residuals beyond their
+            noise.
 
         Raises
         ------
@@ -503,10 +470,12 @@ class Calibration(Record, kind="calibration", version=3):
 
         Notes
         -----
-        M and L fit some of the noise of the exposures that the calibration was made from: the mean
-        square of their residuals in standard deviations is `reduced_chi2` times the degrees of
-        freedom over the number of measurements. For an exposure held out it is above 1, by the
-        variance of the prediction.
+        M and L fit some of the noise of the exposures that the calibration was made from. Where the
+        fit used all of their measurements, the mean square of the residuals in standard deviations
+        is `reduced_chi2` times the degrees of freedom over the number of measurements. It is not
+        that where measurements were left out, along ragged edges of masks or as outliers, or where
+        pixels with one or two measurements left the search. For an exposure held out it is above
+        1, by the variance of the prediction.
         """
         measured = measured_of(frames, variance)
         values = measured.values
@@ -595,15 +564,6 @@ def _is_inside(place: NDArray[Any], grid: tuple[int, ...]) -> bool:
 def _are_whole(places: NDArray[Any]) -> bool:
     """Whether places are whole numbers, but for rounding."""
     return bool(np.all(np.abs(places - np.rint(places)) < ROUNDING))
-
-
-def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
-    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
-    if not drift.is_added:
-        return bars
-    hidden = response * np.sqrt(drift.variance_map(response))
-    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
-    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

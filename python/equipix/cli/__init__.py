@@ -1,7 +1,5 @@
 """The command line: it parses options and prints results."""
 
-from __future__ import annotations
-
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; the exit status is 0, 1 (failed), 2 (usage) or 130 (Ctrl-C).

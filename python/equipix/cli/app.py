@@ -1,9 +1,13 @@
 """The commands of the command line, each imported when it is called."""
 
-from __future__ import annotations
-
+import re
+import sys
 import warnings
+from collections.abc import Callable
+from contextvars import ContextVar
+from functools import cache
 from importlib import import_module
+from inspect import signature
 from typing import Annotated, Any
 
 import typer
@@ -11,8 +15,10 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from equipix._native import __version__
-from equipix.cli.terminal import CALLED, say, show_warning
 from equipix.errors import EquipixError, EquipixWarning
+
+CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
+"""The command, or the group of commands, that was called."""
 
 COMMANDS = {
     "calibrate": ("calibrate", "Calibrate a sensor from the images of an experiment."),
@@ -23,14 +29,8 @@ COMMANDS = {
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
     "scene": ("scene", "Learn gain and offset of each pixel from a moving scene."),
     "hardware": ("hardware", "Write a correction as words for a camera's electronics."),
-    "simulate": (
-        "simulate",
-        "Write the images of an experiment with a virtual camera, and its truth.",
-    ),
-    "demo": (
-        "simulate",
-        "Calibrate a simulated CCD from image files and compare with the truth and a flat field.",
-    ),
+    "simulate": ("simulate", "Write the images of a virtual experiment, and its truth."),
+    "demo": ("simulate", "Calibrate a simulated CCD, and compare with the truth and a flat field."),
     "plan": ("plan", "Predict the errors of a pattern of shifts, or find better patterns."),
 }
 """The module of each command, and its line in --help, which needs no import of the module."""
@@ -80,6 +80,75 @@ def run(arguments: list[str] | None) -> None:
         except (EquipixError, OSError, MemoryError) as error:
             say("error", error or type(error).__name__)
             raise SystemExit(1) from None
+
+
+def say(kind: str, message: object) -> None:
+    """Write one line to stderr: ``equipix: kind: message``, which names options."""
+    text, called = " ".join(str(message).split()), CALLED.get()
+    if called is not None:
+        text = in_options(text, called)
+    print(f"equipix: {kind}: {text}", file=sys.stderr)  # noqa: T201
+
+
+def show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Replace `warnings.showwarning`: one line on stderr, no source code."""
+    say("warning", message)
+
+
+_VALUE = r"(?:'([^']*)'|(\w+(?:\.\w+)*))"
+
+
+def in_options(message: str, called: Any) -> str:
+    """Name the options of a command, or group, where a message names Python's keywords.
+
+    A keyword that is no option stays where it is a key of a manifest or an argument of the command;
+    of any other the message says that it is one of Python.
+    """
+    parameters = _parameters(called)
+    options = {
+        each.name: max(each.opts, key=len)
+        for each in parameters
+        if each.param_type_name == "option"
+    }
+    for name, option in options.items():
+        message = _with_values(message, name, option)
+    if ".toml: " in message:
+        return message  # its quoted words are keys of that file
+    for name, option in options.items():
+        message = re.sub(rf"(?<!key )'{name}'(?! (?:in|of) )", option, message)
+        if "_" in name:
+            message = re.sub(rf"(?<![\w'/.\\-]){name}(?![\w'=/\\]|\.\w)", option, message)
+    for name in _python_only() - {each.name for each in parameters}:
+        message = message.replace(f"'{name}'", f"'{name}' (in Python)")
+    return message
+
+
+def _with_values(message: str, name: str, option: str) -> str:
+    """Write ``name='value'`` and ``'name' (--name value)`` as ``--name value``."""
+    message = re.sub(rf"'{name}' \(({option}[^)]*)\)", r"\1", message)
+    message = re.sub(rf"\b{name}={_VALUE}", rf"{option} \1\2", message)
+    message = message.replace(f"{option} True", option)
+    return re.sub(rf"({option}(?: \w+)?)(?:, \1| \(\1\))", r"\1", message)
+
+
+def _parameters(called: Any) -> list[Any]:
+    """Parameters of a command, or of all commands of a group."""
+    inner = getattr(called, "commands", {}).values()
+    return [*called.params, *(each for command in inner for each in _parameters(command))]
+
+
+@cache
+def _python_only() -> frozenset[str]:
+    """Keywords of what commands call that are no keys of manifests."""
+    # Imported where there is a message: pydantic takes as long as the rest of `equipix --help`.
+    from equipix.calibration.calibrate import calibrate
+    from equipix.experiment.manifest import KEYS
+    from equipix.measured.average import average
+    from equipix.nuc.curve_fit import fit
+    from equipix.scene.methods import METHODS
+
+    called: list[Callable[..., object]] = [calibrate, average, fit, *METHODS.values()]
+    return frozenset(name for each in called for name in signature(each).parameters) - KEYS
 
 
 def _show_version(wanted: bool) -> None:

@@ -1,7 +1,5 @@
 """Commands about calibrations: calibrate, inspect, compare."""
 
-from __future__ import annotations
-
 import warnings
 from itertools import combinations
 from pathlib import Path
@@ -10,29 +8,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from equipix._check import FluxModel, Method
 from equipix.calibration.result import Calibration
-from equipix.cli.summary import of_calibration, summary
-from equipix.cli.terminal import (
-    Force,
-    Json,
-    Mask,
-    MaxSweeps,
-    Picture,
-    Tolerance,
-    Uncertainty,
-    Workers,
-    check_output,
-    naming_mask,
-    progress_bars,
-    show_result,
-    show_table,
-)
+from equipix.cli import terminal
+from equipix.cli.summary import of_calibration, summary, told
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
 from equipix.io.formats import SUFFIXES
-from equipix.io.frames import read_mask
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.loading import load
@@ -43,59 +25,45 @@ commands = typer.Typer()
 
 
 @commands.command(epilog="Example: equipix calibrate experiment.toml -o cal.tif")
+@terminal.options_of(
+    Experiment.run,
+    robust="Leave out measurements that disagree with the others.",
+    method="The solver: the fast one, or the paper's.",
+    flux="Fluxes to find: one an exposure, or linear in the file's times.",
+    tolerance="Largest relative error of the sensitivity.",
+    max_sweeps=typer.Option(min=1, help="Stop after so many sweeps."),
+    uncertainty="Find the standard deviation of every pixel.",
+)
 def calibrate(
     experiment: Annotated[Path, typer.Argument(help="The experiment.toml.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Calibration: .tif or .npz.")],
-    robust: Annotated[
-        bool, typer.Option("--robust", help="Leave out measurements that disagree with the others.")
-    ] = False,
-    method: Annotated[
-        Method, typer.Option(help="The solver: the fast one, or the paper's.")
-    ] = "multiscale",
-    flux: Annotated[
-        FluxModel | None,
-        typer.Option(help="Fluxes to find: one an exposure, or linear in the file's times."),
-    ] = None,
-    mask: Mask = None,
-    tolerance: Tolerance = 1e-6,
-    max_sweeps: MaxSweeps = None,
-    uncertainty: Uncertainty = False,
+    mask: terminal.Mask = None,
     partial: Annotated[
         bool,
         typer.Option(
             "--partial", help="Save a result that determines less than half of the pixels."
         ),
     ] = False,
-    workers: Workers = None,
-    force: Force = False,
-    as_json: Json = False,
+    workers: terminal.Workers = None,
+    force: terminal.Force = False,
+    as_json: terminal.Json = False,
+    **options: Any,
 ) -> None:
     """Calibrate a sensor from the images of an experiment."""
-    check_output(output, force=force, suffixes=SUFFIXES)
+    terminal.check_output(output, force=force, suffixes=SUFFIXES)
     loaded = Experiment.load(experiment)
-    refuse_inputs([output], [experiment, *loaded.files(), *([mask] if mask else [])])
+    refuse_inputs([output], [experiment, *loaded.files(), *terminal.given(mask)])
     if not partial:
         # `_refuse_partial` says the same as an error.
         warnings.filterwarnings("ignore", "the exposures determine only|the fit ended far from")
-    with progress_bars() as progress, naming_mask(mask):
-        calibration = loaded.run(
-            flux=flux,
-            mask=None if mask is None else read_mask(mask),
-            robust=robust,
-            method=method,
-            tolerance=tolerance,
-            max_sweeps=max_sweeps,
-            uncertainty=uncertainty,
-            workers=workers,
-            progress=progress,
-        )
+    with terminal.working(mask) as (progress, excluded):
+        calibration = loaded.run(mask=excluded, workers=workers, progress=progress, **options)
     if not partial:
         _refuse_partial(calibration, output)
     calibration.save(output, force=force)
     result = {"output": str(output), **of_calibration(calibration)}
-    if not as_json:  # their messages are on stderr, as warnings
-        result["findings"] = ", ".join(each.kind for each in calibration.findings) or "none"
-    show_result(result, as_json=as_json)
+    result |= told(calibration.findings, as_json=as_json)
+    terminal.show_result(result, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
@@ -110,14 +78,14 @@ def _refuse_partial(calibration: Calibration, output: Path) -> None:
 @commands.command(epilog="Example: equipix inspect cal.tif")
 def inspect(
     file: Annotated[Path, typer.Argument(help="A correction or an average: .tif or .npz.")],
-    as_json: Json = False,
+    as_json: terminal.Json = False,
 ) -> None:
     """Show what a file of a correction, or of averaged frames, holds."""
     content = load(file)
     result = {"file": str(file), **summary(content)}
     if as_json and hasattr(content, "metadata"):
         result["metadata"] = content.metadata
-    show_result(result, as_json=as_json)
+    terminal.show_result(result, as_json=as_json)
 
 
 @commands.command(epilog="Example: equipix compare first.tif second.tif -o agreement.png")
@@ -125,21 +93,20 @@ def compare(
     calibrations: Annotated[
         list[Path], typer.Argument(help="Calibrations of one sensor: .tif or .npz.")
     ],
-    output: Picture = None,
-    force: Force = False,
-    as_json: Json = False,
+    output: terminal.Picture = None,
+    force: terminal.Force = False,
+    as_json: terminal.Json = False,
 ) -> None:
     """Show how far calibrations of one sensor agree."""
-    if output is not None:
-        check_picture(output)
-        check_output(output, force=force)
-        refuse_inputs([output], calibrations)
+    check_picture(output)
+    terminal.check_output(output, calibrations, force=force)
     loaded = [read_record(file, Calibration) for file in calibrations]
     _refuse_equal(calibrations, loaded)
     result = compare_calibrations(loaded)
     if output is not None:
         names = [file.stem for file in calibrations]
         save_figure(draw_comparison(result, names), output, force=force)
+    predicted = None if result.predicted_rms is None else result.predicted_rms.tolist()
     pairs = [
         {
             "files": [str(calibrations[i]) for i in pair],
@@ -147,24 +114,22 @@ def compare(
             "block_rms": float(result.block_rms[k]),
             "largest": float(result.largest[k]),
             "tilt_compared": not result.open_tilt[k],
-            "predicted_rms": None
-            if result.predicted_rms is None
-            else float(result.predicted_rms[k]),
+            "predicted_rms": predicted and predicted[k],
         }
         for k, pair in enumerate(result.pairs)
     ]
     pixels = int(np.isfinite(result.agreement).sum())
     if as_json:
-        show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
-    else:
-        _show_pairs(pairs)
-        words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
-        if result.open_tilt.any():
-            left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}
-            words["tilt"] = "left out: free fluxes leave it undetermined in one or more of " + (
-                ", ".join(sorted(map(str, left_out)))
-            )
-        show_result(words, as_json=False)
+        terminal.show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
+        return
+    _show_pairs(pairs)
+    words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
+    if result.open_tilt.any():
+        left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}
+        words["tilt"] = "left out: free fluxes leave it undetermined in one or more of " + (
+            ", ".join(sorted(map(str, left_out)))
+        )
+    terminal.show_result(words, as_json=False)
 
 
 def _refuse_equal(files: list[Path], calibrations: list[Calibration]) -> None:
@@ -180,7 +145,7 @@ def _refuse_equal(files: list[Path], calibrations: list[Calibration]) -> None:
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:
     """Print how far the calibrations of each pair differ."""
     figures = ("rms", "block_rms", "largest")
-    show_table(
+    terminal.show_table(
         ("relative difference", "pixels, rms", "16×16 means, rms", "largest"),
         [(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures)) for pair in pairs],
     )

@@ -1,24 +1,14 @@
 """The command plan: errors of a pattern of shifts, and better patterns."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer
 
-from equipix.cli.terminal import (
-    Cfa,
-    Force,
-    Json,
-    Picture,
-    Seed,
-    check_output,
-    progress_bars,
-    show_result,
-    show_table,
-)
-from equipix.errors import InputError, InputWarning, warn
+from equipix.cli import terminal
+from equipix.cli.summary import told
+from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
+from equipix.findings import Finding, say
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.plans import draw_plans
 from equipix.plan.budget import ErrorBudget, error_budget
@@ -33,6 +23,13 @@ commands = typer.Typer()
     epilog="Example: equipix plan --shape 582 782 --shifts '0,0 0,11 0,19 11,0 19,0' --drift 1e-4. "
     "To find one: equipix plan --shape 582 782 --exposures 5 --max-shift 80 80"
 )
+@terminal.options_of(
+    suggest,
+    noise="Noise of an exposure, over its signal.",
+    drift="Unknown relative change of the lamp; noise/10 unless given.",
+    shift_error="Error of a shift, in pixels.",
+    beam_width="Width of a Gaussian beam in pixels; even unless given.",
+)
 def plan(
     shape: Annotated[tuple[int, int], typer.Option(min=1, help="Rows and columns of the sensor.")],
     shifts: Annotated[
@@ -46,53 +43,31 @@ def plan(
         int | None,
         typer.Option(min=2, help="Exposures of the patterns to find; five unless given."),
     ] = None,
-    noise: Annotated[float, typer.Option(help="Noise of an exposure, over its signal.")] = 1e-3,
-    drift: Annotated[
-        float | None,
-        typer.Option(help="Unknown relative change of the lamp; noise/10 unless given."),
-    ] = None,
-    shift_error: Annotated[float, typer.Option(help="Error of a shift, in pixels.")] = 0,
-    beam_width: Annotated[
-        float | None, typer.Option(help="Width of a Gaussian beam in pixels; even unless given.")
-    ] = None,
-    cfa: Cfa = None,
-    rng: Seed = 0,
-    output: Picture = None,
-    force: Force = False,
-    as_json: Json = False,
+    cfa: terminal.Cfa = None,
+    rng: terminal.Seed = 0,
+    output: terminal.Picture = None,
+    force: terminal.Force = False,
+    as_json: terminal.Json = False,
+    **causes: Any,
 ) -> None:
     """Predict the errors of a pattern of shifts, or find better patterns."""
     if (shifts is None) == (max_shift is None):
         raise InputError(
             "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
         )
-    if shift_error and beam_width is None:
-        warn(
-            "'--shift-error' has no effect in an even beam: give '--beam-width' for another",
-            InputWarning,
-        )
-    if output is not None:
-        check_picture(output)
-        check_output(output, force=force)
-    causes: dict[str, Any] = {
-        "noise": noise,
-        "shift_error": shift_error,
-        "beam_width": beam_width,
-    }
+    if causes["shift_error"] and causes["beam_width"] is None:
+        words = "'--shift-error' has no effect in an even beam: give '--beam-width' for another"
+        say(Finding("unused", words, "input", "note"))
+    check_picture(output)
+    terminal.check_output(output, force=force)
     if shifts is not None:
-        assumed = noise / 10 if drift is None else drift
-        budgets = [error_budget(shape, _pairs(shifts), drift=assumed, **causes)]
+        if causes["drift"] is None:
+            causes["drift"] = causes["noise"] / 10
+        budgets = [error_budget(shape, _pairs(shifts), **causes)]
     elif max_shift is not None:
-        with progress_bars() as progress:
+        with terminal.working() as (progress, _):
             found = suggest(
-                shape,
-                exposures,
-                max_shift,
-                drift=drift,
-                cfa=cfa,
-                rng=rng,
-                progress=progress,
-                **causes,
+                shape, exposures, max_shift, cfa=cfa, rng=rng, progress=progress, **causes
             )
         budgets = [suggestion.budget for suggestion in found]
     if output is not None:
@@ -100,7 +75,7 @@ def plan(
     plans = [_plan_summary(budget, cfa) for budget in budgets]
     if as_json:
         result = {"shape": list(shape), "patterns": plans}
-        show_result(result | ({"picture": str(output)} if output else {}), as_json=True)
+        terminal.show_result(result | ({"picture": str(output)} if output else {}), as_json=True)
     else:
         _show_plans(plans)
 
@@ -136,6 +111,7 @@ def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
         "distinct_trend": budget.distinct_trend,
         "order": order.tolist(),
         "distinct_trend_in_order": distinct_trend(budget.shifts[order]),
+        **told(budget.findings),
     }
 
 
@@ -157,7 +133,7 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
     if "components_by_colour" not in plans[0]:
         del rows["  of each colour alone"]
     patterns = [f"pattern {k + 1}" for k in range(len(plans))]
-    show_table(
+    terminal.show_table(
         ("rms error of the sensitivity", *patterns),
         [(name, *map(words, plans)) for name, words in rows.items()],
     )

@@ -1,7 +1,5 @@
 """The command about corrections from the scene: scene."""
 
-from __future__ import annotations
-
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,20 +7,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from equipix.cli.summary import of_scene
-from equipix.cli.terminal import (
-    Force,
-    Json,
-    Mask,
-    Workers,
-    check_output,
-    naming_mask,
-    progress_bars,
-    show_result,
-)
+from equipix.cli import terminal
+from equipix.cli.summary import of_scene, told
 from equipix.errors import FileError, InputError
 from equipix.io.formats import SUFFIXES
-from equipix.io.frames import read_mask
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures.canvas import check_picture, save_figure
@@ -44,8 +32,18 @@ def _group() -> None: ...
 
 
 @commands.command(epilog="Example: equipix scene frames/*.tif -o nuc.tif --method registered")
+@terminal.options_of(
+    *METHODS.values(),
+    saturation="Raw value from which a pixel is saturated; that of whole numbers.",
+    step="Step of local-mean, gated and registered.",
+    width="Neighbourhood of gated, constant-statistics and kalman.",
+    threshold="Change of the local mean from which gated learns.",
+    motion="Change from which constant-statistics and kalman take a frame.",
+    least_motion="Shift in pixels from which registered takes a pair.",
+    block="Moving frames of a block of kalman.",
+)
 def scene(
-    source: Annotated[
+    frames: Annotated[
         list[str],
         typer.Argument(help="Raw frames in order: image files or globs, many pages each."),
     ],
@@ -58,32 +56,11 @@ def scene(
         tuple[float, float] | None,
         typer.Option(help="Lowest and highest raw value in DN; that of whole numbers by default."),
     ] = None,
-    saturation: Annotated[
-        float | None,
-        typer.Option(help="Raw value from which a pixel is saturated; that of whole numbers."),
-    ] = None,
     bit_depth: Annotated[
         int | None,
         typer.Option(min=1, max=16, help="Bits of the raw values: --data-range of 0 up."),
     ] = None,
-    mask: Mask = None,
-    step: Annotated[
-        float | None, typer.Option(help="Step of local-mean, gated and registered.")
-    ] = None,
-    width: Annotated[
-        int | None, typer.Option(help="Neighbourhood of gated, constant-statistics and kalman.")
-    ] = None,
-    threshold: Annotated[
-        float | None, typer.Option(help="Change of the local mean from which gated learns.")
-    ] = None,
-    motion: Annotated[
-        float | None,
-        typer.Option(help="Change from which constant-statistics and kalman take a frame."),
-    ] = None,
-    least_motion: Annotated[
-        float | None, typer.Option(help="Shift in pixels from which registered takes a pair.")
-    ] = None,
-    block: Annotated[int | None, typer.Option(help="Moving frames of a block of kalman.")] = None,
+    mask: terminal.Mask = None,
     corrected: Annotated[
         Path | None,
         typer.Option(help="A .tif of all frames, each corrected by what was learned before it."),
@@ -96,61 +73,47 @@ def scene(
         Path | None, typer.Option(help="Save the state, so that --resume goes on: .tif or .npz.")
     ] = None,
     resume: Annotated[Path | None, typer.Option(help="A saved state to go on from.")] = None,
-    workers: Workers = None,
-    force: Force = False,
-    as_json: Json = False,
+    workers: terminal.Workers = None,
+    force: terminal.Force = False,
+    as_json: terminal.Json = False,
+    **options: Any,
 ) -> None:
     """Learn gain and offset of each pixel from a moving scene."""
-    check_output(output, force=force, suffixes=SUFFIXES)
-    others = [(corrected, _TIFF), (state, SUFFIXES), (picture, ())]
-    for path, suffixes in others:
-        if path is not None:
-            check_output(path, force=force, suffixes=suffixes)
-    if picture is not None:
-        check_picture(picture)
-    written = [output, *(path for path, _ in others if path is not None)]
-    refuse_inputs(written, [*find_files(source), *(path for path in (resume, mask) if path)])
-    options = {
-        name: value
-        for name, value in {
-            "step": step,
-            "width": width,
-            "threshold": threshold,
-            "motion": motion,
-            "least_motion": least_motion,
-            "block": block,
-            "saturation": saturation,
-            "mask": None if mask is None else read_mask(mask),
-        }.items()
-        if value is not None
-    }
+    outputs = {output: SUFFIXES, corrected: _TIFF, state: SUFFIXES, picture: ()}
+    for path, suffixes in outputs.items():
+        terminal.check_output(path, force=force, suffixes=suffixes)
+    check_picture(picture)
+    written = terminal.given(output, corrected, state, picture)
+    refuse_inputs(written, [*find_files(frames), *terminal.given(resume, mask)])
     if bit_depth is not None:
         if data_range is not None:
             raise InputError("--bit-depth and --data-range exclude each other: leave out one")
         data_range = (0, 2**bit_depth - 1)
-    with naming_mask(mask):
-        learning = _method(method, source, data_range, options, resume, workers)
-    with progress_bars() as progress:
-        done = run_sequence(learning, source, output=corrected, force=force, progress=progress)
+    with terminal.working(mask) as (progress, excluded):
+        options["mask"] = excluded
+        chosen = {name: value for name, value in options.items() if value is not None}
+        learning = _method(method, frames, data_range, chosen, resume, workers)
+        done = run_sequence(learning, frames, output=corrected, force=force, progress=progress)
     result = learning.correction()
     result.save(output, force=force)
     if state is not None:
         learning.save(state, force=force)
     if picture is not None:
         save_figure(draw_sequence(done, result), picture, force=force)
-    show_result(_summary(output, learning, done), as_json=as_json)
+    figures = _summary(output, learning, done)
+    terminal.show_result(figures | told(result.findings, as_json=as_json), as_json=as_json)
 
 
 def _method(
     name: str,
-    source: list[str],
+    frames: list[str],
     data_range: tuple[float, float] | None,
     options: dict[str, Any],
     resume: Path | None,
     workers: int | None,
 ) -> SceneCorrection:
     """Make the correction, or read its state."""
-    shape, dtype = sequence_format(source)
+    shape, dtype = sequence_format(frames)
     if resume is not None:
         if options or data_range:
             raise InputError(

@@ -1,9 +1,8 @@
 """Main figures of what the command line reads and writes."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -11,41 +10,50 @@ from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.protocol import Correction, sensor_of
-from equipix.findings import Flag, usable
+from equipix.findings import Finding, Flag, usable
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
+from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneCorrection
+
+_Figures: TypeAlias = Callable[[Any], dict[str, Any]]
+
+_LEARNED = ("method", "data_range", "frames")
+"""Keys of a scene's metadata that are shown."""
 
 
 def summary(
     content: Correction | DynamicCorrection | FrameStatistics | SceneCorrection,
 ) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
-    if isinstance(content, FrameStatistics):
-        return of_statistics(content)
-    if isinstance(content, Calibration):
-        return of_calibration(content)
-    if isinstance(content, Response):
-        return of_response(content)
-    if isinstance(content, DynamicCorrection):
-        return of_dynamic(content)
-    if isinstance(content, SceneCorrection):
-        return of_scene(content)
-    return {
-        **_sensor(content),
-        "shape": list(content.shape),
-        "order": len(content.coefficients) - 1,
-        **_learned(content),
-        "flagged_pixels": flagged(content),
-    }
+    figures: _Figures = _FIGURES.get(type(content), _of_correction)
+    return figures(content)
 
 
-def _learned(correction: Correction) -> dict[str, Any]:
-    """How a correction was learned from a scene, where it was."""
+def known(**figures: Any) -> dict[str, Any]:
+    """Leave out what is not known."""
+    return {name: value for name, value in figures.items() if value not in (None, "")}
+
+
+def told(findings: Iterable[Finding], *, as_json: bool = True) -> dict[str, Any]:
+    """Findings; their kinds alone where messages are on stderr, as warnings, already."""
+    if as_json:
+        return {"findings": [asdict(each) for each in findings]}
+    return {"findings": ", ".join(each.kind for each in findings) or "none"}
+
+
+def _of_correction(correction: Correction) -> dict[str, Any]:
+    """Collect the main figures of any correction, and how it was learned from a scene."""
     scene = correction.metadata.get("scene")
-    if not isinstance(scene, dict):
-        return {}
-    return {f"scene_{name}": scene.get(name) for name in ("method", "data_range", "frames")}
+    learned = scene if isinstance(scene, dict) else {}
+    return {
+        **known(sensor=sensor_of(correction)),
+        "shape": list(correction.shape),
+        "order": len(correction.coefficients) - 1,
+        **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
+        "flagged_pixels": flagged(correction),
+        **told(correction.findings),
+    }
 
 
 def of_response(response: Response) -> dict[str, Any]:
@@ -56,9 +64,8 @@ def of_response(response: Response) -> dict[str, Any]:
         f"spread_of_{name}": float(np.std(plane[good]))
         for name, plane in zip("aKce", response.deviation, strict=False)
     }
-    prediction = options.get("prediction_errors")
     return {
-        **_sensor(response),
+        **known(sensor=sensor_of(response)),
         "shape": list(response.shape),
         "order": 0 if options.get("by") == "gain" else response.order,
         "levels": [float(f"{level:.6g}") for level in response.levels],
@@ -67,15 +74,10 @@ def of_response(response: Response) -> dict[str, Any]:
         **spread,
         _misfit_name(options): _misfit(response, options),
         "largest_inverse_error": response.largest_inverse_error,
-        **({} if prediction is None else {"prediction_errors": prediction}),
+        **known(prediction_errors=options.get("prediction_errors")),
         "flagged_pixels": flagged(response),
+        **told(response.findings),
     }
-
-
-def _sensor(correction: Correction) -> dict[str, str]:
-    """Name of the sensor, where it is known."""
-    name = sensor_of(correction)
-    return {"sensor": name} if name else {}
 
 
 def _colours(correction: Calibration | Response) -> dict[str, str]:
@@ -117,6 +119,7 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_order": correction.axes.bias_order,
         "gain_order": None if correction.gain is None else correction.gain_axes.order,
         "flagged_pixels": flagged(correction),
+        **told(correction.findings),
     }
 
 
@@ -145,7 +148,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
         "saturation": frames.saturation,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
-        **({} if frames.reject is None else {"rejected_beyond_sigmas": frames.reject}),
+        **known(rejected_beyond_sigmas=frames.reject),
         "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
     }
 
@@ -163,9 +166,8 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
     """Collect the main figures of a calibration."""
     sensitivity = calibration.sensitivity
     options = calibration.metadata.get("options", {})
-    orientation = calibration.orientation
     return {
-        **_sensor(calibration),
+        **known(sensor=sensor_of(calibration)),
         "shape": list(calibration.shape),
         **_colours(calibration),
         "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
@@ -177,12 +179,12 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         _misfit_name(options): calibration.reduced_chi2,
         "components": calibration.components,
         "shift_sign": calibration.shift_sign,
-        **({"orientation": orientation.words} if orientation else {}),
+        **known(orientation=calibration.orientation and calibration.orientation.words),
         "fluxes": options.get("flux", "known"),
         "flagged_pixels": flagged(calibration),
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
-        "findings": [asdict(finding) for finding in calibration.findings],
+        **told(calibration.findings),
     }
 
 
@@ -219,3 +221,13 @@ def _tilt_in_words(std: Array) -> str:
     """Say which tilts are undetermined: JSON has no infinite standard deviation."""
     names = [name for name, each in zip(("rows", "cols"), std, strict=True) if np.isinf(each)]
     return f"undetermined along {' and '.join(names)}, and set to 0" if names else "determined"
+
+
+_FIGURES: dict[type, _Figures] = {
+    FrameStatistics: of_statistics,
+    Calibration: of_calibration,
+    Response: of_response,
+    DynamicCorrection: of_dynamic,
+    **dict.fromkeys(METHODS.values(), of_scene),
+}
+"""What collects the main figures of each kind of result."""

@@ -1,28 +1,27 @@
 """Options, progress, messages and results at a terminal."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math
 import os
-import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.models import OptionInfo
 
+from equipix._check import Array, Bools
+from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
+from equipix.experiment import image_files
+from equipix.io.formats import raw_header
+from equipix.io.frames import read_frames, read_mask
+from equipix.io.paths import find_files, refuse_inputs
 
 Report = Callable[[int, int, str], None]
-
-CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
-"""The command, or the group of commands, that was called."""
 
 _WHOLE = 1e9
 """Whole numbers below this are printed with all digits, as saturation levels are."""
@@ -35,21 +34,14 @@ def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
     With `announce`, a pipe gets the name of each stage instead, on a line of its own.
     """
     if not sys.stderr.isatty():
-        yield _Announcer() if announce else None
+        yield _announcer() if announce else None
         return
     # Imported where bars are drawn: it takes as long as the rest of `equipix --help`.
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-    )
+    from rich import console, progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bars:
+    columns = (progress.BarColumn(), progress.MofNCompleteColumn(), progress.TimeElapsedColumn())
+    err = console.Console(stderr=True)
+    with progress.Progress("{task.description}", *columns, console=err, transient=True) as bars:
         stages: dict[str, Any] = {}
 
         def report(done: int, total: int, stage: str) -> None:
@@ -60,32 +52,16 @@ def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
         yield report
 
 
-class _Announcer:
-    """Writes the name of each stage once."""
+def _announcer() -> Report:
+    """Return what writes the name of each stage once."""
+    stages: set[str] = set()
 
-    def __init__(self) -> None:
-        self._stage = ""
-
-    def __call__(self, done: int, total: int, stage: str) -> None:  # noqa: ARG002
-        if stage != self._stage:
+    def report(done: int, total: int, stage: str) -> None:  # noqa: ARG001
+        if stage not in stages:
             print(f"equipix: {stage}", file=sys.stderr, flush=True)  # noqa: T201
-            self._stage = stage
+            stages.add(stage)
 
-
-def say(kind: str, message: object) -> None:
-    """Write one line to stderr: ``equipix: kind: message``, which names options."""
-    text, called = " ".join(str(message).split()), CALLED.get()
-    if called is not None:
-        # Imported where there is a message: `equipix --help` needs none.
-        from equipix.cli.terminal import in_options
-
-        text = in_options(text, called)
-    print(f"equipix: {kind}: {text}", file=sys.stderr)  # noqa: T201
-
-
-def show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Replace `warnings.showwarning`: one line on stderr, no source code."""
-    say("warning", message)
+    return report
 
 
 def show_result(result: dict[str, Any], *, as_json: bool) -> None:
@@ -101,20 +77,23 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
 
 def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
     """Print rows of words in columns under titles."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
+    from rich import box, console, table
 
-    table = Table(*titles, box=SIMPLE_HEAD)
+    shown = table.Table(*titles, box=box.SIMPLE_HEAD)
     for row in rows:
-        table.add_row(*row)
-    Console(soft_wrap=True).print(table)
+        shown.add_row(*row)
+    console.Console(soft_wrap=True).print(shown)
 
 
 def check_output(
-    path: Path, *, force: bool, folder: bool = False, suffixes: tuple[str, ...] = ()
+    path: Path | None,
+    inputs: Iterable[Path] = (),
+    *,
+    force: bool,
+    folder: bool = False,
+    suffixes: tuple[str, ...] = (),
 ) -> None:
-    """Refuse an output that cannot be written, before the work starts.
+    """Refuse an output that cannot be written, or is an input, before the work starts.
 
     Raises
     ------
@@ -122,8 +101,10 @@ def check_output(
         If `path` exists and `force` is not given, is a file where a `folder` is wanted or the
         other way about, or its folder does not exist or is closed.
     InputError
-        If `path` ends in none of `suffixes`.
+        If `path` ends in none of `suffixes`, or is one of the inputs.
     """
+    if path is None:
+        return
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(f"'{path}' ends in none of {', '.join(suffixes)}, which name the format")
     if path.exists() and path.is_dir() != folder:
@@ -135,6 +116,75 @@ def check_output(
         raise FileError(f"'{path}' cannot be written: there is no folder '{path.parent}'")
     if not os.access(path.parent, os.W_OK):
         raise FileError(f"'{path}' cannot be written: folder '{path.parent}' is read-only")
+    refuse_inputs([path], list(inputs))
+
+
+def raw_frames(frames: Iterable[str], correction: Path | None = None) -> Array:
+    """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
+    files = find_files(frames)
+    marks = {file: raw_header(file).description for file in files}
+    if correction is not None:
+        warn_of_corrected(marks, image_files.origin_of(correction))
+    return read_frames(files)
+
+
+def given(*paths: Path | None) -> list[Path]:
+    """Paths of options that are given."""
+    return [path for path in paths if path is not None]
+
+
+@contextmanager
+def working(
+    mask: Path | None = None, *, announce: bool = False
+) -> Iterator[tuple[Report | None, Bools | None]]:
+    """Give bars of progress, and the mask in a file, which messages on the mask name."""
+    excluded = None if mask is None else read_mask(mask)
+    try:
+        with progress_bars(announce=announce) as progress:
+            yield progress, excluded
+    except InputError as error:
+        if mask is None or not str(error).startswith("'mask'"):
+            raise
+        raise InputError(f"{mask}: {error}") from error
+
+
+_LAST = ("sensor", "workers", "force")
+"""Options that stand behind those of a call."""
+
+
+def options_of(
+    *calls: Callable[..., object], suffix: str = "", **help_of: str | OptionInfo
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command, as its ``**options``, keywords of a call with their types and defaults.
+
+    Of several calls, each of which has some of the keywords, the defaults are None. `help_of` has a
+    line of help, or an option, for each keyword; an option is named like it, with a suffix.
+    """
+    known: dict[str, inspect.Parameter] = {}
+    for call in calls:
+        known |= inspect.signature(call, eval_str=True).parameters
+
+    def option(name: str, told: str | OptionInfo) -> inspect.Parameter:
+        keyword = known[name.removesuffix(suffix)]
+        kind, default = keyword.annotation, keyword.default
+        if len(calls) > 1:
+            kind, default = kind | None, None
+        if isinstance(told, str):
+            told = typer.Option(*([f"--{name}"] if kind is bool else []), help=told)
+        return keyword.replace(
+            name=name, kind=keyword.KEYWORD_ONLY, default=default, annotation=Annotated[kind, told]
+        )
+
+    def declared(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True)
+        *mine, _ = own.parameters.values()
+        place = min(k for k, each in enumerate(mine) if each.name in _LAST)
+        mine = [each.replace(kind=each.KEYWORD_ONLY) for each in mine]
+        mine[place:place] = [option(*each) for each in help_of.items()]
+        command.__signature__ = own.replace(parameters=mine)  # type: ignore[attr-defined]
+        return command
+
+    return declared
 
 
 def _json_value(value: Any) -> Any:
@@ -168,10 +218,8 @@ def _words(value: Any) -> str:
 
 
 def _row(fields: dict[str, Any]) -> str:
-    """Words of a row: texts by themselves, such as a finding's, and numbers with their names."""
-    if any(isinstance(each, str) for each in fields.values()):
-        return ": ".join(map(str, fields.values()))
-    return _words(fields)
+    """Words of a row: of a finding its kind and its message, else numbers with their names."""
+    return f"{fields['kind']}: {fields['message']}" if "kind" in fields else _words(fields)
 
 
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
@@ -180,21 +228,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
 
-Tolerance = Annotated[float, typer.Option(help="Largest relative error of the sensitivity.")]
-
-MaxSweeps = Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")]
-
-Uncertainty = Annotated[
-    bool, typer.Option("--uncertainty", help="Find the standard deviation of every pixel.")
-]
-
-Saturation = Annotated[
-    float | None, typer.Option(help="Saturation level in DN; the largest value unless given.")
-]
-
 Mask = Annotated[
-    Path | None,
-    typer.Option(help="An image or .npy: pixels that are not 0 in it are not used."),
+    Path | None, typer.Option(help="An image or .npy: pixels that are not 0 in it are not used.")
 ]
 
 Cfa = Annotated[
@@ -213,17 +248,6 @@ Sensor = Annotated[
 ]
 
 
-@contextmanager
-def naming_mask(file: Path | None) -> Iterator[None]:
-    """Name the file in messages on the mask that was read from it."""
-    try:
-        yield
-    except InputError as error:
-        if file is None or not str(error).startswith("'mask'"):
-            raise
-        raise InputError(f"{file}: {error}") from error
-
-
 Picture = Annotated[
     Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
 ]
@@ -233,58 +257,3 @@ Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numb
 Shape = Annotated[
     tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
 ]
-
-_VALUE = r"(?:'([^']*)'|(\w+(?:\.\w+)*))"
-
-
-def in_options(message: str, called: Any) -> str:
-    """Name the options of a command, or group, where a message names Python's keywords.
-
-    A keyword that is no option stays where it is a key of a manifest or an argument of the command;
-    of any other the message says that it is one of Python.
-    """
-    parameters = _parameters(called)
-    options = {
-        each.name: max(each.opts, key=len)
-        for each in parameters
-        if each.param_type_name == "option"
-    }
-    for name, option in options.items():
-        message = _with_values(message, name, option)
-    if ".toml: " in message:
-        return message  # its quoted words are keys of that file
-    for name, option in options.items():
-        message = re.sub(rf"(?<!key )'{name}'(?! (?:in|of) )", option, message)
-        if "_" in name:
-            message = re.sub(rf"(?<![\w'/.\\-]){name}(?![\w'=/\\]|\.\w)", option, message)
-    for name in _python_only() - {each.name for each in parameters}:
-        message = message.replace(f"'{name}'", f"'{name}' (in Python)")
-    return message
-
-
-def _with_values(message: str, name: str, option: str) -> str:
-    """Write ``name='value'`` and ``'name' (--name value)`` as ``--name value``."""
-    message = re.sub(rf"'{name}' \(({option}[^)]*)\)", r"\1", message)
-    message = re.sub(rf"\b{name}={_VALUE}", rf"{option} \1\2", message)
-    message = message.replace(f"{option} True", option)
-    return re.sub(rf"({option}(?: \w+)?)(?:, \1| \(\1\))", r"\1", message)
-
-
-def _parameters(called: Any) -> list[Any]:
-    """Parameters of a command, or of all commands of a group."""
-    inner = getattr(called, "commands", {}).values()
-    return [*called.params, *(each for command in inner for each in _parameters(command))]
-
-
-@cache
-def _python_only() -> frozenset[str]:
-    """Keywords of what commands call that are no keys of manifests."""
-    # Imported where there is a message: pydantic takes as long as the rest of `equipix --help`.
-    from equipix.calibration.calibrate import calibrate
-    from equipix.experiment.manifest import KEYS
-    from equipix.measured.average import average
-    from equipix.nuc.curve_fit import fit
-    from equipix.scene.methods import METHODS
-
-    called: list[Callable[..., object]] = [calibrate, average, fit, *METHODS.values()]
-    return frozenset(name for each in called for name in inspect.signature(each).parameters) - KEYS

@@ -1,130 +1,243 @@
-"""Corrections applied to frames."""
+"""The one way to apply a correction to frames: coefficients prepared once."""
 
 from __future__ import annotations
 
-import weakref
+import threading
 from collections.abc import Callable
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
 from equipix import _native
-from equipix._check import Array, Flagged, as_array, check_word, naming_memory
-from equipix.correction.protocol import UNKNOWN, Depth
+from equipix._check import (
+    Array,
+    Flagged,
+    ReadOnly,
+    as_array,
+    check_word,
+    naming_memory,
+    positive_workers,
+)
+from equipix.correction.protocol import (
+    Correction,
+    Dark,
+    bits_of,
+    check_correction,
+    check_sensor,
+    depth_of,
+    is_stored,
+    sensor_table,
+    with_dark,
+)
 from equipix.errors import InputError
 from equipix.findings import usable
 from equipix.measured.colour import Colours
-from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
 FAST = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
-"""Types of frames, and of corrected frames, that the compiled part takes."""
+"""Types of frames, and of corrected frames, that are corrected in single precision."""
+
+_DOUBLE = np.dtype(np.float64)
+
+Formula = Callable[[Array], Array]
 
 
-class _Kept(NamedTuple):
-    """Prepared coefficients, and the arrays and the treatment that they were prepared for."""
+class Prepared:
+    """Coefficients of a correction for the compiled part, of one treatment of bad pixels.
 
-    references: tuple[weakref.ref[Array], ...]
-    flagged: str
-    cfa: Colours | None
-    prepared: _native.Corrector
+    They are of single precision, which takes and gives the types of `FAST`, or of double precision
+    for float64. Where `levels` of shape (2, rows, cols) are given, values corrected to outside of
+    them are counted.
+    """
 
-    def fits(self, sources: tuple[Array, ...], flagged: str, cfa: Colours | None) -> bool:
-        """Whether they are for these; another array may have the identity of one that is gone."""
-        pairs = zip(self.references, sources, strict=True)
-        same = (self.flagged, self.cfa) == (flagged, cfa)
-        return same and all(own() is other for own, other in pairs)
+    def __init__(
+        self,
+        correction: Correction,
+        coefficients: Array,
+        flagged: Flagged,
+        *,
+        levels: Array | None = None,
+        double: bool = False,
+    ) -> None:
+        self.depth, colours = depth_of(correction), correction.colours
+        planes = np.ascontiguousarray(coefficients, np.float64 if double else np.float32)
+        ends = None if levels is None else np.ascontiguousarray(levels, np.float32)
+        bad = np.ascontiguousarray(~usable(correction.flags))
+        numbers = None if colours is None else colours.numbers(bad.shape)
+        # Most rows and columns from a pixel to the next one of its colour.
+        reach = 1 if colours is None else max(colours.period)
+        self._types = (_DOUBLE,) if double else FAST
+        self._native = _native.Corrector(planes, bad, flagged, ends, numbers, reach)
+
+    def run(
+        self, raw: Array, result: Array, largest: float, workers: int | None = None
+    ) -> tuple[int, int, float]:
+        """Correct frames into an array of the types that these coefficients take and give.
+
+        It can be written to, and is not part of `raw`. Returned are the numbers of values limited
+        to whole numbers and of those outside of the levels, and the largest raw value, or 0.
+        """
+        shape = (-1, *raw.shape[-2:])
+        aligned = np.require(raw, requirements=("C", "A")).reshape(shape)
+        return self._native.apply(aligned, result.reshape(shape), largest, workers=workers)
+
+    def write(self, raw: Array, result: Array, formula: Formula | None) -> None:
+        """Correct frames into any array, frame by frame where types must be converted."""
+        self.depth.refuse_type(raw.dtype)
+        plain = result.flags.carray and not np.may_share_memory(result, raw)
+        if formula is None and plain and {raw.dtype, result.dtype} <= {*self._types}:
+            highest = self.run(raw, result, largest_of(result.dtype))[-1]
+            self.depth.refuse_highest(highest, raw.dtype)
+            return
+        kind = result.dtype if result.dtype in self._types else _DOUBLE
+        for source, target in zip(_each(raw), _each(result), strict=True):
+            self.depth.refuse_highest(float(np.fmax.reduce(source, axis=None)), raw.dtype)
+            taken = source if formula is None else formula(source)
+            if taken.dtype not in self._types:
+                taken = taken.astype(_DOUBLE)
+            made = np.empty(source.shape, kind)
+            self.run(taken, made, largest_of(kind))
+            target[...] = made
 
 
-_KEPT: dict[tuple[int, ...], _Kept] = {}
-"""Prepared coefficients of results, by the identities of their arrays: of each the last ones."""
+class CorrectionBase(ReadOnly):
+    """Base of corrections that are frozen dataclasses: what follows from flags and metadata.
+
+    Coefficients are prepared once, for the dark and the treatment of bad pixels of the last call.
+    """
+
+    __slots__ = ("_last",)
+
+    @property
+    def shape(self: Correction) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.flags.shape
+        return rows, cols
+
+    @property
+    def bits(self: Correction) -> int:
+        """Bits of the raw values, 0 where they are unknown."""
+        return bits_of(self.metadata, self.saturation)
+
+    @property
+    def colours(self: Correction) -> Colours | None:
+        """Colour filters of the pixels, where they are known."""
+        return Colours.of(sensor_table(self.metadata).get("cfa"))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the prepared coefficients, which cannot be pickled."""
+        return dict(vars(self))
+
+    def correct(
+        self: Any,
+        frames: ArrayLike,
+        *,
+        dark: Dark = "stored",
+        flagged: Flagged = "nan",
+        out: Array | None = None,
+    ) -> Array:
+        """Frames as a sensor of equal pixels would have given them, Σ c_j y^j of raw values y.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames, in DN.
+        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+            The dark frame to subtract, in DN: the one that is part of the correction, another (of
+            averaged frames the mean), or none where it is already subtracted. Only what
+            `takes_dark` takes another than "stored".
+        flagged : {"nan", "keep", "replace"}
+            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
+            (NaN still in an undetermined pixel), or the mean of the nearest good pixels around.
+        out : ndarray, optional
+            Array for the result, of the frames' shape, float32 or float64; for frames of 8 or 16
+            bits and float32 also uint8 or uint16, which hold no NaN, so they need another
+            `flagged`: values are rounded half to even, and limited to the range of the type
+            (`equipix.Corrector` counts such values).
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of dtype float64 for float64 frames, else float32; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape does not fit, `dark` is "stored" and one is needed or another than "stored"
+            and none can be taken, `flagged` is unknown, or frames are of another bit depth than the
+            sensor: `out` is then of no use.
+        """
+        return apply(self, frames, dark, flagged, out)
+
+    @property
+    def _planes(self: Correction) -> Array:
+        """The coefficients, not rounded to single precision."""
+        return self.coefficients
 
 
-def reach_of(cfa: Colours | None) -> int:
-    """Most rows and columns from a pixel to the next one of its colour."""
-    return 1 if cfa is None else max(cfa.period)
-
-
-def native(
-    coefficients: Array,
-    flags: Array,
+def apply(
+    correction: Any,
+    frames: ArrayLike,
+    dark: Dark,
     flagged: Flagged,
-    levels: Array | None = None,
-    cfa: Colours | None = None,
-) -> _native.Corrector:
-    """Prepare coefficients of shape (n, rows, cols) for the compiled part.
+    out: Array | None,
+    formula: Formula | None = None,
+) -> Array:
+    """Correct frames by coefficients, or by a formula that is none; see `CorrectionBase.correct`.
 
-    It counts values corrected to outside of `levels`, of shape (2, rows, cols), where they are
-    given, and replaces pixels by those of their colour where there is a `cfa`.
+    A formula gives the corrected frame, float64, of a frame of shape (rows, cols); `out` is then
+    float32 or float64.
     """
-    planes = np.ascontiguousarray(coefficients, dtype=np.float32)
-    ends = None if levels is None else np.ascontiguousarray(levels, dtype=np.float32)
-    bad = np.ascontiguousarray(~usable(flags))
-    colours = None if cfa is None else cfa.numbers(bad.shape)
-    return _native.Corrector(planes, bad, flagged, ends, colours, reach_of(cfa))
+    with naming_memory("correcting"):
+        raw = checked_frames(frames, correction.shape)
+        result = _result(raw, out, flagged, whole=formula is None and raw.dtype in FAST)
+        if formula is None:
+            double = not {raw.dtype, result.dtype} <= {*FAST}
+            prepared = _prepared(correction, dark, flagged, double=double)
+        else:
+            same = np.stack([np.zeros(correction.shape), np.ones(correction.shape)])
+            prepared = Prepared(correction, same, flagged, double=True)
+        prepared.write(raw, result, formula)
+    return result
 
 
-def kept(
-    sources: tuple[Array, ...],
-    flagged: Flagged,
-    coefficients: Callable[[], Array],
-    cfa: Colours | None,
-) -> _native.Corrector:
-    """Prepare coefficients once for a result, as long as its arrays live and `flagged` is the same.
-
-    Parameters
-    ----------
-    sources : tuple of ndarray
-        Arrays that the coefficients are made of, the flags last. Only read-only ones, which belong
-        to an immutable result, are recognised at the next call.
-    flagged : {"nan", "keep", "replace"}
-        What becomes of flagged pixels.
-    coefficients : callable
-        Makes the coefficients.
-    cfa : Colours or None
-        Colour filters of the pixels.
-
-    Returns
-    -------
-    _native.Corrector
-        As `native` gives it.
-    """
-    flags = sources[-1]
-    if any(array.flags.writeable for array in sources):
-        return native(coefficients(), flags, flagged, None, cfa)
-    key = tuple(map(id, sources))
-    found = _KEPT.get(key)
-    if found is not None and found.fits(sources, flagged, cfa):
-        return found.prepared
-
-    def forget(_: object) -> None:
-        _KEPT.pop(key, None)
-
-    references = tuple(weakref.ref(array, forget) for array in sources)
-    prepared = native(coefficients(), flags, flagged, None, cfa)
-    found = _KEPT[key] = _Kept(references, flagged, cfa, prepared)
-    return found.prepared
+def _prepared(correction: Any, dark: Dark, flagged: Flagged, *, double: bool) -> Prepared:
+    """Prepare coefficients, or take those of the last call: a dark of the caller may change."""
+    key, stays = (flagged, double, dark is None), dark is None or is_stored(dark)
+    last: tuple[Any, Prepared] | None = getattr(correction, "_last", None)
+    if stays and last is not None and last[0] == key:
+        return last[1]
+    made = Prepared(correction, with_dark(correction, dark)._planes, flagged, double=double)
+    if stays:
+        object.__setattr__(correction, "_last", (key, made))
+    return made
 
 
-class Counts(NamedTuple):
-    """What `run` found: values limited to whole numbers, those outside of the levels, the largest.
-
-    The largest raw value is 0 where none is above 0.
-    """
-
-    limited: int
-    extrapolated: int
-    highest: float
+def _each(stack: Array) -> Array:
+    return stack[None] if stack.ndim == 2 else stack
 
 
-def run(
-    corrector: _native.Corrector, raw: Array, result: Array, largest: float, workers: int | None
-) -> Counts:
-    """Correct frames into an array."""
-    shape = (-1, *raw.shape[-2:])
-    aligned = np.require(raw, requirements=("C", "A"))
-    done = corrector.apply(aligned.reshape(shape), result.reshape(shape), largest, workers=workers)
-    return Counts(*done)
+def checked_frames(frames: ArrayLike, shape: tuple[int, int]) -> Array:
+    """Refuse frames of another shape than the sensor."""
+    raw = as_array("frames", frames, ndim=(2, 3))
+    if raw.shape[-2:] != shape:
+        raise InputError(f"'frames' has shape {raw.shape}, the sensor {shape}")
+    return raw
+
+
+def _result(raw: Array, out: Array | None, flagged: Flagged, *, whole: bool) -> Array:
+    """Give the array for corrected frames, of floating-point or also of `whole` numbers."""
+    check_flagged(flagged)
+    if out is None:
+        return np.empty(raw.shape, _DOUBLE if raw.dtype == _DOUBLE else np.float32)
+    fits = isinstance(out, np.ndarray) and out.shape == raw.shape and out.flags.writeable
+    if not fits or out.dtype not in ((*FAST, _DOUBLE) if whole else (FAST[-1], _DOUBLE)):
+        got = f"{getattr(out, 'dtype', type(out).__name__)} {np.shape(out)}"
+        raise InputError(
+            f"'out' is {got}, expected a writeable float32 or float64 array of shape {raw.shape}"
+        )
+    check_flagged(flagged, out.dtype)
+    return out
 
 
 def check_flagged(flagged: object, dtype: np.dtype[Any] | None = None) -> None:
@@ -172,276 +285,166 @@ def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
     return float(2**bit_depth - 1)
 
 
-_ONE = Colours((("",),))
-"""The pattern of a sensor without filters."""
-
-
-def apply(
-    frames: ArrayLike,
-    formula: Callable[[NDArray[Any], NDArray[Any]], object],
-    *,
-    flags: NDArray[Any],
-    flagged: Flagged,
-    out: NDArray[Any] | None,
-    depth: Depth = UNKNOWN,
-    cfa: Colours | None = None,
-) -> NDArray[Any]:
-    """Correct frames by a formula, and treat flagged pixels as `flagged` requires.
+class Corrector:
+    """A correction prepared for many frames: whole numbers in and out, no array made per frame.
 
     Parameters
     ----------
-    frames : array_like, shape (rows, cols) or (n, rows, cols)
-        Raw frames, in DN.
-    formula : callable
-        ``formula(frame, corrected)`` writes a corrected frame of shape (rows, cols) to its second
-        argument, a float32 or float64 array.
-    flags : ndarray, shape (rows, cols)
-        Bits of `Flag` per pixel.
-    flagged : {"nan", "keep", "replace"}
-        What becomes of pixels flagged ``DO_NOT_USE``.
-    out : ndarray or None
-        Array for the result, of the frames' shape, float32 or float64.
-    depth : Depth
-        Bits of the sensor.
-    cfa : Colours or None
-        Colour filters of the pixels: a pixel is replaced by those of its colour.
+    correction : Correction
+        What to apply: a calibration, a response, or any other with ``coefficients`` and ``flags``.
+    dtype : {"uint16", "uint8", "float32"}
+        Type of the corrected frames.
+    bit_depth : int, optional
+        Significant bits of whole numbers, 8 to 16: the largest value is 2^bits − 1. By default all
+        bits of the type.
+    flagged : {"nan", "replace", "keep"}, optional
+        The value of pixels flagged ``DO_NOT_USE``: NaN; the mean of the nearest good pixels around,
+        in the same pass; or the value that the formula gives. Unless given, they become NaN in
+        floating-point numbers, and are replaced in whole numbers, which hold no NaN.
+    dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
+        The dark frame to subtract, as for the correction's own ``correct``. A calibration that
+        holds none needs one, or None for frames whose dark is already subtracted.
+    sensor : str, optional
+        Name of the sensor that gives the frames, to be compared with that of the correction.
+    workers : int, optional
+        Number of threads; by default one for each processor. It changes no bit of the result. Up to
+        2²⁰ values the calling thread works alone; of larger stacks each thread takes whole frames,
+        and of frames of more than 2²⁰ pixels parts.
 
-    Returns
-    -------
-    ndarray, of the frames' shape
-        Of dtype float64 for float64 frames, else float32; or `out`.
+    Attributes
+    ----------
+    clipped : int
+        Values of whole numbers so far that had to be limited to the range from 0 to the largest
+        value, or were not a number.
+    extrapolated : int or None
+        Values so far that were corrected to below the lowest or above the highest level that the
+        response of their pixel was fitted to, to the rounding of float32. None where a correction
+        has no range of levels, such as a calibration.
+    frames : int
+        Frames corrected so far.
+    replaced : int
+        Pixels that are replaced in each frame; 0 where no pixel is good.
 
     Raises
     ------
     InputError
-        If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
+        If an argument has a wrong value, the correction has more than four coefficients, or needs
+        a dark frame, or is of another sensor.
+    InsufficientMemoryError
+        If the memory for the coefficients cannot be had.
+
+    Notes
+    -----
+    A corrected value is c₀ + y·(c₁ + y·(c₂ + y·c₃)), in float32 by Horner's scheme, each operation
+    rounded: the same bytes on every processor. Whole numbers are rounded half to even. A value of
+    16 bits with four coefficients is off by less than 0.05 DN through float32.
+
+    A pixel is replaced by the mean of the good ones of its eight neighbours; where there are none,
+    by that of neighbours replaced before. Behind colour filters those of its colour count, on the
+    nearest square around it that has any. NaN counts in no mean, so it does not spread.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import equipix
+    >>> gain = np.array([[0.9, 1.0, 1.1]])
+    >>> response = equipix.nuc.fit([100 * gain, 1000 * gain], order=1)
+    >>> corrector = equipix.Corrector(response, "uint8")
+    >>> corrector.apply(np.array([[90, 100, 110]], np.uint8))
+    array([[100, 100, 100]], dtype=uint8)
+    >>> corrector.clipped
+    0
     """
-    with naming_memory("correcting"):
-        raw = _checked(frames, flags, flagged)
-        depth.refuse_type(raw.dtype)
-        dtype = np.dtype(np.float64 if raw.dtype == np.float64 else np.float32)
-        result = np.empty(raw.shape, dtype) if out is None else _checked_out(out, raw.shape)
-        bad = ~usable(flags)
-        for source, target in zip(_each(raw), _each(result), strict=True):
-            depth.refuse_highest(float(np.fmax.reduce(source, axis=None)), raw.dtype)
-            formula(source, target)
-            if flagged == "nan":
-                target[bad] = np.nan
-            elif flagged == "replace":
-                replace_bad(target, bad, cfa)
+
+    def __init__(
+        self,
+        correction: Correction,
+        dtype: DTypeLike = "uint16",
+        *,
+        bit_depth: int | None = None,
+        flagged: Flagged | None = None,
+        dark: Dark = "stored",
+        sensor: str | None = None,
+        workers: int | None = None,
+    ) -> None:
+        check_correction("correction", correction)
+        self.shape = correction.shape
+        self.dtype = output_dtype(dtype)
+        self._largest = largest_value(self.dtype, bit_depth)
+        self._workers = positive_workers(workers)
+        flagged = usual_treatment(self.dtype) if flagged is None else flagged
+        check_flagged(flagged, self.dtype)
+        check_sensor(correction, sensor)
+        levels = correction.limits
+        if levels is not None and not (levels[1] > levels[0]).any():
+            levels = None
+        with naming_memory("preparing a correction"):
+            planes = with_dark(correction, dark).coefficients
+            self._prepared = Prepared(correction, planes, flagged, levels=levels)
+        good = int(np.count_nonzero(usable(correction.flags)))
+        self.replaced = correction.flags.size - good if flagged == "replace" and good else 0
+        self.clipped = self.frames = 0
+        self.extrapolated = None if levels is None else 0
+        self._counting = threading.Lock()
+
+    def __repr__(self) -> str:
+        """Short form: sizes and types."""
+        return f"<Corrector of {self.shape[0]} x {self.shape[1]} pixels to {self.dtype}>"
+
+    def apply(self, frames: ArrayLike, out: Array | None = None) -> Array:
+        """Correct one frame or a stack.
+
+        Parameters
+        ----------
+        frames : array_like, shape (rows, cols) or (n, rows, cols)
+            Raw frames in DN, uint8, uint16 or float32.
+        out : ndarray, optional
+            Array for the result, of the frames' shape and this corrector's dtype, C-contiguous, not
+            the frames themselves.
+
+        Returns
+        -------
+        ndarray, of the frames' shape
+            Of this corrector's dtype; or `out`.
+
+        Raises
+        ------
+        InputError
+            If a shape or dtype does not fit, whole numbers have fewer bits than those of the
+            correction, or a value is above what these hold: `out` is then of no use.
+        InsufficientMemoryError
+            If the memory for the result cannot be had.
+        """
+        with naming_memory("correcting"):
+            raw = checked_frames(frames, self.shape)
+            if raw.dtype not in FAST:
+                raise InputError(
+                    f"'frames' is {raw.dtype}, expected uint8, uint16 or float32: convert them, or "
+                    "use the correction's own correct()"
+                )
+            self._prepared.depth.refuse_type(raw.dtype)
+            result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
+            limited, outside, highest = self._prepared.run(
+                raw, result, self._largest, self._workers
+            )
+        self._prepared.depth.refuse_highest(highest, raw.dtype)
+        with self._counting:
+            self.clipped += limited
+            self.frames += 1 if raw.ndim == 2 else len(raw)
+            if self.extrapolated is not None:
+                self.extrapolated += outside
         return result
 
-
-def apply_polynomial(
-    frames: ArrayLike,
-    coefficients: Callable[[], NDArray[Any]],
-    *,
-    sources: tuple[NDArray[Any], ...] | None,
-    flags: NDArray[Any],
-    flagged: Flagged,
-    out: NDArray[Any] | None,
-    depth: Depth,
-    cfa: Colours | None = None,
-) -> NDArray[Any]:
-    """Σ c_j y^j of each value y by Horner's scheme, and the values of flagged pixels.
-
-    Frames of 8 or 16 bits and float32 are corrected in float32 by the compiled part; `out` may
-    then be of whole numbers, which are rounded half to even and limited to the range of the type.
-    Others are corrected in float64. `coefficients` makes the coefficients, once for the arrays
-    `sources` of a result, the flags last. The other parameters are those of `apply`.
-    """
-    # A copy is no array of the result.
-    known = (flags.copy(),) if sources is None else sources
-    fast = _fast(frames, known, coefficients, flagged=flagged, out=out, depth=depth, cfa=cfa)
-    if fast is not None:
-        return fast
-    planes = coefficients()
-
-    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
-        total = np.zeros(frame.shape)
-        with np.errstate(invalid="ignore"):  # a dead pixel has infinite coefficients
-            for coefficient in planes[::-1]:
-                total *= frame
-                total += coefficient
-        corrected[...] = total
-
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth, cfa=cfa)
-
-
-def apply_gain(
-    frames: ArrayLike,
-    *,
-    gain: NDArray[Any],
-    dark: FrameStatistics | ArrayLike | None,
-    stored: NDArray[Any] | None,
-    flags: NDArray[Any],
-    flagged: Flagged,
-    out: NDArray[Any] | None,
-    depth: Depth,
-    cfa: Colours | None = None,
-) -> NDArray[Any]:
-    """(frame − dark) / gain of each value, and the values of flagged pixels.
-
-    The parameters are those of `equipix.Calibration.correct`; frames and results of some types go
-    to the compiled part, as in `apply_polynomial`. Coefficients are prepared once for no dark and
-    for the `stored` one of the result; another may change between two calls.
-    """
-    offset = None if dark is None else dark_frame(dark, gain.shape)
-    sources: tuple[NDArray[Any], ...] = (gain, flags)
-    if dark is stored and stored is not None:
-        sources = (gain, stored, flags)
-    elif offset is not None:
-        sources = (gain, offset.copy(), flags)  # a copy is no array of the result
-
-    def coefficients() -> NDArray[Any]:
-        return gain_coefficients(gain, offset)
-
-    fast = _fast(frames, sources, coefficients, flagged=flagged, out=out, depth=depth, cfa=cfa)
-    if fast is not None:
-        return fast
-    dark_level = np.zeros((), np.float32) if offset is None else offset
-
-    def formula(frame: NDArray[Any], corrected: NDArray[Any]) -> None:
-        np.subtract(frame, dark_level, out=corrected, dtype=corrected.dtype, casting="same_kind")
-        with np.errstate(divide="ignore", invalid="ignore"):
-            np.divide(corrected, gain, out=corrected, casting="same_kind")
-
-    return apply(frames, formula, flags=flags, flagged=flagged, out=out, depth=depth, cfa=cfa)
-
-
-def gain_coefficients(gain: NDArray[Any], dark: NDArray[Any] | None) -> NDArray[Any]:
-    """Coefficients c_0 = −dark/gain, 0 without a dark, and c_1 = 1/gain; NaN where gain is."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have gain 0
-        inverse = 1 / gain.astype(np.float64)
-        offset = np.zeros_like(inverse) if dark is None else -dark * inverse
-    offset[np.isnan(inverse)] = np.nan
-    return np.stack([offset, inverse])
-
-
-def _fast(
-    frames: ArrayLike,
-    sources: tuple[NDArray[Any], ...],
-    coefficients: Callable[[], NDArray[Any]],
-    *,
-    flagged: Flagged,
-    out: NDArray[Any] | None,
-    depth: Depth,
-    cfa: Colours | None,
-) -> NDArray[Any] | None:
-    """Correct frames by the compiled part; None where it does not take their types.
-
-    `sources` are the arrays that `coefficients` makes coefficients of, the flags last.
-    """
-    with naming_memory("correcting"):
-        raw = _checked(frames, sources[-1], flagged)
-        if raw.dtype not in FAST or not (out is None or _is_plain(out, raw)):
-            return None
-        depth.refuse_type(raw.dtype)
-        result = np.empty(raw.shape, np.float32) if out is None else out
-        check_flagged(flagged, result.dtype)
-        if raw.size:
-            prepared = kept(sources, flagged, coefficients, cfa)
-            counts = run(prepared, raw, result, largest_of(result.dtype), None)
-            depth.refuse_highest(counts.highest, raw.dtype)
-        return result
-
-
-def _is_plain(out: NDArray[Any], raw: NDArray[Any]) -> bool:
-    """Whether the compiled part can write to an array."""
-    fits = isinstance(out, np.ndarray) and out.dtype in FAST and out.shape == raw.shape
-    return bool(fits and out.flags.carray and not np.may_share_memory(out, raw))
-
-
-def _checked(frames: ArrayLike, flags: NDArray[Any], flagged: Flagged) -> NDArray[Any]:
-    """Refuse frames of another shape than the sensor, and unknown treatments."""
-    raw = as_array("frames", frames, ndim=(2, 3))
-    if raw.shape[-2:] != flags.shape:
-        raise InputError(f"'frames' has shape {raw.shape}, the sensor {flags.shape}")
-    check_flagged(flagged)
-    return raw
-
-
-def is_stored(dark: str | FrameStatistics | ArrayLike | None) -> bool:
-    """Whether a dark is the word "stored"; another word is refused."""
-    if isinstance(dark, str) and dark != "stored":
-        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
-    return isinstance(dark, str)
-
-
-def dark_or_stored(
-    dark: str | FrameStatistics | ArrayLike | None, stored: NDArray[Any] | None
-) -> FrameStatistics | ArrayLike | None:
-    """Return the dark given, or the stored one of a calibration where it is "stored"."""
-    if not is_stored(dark):
-        return dark
-    if stored is None:
-        raise InputError(
-            "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if it "
-            "is already subtracted"
-        )
-    return stored
-
-
-def dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Check a dark frame that is to be subtracted; of averages it is the mean."""
-    if isinstance(dark, FrameStatistics):
-        refuse_subtracted(dark)
-        dark = dark.mean
-    offset = as_array("dark", dark, ndim=2)
-    if offset.shape != shape:
-        raise InputError(f"'dark' has shape {offset.shape}, the sensor {shape}")
-    return offset
-
-
-def replace_bad(image: NDArray[Any], bad: NDArray[np.bool_], cfa: Colours | None = None) -> None:
-    """Put the mean of the nearest good pixels in place of each bad one.
-
-    The good ones of the eight neighbours count; where there are none, those that were filled in
-    the round before. With a `cfa` those of its colour count, on the nearest square around the pixel
-    that has any. A value that is NaN counts in no mean. An image without any good pixel becomes
-    NaN.
-    """
-    reach = reach_of(cfa)
-    inner = (slice(reach, -reach), slice(reach, -reach))
-    good = np.pad(~bad & ~np.isnan(image), reach)
-    values = np.pad(np.where(good[inner], image, 0).astype(np.float64), reach)
-    colours = np.pad((cfa or _ONE).numbers(image.shape), reach)
-    todo = np.argwhere(bad) + reach
-    while len(todo):
-        count, total = np.zeros(len(todo)), np.zeros(len(todo))
-        for steps in map(_square, range(1, reach + 1)):
-            # Places (steps, pixels to do) in rows and columns.
-            places = tuple((todo + steps[:, None]).transpose(2, 0, 1))
-            used = good[places] & (colours[places] == colours[tuple(todo.T)]) & (count == 0)
-            count += used.sum(axis=0)
-            total += np.where(used, values[places], 0).sum(axis=0)
-        ready = count > 0
-        if not ready.any():
-            image[tuple((todo - reach).T)] = np.nan
-            return
-        filled = tuple(todo[ready].T)
-        values[filled] = total[ready] / count[ready]
-        good[filled] = True
-        image[tuple((todo[ready] - reach).T)] = values[filled]
-        todo = todo[~ready]
-
-
-def _square(reach: int) -> NDArray[np.int64]:
-    """Steps (n, 2) to the pixels on the square around a pixel, so far from it."""
-    side = np.arange(-reach, reach + 1)
-    steps = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.asarray(steps[np.abs(steps).max(axis=1) == reach])
-
-
-def _each(stack: NDArray[Any]) -> NDArray[Any]:
-    return stack[None] if stack.ndim == 2 else stack
-
-
-def _checked_out(out: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    fits = isinstance(out, np.ndarray) and out.shape == shape and out.flags.writeable
-    if not fits or out.dtype not in (np.float32, np.float64):
-        got = f"{getattr(out, 'dtype', type(out).__name__)} {np.shape(out)}"
-        raise InputError(
-            f"'out' is {got}, expected a writeable float32 or float64 array of shape {shape}"
-        )
-    return out
+    def _checked(self, out: Array, raw: Array) -> Array:
+        """Refuse an array that the result cannot be written to."""
+        array = isinstance(out, np.ndarray)
+        if not array or out.dtype != self.dtype or out.shape != raw.shape:
+            got = f"{getattr(out, 'dtype', type(out).__name__)} of shape {np.shape(out)}"
+            raise InputError(f"'out' is {got}, expected {self.dtype} of shape {raw.shape}")
+        if not out.flags.carray:
+            raise InputError(
+                "'out' is not contiguous, not aligned or read-only: give a writeable C-order array"
+            )
+        if np.may_share_memory(out, raw):
+            raise InputError("'out' overlaps 'frames': neighbours of replaced pixels must stay raw")
+        return out

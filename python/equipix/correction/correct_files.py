@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,26 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from equipix._check import Array, Display, Flagged, OutputType, Progress
-from equipix.correction.apply import FAST, output_dtype, usual_treatment
-from equipix.correction.corrector import Corrector, Dark
-from equipix.correction.protocol import Correction, takes_dark
+from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
+from equipix.correction.protocol import Correction, Dark
 from equipix.errors import (
     FileError,
     InputError,
-    InputWarning,
-    warn,
 )
-from equipix.findings import usable
-from equipix.io.formats import refuse_saved
-from equipix.io.frames import description, frame_format, stream_frames
+from equipix.findings import Finding, say, usable
+from equipix.io.formats import raw_header
+from equipix.io.frames import Header, stream_frames
 from equipix.io.paths import find_files, folder_beside, refuse_inputs, write_whole
 from equipix.io.png import write_png
 from equipix.io.tiff import write_frames
 from equipix.measured.average import average
 from equipix.measured.statistics import DARKER, FrameStatistics, refuse_subtracted
-
-_MARKED = (".tif", ".tiff", ".png")
-"""Formats that this module writes."""
 
 _MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
@@ -141,10 +135,10 @@ def correct_files(
     files = find_files(source)
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
-    counts = {file: _count(file, correction) for file in files}
-    total, done = sum(counts.values()), 0
+    headers = {file: _header(file, correction) for file in files}
+    total, done = sum(header.shape[0] for header in headers.values()), 0
     _refuse_pictures(output, total, wanted)
-    warn_of_corrected(files, origin)
+    warn_of_corrected({file: header.description for file, header in headers.items()}, origin)
     flagged = usual_treatment(wanted) if flagged is None else flagged
     of_dark = _dark(correction, dark)
     corrector = Corrector(
@@ -176,7 +170,7 @@ def correct_files(
     else:
         with folder_beside(output) as folder:
             for file, path in zip(files, outputs, strict=True):
-                nbytes = counts[file] * frame_bytes
+                nbytes = headers[file].shape[0] * frame_bytes
                 _write(folder / path.name, corrected([file]), nbytes=nbytes, mark=mark)
             output.mkdir(exist_ok=True)
             for path in outputs:
@@ -254,35 +248,34 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def warn_of_corrected(files: list[Path], origin: str) -> None:
-    """Warn of files that this module has written; `origin` as for `correct_files`."""
-    marks = {file: description(file) for file in files if file.suffix.lower() in _MARKED}
+def warn_of_corrected(marks: Mapping[Path, str], origin: str) -> None:
+    """Warn of files whose text this module has written; `origin` as for `correct_files`."""
     corrected = [file for file, mark in marks.items() if mark.startswith(_MARK)]
     if not corrected:
         return
     others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
     same = bool(origin) and marks[corrected[0]].endswith(origin)
     by = "by this correction" if same else "by another correction"
-    warn(
+    words = (
         f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
-        "the raw frames",
-        InputWarning,
+        "the raw frames"
     )
+    say(Finding("corrected", words, "input"))
 
 
 def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> None:
     """Warn of a frame from which the dark was probably subtracted before."""
-    given = getattr(correction, "dark", None) if isinstance(dark, str) else dark
+    given = correction.dark if isinstance(dark, str) else dark
     if given is None:
         return
     offset = np.asarray(given.mean if isinstance(given, FrameStatistics) else given)
     level, below = np.nanmedian(offset), np.nanmedian(offset - frame)
     if level > 0 and below > DARKER * level:
-        warn(
+        words = (
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
-            "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them",
-            InputWarning,
+            "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them"
         )
+        say(Finding("bright_dark", words, "input"))
 
 
 def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
@@ -292,29 +285,27 @@ def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
     remedy = "float32, or more bits in 'bit_depth' (--bit-depth)"
     if dtype == np.uint8:
         remedy = "uint16; or 'display' (--display linear), which scales frames to 8 bits"
-    warn(
+    words = (
         f"{limited / values:.0%} of the corrected values were limited to the range of {dtype}: "
-        f"choose 'dtype' (--dtype) {remedy}",
-        InputWarning,
+        f"choose 'dtype' (--dtype) {remedy}"
     )
+    say(Finding("limited", words, "input"))
 
 
-def _count(file: Path, correction: Correction) -> int:
-    """Count the frames of a file; they must be raw, and of the sensor's shape."""
-    refuse_saved(file)
-    (count, *shape), _ = frame_format(file)
-    if tuple(shape) != correction.shape:
-        raise InputError(
-            f"{file}: holds frames of shape {tuple(shape)}, expected {correction.shape}"
-        )
-    return count
+def _header(file: Path, correction: Correction) -> Header:
+    """Read what a file says of its frames; they must be raw, and of the sensor's shape."""
+    found = raw_header(file)
+    shape = found.shape[1:]
+    if shape != correction.shape:
+        raise InputError(f"{file}: holds frames of shape {shape}, expected {correction.shape}")
+    return found
 
 
 def _dark(correction: Correction, dark: str) -> Dark:
     """Give the dark frame that an option names, for the argument of `Corrector`."""
     if dark == "stored":
         return "stored"
-    if not takes_dark(correction):
+    if not correction.takes_dark:
         raise InputError(
             f"'dark' is '{dark}', but the offsets of this correction are part of it and no dark "
             "frame can replace them: expected 'stored'"

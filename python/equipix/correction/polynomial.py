@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Array, Flagged, check_type
-from equipix.correction.apply import apply_polynomial
-from equipix.correction.protocol import Correction, cfa_of, check_correction, depth_of
+from equipix._check import Array, check_type
+from equipix.correction.apply import CorrectionBase
+from equipix.correction.protocol import Correction, check_correction, sensor_table
 from equipix.errors import InputError
+from equipix.findings import Finding
 from equipix.io.record import Counts, Record
 
 _MOST = 4
@@ -19,7 +19,7 @@ _MOST = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Polynomial(Record, kind="polynomial", version=2):
+class Polynomial(CorrectionBase, Record, kind="polynomial", version=2):
     """A correction Σ c_j y^j of raw values y, such as two corrections combined.
 
     Attributes
@@ -35,6 +35,8 @@ class Polynomial(Record, kind="polynomial", version=2):
     leaves_offset : bool
         Whether corrected frames hold an offset, such as the mean one of raw levels, which no gain
         may multiply.
+    findings : tuple of Finding
+        What limits it: of two corrections combined, those of both.
 
     Raises
     ------
@@ -47,6 +49,11 @@ class Polynomial(Record, kind="polynomial", version=2):
     metadata: dict[str, Any] = field(default_factory=dict)
     saturation: float | None = None
     leaves_offset: bool = False
+    findings: tuple[Finding, ...] = ()
+    dark: ClassVar[None] = None
+    takes_dark: ClassVar[bool] = False
+    needs_dark: ClassVar[bool] = False
+    limits: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -64,49 +71,6 @@ class Polynomial(Record, kind="polynomial", version=2):
         """Short form: sizes and order."""
         rows, cols = self.shape
         return f"<Polynomial of {rows} x {cols} pixels, order {len(self.coefficients) - 1}>"
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.flags.shape
-        return rows, cols
-
-    def correct(
-        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
-    ) -> Array:
-        """Frames as a sensor of equal pixels would have given them.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Raw frames, in DN.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, that of the formula, or the mean of the
-            nearest good pixels around.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32, float64 or as of `Corrector`;
-            whole numbers hold no NaN, so they need another `flagged`.
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `flagged` is unknown, or frames are of another bit depth.
-        """
-        return apply_polynomial(
-            frames,
-            lambda: self.coefficients,
-            sources=(self.coefficients, self.flags),
-            flags=self.flags,
-            flagged=flagged,
-            out=out,
-            depth=depth_of(self),
-            cfa=cfa_of(self),
-        )
 
 
 def combine(first: Correction, then: Correction) -> Polynomial:
@@ -134,8 +98,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
         If the sensors differ in shape, or in the name or the bit depth where both metadata have
         one, or `then` is of an order above 1, subtracts a dark frame, or is of raw frames: a
         response to averages of raw levels, or the result of a scene method; or `then` is a gain
-        alone, and `first` a response to averages of raw levels: the mean offset stays in frames
-        that it has corrected, and the gain would multiply it.
+        alone, and `first` leaves an offset in frames that it has corrected, as a response to
+        averages of raw levels, a scene method or a correction of bolometers: the gain would
+        multiply it.
 
     Examples
     --------
@@ -152,11 +117,10 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     if first.shape != then.shape:
         raise InputError(f"'first' is of shape {first.shape}, 'then' of {then.shape}")
     sensor = _common_sensor(first, then)
-    dark = getattr(then, "dark", None)
-    if dark is not None:
+    if then.dark is not None:
         raise InputError(
-            f"'then' subtracts a dark frame of {np.nanmean(dark):.4g} DN in the mean, which frames "
-            "that 'first' has corrected do not hold: expected a correction without one"
+            f"'then' subtracts a dark frame of {np.nanmean(then.dark):.4g} DN in the mean, which "
+            "frames that 'first' has corrected do not hold: expected a correction without one"
         )
     after = np.asarray(then.coefficients, np.float64)
     if len(after) > 2:
@@ -166,16 +130,21 @@ def combine(first: Correction, then: Correction) -> Polynomial:
         )
     gain = after[1] if len(after) == 2 else 0.0
     _refuse_raw(then)
-    leaves = _leaves_offset(first) and not np.nan_to_num(after[0]).any()
+    leaves = first.leaves_offset and not np.nan_to_num(after[0]).any()
     if leaves and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
-        raise InputError(_words_of_offset(first))
+        raise InputError(
+            "'first' leaves an offset in corrected frames, as a response to raw levels, a scene "
+            "method or a correction of bolometers does, and the gain of 'then' would multiply it: "
+            "average levels with a dark, equipix.average(frames, dark=dark), and fit again, or "
+            "subtract a corrected frame without light, such as of a shutter, before 'then'"
+        )
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
     metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
     if sensor:
         metadata["sensor"] = sensor
-    level: float | None = getattr(first, "saturation", None)
-    return Polynomial(coefficients, first.flags | then.flags, metadata, level, leaves)
+    flags, findings = first.flags | then.flags, first.findings + then.findings
+    return Polynomial(coefficients, flags, metadata, first.saturation, leaves, findings)
 
 
 def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
@@ -183,8 +152,7 @@ def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
 
     Levels of `then` are those of corrected frames, so none is taken over.
     """
-    tables = [each.metadata.get("sensor") for each in (first, then)]
-    one, other = (each if isinstance(each, dict) else {} for each in tables)
+    one, other = (sensor_table(each.metadata) for each in (first, then))
     for key, words in (("name", "the sensor"), ("bit_depth", "a sensor of the bit depth")):
         known, found = one.get(key), other.get(key)
         if known and found and known != found:
@@ -192,41 +160,21 @@ def _common_sensor(first: Correction, then: Correction) -> dict[str, Any]:
                 f"'first' is of {words} {known!r}, 'then' of {found!r}: expected one sensor"
             )
     # Without any the bits follow from the level of saturation of `first`.
-    taken = ("name",) if depth_of(first).bits else ("name", "bit_depth")
+    taken = ("name",) if first.bits else ("name", "bit_depth")
     added = {key: other[key] for key in taken if other.get(key) and not one.get(key)}
-    colours = cfa_of(first) or cfa_of(then)
+    colours = first.colours or then.colours
     return {**one, **added, **({} if colours is None else {"cfa": colours.rows})}
 
 
 def _refuse_raw(then: Correction) -> None:
     """Refuse a second correction that holds the offsets of raw frames."""
-    if _leaves_offset(then):
-        raise InputError(
-            "'then' holds the offsets of raw levels, which 'first' takes away already: fit it to "
-            "levels that 'first' has corrected"
-        )
     if "scene" in then.metadata:
         raise InputError(
             "'then' is the result of a scene method, which does not state whether its frames were "
             "raw or corrected by 'first': correct frames by 'first' and then by 'then'"
         )
-
-
-def _leaves_offset(correction: Correction) -> bool:
-    """Whether corrected frames hold an offset, such as the mean one of the raw levels fitted to."""
-    return bool(getattr(correction, "raw", False) or getattr(correction, "leaves_offset", False))
-
-
-def _words_of_offset(first: Correction) -> str:
-    """Say what leaves an offset, and what to do."""
-    if getattr(first, "raw", False):
-        return (
-            "'first' is a response to raw levels, which leaves the mean offset in corrected "
-            "frames, and the gain of 'then' would multiply it: average the levels with a dark, "
-            "equipix.average(frames, dark=dark), and fit the response again"
+    if then.leaves_offset:
+        raise InputError(
+            "'then' holds the offsets of raw levels, which 'first' takes away already: fit it to "
+            "levels that 'first' has corrected"
         )
-    return (
-        "'first' leaves an offset in corrected frames, as a response to raw levels or a correction "
-        "of bolometers does, and the gain of 'then' would multiply it: average levels with a dark, "
-        "or subtract a corrected frame of a shutter before 'then'"
-    )

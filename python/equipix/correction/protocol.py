@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from os import PathLike
-from typing import Any, Literal, NamedTuple, Protocol, TypeGuard, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from equipix._check import Flagged, described
+from equipix._check import Array, Flagged, as_array, described
 from equipix.errors import InputError
+from equipix.findings import Finding
 from equipix.measured.colour import Colours
-from equipix.measured.statistics import FrameStatistics
+from equipix.measured.statistics import FrameStatistics, refuse_subtracted
+
+Dark = Literal["stored"] | FrameStatistics | ArrayLike | None
+"""A dark frame to subtract: that which is part of the correction, another, or none."""
+
+_C = TypeVar("_C", bound="Correction")
 
 
 @runtime_checkable
@@ -24,23 +32,71 @@ class Correction(Protocol):
         """Sizes of the sensor (rows, cols)."""
 
     @property
-    def flags(self) -> NDArray[Any]:
+    def flags(self) -> Array:
         """Bits of `Flag` per pixel, shape (rows, cols), uint32."""
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients c of the corrected frame Σ c_j y^j, shape (2 to 4, rows, cols).
+
+        y is the raw frame in DN, and a stored dark is part of them. NaN in a pixel that the
+        correction does not determine.
+        """
 
     @property
     def metadata(self) -> dict[str, Any]:
         """Versions, options and origin, as JSON values."""
 
     @property
-    def coefficients(self) -> NDArray[Any]:
-        """Coefficients c of the corrected frame Σ c_j y^j, shape (order + 1, rows, cols).
+    def findings(self) -> tuple[Finding, ...]:
+        """What limits the result."""
 
-        y is the raw frame in DN. NaN in a pixel that the correction does not determine.
+    @property
+    def dark(self) -> Array | None:
+        """The dark frame in DN, shape (rows, cols), if one is part of the correction."""
+
+    @property
+    def takes_dark(self) -> bool:
+        """Whether another dark frame, or none, can take the place of that stored.
+
+        Such a correction is a dataclass, and `dark` one of its fields.
         """
 
+    @property
+    def needs_dark(self) -> bool:
+        """Whether it is of frames less a dark frame, and stores none: `correct` asks for one."""
+
+    @property
+    def limits(self) -> Array | None:
+        """Lowest and highest corrected value that was measured, shape (2, rows, cols), in DN.
+
+        None where a correction has no range of levels.
+        """
+
+    @property
+    def saturation(self) -> float | None:
+        """Level of saturation of raw values in DN, where it is kept."""
+
+    @property
+    def bits(self) -> int:
+        """Bits of the raw values, 0 where they are unknown."""
+
+    @property
+    def leaves_offset(self) -> bool:
+        """Whether corrected frames keep an offset, as of raw levels, which no gain may multiply."""
+
+    @property
+    def colours(self) -> Colours | None:
+        """Colour filters of the pixels, where they are known."""
+
     def correct(
-        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: NDArray[Any] | None = None
-    ) -> NDArray[Any]:
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Dark = "stored",
+        flagged: Flagged = "nan",
+        out: Array | None = None,
+    ) -> Array:
         """Frames as a sensor of equal pixels would have given them.
 
         Of the frames' shape, (rows, cols) or (n, rows, cols); float64 for float64 frames, else
@@ -51,29 +107,14 @@ class Correction(Protocol):
         """Write to a file that `equipix.load` reads; its suffix names the format."""
 
 
-class DarkCorrection(Correction, Protocol):
-    """A dataclass of a correction that subtracts a dark frame, which another may replace."""
-
-    @property
-    def dark(self) -> NDArray[Any] | None:
-        """The dark frame in DN, shape (rows, cols), if it is part of the correction."""
-
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
-        flagged: Flagged = "nan",
-        out: NDArray[Any] | None = None,
-    ) -> NDArray[Any]:
-        """Frames as `Correction.correct` gives them, after `dark` is subtracted."""
+MEMBERS = tuple(name for name in vars(Correction) if not name.startswith("_"))
+"""Names of what every correction gives."""
 
 
 def check_correction(name: str, given: object) -> None:
     """Refuse what is no correction, such as the name of its file."""
-    needed = ("shape", "flags", "metadata", "coefficients")
     # Of the class first: a property of the object may be costly.
-    if all(hasattr(type(given), each) or hasattr(given, each) for each in needed):
+    if all(hasattr(type(given), each) or hasattr(given, each) for each in MEMBERS):
         return
     raise InputError(
         f"'{name}' is {described(given)}, expected a correction: equipix.load(path), or the result "
@@ -81,23 +122,15 @@ def check_correction(name: str, given: object) -> None:
     )
 
 
-def takes_dark(correction: Correction) -> TypeGuard[DarkCorrection]:
-    """Whether another dark frame can take the place of that stored."""
-    return hasattr(correction, "dark")
+def sensor_table(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what metadata hold of the sensor."""
+    sensor = metadata.get("sensor")
+    return sensor if isinstance(sensor, dict) else {}
 
 
 def sensor_of(correction: Correction) -> str:
     """Return the name of the sensor in the metadata; empty where there is none."""
-    sensor = correction.metadata.get("sensor")
-    return str(sensor.get("name", "")) if isinstance(sensor, dict) else ""
-
-
-def cfa_of(correction: Correction) -> Colours | None:
-    """Return the colour filters of the pixels, of the correction or of the sensor in metadata."""
-    own = getattr(correction, "cfa", None)
-    sensor = correction.metadata.get("sensor")
-    named = sensor.get("cfa") if isinstance(sensor, dict) else None
-    return Colours.of(named if own is None else own)
+    return str(sensor_table(correction.metadata).get("name", ""))
 
 
 def named_cfa(correction: Correction, cfa: ArrayLike | None) -> Colours | None:
@@ -108,7 +141,7 @@ def named_cfa(correction: Correction, cfa: ArrayLike | None) -> Colours | None:
     InputError
         If `cfa` is no pattern, or another than that of the correction.
     """
-    own, given = cfa_of(correction), Colours.of(cfa)
+    own, given = correction.colours, Colours.of(cfa)
     if own is not None and given not in (None, own):
         raise InputError(
             f"'cfa' is {str(given)!r}, but the correction was fitted with {str(own)!r}: "
@@ -129,6 +162,51 @@ def check_sensor(correction: Correction, sensor: str | None) -> None:
         )
     if own != sensor:
         raise InputError(f"'sensor' is '{sensor}', but the correction is of '{own}'")
+
+
+def is_stored(dark: Dark) -> bool:
+    """Whether a dark is the word "stored"; another word is refused."""
+    if isinstance(dark, str) and dark != "stored":
+        raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
+    return isinstance(dark, str)
+
+
+def with_dark(correction: _C, dark: Dark) -> _C:
+    """Return a correction with this dark frame in place of that stored."""
+    if is_stored(dark):
+        if correction.needs_dark:
+            raise InputError(
+                "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if "
+                "it is already subtracted"
+            )
+        return correction
+    if not correction.takes_dark:
+        raise InputError(
+            "'dark' is given, but the offsets of this correction are part of it and no dark frame "
+            "can replace them: expected 'stored'"
+        )
+    if dark is not None and correction.leaves_offset:
+        raise InputError(
+            "'dark' is given, but the offsets of this response are part of its curves: it was "
+            "fitted to levels from which no dark was subtracted"
+        )
+    offset = None if dark is None else _dark_frame(dark, correction.shape)
+    if offset is correction.dark:
+        return correction
+    changed: Any = correction
+    made: _C = replace(changed, dark=offset)
+    return made
+
+
+def _dark_frame(dark: FrameStatistics | ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Check a dark frame that is to be subtracted; of averages it is the mean."""
+    if isinstance(dark, FrameStatistics):
+        refuse_subtracted(dark)
+        dark = dark.mean
+    offset = as_array("dark", dark, ndim=2)
+    if offset.shape != shape:
+        raise InputError(f"'dark' has shape {offset.shape}, the sensor {shape}")
+    return offset
 
 
 class Depth(NamedTuple):
@@ -178,26 +256,24 @@ class Depth(NamedTuple):
 _DARK = 10.0
 """Level without light, in DN, from which frames of at most 1 DN are in another unit."""
 
-UNKNOWN = Depth()
+
+def bits_of(metadata: Mapping[str, Any], saturation: float | None) -> int:
+    """Return the bits of the sensor in metadata, else those that hold the saturation level.
+
+    Pixels may give more than that level, which may be set below the largest value. 0 without both.
+    """
+    bits = sensor_table(metadata).get("bit_depth")
+    if isinstance(bits, int):
+        return bits
+    return 0 if saturation in (None, math.inf) else math.ceil(saturation).bit_length()
 
 
 def depth_of(correction: Correction) -> Depth:
-    """Return the bits of the sensor in the metadata, else those that hold the saturation level.
-
-    Pixels may give more than that level, which may be set below the largest value.
-    """
-    level: float | None = getattr(correction, "saturation", None)
-    sensor = correction.metadata.get("sensor")
-    bits = sensor.get("bit_depth") if isinstance(sensor, dict) else None
-    if not isinstance(bits, int):
-        bits = 0 if level is None or level == math.inf else math.ceil(level).bit_length()
-    return Depth(bits, level is not None, _dark_level(correction))
-
-
-def _dark_level(correction: Correction) -> float:
-    """Median of the dark that is subtracted; of raw levels the lowest mean."""
-    values = getattr(correction, "dark", None)
-    if values is None and getattr(correction, "raw", False):
-        return float(np.min(getattr(correction, "levels", 0.0)))
-    known = np.zeros(0) if values is None else values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else 0.0
+    """Return the bits of raw values, with what shows that frames are in another unit."""
+    known = np.zeros(0)
+    if correction.dark is not None:
+        known = correction.dark[np.isfinite(correction.dark)]
+    elif correction.leaves_offset and correction.limits is not None:
+        known = np.fmin.reduce(correction.limits[0], axis=None, keepdims=True)
+    dark = float(np.median(known)) if known.size else 0.0
+    return Depth(correction.bits, correction.saturation is not None, dark)

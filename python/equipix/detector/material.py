@@ -1,20 +1,12 @@
 """Pixels of HgCdTe and the filter before them: which photons they absorb."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Floats, number
-from equipix.detector.photons import (
-    EV_UM,
-    band_photons,
-    hgcdte_composition,
-    hgcdte_cutoff,
-    hgcdte_gap,
-)
+from equipix._check import ArrayLike, Floats, number, positive
+from equipix.detector import photons
+from equipix.detector.photons import EV_UM, band_photons
 from equipix.errors import InputError
 
 _TAIL = 30.0
@@ -62,8 +54,8 @@ class ShortPass:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        _check_above_0(self, "edge_um", "peak")
-        _check_um(self, "edge_um")
+        _check_um("edge_um", self.edge_um)
+        positive("peak", self.peak)
         if not _SLOPES[0] <= number("slope", self.slope) <= _SLOPES[1]:
             raise InputError(
                 f"'slope' is {self.slope!r}, expected {_SLOPES[0]} to {_SLOPES[1]}: wavelength of "
@@ -138,13 +130,14 @@ class HgCdTe:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        _check_above_0(self, "start_um", "cutoff_um", "detector_k")
-        _check_um(self, "start_um", "cutoff_um")
+        _check_um("start_um", self.start_um)
+        _check_um("cutoff_um", self.cutoff_um)
+        positive("detector_k", self.detector_k)
         if self.cutoff_um <= self.start_um:
             raise InputError(
                 f"'cutoff_um' is {self.cutoff_um!r}, expected more than 'start_um', {self.start_um}"
             )
-        most = 1e3 * _WIDEST * float(hgcdte_gap(self.composition, self.detector_k))
+        most = 1e3 * _WIDEST * float(photons.hgcdte_gap(self.composition, self.detector_k))
         width = number("edge_mev", self.edge_mev)
         if width != 0 and not _STEEPEST_MEV <= width <= most:
             raise InputError(
@@ -160,7 +153,7 @@ class HgCdTe:
     @property
     def composition(self) -> float:
         """Mean fraction x of Cd, that of `cutoff_um`."""
-        return hgcdte_composition(self.cutoff_um, self.detector_k)
+        return photons.hgcdte_composition(self.cutoff_um, self.detector_k)
 
     def photons(self, composition: ArrayLike, temperature_k: float) -> Floats:
         """Photons that pixels of some compositions absorb of a black body.
@@ -184,9 +177,9 @@ class HgCdTe:
         """
         x = np.asarray(composition, np.float64)
         if self.edge_mev == 0:
-            cutoffs = hgcdte_cutoff(x, self.detector_k)
+            cutoffs = photons.hgcdte_cutoff(x, self.detector_k)
             return band_photons(self.start_um, cutoffs, temperature_k, response=self._filtered)
-        gaps = 1e3 * hgcdte_gap(x, self.detector_k)
+        gaps = 1e3 * photons.hgcdte_gap(x, self.detector_k)
         each = [self._behind_edge(float(gap), temperature_k) for gap in gaps.ravel()]
         return np.reshape(each, x.shape)
 
@@ -224,18 +217,9 @@ class HgCdTe:
         return float(band_photons(self.start_um, end_um, temperature_k, response=response))
 
 
-def _check_above_0(owner: object, *names: str) -> None:
-    for name in names:
-        value = getattr(owner, name)
-        if not 0 < number(name, value) < np.inf:
-            raise InputError(f"'{name}' is {value!r}, expected a finite number above 0")
-
-
-def _check_um(owner: object, *names: str) -> None:
+def _check_um(name: str, value: float) -> None:
     """Refuse wavelengths that no HgCdTe has, such as nanometres."""
-    for name in names:
-        value = getattr(owner, name)
-        if value > _LONGEST_UM:
-            raise InputError(
-                f"'{name}' is {value!r} µm, expected at most {_LONGEST_UM:g}: divide nm by 1000"
-            )
+    if positive(name, value) > _LONGEST_UM:
+        raise InputError(
+            f"'{name}' is {value!r} µm, expected at most {_LONGEST_UM:g}: divide nm by 1000"
+        )

@@ -1,13 +1,10 @@
 """Photons of black bodies, cut-off of HgCdTe, heat of a bias pulse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Floats, number
+from equipix._check import ArrayLike, Floats, number, positive
 from equipix.errors import InputError
 
 _SECOND_RADIATION = 14387.768775
@@ -83,15 +80,14 @@ def band_photons(
 
     Examples
     --------
-    >>> from equipix.simulate import blackbody
-    >>> low, high = blackbody.band_photons(3.0, 5.1, 290.0), blackbody.band_photons(3.0, 5.1, 310.0)
+    >>> from equipix.detector import photons
+    >>> low, high = photons.band_photons(3.0, 5.1, 290.0), photons.band_photons(3.0, 5.1, 310.0)
     >>> round(float(high / low), 2)
     2.03
     """
     cutoff = np.asarray(cutoff_um, np.float64)
-    for name, values in (("start_um", start_um), ("temperature_k", temperature_k)):
-        if not 0 < values < np.inf:
-            raise InputError(f"'{name}' is {values!r}, expected a finite number above 0")
+    positive("start_um", start_um)
+    positive("temperature_k", temperature_k)
     wrong = cutoff[~((cutoff >= start_um) & (cutoff < np.inf))]
     if wrong.size:
         raise InputError(f"'cutoff_um' holds {wrong.flat[0]:g}, expected {start_um:g} or more")
@@ -138,8 +134,8 @@ def hgcdte_cutoff(composition: ArrayLike, temperature_k: float = 77.0) -> Floats
 
     Examples
     --------
-    >>> from equipix.simulate import blackbody
-    >>> round(float(blackbody.hgcdte_cutoff(0.225)), 1)
+    >>> from equipix.detector import photons
+    >>> round(float(photons.hgcdte_cutoff(0.225)), 1)
     10.0
     """
     return np.asarray(EV_UM / hgcdte_gap(composition, temperature_k))
@@ -187,8 +183,8 @@ def hgcdte_composition(cutoff_um: float, temperature_k: float = 77.0) -> float:
 
     Examples
     --------
-    >>> from equipix.simulate import blackbody
-    >>> round(blackbody.hgcdte_composition(10.0), 4)
+    >>> from equipix.detector import photons
+    >>> round(photons.hgcdte_composition(10.0), 4)
     0.2254
     """
     low, high = (float(hgcdte_cutoff(x, temperature_k)) for x in (LARGEST_X, 0.0))

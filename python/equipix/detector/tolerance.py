@@ -1,14 +1,12 @@
 """The spread of composition of HgCdTe that a correction tolerates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
 
-from equipix._check import By, Floats, as_array, check_type, check_word, number
+from equipix._check import By, Floats, as_array, check_type, check_word, positive
 from equipix.detector.material import HgCdTe
 from equipix.detector.photons import LARGEST_X, hgcdte_composition, hgcdte_cutoff
 from equipix.errors import InputError
@@ -132,11 +130,7 @@ def composition_tolerance(
 
 
 def _checked(
-    references_k: Sequence[float],
-    scene_k: float,
-    charge_e: float,
-    filled_k: float | None,
-    by: str,
+    references_k: Sequence[float], scene_k: float, charge_e: float, filled_k: float | None, by: str
 ) -> list[float]:
     """Temperatures of the references, after all arguments are checked."""
     given = as_array("references_k", references_k, ndim=1)
@@ -144,21 +138,15 @@ def _checked(
     if len(references) > 2 or len(set(references)) < len(references):
         raise InputError(f"'references_k' is {references}, expected up to two that differ")
     filled = scene_k if filled_k is None else filled_k
-    for name, value in (("scene_k", scene_k), ("charge_e", charge_e), ("filled_k", filled)):
-        if not 0 < number(name, value) < np.inf:
-            raise InputError(f"'{name}' is {value!r}, expected a finite number above 0")
-    if any(not 0 < each < np.inf for each in references):
-        raise InputError(f"'references_k' is {references}, expected temperatures above 0 K")
-    for name, values in (
-        ("scene_k", [scene_k]),
-        ("filled_k", [filled]),
-        ("references_k", references),
-    ):
-        if min(values, default=np.inf) < _COLDEST_K:
-            raise InputError(
-                f"'{name}' is {min(values):g} K, expected {_COLDEST_K:g} or more: give kelvin, "
-                "which is °C + 273.15"
-            )
+    positive("charge_e", charge_e)
+    kelvin = {"scene_k": [scene_k], "filled_k": [filled], "references_k": references}
+    for name, values in kelvin.items():
+        for value in values:
+            if positive(name, value) < _COLDEST_K:
+                raise InputError(
+                    f"'{name}' is {value:g} K, expected {_COLDEST_K:g} or more: give kelvin, which "
+                    "is °C + 273.15"
+                )
     check_word("by", by, get_args(By))
     if by == "gain" and len(references) != 1:
         raise InputError(f"'by' is 'gain', but there are {len(references)} references, expected 1")

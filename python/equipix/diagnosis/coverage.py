@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from equipix import _native
-from equipix._check import Array, Bools
+from equipix._check import Bools
 from equipix._native import Fit
-from equipix.diagnosis.rules import TOO_WEAK, fits_noise
+from equipix.diagnosis.evidence import Evidence
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import whole_moves
-from equipix.findings import Finding, Flag, usable
-from equipix.fitting.weighted import Weighted
+from equipix.findings import Flag, usable
+from equipix.fitting.error_bars import fits_noise
 
 _LEAST = 0.5
 """Least share of the pixels not masked by the caller that a calibration must determine."""
@@ -23,37 +23,51 @@ _FEWEST = 3
 """Fewest exposures that compare pixels along both axes."""
 
 
-def with_coverage(found: list[Finding], weighted: Weighted, flags: Array) -> list[Finding]:
-    """Add the finding on a fit that determines less than half of the pixels that are not masked.
+TOO_WEAK = (
+    "the light is too weak for its noise, or the measurements contradict each other: use more "
+    "light or more frames, mask pixels that receive almost no light, and see that the shifts are "
+    "those of the frames"
+)
 
-    It stands in the place of that on components, which it contains. A fit that ended far from its
-    minimum determines none.
-    """
-    if not float(weighted.fit.error_estimate[-1]) <= _LARGEST_ERROR:
-        return [Finding("partial", _far(weighted.fit)), *found]
-    wanted = _wanted(weighted.exposures)
-    determined = usable(flags) & wanted
-    count, total = int(determined.sum()), int(wanted.sum())
-    if count >= _LEAST * total:
-        return found
-    text = (
-        f"the exposures determine only {count} of {total} unmasked pixels (limit {_LEAST:.0%}): "
-        f"{_cause(weighted, wanted & ~determined, flags)}"
+
+def left_out(fit: Fit) -> str:
+    """Words on the measurements that a fit lost, another cause of slow convergence; or none."""
+    count = sum(map(len, fit.lost))
+    if not count:
+        return ""
+    return (
+        f". Besides, {count} measurement{'s' * (count != 1)} along ragged edges of masks "
+        f"{'were' if count != 1 else 'was'} left out: where that is many, use masks with smooth "
+        "edges"
     )
-    return [Finding("partial", text), *(each for each in found if each.kind != "components")]
 
 
-def _far(fit: Fit) -> str:
-    """Return the words on a fit that ended far from its minimum."""
+def too_far(evidence: Evidence) -> str | None:
+    """Say that the fit ended so far from its minimum that it determines no pixel."""
+    fit = evidence.fit
+    error = float(fit.error_estimate[-1])
+    if error <= _LARGEST_ERROR:  # a NaN is not
+        return None
     more = "use larger shifts in a beam with more structure"
-    if fit.lost:
-        more += ", or masks with smooth edges"
     if fit.ended == "sweeps used":
         more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
-        f"{float(fit.error_estimate[-1]):.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) and not fit.lost else more}"
+        f"{error:.1e}, limit {_LARGEST_ERROR:g}): "
+        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
+    )
+
+
+def too_few(evidence: Evidence) -> str | None:
+    """Say that the fit determines less than half of the pixels that are not masked."""
+    wanted = _wanted(evidence.exposures)
+    determined = usable(evidence.flags) & wanted
+    count, total = int(determined.sum()), int(wanted.sum())
+    if count >= _LEAST * total:
+        return None
+    return (
+        f"the exposures determine only {count} of {total} unmasked pixels (limit {_LEAST:.0%}): "
+        f"{_cause(evidence, wanted & ~determined)}"
     )
 
 
@@ -68,9 +82,9 @@ def _wanted(exposures: Exposures) -> Bools:
     return wanted
 
 
-def _cause(weighted: Weighted, missing: Bools, flags: Array) -> str:
+def _cause(evidence: Evidence, missing: Bools) -> str:
     """Return what most of the missing pixels have in common, and the remedy."""
-    exposures, fit = weighted.exposures, weighted.fit
+    exposures, flags = evidence.exposures, evidence.flags
     if _most(missing, exposures.bad_pixels.saturated):
         return (
             "most of the others reach the saturation level: expose less, or correct the level "
@@ -83,7 +97,7 @@ def _cause(weighted: Weighted, missing: Bools, flags: Array) -> str:
         )
     if _most(missing, (flags & Flag.UNRELIABLE_FLAT) != 0):
         return "most of the others receive almost no light: mask them, or use more light"
-    return _cause_in_shifts(exposures, fit.components)
+    return _cause_in_shifts(exposures, evidence.fit.components)
 
 
 def _most(missing: Bools, found: Bools | None) -> bool:

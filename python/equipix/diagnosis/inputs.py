@@ -1,4 +1,4 @@
-"""Findings on what was given, before any fit."""
+"""Rules on what was given, before any fit."""
 
 from __future__ import annotations
 
@@ -9,90 +9,91 @@ import numpy as np
 from equipix._check import Array, Bools
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import Positions, micrometre_step, nearest_whole
-from equipix.findings import Finding
+from equipix.findings import Rule
 from equipix.fitting.residuals import on_sensor
 from equipix.measured.saturation import clipping_advice
+from equipix.plan.drift import distinct_trend
 
 _LEAST_MOVE = 0.5
 """Least distance, in pixels, between shifts that are in pixels."""
 
 
-def on_input(exposures: Exposures) -> list[Finding]:
-    """Findings on exposures that the values given contradict."""
-    found = [
-        _on_clipping(exposures),
-        _on_raw(exposures),
-        Finding("light", exposures.unsteady) if exposures.unsteady else None,
-        _on_units(exposures),
-        _on_brightness(exposures),
-        _on_repeats(exposures),
-        _on_filters(exposures),
-    ]
-    return [finding for finding in found if finding is not None]
+_DEGENERATE = 0.1
+"""Share of the variance of a drift below which the error of its size is over three times larger."""
 
 
-def _on_clipping(exposures: Exposures) -> Finding | None:
-    """Finding on a saturation level that is missing or too high."""
-    if exposures.clipped is None:
-        return None
-    return Finding("saturation", clipping_advice(exposures.clipped))
+def _on_clipping(exposures: Exposures) -> str | None:
+    """Say that a saturation level is missing or too high."""
+    return None if exposures.clipped is None else clipping_advice(exposures.clipped)
 
 
-def _on_raw(exposures: Exposures) -> Finding | None:
-    """Finding on averages, or arrays as cameras write them, without a dark."""
+def _on_raw(exposures: Exposures) -> str | None:
+    """Say that averages, or arrays as cameras write them, are without a dark."""
     if not exposures.raw:
         return None
-    return Finding(
-        "raw",
+    return (
         "no dark was subtracted from frames of whole numbers, so that an offset of the camera "
-        "counts as light: give 'dark' to equipix.average (--dark), or subtract it before",
+        "counts as light: give 'dark' to equipix.average (--dark), or subtract it before"
     )
 
 
-def _on_units(exposures: Exposures) -> Finding | None:
-    """Finding on shifts that look like millimetres, or like micrometres."""
+def _on_units(exposures: Exposures) -> str | None:
+    """Say that shifts look like millimetres, or like micrometres."""
     shifts = exposures.positions.shifts
     most = float(np.ptp(shifts, axis=0).max())
     if 0 < most < _LEAST_MOVE:
-        return Finding(
-            "unit",
+        return (
             f"the shifts differ by {most:.2g} pixel at most (limit {_LEAST_MOVE:g}), from which "
             "next to nothing follows. Expected are pixels: divide millimetres by the pixel pitch, "
-            "see 'From micrometres to pixels' in README",
+            "see 'From micrometres to pixels' in docs/shifts.md"
         )
     step = micrometre_step(shifts, exposures.shape)
     if step is None:
         return None
-    return Finding(
-        "unit",
+    return (
         f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
         f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
-        "pitch, see 'From micrometres to pixels' in README",
+        "pitch, see 'From micrometres to pixels' in docs/shifts.md"
     )
 
 
-def _on_brightness(exposures: Exposures) -> Finding | None:
-    """Finding on one exposure with far more or less light than its flux says."""
-    words = on_brightness(exposures)
-    return None if words is None else Finding("flux", words)
+def _on_filters(exposures: Exposures) -> str | None:
+    """Say that colour filters, or those of the read-out, are not the ones named."""
+    return None if exposures.filters is None else exposures.filters.words
 
 
-def _on_filters(exposures: Exposures) -> Finding | None:
-    """Finding on a pattern of colour filters, or of the read-out, that is not the one named."""
-    filters = exposures.filters
-    return Finding("cfa", filters.words) if filters is not None and filters.words else None
-
-
-def _on_repeats(exposures: Exposures) -> Finding | None:
-    """Finding on one exposure that is given for two positions."""
+def _on_repeats(exposures: Exposures) -> str | None:
+    """Say that one exposure is given for two positions."""
     pair = repeated(exposures.values, exposures.positions)
     if pair is None:
         return None
     first, second = pair
-    return Finding(
-        "repeated",
+    return (
         f"exposures {first} and {second} are equal, value for value, which noise prevents: give "
-        "each position its own frames, and see whether the sensor moved",
+        "each position its own frames, and see whether the sensor moved"
+    )
+
+
+def _on_rounding(exposures: Exposures) -> str | None:
+    """Say that fractions of shifts were rounded away."""
+    rounding = exposures.positions.rounding
+    if rounding is None:
+        return None
+    return f"{rounding.words}: use method='multiscale', or move the sensor by whole pixels"
+
+
+def _on_order(exposures: Exposures) -> str | None:
+    """Say that a drift in time is degenerate with a tilt in the order of the exposures."""
+    times, positions = exposures.flux.time, exposures.positions
+    if times is None or len(set(positions.rotation.tolist())) > 1:
+        return None
+    share = distinct_trend(positions.shifts, times)
+    if share >= _DEGENERATE:
+        return None
+    return (
+        f"in this order of exposures only {share:.1%} of the variance of a drift linear in time is "
+        f"distinguishable from a tilt of the sensitivity (limit {_DEGENERATE:.0%}): take the "
+        "exposures in another order, see equipix.plan.advise_order"
     )
 
 
@@ -204,3 +205,17 @@ def repeated(values: Array, positions: Positions) -> tuple[int, int] | None:
         if not is_constant and np.array_equal(values[first], values[second], equal_nan=True):
             return first, second
     return None
+
+
+BEFORE: tuple[Rule[Exposures], ...] = (
+    Rule("saturation", "input", _on_clipping),
+    Rule("raw", "input", _on_raw),
+    Rule("light", "misfit", lambda exposures: exposures.unsteady),
+    Rule("unit", "identifiability", _on_units),
+    Rule("flux", "misfit", on_brightness),
+    Rule("repeated", "misfit", _on_repeats),
+    Rule("cfa", "misfit", _on_filters),
+    Rule("rounding", "input", _on_rounding),
+    Rule("order", "identifiability", _on_order, severity="note"),
+)
+"""What is asked of exposures, in this order."""

@@ -8,7 +8,8 @@ from typing import Annotated
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, ReadOnly
-from equipix.fitting.residuals import EXACT, FEWEST, Residuals, on_sensor, testable
+from equipix.fitting.error_bars import ErrorBars
+from equipix.fitting.residuals import EXACT, FEWEST, Residuals, left_by, on_sensor, testable
 from equipix.fitting.stated_errors import flux_variance
 from equipix.fitting.weighted import Weighted
 from equipix.measured.noise import ROBUST, chi2_tail
@@ -160,15 +161,24 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     variances += _solver_error(fit.error_estimate[-1], shifts, exposures.shape) ** 2
     variances += flux_variance(weighted, residuals)
     roots = np.sqrt(variances)
-    scatter = _rest(columns / roots[:, None], fluxes / roots)
+    scatter = left_by(columns / roots[:, None], fluxes / roots)[0]
     flux_std = float(np.sqrt(variances.mean()))
-    rest = _rest(columns, fluxes)
+    rest = left_by(columns, fluxes)[0]
     size = max(0.0, float(rest @ rest) / freedom - flux_std**2) ** 0.5
     covariance = slope_covariance(shifts, size, exposures.flux.time)
     tilt = np.sqrt(np.diag(covariance)) * exposures.shape
     probability = chi2_tail(float(scatter @ scatter), freedom)
     trend = np.abs(_slope_of_trend(columns, rest, exposures.flux.time)) * exposures.shape
     return Drift(size, flux_std, freedom, probability, covariance, tilt, trend)
+
+
+def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
+    """Add the tilt that a drift of the lamp hides, where the data show a drift."""
+    if not drift.is_added:
+        return bars
+    hidden = response * np.sqrt(drift.variance_map(response))
+    std = np.hypot(bars.sensitivity, hidden).astype(bars.sensitivity.dtype)
+    return bars._replace(sensitivity=std, tilt=np.hypot(bars.tilt, drift.tilt_std))
 
 
 def _free_fluxes(
@@ -205,7 +215,7 @@ def _agreeing(strengths: Floats, slopes: Floats) -> Bools:
 def _slope_of_trend(columns: Floats, rest: Floats, time: Array | None) -> Floats:
     """Slope of ln M (row, col) that a trend in the order of exposures hides if it leaves `rest`."""
     order = unit_times(np.arange(len(columns)))
-    visible = _rest(columns, order)
+    visible = left_by(columns, order)[0]
     if time is not None or not visible @ visible > _VISIBLE:
         return np.zeros(2)
     hidden = np.linalg.lstsq(columns, order, rcond=None)[0][1:3]
@@ -216,9 +226,3 @@ def _solver_error(error: float, shifts: Floats, shape: tuple[int, int]) -> float
     """Flux that an error of M of the sensor's own size leaves: its second difference."""
     reach = np.ptp(shifts, axis=0) / np.maximum(shape, 1)
     return float(error * np.sum((np.pi * reach) ** 2) / 2)
-
-
-def _rest(columns: Array, values: Array) -> Floats:
-    """What least squares along columns leaves."""
-    found = np.linalg.lstsq(columns, values, rcond=None)[0]
-    return np.asarray(values - columns @ found)

@@ -20,6 +20,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions
+from equipix.fitting.residuals import left_by
 from equipix.fitting.windows import WindowFit
 from equipix.measured.noise import chi2_tail
 from equipix.plan.drift import affine_columns
@@ -41,7 +42,7 @@ AS_GIVEN = Orientation()
 _QUESTIONS = {"rows": "rows", "cols": "columns", "exchanged": "order of axes", "turned": "turns"}
 
 _REMEDY = (
-    "compare the axes of the stage once with the figure of shifts in README, or put an object with "
+    "compare the axes of the stage once with the figure in docs/shifts.md, or put an object with "
     "structure into the beam"
 )
 
@@ -397,8 +398,8 @@ def _fluxes(fit: WindowFit, window: Exposures, flux: Flux) -> _Fluxes:
         return _Fluxes(0.0, agree=True)
     columns = _undetermined(window.positions, flux)
     deviations = np.log(np.array(fit.fit.flux) / flux.values)
-    rest = deviations - columns @ np.linalg.lstsq(columns, deviations, rcond=None)[0]
-    freedom = len(rest) - int(np.linalg.matrix_rank(columns))
+    rest, rank = left_by(columns, deviations)
+    freedom = len(rest) - rank
     if freedom < 1:
         return _Fluxes(0.0, agree=True)
     pixels = np.isfinite(fit.residuals).sum(axis=(1, 2)).mean()

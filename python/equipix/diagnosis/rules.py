@@ -1,311 +1,268 @@
-"""BadPixels that limit a result, as data."""
+"""Rules on a fit and on its error bars: the tables of what is asked of a calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 
-from equipix._native import Fit
-from equipix.diagnosis.lamp_drift import Drift
-from equipix.diagnosis.misfit import Misfit
-from equipix.diagnosis.orientation import OrientationTest
-from equipix.exposures.exposures import Exposures
-from equipix.findings import Finding
+from equipix.diagnosis.coverage import TOO_WEAK, left_out, too_far, too_few
+from equipix.diagnosis.evidence import Evidence
+from equipix.diagnosis.small_errors import small_errors_found
+from equipix.findings import Rule
 from equipix.fitting.error_bars import (
-    DarkStd,
-    ErrorBars,
+    NOT_FOUND,
+    fits_noise,
     incomplete_searches,
+    is_too_far,
     is_too_fine,
     too_fine,
 )
-from equipix.fitting.stated_errors import Contradiction, words
-from equipix.fitting.weighted import Options, Weighted
-from equipix.plan.drift import distinct_trend
 
 _UNDETERMINED = 1e-4
 """A Ritz value this small belongs to a pattern that the measurements do not determine: its noise is
 100 times that of others."""
 
-_NOT_FOUND = 0.1
-"""Largest estimated error of M of a joint fit for which noise determines the errors."""
-
 _FEW = 0.01
 """Smallest share of faint pixels that gives a finding."""
-
-TOO_WEAK = (
-    "the light is too weak for its noise, or the measurements contradict each other: use more "
-    "light or more frames, mask pixels that receive almost no light, and see that the shifts are "
-    "those of the frames"
-)
-
-_BY_FLUX = frozenset({"drift", "misfit", "prior", "colour"})
-"""Kinds that name a cause, and are no news where the flux of an exposure is wrong."""
-
-_BY_SHIFTS = _BY_FLUX | {"orientation", "pattern"}
-"""The same where the sign or the unit of the shifts is wrong."""
 
 _WHITE = frozenset({"noise", "signal"})
 """Causes of a misfit that neighbouring residuals do not have in common."""
 
-_DEGENERATE = 0.1
-"""Share of the variance of a drift below which the error of its size is over three times larger."""
 
-
-def on_plan(exposures: Exposures) -> list[Finding]:
-    """Findings before any fit."""
-    found = [_on_rounding(exposures), _on_order(exposures)]
-    return [finding for finding in found if finding is not None]
-
-
-def on_noise(frames: float | None) -> list[Finding]:
-    """Finding on variances, where those given were sample variances of so many frames."""
-    return [] if frames is None else [Finding("variance", words(frames))]
-
-
-def unexplained(found: list[Finding], advice: list[Finding]) -> list[Finding]:
-    """Findings that a wrong sign or unit of the shifts, or a wrong flux, does not explain."""
-    kinds = {each.kind for each in (*advice, *found)}
-    if {"sign", "unit"} & kinds:
-        return [each for each in found if each.kind not in _BY_SHIFTS]
-    return [each for each in found if "flux" not in kinds or each.kind not in _BY_FLUX]
-
-
-def on_standard_deviations(
-    weighted: Weighted, options: Options, bars: ErrorBars | None, dark: DarkStd | None
-) -> list[Finding]:
-    """Findings that need standard deviations: on a fitted dark, and on the error bars."""
-    found = [_on_dark(weighted.fit, options, dark), _on_searches(bars)]
-    return [finding for finding in found if finding is not None]
-
-
-def _on_searches(bars: ErrorBars | None) -> Finding | None:
-    count = 0 if bars is None else bars.exactness["incomplete_searches"]
-    return Finding("uncertainty", incomplete_searches(count)) if count else None
-
-
-def _on_rounding(exposures: Exposures) -> Finding | None:
-    rounding = exposures.positions.rounding
-    if rounding is None:
-        return None
-    remedy = "use method='multiscale', or move the sensor by whole pixels"
-    return Finding("rounding", f"{rounding.words}: {remedy}")
-
-
-def _on_order(exposures: Exposures) -> Finding | None:
-    """Finding on an order in which a drift in time is degenerate with a tilt."""
-    times, positions = exposures.flux.time, exposures.positions
-    if times is None or len(set(positions.rotation.tolist())) > 1:
-        return None
-    share = distinct_trend(positions.shifts, times)
-    if share >= _DEGENERATE:
-        return None
-    return Finding(
-        "order",
-        f"in this order of exposures only {share:.1%} of the variance of a drift linear in time is "
-        f"distinguishable from a tilt of the sensitivity (limit {_DEGENERATE:.0%}): take the "
-        "exposures in another order, see equipix.plan.advise_order",
-    )
-
-
-def on_fit(
-    weighted: Weighted,
-    options: Options,
-    test: OrientationTest,
-    drift: Drift | None,
-    misfit: Misfit | None,
-    contradictions: Sequence[Contradiction] = (),
-    colours: str | None = None,
-) -> list[Finding]:
-    """Findings on a fit, the most important first.
-
-    `colours` are words on their contradiction, which explains drifts and a misfit. One exposure
-    that is flipped explains the contradiction.
-    """
-    if misfit is not None and misfit.cause == "order":
-        colours = None
-    if misfit is not None and misfit.chi2 < 1 and weighted.exposures.clipped is not None:
-        # Values that saturate do not scatter.
-        misfit = None
-    found = [
-        _on_sign(test),
-        _on_orientation(test),
-        _on_components(weighted.fit),
-        _on_patterns(weighted.fit),
-        _on_hidden(weighted.fit, test),
-        _on_faint(weighted.exposures),
-        None if colours is None else Finding("colour", colours),
-        *([] if colours else _on_residuals(drift, misfit)),
-        *(Finding("prior", each.words) for each in contradictions),
-        _on_convergence(weighted.fit, options),
-        _on_uncertainty(weighted, options),
-    ]
-    return [finding for finding in found if finding is not None]
-
-
-def is_too_far(fit: Fit) -> bool:
-    """Whether a fit is too far from its minimum for standard deviations."""
-    is_far = not float(fit.error_estimate[-1]) <= _NOT_FOUND
-    return fits_noise(fit) or (fit.is_joint and is_far)
-
-
-def fits_noise(fit: Fit) -> bool:
-    """Whether a fit went on without bringing M within its own size."""
-    return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
-
-
-def _on_uncertainty(weighted: Weighted, options: Options) -> Finding | None:
-    """Finding on a fit that is too far from its minimum or its beam for standard deviations."""
-    if options.uncertainty and is_too_fine(weighted):
-        return Finding("uncertainty", too_fine(weighted))
-    if not (options.uncertainty and is_too_far(weighted.fit)):
-        return None
-    error = float(weighted.fit.error_estimate[-1])
-    return Finding(
-        "uncertainty",
-        "no standard deviations: the fit is too far from its minimum (estimated error "
-        f"{error:.1e}, limit {_NOT_FOUND:g})",
-    )
-
-
-def _on_sign(test: OrientationTest) -> Finding | None:
+def _on_sign(e: Evidence) -> str | None:
+    test = e.orientation
     if test.sign != "contradicted":
         return None
-    return Finding(
-        "sign",
+    return (
         f"{test.words}; as given and with free fluxes the squared residuals are {test.ratio:.2g} "
         "times as large. A shift grows when the sensor moves towards larger rows and columns: "
-        "give 'shifts' so, or exchange the aperture images before and after the moves",
+        "give 'shifts' so, or exchange the aperture images before and after the moves"
     )
 
 
-def _on_orientation(test: OrientationTest) -> Finding | None:
-    """Finding on another orientation, with which the fluxes agree as they do not as given."""
+def _on_orientation(e: Evidence) -> str | None:
+    """Another orientation, with which the fluxes agree as they do not as given."""
+    test = e.orientation
     if test.hidden is None or not test.is_likely:
         return None
-    return Finding(
-        "orientation",
+    return (
         f"the orientation of the shifts is probably wrong: with {test.hidden.changes} the data "
         "fit equally well, and the fluxes found agree with those given ten times as closely. "
         f"The sensitivity is then wrong by {test.difference:.1%}, rms: {test.hidden.words}, "
-        "unless the figure of shifts in README confirms the axes of the stage",
+        "unless the figure in docs/shifts.md confirms the axes of the stage"
     )
 
 
-def _on_hidden(fit: Fit, test: OrientationTest) -> Finding | None:
-    """Finding on what neither residuals nor fluxes determine: a tilt, the orientation, or both."""
-    words = "" if test.hidden is None or test.is_likely else _undetermined(test)
-    if not fit.leaves_tilt:
-        return Finding("orientation", words) if words else None
-    return Finding(
-        "tilt",
+def _on_tilt(e: Evidence) -> str | None:
+    if not e.fit.leaves_tilt:
+        return None
+    words = _hidden(e)
+    return (
         "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: turn "
         "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp"
-        f"{'. Besides, ' if words else ''}{words}",
+        f"{f'. Besides, {words}' if words else ''}"
     )
 
 
-def _undetermined(test: OrientationTest) -> str:
-    changes = "" if test.hidden is None else test.hidden.changes
+def _hidden(e: Evidence) -> str | None:
+    """Another orientation that neither residuals nor fluxes exclude."""
+    test = e.orientation
+    if test.hidden is None or test.is_likely:
+        return None
     return (
         "neither residuals nor fluxes determine the orientation of the shifts: with "
-        f"{changes} the data fit equally well, and the sensitivity differs by "
+        f"{test.hidden.changes} the data fit equally well, and the sensitivity differs by "
         f"{test.difference:.1%}, rms, which no error bar contains. Compare the axes of the stage "
-        "once with the figure of shifts in README, put an object with structure into the beam, or "
+        "once with the figure in docs/shifts.md, put an object with structure into the beam, or "
         "give fluxes that a monitor measured"
     )
 
 
-def _on_components(fit: Fit) -> Finding | None:
-    if fit.components <= 1:
+def _on_components(e: Evidence) -> str | None:
+    if e.fit.components <= 1:
         return None
-    left = int(np.count_nonzero(fit.component_labels > 0))
-    return Finding(
-        "components",
-        f"the shifts leave {fit.components} parts of the sensor unconnected: the sensitivity of "
+    left = int(np.count_nonzero(e.fit.component_labels > 0))
+    return (
+        f"the shifts leave {e.fit.components} parts of the sensor unconnected: the sensitivity of "
         f"{left} pixel{'s' * (left != 1)} outside the largest part is undetermined (NaN): choose "
-        "other shifts, see equipix.plan.identify",
+        "other shifts, see equipix.plan.identify"
     )
 
 
-def _on_patterns(fit: Fit) -> Finding | None:
-    if fit.smallest_ritz is None or fit.smallest_ritz >= _UNDETERMINED:
+def _on_patterns(e: Evidence) -> str | None:
+    ritz = e.fit.smallest_ritz
+    if ritz is None or ritz >= _UNDETERMINED:
         return None
-    return Finding(
-        "pattern",
+    return (
         "the shifts barely constrain a spatial pattern of the sensitivity (smallest Ritz value "
-        f"{fit.smallest_ritz:.1e}, limit {_UNDETERMINED:g}): choose less regular shifts, see "
-        "equipix.plan.error_budget",
+        f"{ritz:.1e}, limit {_UNDETERMINED:g}): choose less regular shifts, see "
+        "equipix.plan.error_budget"
     )
 
 
-def _on_faint(exposures: Exposures) -> Finding | None:
-    faint = exposures.bad_pixels.faint
+def _on_faint(e: Evidence) -> str | None:
+    faint = e.exposures.bad_pixels.faint
     if faint is None or faint.mean() < _FEW:
         return None
-    return Finding(
-        "faint",
+    return (
         f"the noise of the dark leaves M of {np.count_nonzero(faint)} pixels in "
         "weak light known to worse than 4 %, and four times worse than in bright pixels: they are "
-        "flagged UNRELIABLE_FLAT; average more dark frames",
+        "flagged UNRELIABLE_FLAT; average more dark frames"
     )
 
 
-def _on_dark(fit: Fit, options: Options, dark: DarkStd | None) -> Finding | None:
-    if dark is None:
-        return None
-    along, alone = dark.along_sensitivity, dark.of_a_pixel
-    limited = fit.ended == "sweeps used" and options.fit.max_sweeps is not None
-    if along is not None and alone is not None and along > alone:
-        known = f"its standard deviation is {along:.1e}, that of a pixel by noise {alone:.1e}"
-    elif fit.ended != "converged" and not limited:
-        known = "the fit did not determine it"
-    else:
-        return None
-    return Finding(
-        "dark",
-        "the fitted dark is nearly degenerate with the sensitivity: with fitted fluxes it may "
-        f"contain any multiple b of the sensitivity, and {known}: give the ratio of the levels as "
-        "'flux', or use larger shifts in a beam with more structure",
-    )
+def _on_colours(e: Evidence) -> str | None:
+    """Colours that differ; one exposure that is flipped, or at a wrong place, explains them."""
+    return None if e.misfit is not None and e.misfit.cause == "order" else e.colours
 
 
-def _on_residuals(drift: Drift | None, misfit: Misfit | None) -> list[Finding]:
-    """Findings on fluxes and residuals, that which explains the other first.
+def _on_drift(e: Evidence) -> str | None:
+    return e.drift.words if e.drift is not None and e.drift.is_certain else None
 
-    A misfit that wrong fluxes cause is said once. Any other that neighbours have in common makes
-    the fluxes wrong too.
+
+def _misfit(e: Evidence) -> str | None:
+    if e.misfit is None or (e.misfit.chi2 < 1 and e.exposures.clipped is not None):
+        return None  # values that saturate do not scatter
+    return e.misfit.words
+
+
+def _on_common_misfit(e: Evidence) -> str | None:
+    """A misfit that neighbours have in common: it makes the fluxes wrong too.
+
+    One that wrong fluxes cause is said of them.
     """
-    of_fluxes = [Finding("drift", drift.words)] if drift is not None and drift.is_certain else []
-    if misfit is None or (of_fluxes and misfit.cause == "flux"):
-        return of_fluxes
-    of_all = [Finding("misfit", misfit.words)]
-    return of_fluxes + of_all if misfit.cause in _WHITE else of_all + of_fluxes
+    if e.misfit is None or e.misfit.cause in _WHITE:
+        return None
+    return None if e.misfit.cause == "flux" and _on_drift(e) else _misfit(e)
 
 
-def _on_convergence(fit: Fit, options: Options) -> Finding | None:
+def _on_white_misfit(e: Evidence) -> str | None:
+    return _misfit(e) if e.misfit is not None and e.misfit.cause in _WHITE else None
+
+
+def _replaced(name: str) -> Callable[[Evidence], str | None]:
+    """Why a variance or a prior was replaced, if it was."""
+    return lambda e: e.weighted.replaced.get(name)
+
+
+def _on_convergence(e: Evidence) -> str | None:
+    fit, tolerance = e.fit, e.options.fit.tolerance
     if fit.ended == "converged":
         return None
-    if fits_noise(fit) and not fit.lost:
+    if fits_noise(fit):
         remedy = f": {TOO_WEAK}"
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"
-    elif fit.lost:
-        remedy = ", and no longer decreasing: use masks with smooth edges, or a larger 'tolerance'"
     else:
         remedy = (
             ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
             "almost no light"
         )
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
-    if error <= options.fit.tolerance:
-        return Finding(
-            "convergence",
+    if error <= tolerance:
+        return (
             f"not converged after {sweeps} sweeps, which are too few to estimate the error: "
-            "probably most pixels saturate or have no light",
+            "probably most pixels saturate or have no light"
         )
-    return Finding(
-        "convergence",
+    return (
         f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
-        f"tolerance {options.fit.tolerance:g}{remedy}",
+        f"tolerance {tolerance:g}{remedy}{left_out(fit)}"
     )
+
+
+def _on_uncertainty(e: Evidence) -> str | None:
+    """A fit that is too far from its minimum or its beam for standard deviations."""
+    if not e.options.uncertainty:
+        return None
+    if is_too_fine(e.weighted):
+        return too_fine(e.weighted)
+    if not is_too_far(e.fit):
+        return None
+    return (
+        "no standard deviations: the fit is too far from its minimum (estimated error "
+        f"{float(e.fit.error_estimate[-1]):.1e}, limit {NOT_FOUND:g})"
+    )
+
+
+def _on_dark(e: Evidence) -> str | None:
+    if e.dark is None:
+        return None
+    along, alone = e.dark.along_sensitivity, e.dark.of_a_pixel
+    limited = e.fit.ended == "sweeps used" and e.options.fit.max_sweeps is not None
+    if along is not None and alone is not None and along > alone:
+        known = f"its standard deviation is {along:.1e}, that of a pixel by noise {alone:.1e}"
+    elif e.fit.ended != "converged" and not limited:
+        known = "the fit did not determine it"
+    else:
+        return None
+    return (
+        "the fitted dark is nearly degenerate with the sensitivity: with fitted fluxes it may "
+        f"contain any multiple b of the sensitivity, and {known}: give the ratio of the levels as "
+        "'flux', or use larger shifts in a beam with more structure"
+    )
+
+
+def _on_searches(e: Evidence) -> str | None:
+    count = 0 if e.bars is None else e.bars.exactness["incomplete_searches"]
+    return incomplete_searches(count) if count else None
+
+
+_SHIFTS = frozenset({"sign", "unit"})
+"""Kinds that explain all that wrong places in the beam do."""
+
+_SOURCES = _SHIFTS | {"flux"}
+"""Kinds beside which a cause of residuals is no news."""
+
+_STRONGER = _SOURCES | {
+    "orientation",
+    "repeated",
+    "saturation",
+    "variance",
+    "prior",
+    "drift",
+    "colour",
+}
+"""Kinds whose causes leave what looks like a small error."""
+
+AFTER: tuple[Rule[Evidence], ...] = (
+    Rule("partial", "identifiability", too_far, severity="failure"),
+    Rule("sign", "misfit", _on_sign),
+    Rule("orientation", "identifiability", _on_orientation, unless=_SHIFTS),
+    Rule("components", "identifiability", _on_components),
+    Rule(
+        "partial",
+        "identifiability",
+        too_few,
+        unless=frozenset({"partial"}),
+        instead=frozenset({"components"}),
+        severity="failure",
+    ),
+    Rule("pattern", "identifiability", _on_patterns, unless=_SHIFTS),
+    Rule("tilt", "identifiability", _on_tilt),
+    Rule("orientation", "identifiability", _hidden, unless=_SHIFTS | {"tilt"}),
+    Rule("faint", "identifiability", _on_faint, severity="note"),
+    Rule("colour", "misfit", _on_colours, unless=_SOURCES),
+    Rule("misfit", "misfit", _on_common_misfit, unless=_SOURCES | {"colour"}),
+    Rule("drift", "misfit", _on_drift, unless=_SOURCES | {"colour"}),
+    Rule("misfit", "misfit", _on_white_misfit, unless=_SOURCES | {"colour"}),
+    Rule("prior", "misfit", _replaced("flux_std"), unless=_SOURCES),
+    Rule("prior", "misfit", _replaced("shift_std"), unless=_SOURCES),
+    Rule("convergence", "convergence", _on_convergence),
+    Rule("uncertainty", "convergence", _on_uncertainty),
+    Rule("variance", "misfit", _replaced("variance"), severity="note"),
+    Rule(
+        "misfit",
+        "misfit",
+        small_errors_found,
+        unless=_STRONGER,
+        instead=frozenset({"misfit"}),
+    ),
+)
+"""What is asked of a fit, the most important first."""
+
+LAST: tuple[Rule[Evidence], ...] = (
+    Rule("dark", "identifiability", _on_dark),
+    Rule("uncertainty", "convergence", _on_searches),
+)
+"""What is asked of standard deviations."""

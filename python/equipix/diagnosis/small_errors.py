@@ -11,12 +11,13 @@ import numpy as np
 
 from equipix._check import Array, Floats
 from equipix._native import Fit
+from equipix.diagnosis.evidence import Evidence
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
-from equipix.findings import Finding, usable
+from equipix.findings import usable
 from equipix.fitting.error_bars import with_dark_misfit
-from equipix.fitting.residuals import EXACT, FEWEST, Residuals, tested
-from equipix.fitting.weighted import Weighted
+from equipix.fitting.residuals import EXACT, FEWEST, tested
+from equipix.fitting.weighted import Options, Weighted
 from equipix.fitting.windows import if_there_is_light, simulated, window_of
 
 _SIGMAS = 6.0
@@ -48,20 +49,6 @@ pattern and the one that it should have had, a half each."""
 
 _TOLERANCE, _PRODUCTS = 1e-8, 200
 """Exactness of the fits that are compared, and the products that they may take."""
-
-_STRONGER = {
-    "sign",
-    "unit",
-    "flux",
-    "orientation",
-    "repeated",
-    "saturation",
-    "variance",
-    "prior",
-    "drift",
-    "colour",
-}
-"""Kinds of findings whose causes leave what looks like a small error."""
 
 
 class Cause(NamedTuple):
@@ -135,27 +122,20 @@ class SmallError:
     share: float
 
 
-def with_small_errors(
-    found: list[Finding],
-    weighted: Weighted,
-    flags: Array,
-    residuals: Residuals,
-    options: FitOptions,
-) -> list[Finding]:
-    """Findings, with that on small errors: where no other one explains them better.
+def small_errors_found(evidence: Evidence) -> str | None:
+    """Say which small errors the residuals show, if they explain a misfit that they have.
 
     Values of flagged pixels that are not proportional to light are none, and residuals of a beam
     finer than its spline have their cause.
     """
-    kinds = {each.kind for each in found}
-    if kinds & _STRONGER or not residuals.inexactness <= EXACT or weighted.excess > 1:
-        return found
-    exposures = weighted.exposures.without(~usable(flags))
-    errors = small_errors(weighted._replace(exposures=exposures), options)
-    if not errors or ("misfit" in kinds and not errors[0].share > _MOST):
-        return found
-    others = [each for each in found if each.kind != "misfit"]
-    return [*others, Finding("misfit", _words(errors))]
+    weighted = evidence.weighted
+    if not evidence.residuals.inexactness <= EXACT or weighted.excess > 1:
+        return None
+    exposures = weighted.exposures.without(~usable(evidence.flags))
+    errors = small_errors(weighted._replace(exposures=exposures), evidence.options.fit)
+    if not errors or (evidence.misfit is not None and not errors[0].share > _MOST):
+        return None
+    return _words(errors)
 
 
 def _words(errors: list[SmallError]) -> str:
@@ -207,7 +187,7 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     """Each error that is larger than noise."""
     window, start = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)
-    part = with_dark_misfit(Weighted(window, window.fit(exact, start), None), options)
+    part = with_dark_misfit(Weighted(window, window.fit(exact, start), None), Options(options))
     here = _Fitted.of(window, part.fit, options)
     fit, own, signal = part.fit, here.residuals, here.signal
     square, noise = float(np.nansum(own**2)), part.noise_variance * part.expected_misfit

@@ -1,7 +1,5 @@
 """Moves of the sensor, measured from images of a small aperture in the beam."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -10,13 +8,12 @@ import numpy as np
 
 from equipix._check import Array, Bools, Floats
 from equipix.errors import InputError
+from equipix.experiment.image_files import raw_frames
 from equipix.experiment.manifest import Exposure, Manifest, entry_files
 from equipix.exposures.positions import in_beam, variance_in_beam
 from equipix.exposures.spots import ShiftMeasurement, Spot, hot_places, measure_shift, mended
 from equipix.findings import usable
 from equipix.fitting.weighted import Weighted
-from equipix.io.formats import refuse_saved
-from equipix.io.frames import read_frames
 from equipix.measured.filters import Filters
 from equipix.measured.saturation import saturation_level
 from equipix.measured.statistics import FrameStatistics
@@ -138,7 +135,7 @@ def _spots(
 ) -> tuple[ShiftMeasurement, tuple[int, int]]:
     """Find the spots of the move to `exposure`, and the shape of the sensor."""
     before, after = (
-        _images(entry_files(path, entry))
+        raw_frames(entry_files(path, entry))
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )
@@ -154,13 +151,6 @@ def _spots(
         return measure_shift(before, after, saturation=level, hot=hot), before.shape[-2:]
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
-
-
-def _images(files: list[Path]) -> Array:
-    """Images of the aperture, as the camera gave them."""
-    for file in files:
-        refuse_saved(file)
-    return read_frames(files)
 
 
 def _equalised(

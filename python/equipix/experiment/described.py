@@ -1,32 +1,39 @@
 """What both kinds of manifest share: averages, masks, provenance."""
 
-from __future__ import annotations
-
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, Progress
-from equipix.errors import FileError
-from equipix.experiment.image_files import image_files, refuse_repeats
-from equipix.experiment.manifest import LevelManifest, Manifest, Region, entry_files
+from equipix._check import EXPOSURES, Bools, Progress, Words, as_mask, naming_memory, union
+from equipix.errors import FileError, InputError
+from equipix.experiment.image_files import check_formats, image_files, refuse_repeats, sha256_of
+from equipix.experiment.manifest import (
+    Dark,
+    LevelManifest,
+    Manifest,
+    Region,
+    entry_files,
+    read_manifest,
+)
 from equipix.io.frames import read_mask
 from equipix.io.paths import as_path
 from equipix.measured.average import average
+from equipix.measured.colour import Colours
+from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
-from equipix.measured.statistics import FrameStatistics
+from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
 _Manifest = TypeVar("_Manifest", Manifest, LevelManifest)
 
 
 @dataclass(frozen=True)
-class Described(ABC, Generic[_Manifest]):
+class Described(Generic[_Manifest]):
     """Images of a sensor as files on disk, and the file that describes them.
 
     Attributes
@@ -39,6 +46,10 @@ class Described(ABC, Generic[_Manifest]):
 
     path: Path
     manifest: _Manifest
+
+    _model: ClassVar[Any]
+    _dtype: ClassVar[type[np.floating[Any]]] = np.float64
+    _words: ClassVar[Words] = EXPOSURES
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -61,7 +72,7 @@ class Described(ABC, Generic[_Manifest]):
             does not exist, or one file for two measurements.
         """
         file = as_path("path", path)
-        described = cls(file, cls._read(file))
+        described = cls(file, read_manifest(file, cls._model))
         described.files()
         refuse_repeats(file, described.manifest)
         return described
@@ -70,16 +81,7 @@ class Described(ABC, Generic[_Manifest]):
         """All image files, each once."""
         mask = self.manifest.sensor.mask
         masks: list[Path] = [] if mask is None else entry_files(self.path, mask)
-        return list(dict.fromkeys([*self._images(), *masks]))
-
-    @classmethod
-    @abstractmethod
-    def _read(cls, path: Path) -> _Manifest:
-        """Read and check a file."""
-
-    def _images(self) -> list[Path]:
-        """The files of measurements, each once, those of the dark first."""
-        return image_files(self.path, self.manifest)
+        return list(dict.fromkeys([*image_files(self.path, self.manifest), *masks]))
 
     def _statistics(
         self,
@@ -106,43 +108,82 @@ class Described(ABC, Generic[_Manifest]):
             )
         return found
 
+    @naming_memory("averaging")
+    def _dark(
+        self, entry: Dark, workers: int | None = None, progress: Progress | None = None
+    ) -> FrameStatistics:
+        """Average the dark frames."""
+        dark = self._statistics("dark", entry.frames, None, workers, progress)
+        files = ", ".join(map(str, entry_files(self.path, entry.frames)))
+        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
+        return dark
 
-def excluded_pixels(
-    path: Path, manifest: Manifest | LevelManifest, shape: tuple[int, int]
-) -> Bools | None:
-    """Return the pixels that ``[sensor]`` excludes; None without a mask and regions.
+    @naming_memory("averaging")
+    def _average(
+        self,
+        dark: FrameStatistics | None,
+        workers: int | None = None,
+        progress: Progress | None = None,
+    ) -> Averaged:
+        """Mean of every exposure or level; the frames' other statistics are reduced at once."""
+        sensor, measurements = self.manifest.sensor, self.manifest.measurements
+        averaged = Averaged(
+            len(measurements),
+            dtype=self._dtype,
+            gain=sensor.gain_dn_per_e,
+            saturation=sensor.saturation_level,
+            saturation_key=sensor.saturation_key,
+            words=self._words,
+            colours=Colours.of(sensor.cfa),
+        )
+        for name, frames in measurements:
+            statistics = self._statistics(name, frames, dark, workers, progress)
+            try:
+                averaged.add(statistics, name)
+            except InputError as error:
+                raise FileError(f"{self.path}: {error}") from error
+        return averaged
 
-    Parameters
-    ----------
-    path : Path
-        The experiment.toml or levels.toml.
-    manifest : Manifest or LevelManifest
-        Its content.
-    shape : tuple of int
-        Rows and columns of the sensor.
+    def _checked(self, mask: ArrayLike | None) -> tuple[Bools | None, dict[Path, str]]:
+        """Check all images; pixels that the file or the caller excludes, and hashes of the files.
 
-    Returns
-    -------
-    ndarray of bool, shape (rows, cols), or None
-        True = do not use.
+        Raises
+        ------
+        FileError
+            If images differ in shape or depth, or two are the same; if the mask file is of another
+            shape, a region reaches beyond the sensor, or nothing is left.
+        """
+        shape: tuple[int, int] = check_formats(image_files(self.path, self.manifest))
+        count = len(self.manifest.measurements)
+        given = None if mask is None else as_mask(mask, (count, *shape))
+        excluded = union(given, self._excluded(shape))
+        hashes = sha256_of([self.path, *self.files()])
+        refuse_repeats(self.path, self.manifest, hashes)
+        return excluded, hashes
 
-    Raises
-    ------
-    FileError
-        If the mask file is of another shape, a region reaches beyond the sensor, or nothing is
-        left.
-    """
-    sensor = manifest.sensor
-    if sensor.mask is None and sensor.region is None:
-        return None
-    excluded = np.zeros(shape, bool)
-    if sensor.mask is not None:
-        excluded |= _of_file(path, sensor.mask, shape)
-    for index, region in enumerate(sensor.region or [], start=1):
-        excluded |= _of_region(f"{path}: [[sensor.region]] {index}", region, shape)
-    if excluded.all():
-        raise FileError(f"{path}: 'mask' and 'region' in [sensor] leave no pixel to use")
-    return excluded
+    def _excluded(self, shape: tuple[int, int]) -> Bools | None:
+        """Pixels that ``[sensor]`` excludes; None without a mask and regions."""
+        sensor = self.manifest.sensor
+        masks = [] if sensor.mask is None else [_of_file(self.path, sensor.mask, shape)]
+        for index, region in enumerate(sensor.region or [], start=1):
+            masks.append(_of_region(f"{self.path}: [[sensor.region]] {index}", region, shape))
+        excluded = union(*masks)
+        if excluded is not None and excluded.all():
+            raise FileError(f"{self.path}: 'mask' and 'region' in [sensor] leave no pixel to use")
+        return excluded
+
+    def _provenance(
+        self, hashes: Mapping[Path, str], noise: NoiseModel | None, **more: object
+    ) -> dict[str, Any]:
+        """Sensor, noise, the hashes of the files, and what else is given, as JSON values."""
+        folder = self.path.parent
+        return {
+            "experiment": str(self.path),
+            "sensor": self.manifest.sensor.model_dump(),
+            **more,
+            "noise": None if noise is None else asdict(noise),
+            "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
+        }
 
 
 def _of_file(path: Path, entry: str, shape: tuple[int, int]) -> Bools:
@@ -183,24 +224,3 @@ def _disc(place: str, region: Region, shape: tuple[int, int]) -> Bools:
             f"sensor, which has {shape[0]} rows and {shape[1]} columns"
         )
     return inside
-
-
-def provenance(
-    path: Path,
-    manifest: Manifest,
-    hashes: Mapping[Path, str],
-    shifts: Floats,
-    std: Floats,
-    noise: NoiseModel | None,
-) -> dict[str, Any]:
-    """Names, measured shifts, noise and the hashes of the files, as JSON values."""
-    folder = path.parent
-    return {
-        "experiment": str(path),
-        "sensor": manifest.sensor.model_dump(),
-        "exposures": [exposure.name for exposure in manifest.exposure],
-        "measured_shifts": shifts.tolist(),
-        "measured_shift_std": std.tolist(),
-        "noise": None if noise is None else asdict(noise),
-        "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
-    }

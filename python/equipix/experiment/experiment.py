@@ -1,30 +1,25 @@
 """A calibration experiment on disk, as experiment.toml describes it, and its evaluation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Bools, Floats, FluxModel, Method, Progress, as_mask, naming_memory, union
+from equipix._check import Array, ArrayLike, FluxModel, Method, Progress, naming_memory
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
-from equipix.errors import FileError, InputError, InputWarning, warn
+from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
-from equipix.experiment.described import Described, excluded_pixels, provenance
-from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
-from equipix.experiment.manifest import Manifest, entry_files, read_manifest
-from equipix.exposures.exposures import Exposures, exposures_of
+from equipix.experiment.described import Described
+from equipix.experiment.manifest import Manifest
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
+from equipix.findings import Finding, say
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
-from equipix.measured.colour import Colours
 from equipix.measured.defects import hot_pixels
-from equipix.measured.means import Averaged
-from equipix.measured.statistics import FrameStatistics, refuse_subtracted
+from equipix.measured.measured import measured_of
 
 _ROUGH = 1e-4
 """Tolerance of the fit that the aperture's images are corrected by: 3e-5 pixel."""
@@ -55,23 +50,9 @@ class Experiment(Described[Manifest]):
     a small aperture in the beam, taken before and after the move.
     """
 
-    @classmethod
-    def _read(cls, path: Path) -> Manifest:
-        return read_manifest(path)
+    _model, _dtype = Manifest, np.float32
 
-    def check_formats(self) -> None:
-        """Read the files' headers: all images must be of one shape and depth.
-
-        Raises
-        ------
-        FileError
-            If a file cannot be read or differs from the first dark frames.
-        """
-        check_formats(self._images())
-
-    def measure_shifts(
-        self, calibration: Calibration | None = None
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+    def measure_shifts(self, calibration: Calibration | None = None) -> tuple[Array, Array]:
         """Shift of each exposure and its standard error.
 
         Parameters
@@ -112,27 +93,17 @@ class Experiment(Described[Manifest]):
                     "give the result of Experiment.run"
                 )
             equalisation = Equalisation.of(calibration.weighted, calibration.flags)
-        options = FitOptions()
-        hot = self._hot(options) if self._is_moved() else None
-        if calibration is None and self.manifest.sensor.cfa is not None and self._is_moved():
-            dark = self._dark(options)
-            equalisation = Equalisation.of_colours(self._average(dark, options).filters, dark)
+        hot = None
+        if self._is_moved():
+            dark = self._dark(self.manifest.dark)
+            hot = hot_pixels(dark, None)
+            if calibration is None and self.manifest.sensor.cfa is not None:
+                equalisation = Equalisation.of_colours(self._average(dark).filters, dark)
         return measured_shifts(self.path, self.manifest, equalisation, hot=hot)
 
     def _is_moved(self) -> bool:
         """Whether a move is measured from images of the aperture."""
         return any(exposure.shift is None for exposure in self.manifest.exposure[1:])
-
-    def _hot(self, options: FitOptions) -> Bools:
-        """Pixels that the dark frames show to be hot."""
-        return hot_pixels(self._dark(options), None)
-
-    def _dark(self, options: FitOptions) -> FrameStatistics:
-        frames = self.manifest.dark.frames
-        dark = self._statistics("dark", frames, None, options.workers, options.progress)
-        files = ", ".join(map(str, entry_files(self.path, frames)))
-        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
-        return dark
 
     def run(
         self,
@@ -200,100 +171,66 @@ class Experiment(Described[Manifest]):
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
-        self._warn_of_unused(flux)
+        said = say(*self._unused(flux))
         if flux == "linear" and self._column("time") is None:
             raise InputError(
                 f"{self.path}: flux='linear' (--flux linear) needs 'time', in seconds, in each "
                 "[[exposure]]"
             )
-        self.check_formats()
-        excluded = self._excluded(mask)
-        hashes = sha256_of([self.path, *self.files()])
-        refuse_repeats(self.path, self.manifest, hashes)
-        dark = self._dark(fit_options)
+        excluded, hashes = self._checked(mask)
+        dark = self._dark(self.manifest.dark, workers, progress)
         hot = hot_pixels(dark, None)
-        averaged = self._average(dark, fit_options)
+        averaged = self._average(dark, workers, progress)
         colours = Equalisation.of_colours(averaged.filters, dark)
         shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
-        exposures = self._exposures(averaged, shifts, std, flux, excluded, fit_options)
+        whole = fit_options.whole_shifts
+        with naming_memory("calibrating"):
+            measured = measured_of(averaged)
+            positions = Positions.of(
+                shifts,
+                rotation=[exposure.rotation for exposure in self.manifest.exposure],
+                std=std if std.any() and not whole else None,
+                shape=measured.values.shape,
+            )
+            fluxes = Flux.of(
+                self._column("flux") if flux is None else flux,
+                self._column("flux_std") if flux is None else None,
+                self._column("time") if flux == "linear" else None,
+                len(measured),
+            )
+            exposures = Exposures.of(measured, positions, fluxes, mask=excluded)
         start = None
-        if self._is_moved() and not fit_options.whole_shifts:
+        if whole:
+            exposures = exposures.whole(std)
+        elif self._is_moved():
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
             shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
             exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
             start = first.fit
-        origin = provenance(self.path, self.manifest, hashes, shifts, std, averaged.noise)
-        return calibrated(exposures, options, start=start, provenance=origin)
+        origin = self._provenance(
+            hashes,
+            averaged.noise,
+            exposures=[exposure.name for exposure in self.manifest.exposure],
+            measured_shifts=shifts.tolist(),
+            measured_shift_std=std.tolist(),
+        )
+        return calibrated(exposures, options, start=start, said=said, provenance=origin)
 
-    def _warn_of_unused(self, flux: FluxModel | None) -> None:
-        """Warn of values in the file that the fluxes to find leave without use."""
+    def _unused(self, flux: FluxModel | None) -> list[Finding]:
+        """Findings on values in the file that the fluxes to find leave without use."""
+        words = []
         if flux is not None and self._column("flux") is not None:
-            warn(
+            words.append(
                 f"'flux' in {self.path} is not used, since fluxes are to be found (flux='{flux}', "
-                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior",
-                InputWarning,
+                f"--flux {flux}): leave one of the two out, or give 'flux_std' too for a prior"
             )
         if flux != "linear" and self._column("time") is not None:
-            warn(
-                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)",
-                InputWarning,
+            words.append(
+                f"'time' in {self.path} is not used: it is for flux='linear' (--flux linear)"
             )
-
-    def _excluded(self, mask: ArrayLike | None) -> Bools | None:
-        """Pixels that the file or the caller excludes."""
-        shape = check_formats(self._images()[:1])
-        given = None
-        if mask is not None:
-            given = as_mask(mask, (len(self.manifest.exposure), *shape))
-        return union(given, excluded_pixels(self.path, self.manifest, shape))
-
-    def _exposures(
-        self,
-        averaged: Averaged,
-        shifts: Floats,
-        std: Floats,
-        flux: FluxModel | None,
-        mask: Bools | None,
-        options: FitOptions,
-    ) -> Exposures:
-        """The exposures from averaged frames and the file."""
-        refined = std.any() and not options.whole_shifts
-        exposures = exposures_of(
-            averaged,
-            shifts,
-            mask=mask,
-            shift_std=std if refined else None,
-            flux=self._column("flux") if flux is None else flux,
-            flux_std=self._column("flux_std") if flux is None else None,
-            time=self._column("time") if flux == "linear" else None,
-            rotation=[exposure.rotation for exposure in self.manifest.exposure],
-        )
-        return exposures.whole(std) if options.whole_shifts else exposures
-
-    def _average(self, dark: FrameStatistics, options: FitOptions) -> Averaged:
-        """Mean signal of every exposure; the frames' other statistics are reduced at once."""
-        exposures = self.manifest.exposure
-        with naming_memory("averaging"):
-            sensor = self.manifest.sensor
-            averaged = Averaged(
-                len(exposures),
-                dtype=np.float32,
-                gain=sensor.gain_dn_per_e,
-                saturation=sensor.saturation_level,
-                saturation_key=sensor.saturation_key,
-                colours=Colours.of(sensor.cfa),
-            )
-            for each in exposures:
-                statistics = self._statistics(
-                    each.name, each.frames, dark, options.workers, options.progress
-                )
-                try:
-                    averaged.add(statistics, each.name)
-                except InputError as error:
-                    raise FileError(f"{self.path}: {error}") from error
-        return averaged
+        return [Finding("unused", each, "input", "note") for each in words]
 
     def _column(self, key: str) -> list[float] | None:
         """The values of a key that all exposures have, or none."""

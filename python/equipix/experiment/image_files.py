@@ -1,7 +1,5 @@
 """Formats, repeats and hashes of image files."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
@@ -10,9 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from equipix._check import Array
 from equipix.errors import FileError
 from equipix.experiment.manifest import LevelManifest, Manifest, entry_files
-from equipix.io.frames import frame_format
+from equipix.io.formats import refuse_saved
+from equipix.io.frames import frame_format, read_frames
 from equipix.measured.statistics import saved_shape
 
 
@@ -75,7 +75,7 @@ def refuse_repeats(
     entries = [*_entries(path, manifest)]
     for entry in entries:
         if hashes is None or entry.key != "dark":
-            for one, other in _alike(entry.files, entry.files, hashes, within=True):
+            for one, other in _alike(entry.files, entry.files, hashes):
                 raise FileError(f"{path}: {_words(one, other)} twice in {entry}")
     for first, second in combinations(entries, 2):
         images = "aperture" in first.key and "aperture" in second.key
@@ -96,7 +96,7 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
         With the file and where it stands.
     """
     for hashes in (None, sha256_of(dict.fromkeys([*frames, *dark]))):
-        for one, other in _alike(frames, frames, hashes, within=True):
+        for one, other in _alike(frames, frames, hashes):
             raise FileError(f"{_words(one, other)} twice in the frames: give each once")
         for one, other in _alike(frames, dark, hashes):
             raise FileError(
@@ -125,30 +125,32 @@ def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
 
 
 def _alike(
-    first: list[Path],
-    second: list[Path],
-    hashes: Mapping[Path, str] | None,
-    *,
-    within: bool = False,
+    first: list[Path], second: list[Path], hashes: Mapping[Path, str] | None
 ) -> Iterator[tuple[Path, Path]]:
-    """Give the pairs of the same file, or of the same content."""
-    seen: dict[object, Path] = {}
+    """Give the pairs of the same file, or of the same content; within a list if both are one."""
+    marks = {file: file.resolve() if hashes is None else hashes[file] for file in [*first, *second]}
+    if second is not first:
+        seen = {marks[file]: file for file in reversed(first)}
+        yield from ((seen[marks[file]], file) for file in second if marks[file] in seen)
+        return
+    seen = {}
     for file in first:
-        mark = file.resolve() if hashes is None else hashes[file]
-        if within and mark in seen:
-            yield seen[mark], file
-        seen.setdefault(mark, file)
-    if not within:
-        for file in second:
-            mark = file.resolve() if hashes is None else hashes[file]
-            if mark in seen:
-                yield seen[mark], file
+        if marks[file] in seen:
+            yield seen[marks[file]], file
+        seen.setdefault(marks[file], file)
 
 
 def _words(one: Path, other: Path) -> str:
     if one == other:
         return f"'{one.name}' stands"
     return f"'{one.name}' and '{other.name}' are the same images, and stand"
+
+
+def raw_frames(files: Iterable[Path]) -> Array:
+    """Read frames as the camera gave them, and refuse files that equipix has saved."""
+    for file in files:
+        refuse_saved(file)
+    return read_frames(files)
 
 
 def sha256_of(files: Iterable[Path]) -> dict[Path, str]:

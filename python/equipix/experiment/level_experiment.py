@@ -1,25 +1,16 @@
 """Levels of a uniform source on disk, as levels.toml describes them, and their evaluation."""
 
-from __future__ import annotations
-
-import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from operator import itemgetter
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import By, Order, Progress, Words, as_mask, naming_memory, union
-from equipix.errors import EquipixWarning, FileError, InputError, warn
-from equipix.experiment.described import Described, excluded_pixels
-from equipix.experiment.image_files import check_formats, refuse_repeats, sha256_of
-from equipix.experiment.manifest import LevelManifest, read_level_manifest
-from equipix.measured.colour import Colours
+from equipix._check import ArrayLike, By, Order, Progress, Words
+from equipix.experiment.described import Described
+from equipix.experiment.manifest import LevelManifest
+from equipix.findings import Finding, say
 from equipix.measured.defects import SIGMAS
-from equipix.measured.means import Averaged
-from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 from equipix.nuc.curve_fit import fitted
 from equipix.nuc.levels import Levels, levels_of
 from equipix.nuc.order import check_order
@@ -49,9 +40,7 @@ class LevelExperiment(Described[LevelManifest]):
     of the curves.
     """
 
-    @classmethod
-    def _read(cls, path: Path) -> LevelManifest:
-        return read_level_manifest(path)
+    _model, _words = LevelManifest, Words("[[level]]", "level")
 
     def run(
         self,
@@ -95,84 +84,38 @@ class LevelExperiment(Described[LevelManifest]):
 
         Warns
         -----
-        EquipixWarning
+        MisfitWarning
             If the mean of a level is lower than that of a level with a lower value, beside the
             warnings of `equipix.nuc.fit`.
         """
         check_order(order, by)
-        shape = check_formats(self._images())
-        given = None if mask is None else as_mask(mask, (len(self.manifest.level), *shape))
-        excluded = union(given, excluded_pixels(self.path, self.manifest, shape))
-        hashes = sha256_of([self.path, *self.files()])
-        refuse_repeats(self.path, self.manifest, hashes)
-        averaged = self._average(workers, progress)
+        excluded, hashes = self._checked(mask)
+        entry = self.manifest.dark
+        dark = None if entry is None else self._dark(entry, workers, progress)
+        averaged = self._average(dark, workers, progress)
         levels = levels_of(averaged, mask=excluded)
-        self._warn_of_order(levels)
-        origin = self._provenance(averaged, levels.references.tolist(), hashes)
+        if words := self._falling(levels):
+            said = say(Finding("light", words, "misfit"))
+            levels = replace(levels, findings=levels.findings + said)
+        named = zip(self.manifest.names, self.manifest.level, levels.references, strict=True)
+        written = [
+            {"name": name, "value": level.value, "unit": level.unit, "mean": float(mean)}
+            for name, level, mean in named
+        ]
+        origin = self._provenance(hashes, averaged.noise, levels=written)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
-    def _average(self, workers: int | None, progress: Progress | None) -> Averaged:
-        """Mean of every level; the frames' other statistics are reduced at once."""
-        sensor = self.manifest.sensor
-        averaged = Averaged(
-            len(self.manifest.level),
-            gain=sensor.gain_dn_per_e,
-            saturation=sensor.saturation_level,
-            saturation_key=sensor.saturation_key,
-            words=Words("[[level]]", "level"),
-            colours=Colours.of(sensor.cfa),
-        )
-        with naming_memory("averaging"):
-            dark = self._dark(workers, progress)
-            for name, level in zip(self.manifest.names, self.manifest.level, strict=True):
-                frames = self._statistics(name, level.frames, dark, workers, progress)
-                try:
-                    averaged.add(frames, name)
-                except InputError as error:
-                    raise FileError(f"{self.path}: {error}") from error
-        return averaged
-
-    def _warn_of_order(self, levels: Levels) -> None:
-        """Warn of values of levels that do not rise with the means by more than noise explains."""
-        entries = zip(self.manifest.level, self.manifest.names, strict=True)
-        known = [
-            (level.value, name, mean, sigma)
-            for (level, name), mean, sigma in zip(
-                entries, levels.references, np.sqrt(levels.variances), strict=True
-            )
-            if level.value is not None
-        ]
-        known.sort(key=lambda each: each[0])
+    def _falling(self, levels: Levels) -> str | None:
+        """Say which values of levels do not rise with the means by more than noise explains."""
+        values = [level.value for level in self.manifest.level]
+        sigmas = np.sqrt(levels.variances)
+        entries = zip(values, self.manifest.names, levels.references, sigmas, strict=True)
+        known = sorted((each for each in entries if each[0] is not None), key=itemgetter(0))
         for (_, below, least, one), (_, above, most, other) in pairwise(known):
             if most < least - SIGMAS * np.hypot(one, other):
-                warn(
+                return (
                     f"{self.path}: the mean of the frames falls from {least:.6g} DN in level "
                     f"'{below}' to {most:.6g} DN in level '{above}', whose 'value' is higher: see "
-                    "that each value is that of its frames",
-                    EquipixWarning,
+                    "that each value is that of its frames"
                 )
-                return
-
-    def _dark(self, workers: int | None, progress: Progress | None) -> FrameStatistics | None:
-        if self.manifest.dark is None:
-            return None
-        dark = self._statistics("dark", self.manifest.dark.frames, None, workers, progress)
-        refuse_subtracted(dark, f"{self.path}: [dark]")
-        return dark
-
-    def _provenance(
-        self, averaged: Averaged, means: list[float], hashes: dict[Path, str]
-    ) -> dict[str, Any]:
-        """Sensor, levels, noise and the hashes of the files, as JSON values."""
-        named = zip(self.manifest.names, self.manifest.level, means, strict=True)
-        folder = self.path.parent
-        return {
-            "experiment": str(self.path),
-            "sensor": self.manifest.sensor.model_dump(),
-            "levels": [
-                {"name": name, "value": level.value, "unit": level.unit, "mean": mean}
-                for name, level, mean in named
-            ],
-            "noise": None if averaged.noise is None else asdict(averaged.noise),
-            "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
-        }
+        return None

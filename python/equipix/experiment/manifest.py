@@ -1,7 +1,5 @@
 """The content of experiment.toml and levels.toml, checked: errors name the value and its place."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -54,6 +52,8 @@ Text = Annotated[str, Field(min_length=1)]
 Files = Text | Annotated[list[Text], Field(min_length=1)]
 
 Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+
+Errors = Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
 Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
@@ -149,10 +149,7 @@ class Exposure(_Table):
     aperture_before: Files | None = None
     aperture_after: Files | None = None
     shift: Pair | None = None
-    shift_std: (
-        Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
-        | None
-    ) = None
+    shift_std: Errors | None = None
     flux: Positive | None = None
     flux_std: Positive | None = None
     time: FiniteFloat | None = None
@@ -212,6 +209,11 @@ class LevelManifest(_Table):
             for index, each in enumerate(self.level)
         ]
 
+    @property
+    def measurements(self) -> list[tuple[str, str | list[str]]]:
+        """Name and frames of each level."""
+        return [(name, each.frames) for name, each in zip(self.names, self.level, strict=True)]
+
 
 class Manifest(_Table):
     """The whole experiment.toml."""
@@ -243,18 +245,14 @@ class Manifest(_Table):
                 raise _problem(f"'{key}' is missing in exposure '{missing[0]}': give all or none")
         return self
 
-
-def read_manifest(path: Path) -> Manifest:
-    """Read and check the experiment.toml `path`."""
-    return _read(path, Manifest)
-
-
-def read_level_manifest(path: Path) -> LevelManifest:
-    """Read and check the levels.toml `path`."""
-    return _read(path, LevelManifest)
+    @property
+    def measurements(self) -> list[tuple[str, str | list[str]]]:
+        """Name and frames of each exposure."""
+        return [(each.name, each.frames) for each in self.exposure]
 
 
-def _read(path: Path, model: type[_Content]) -> _Content:
+def read_manifest(path: Path, model: type[_Content]) -> _Content:
+    """Read and check the experiment.toml or levels.toml `path`."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:

@@ -1,10 +1,9 @@
-"""Exposures of one beam, and the one function that makes them."""
+"""Exposures of one beam: fitted, predicted, and parts of them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -15,8 +14,6 @@ from equipix._check import (
     Array,
     Bools,
     Floats,
-    FluxModel,
-    ReadOnly,
     as_array,
     as_mask,
     naming_memory,
@@ -26,101 +23,93 @@ from equipix._native import Fit
 from equipix.errors import InputError
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
-from equipix.exposures.positions import Orientation, Positions, check_reach, nearest_whole
-from equipix.measured.colour import Colours
+from equipix.exposures.positions import Orientation, Positions, nearest_whole
 from equipix.measured.defects import BadPixels
 from equipix.measured.filters import Filters, mean_signal
-from equipix.measured.means import Averaged
-from equipix.measured.measured import Measured, measured_of
-from equipix.measured.noise import NoiseModel
-from equipix.measured.saturation import Clipping, _is_unsigned, clipping_advice
-from equipix.measured.statistics import FrameStatistics
+from equipix.measured.measured import Measured
+from equipix.measured.saturation import clipping_advice
 
 _BLOCK = 64
 """Rows of a block for medians."""
 
 
-@dataclass(frozen=True, eq=False)
-class Exposures(ReadOnly):
-    """Exposures of one beam, as read-only arrays.
+_REASONS = {  # the first that most pixels share: dark frames scatter more than a wrong model too
+    "noisy": "scatters between frames by more than its noise model explains: correct the gain "
+    "('gain_dn_per_e' in [sensor], 'variance' of calibrate), or leave it out",
+    "hot": "is hot in the dark frames: give dark frames of the same camera and exposure time",
+    "dead": "does not respond to light: is the dark that of these frames?",
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Exposures(Measured):
+    """Exposures of one beam: what is measured, where the sensor stood, and the fluxes.
 
     Attributes
     ----------
-    values : ndarray, shape (n, rows, cols), float32 or float64
-        Mean frames, the dark subtracted unless an offset is sought, in DN; what is not finite is
-        not used.
     positions : Positions
         Where the sensor stood.
     flux : Flux
         Relative flux of each exposure, and what is known of it.
-    mask : ndarray of bool, shape (rows, cols) or (n, rows, cols), or None
-        True = do not use.
-    variance : ndarray, shape (n,) or (n, rows, cols), or None
-        Variance of the values, in DN²; None: all weights are 1.
-    noise : tuple of NoiseModel
-        Noise model of each mean frame, where the variance is to be evaluated at what a fit expects.
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
-    bad_pixels : BadPixels
-        Bad pixels found before the last fit.
-    dark : ndarray, shape (rows, cols), or None
-        The dark frame that was subtracted, in DN, where it is known.
-    dark_variance : ndarray, shape (rows, cols), float64, or None
-        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are
-        without it. None where it is unknown, or where an offset is sought, which takes all of it.
-    clipped : Clipping or None
-        A saturation level that was not given, if the values show one.
-    raw : bool
-        Whether no dark was subtracted: from averages of whole numbers, or arrays of unsigned ones.
-    unsteady : str
-        Which exposure has light that varied between its frames, and by how much; empty if none has.
     filters : Filters or None
         Colour filters of the pixels: values and deviations are over the response of the pixel's
         colour, so that all pixels are alike; `noise` and `dark` are in DN.
     relative : bool
         Whether the variances are relative, in an unknown unit.
-    names : tuple of str
-        What the user calls each exposure, if anything.
     """
 
-    values: Array
     positions: Positions
     flux: Flux
-    mask: Bools | None = None
-    variance: Array | None = None
-    noise: tuple[NoiseModel, ...] = ()
     offset: bool = False
-    bad_pixels: BadPixels = field(default_factory=BadPixels)
-    dark: Array | None = None
-    dark_variance: Floats | None = None
-    clipped: Clipping | None = None
-    raw: bool = False
-    unsteady: str = ""
     filters: Filters | None = None
     relative: bool = False
-    names: tuple[str, ...] = ()
 
-    def __len__(self) -> int:
-        """Return the number of exposures."""
-        return len(self.values)
+    @classmethod
+    def of(
+        cls,
+        measured: Measured,
+        positions: Positions,
+        flux: Flux,
+        *,
+        mask: ArrayLike | None = None,
+        offset: bool = False,
+        dark_variance: ArrayLike | None = None,
+    ) -> Self:
+        """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
+        given = as_mask(mask, measured.values.shape)
+        found = vars(measured) | {
+            "mask": union(given, measured.mask),
+            "raw": measured.raw and not offset,
+            "dark_variance": _of_dark(dark_variance, measured, offset=offset),
+        }
+        exposures = cls(positions=positions, flux=flux, offset=offset, **found)
+        exposures._refuse_nothing(given)
+        shown = mean_signal(exposures.values, exposures.mask)
+        return exposures.behind(Filters.of(measured.colours, *shown))
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.values.shape[1:]
-        return rows, cols
+    def _refuse_nothing(self, given: Bools | None) -> None:
+        """Refuse exposures that leave no value to use, if the mask `given` is not the reason."""
+        if any(self.usable(k).any() for k in range(len(self))):
+            return
+        if not np.isfinite(self.values).any():
+            raise InputError(
+                "'frames' holds no finite number: every value is NaN, infinite or saturated"
+            )
+        free = dataclasses.replace(self, mask=given)
+        left = np.any([free.usable(k) for k in range(len(self))], axis=0)
+        if self.clipped is not None and left.any():
+            raise InputError(f"'frames': {clipping_advice(self.clipped)}")
+        for name, reason in _REASONS.items():
+            found = getattr(self.bad_pixels, name)
+            if found is not None and 2 * np.count_nonzero(left & found) > np.count_nonzero(left):
+                raise InputError(f"'frames' leave no usable pixel: nearly each {reason}")
 
     def name_of(self, exposure: int) -> str:
         """Return how messages name an exposure."""
         own = self.names[exposure] if self.names else ""
         return f"exposure {exposure} ({repr(own) if own else 'from 0'})"
-
-    def usable(self, exposure: int | slice = slice(None)) -> Bools:
-        """Return which measurements may be used, of all exposures or of one."""
-        usable: Bools = np.isfinite(self.values[exposure])
-        if self.mask is not None:
-            usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
-        return usable
 
     def used(self, fit: Fit, exposure: int) -> Bools:
         """Return which measurements of an exposure a fit used: usable ones that it did not lose."""
@@ -160,31 +149,14 @@ class Exposures(ReadOnly):
             relative=not known and not self.noise,
         )
 
-    def weighted(self, variance: Array | None) -> Self:
-        """Return the exposures with other variances."""
-        return dataclasses.replace(self, variance=variance)
-
-    def without(self, mask: Bools) -> Self:
-        """Return the exposures without some measurements, besides those masked before."""
-        return dataclasses.replace(self, mask=mask if self.mask is None else mask | self.mask)
-
     def whole(self, std: Floats | None = None) -> Self:
         """Return the exposures at shifts that differ by whole pixels; see `Positions.whole`."""
         return dataclasses.replace(self, positions=self.positions.whole(std))
 
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the exposures."""
-        variance, mask = self.variance, self.mask
-        return dataclasses.replace(
-            self,
-            values=self.values[exposures],
-            positions=self.positions.chosen(exposures),
-            flux=self.flux.chosen(exposures),
-            variance=None if variance is None else variance[exposures],
-            mask=mask[exposures] if mask is not None and mask.ndim == 3 else mask,
-            noise=tuple(self.noise[k] for k in exposures) if self.noise else (),
-            names=tuple(self.names[k] for k in exposures) if self.names else (),
-        )
+        positions, flux = self.positions.chosen(exposures), self.flux.chosen(exposures)
+        return dataclasses.replace(super().chosen(exposures), positions=positions, flux=flux)
 
     def middle(self, side: int) -> tuple[slice, slice]:
         """Return the rows and columns of the central part, at most `side` pixels along an axis."""
@@ -331,51 +303,6 @@ def _medians(values: Array) -> Array:
     return medians
 
 
-def exposures_of(
-    frames: ArrayLike | Sequence[FrameStatistics] | Averaged,
-    shifts: ArrayLike,
-    *,
-    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None = None,
-    mask: ArrayLike | None = None,
-    saturation: float | None = None,
-    flux: ArrayLike | FluxModel | None = None,
-    flux_std: ArrayLike | None = None,
-    time: ArrayLike | None = None,
-    rotation: ArrayLike | None = None,
-    shift_std: ArrayLike | None = None,
-    offset: bool = False,
-    dark_variance: ArrayLike | None = None,
-    cfa: ArrayLike | Colours | None = None,
-) -> Exposures:
-    """Check what the caller gave; the arguments are those of `equipix.calibrate`."""
-    with naming_memory("calibrating"):
-        measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
-        count = len(measured.values)
-        given = None if mask is None else as_mask(mask, measured.values.shape)
-        positions = Positions.of(shifts, rotation=rotation, std=shift_std, count=count)
-        rows, cols = measured.values.shape[1:]
-        check_reach(shifts, positions, (rows, cols))
-        exposures = Exposures(
-            values=measured.values,
-            positions=positions,
-            flux=Flux.of(flux, flux_std, time, count),
-            mask=union(given, measured.mask),
-            variance=measured.variance,
-            noise=tuple(measured.models),
-            offset=offset,
-            bad_pixels=measured.bad_pixels,
-            dark=measured.dark,
-            dark_variance=_of_dark(dark_variance, measured, offset=offset),
-            clipped=measured.clipped,
-            raw=(measured.raw or _is_unsigned(frames)) and not offset,
-            unsteady=measured.unsteady,
-            names=measured.names,
-        )
-        refuse_nothing(exposures, given)
-        shown = mean_signal(exposures.values, exposures.mask)
-        return exposures.behind(Filters.of(measured.colours, *shown))
-
-
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
     """Variance of the dark that was subtracted from all, given or that of the averages."""
     if given is not None and offset:
@@ -397,41 +324,3 @@ def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Fl
     if wrong.size:
         raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")
     return np.array(np.broadcast_to(variance, shape))
-
-
-_REASONS = {  # the first that most pixels share: dark frames scatter more than a wrong model too
-    "noisy": "scatters between frames by more than its noise model explains: correct the gain "
-    "('gain_dn_per_e' in [sensor], 'variance' of calibrate), or leave it out",
-    "hot": "is hot in the dark frames: give dark frames of the same camera and exposure time",
-    "dead": "does not respond to light: is the dark that of these frames?",
-}
-
-
-def refuse_nothing(exposures: Exposures, given: Bools | None) -> None:
-    """Refuse exposures that leave no value to use, if the mask `given` is not the reason.
-
-    Raises
-    ------
-    InputError
-        With what most pixels were left out for.
-    """
-    if any(part.any() for part in _parts(exposures, exposures.mask)):
-        return
-    if not np.isfinite(exposures.values).any():
-        raise InputError(
-            "'frames' holds no finite number: every value is NaN, infinite or saturated"
-        )
-    left = np.any([*_parts(exposures, given)], axis=0)
-    if exposures.clipped is not None and left.any():
-        raise InputError(f"'frames': {clipping_advice(exposures.clipped)}")
-    for name, reason in _REASONS.items():
-        found = getattr(exposures.bad_pixels, name)
-        if found is not None and 2 * np.count_nonzero(left & found) > np.count_nonzero(left):
-            raise InputError(f"'frames' leave no usable pixel: nearly each {reason}")
-
-
-def _parts(exposures: Exposures, mask: Bools | None) -> Iterator[Bools]:
-    """Pixels of each exposure with a finite value that a mask leaves."""
-    for k, values in enumerate(exposures.values):
-        masked = False if mask is None else mask[k] if mask.ndim == 3 else mask
-        yield np.isfinite(values) & ~np.asarray(masked)

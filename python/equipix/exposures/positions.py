@@ -58,17 +58,20 @@ class Positions(ReadOnly):
         *,
         rotation: ArrayLike | None = None,
         std: ArrayLike | None = None,
-        count: int | None = None,
+        shape: tuple[int, ...] | None = None,
     ) -> Self:
-        """Check what the caller gave, for `count` exposures if that is known."""
+        """Check what the caller gave, for frames of a shape (n, rows, cols) if that is known."""
         # A shift beyond any sensor, which the solver refuses, must still fit an integer.
         exact = np.clip(as_shifts(shifts), -_BEYOND, _BEYOND)
         whole = nearest_whole(exact)
         places = np.where(np.abs(exact - whole) < ROUNDING, whole, exact)
-        if count is not None:
-            check_count("shifts", len(places), count)
+        if shape is not None:
+            check_count("shifts", len(places), shape[0])
         turns = as_rotation(rotation, len(places))
-        return cls(places, turns, None if std is None else as_shift_std(std, len(places)))
+        errors = None if std is None else as_shift_std(std, len(places))
+        if shape is not None:
+            _check_reach(as_shifts(shifts), turns, shape[1:])
+        return cls(places, turns, errors)
 
     def __len__(self) -> int:
         """Return the number of exposures."""
@@ -96,7 +99,7 @@ class Positions(ReadOnly):
 
     def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
         """Return the same exposures at other shifts, measured with standard deviations `std`."""
-        return type(self).of(shifts, rotation=self.rotation, std=std, count=len(self))
+        return type(self).of(shifts, rotation=self.rotation, std=std)
 
     def chosen(self, exposures: Sequence[int] | NDArray[Any]) -> Self:
         """Return the positions of some exposures."""
@@ -239,15 +242,9 @@ _LEAST_STEP, _LEAST_WHOLE_STEP = 1.0, 3.0
 """Least step, in pixels, of which all shifts are multiples; pixels are 1 to 25 micrometres wide."""
 
 
-def check_reach(shifts: ArrayLike, positions: Positions, shape: tuple[int, int]) -> None:
-    """Refuse a shift as large as the sensor, with its value as it was given.
-
-    Raises
-    ------
-    InputError
-        With the exposure and the remedy.
-    """
-    for k, (shift, turn) in enumerate(zip(as_shifts(shifts), positions.rotation, strict=True)):
+def _check_reach(shifts: Floats, rotation: Array, shape: tuple[int, ...]) -> None:
+    """Refuse a shift as large as the sensor, with its value as it was given."""
+    for k, (shift, turn) in enumerate(zip(shifts, rotation, strict=True)):
         window = shape if turn % 180 == 0 else shape[::-1]
         for name, part, side in zip(("row", "column"), shift, window, strict=True):
             if abs(part) >= side:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, as_array
+from equipix._check import Array, Bools, as_array, is_whole
 from equipix.errors import InputError
 from equipix.exposures.positions import _BEYOND
 from equipix.measured.saturation import saturation_level
@@ -167,7 +167,7 @@ def cross_pattern(first: int, second: int) -> NDArray[np.int64]:
     [[0, 0], [0, 11], [0, 19], [11, 0], [19, 0]]
     """
     for name, length in (("first", first), ("second", second)):
-        if isinstance(length, bool) or not isinstance(length, int | np.integer) or length == 0:
+        if not is_whole(length) or length == 0:
             raise InputError(f"'{name}' is {length!r}, expected a whole number of pixels, not 0")
         if abs(length) > _BEYOND:
             raise InputError(f"'{name}' is {length!r}, more pixels than any sensor has")

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike
 
 from equipix._check import Array, Floats, Progress, naming_memory, positive_workers
 from equipix._native import Fit, Uncertainty
-from equipix.errors import ConvergenceWarning, InputError, warn
-from equipix.exposures.fit import FitOptions
-from equipix.fitting.weighted import Weighted
+from equipix.errors import InputError
+from equipix.findings import Finding, say
+from equipix.fitting.weighted import Options, Weighted
 from equipix.metrics.maps import slope_pixels, tilt_weights
 
-_NOT_FOUND = 0.1
+NOT_FOUND = 0.1
 """Largest estimated error of M for which noise determines the residuals."""
 
 
@@ -51,14 +51,16 @@ class DarkStd(NamedTuple):
 
 
 def standard_deviations(
-    weighted: Weighted, flags: Array, options: FitOptions, *, wanted: bool
+    weighted: Weighted, flags: Array, options: Options
 ) -> tuple[ErrorBars | None, DarkStd | None]:
-    """Standard deviations of sensitivity, tilt and shifts if `wanted`, and of a fitted dark.
+    """Standard deviations of sensitivity, tilt and shifts if asked for, and of a fitted dark.
 
     That of a dark which was fitted together with fluxes is always given: a finding needs it. All
-    are questions of one call, which sets up the linear problem once.
+    are questions of one call, which sets up the linear problem once. A fit too far from its minimum
+    or from its beam has none.
     """
     exposures, fit = weighted.exposures, weighted.fit
+    wanted = options.uncertainty and not (is_too_far(fit) or is_too_fine(weighted))
     asks_dark = exposures.offset and exposures.flux.kind != "known"
     unknown = is_too_fine(weighted) or not np.isfinite(weighted.noise_variance)
     if asks_dark and not wanted and unknown:
@@ -75,8 +77,8 @@ def standard_deviations(
             functionals=of_logarithm(weights, fit) if asks_tilt else None,
             shifts=wanted and refined,
             offset=asks_dark,
-            workers=options.workers,
-            progress=options.progress if wanted else None,
+            workers=options.fit.workers,
+            progress=options.fit.progress if wanted else None,
             dark_variance=_relative(exposures.dark_variance, scale),
         )
     dark = _of_dark(weighted, answer, scale) if asks_dark else None
@@ -107,10 +109,10 @@ def _of_dark(weighted: Weighted, answer: Uncertainty, scale: float) -> DarkStd:
     return DarkStd(along if weighted.fit.ended == "converged" else None, alone)
 
 
-def with_dark_misfit(weighted: Weighted, options: FitOptions) -> Weighted:
+def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:
     """Add what the noise of the dark adds to F, unless the fit is too far from its minimum."""
     exposures, fit = weighted.exposures, weighted.fit
-    found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= _NOT_FOUND
+    found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= NOT_FOUND
     if exposures.dark_variance is None or not found:
         return weighted
     with naming_memory("the misfit of the dark"):
@@ -119,12 +121,23 @@ def with_dark_misfit(weighted: Weighted, options: FitOptions) -> Weighted:
             functionals=None,
             shifts=False,
             offset=False,
-            workers=options.workers,
+            workers=options.fit.workers,
             progress=None,
             dark_variance=exposures.dark_variance,
             dark_misfit=True,
         )
     return weighted._replace(dark_misfit=cast("float", answer.dark_misfit))
+
+
+def is_too_far(fit: Fit) -> bool:
+    """Whether a fit is too far from its minimum for standard deviations."""
+    is_far = not float(fit.error_estimate[-1]) <= NOT_FOUND
+    return fits_noise(fit) or (fit.is_joint and is_far)
+
+
+def fits_noise(fit: Fit) -> bool:
+    """Whether a fit went on without bringing M within its own size."""
+    return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
 
 
 def is_too_fine(weighted: Weighted) -> bool:
@@ -201,7 +214,7 @@ def functional_std(
             dark_variance=_relative(weighted.exposures.dark_variance, scale),
         )
     if answer.incomplete:
-        warn(incomplete_searches(answer.incomplete), ConvergenceWarning)
+        say(Finding("uncertainty", incomplete_searches(answer.incomplete), "convergence"))
     return _std(scale, answer.variances)
 
 

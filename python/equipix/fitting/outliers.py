@@ -146,7 +146,7 @@ def _seen(
     """Light on each pixel in an exposure, and the weights of what may be used there."""
     light = np.nan_to_num(exposures.light(fit, exposure, workers), copy=False)
     used = exposures.used(fit, exposure) & (light * response != 0)
-    return light, _weights(exposures.variance, exposure, used)
+    return light, weights_of(exposures.variance, exposure, used)
 
 
 def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
@@ -172,7 +172,7 @@ def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     return scaled
 
 
-def _weights(variance: Array | None, exposure: int, used: Bools) -> Array:
+def weights_of(variance: Array | None, exposure: int, used: Bools) -> Array:
     """Weights 1/σ² of an exposure; 0 where nothing is used."""
     scale = 1.0 if variance is None else variance[exposure]
     weights: Array = np.divide(1.0, scale, where=used, out=np.zeros(used.shape))

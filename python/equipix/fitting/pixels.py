@@ -9,6 +9,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats, union
 from equipix.exposures.fit import FitOptions
 from equipix.findings import set_bits
+from equipix.fitting.outliers import weights_of
 from equipix.fitting.residuals import FEWEST, in_search
 from equipix.fitting.weighted import Options, Weighted
 from equipix.measured.defects import response_outliers
@@ -134,7 +135,7 @@ _FEWEST = 16
 """Fewer lit pixels are chance."""
 
 
-def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
+def without_faint_pixels(weighted: Weighted, options: Options) -> Weighted:
     """Find pixels that the noise of the dark makes unreliable, and leave them out of mean(M).
 
     The solver knows the noise of exposures alone. The noise of their common dark adds to it where
@@ -143,13 +144,13 @@ def without_faint_pixels(weighted: Weighted, options: FitOptions) -> Weighted:
     exposures = weighted.exposures
     if exposures.dark_variance is None:
         return weighted
-    without, with_dark = std_of_pixels(weighted, options.workers)
+    without, with_dark = std_of_pixels(weighted, options.fit.workers)
     faint = _faint(with_dark) & ~_faint(without) & (weighted.fit.flags == 0)
     if not faint.any():
         return weighted
     bad_pixels = dataclasses.replace(exposures.bad_pixels, faint=faint)
     exposures = dataclasses.replace(exposures, bad_pixels=bad_pixels)
-    return weighted._replace(exposures=exposures, fit=exposures.fit(options, weighted.fit))
+    return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
 def _faint(std: Array) -> Bools:
@@ -191,9 +192,7 @@ def _weights(weighted: Weighted) -> Floats:
     exposures = weighted.exposures
     total = np.zeros(exposures.shape)
     for k in range(len(exposures)):
-        variance = 1.0 if exposures.variance is None else exposures.variance[k]
-        used = exposures.used(weighted.fit, k)
-        total += np.divide(1.0, variance, where=used, out=np.zeros(exposures.shape))
+        total += weights_of(exposures.variance, k, exposures.used(weighted.fit, k))
     return total
 
 

@@ -159,11 +159,20 @@ def bands(measured: Array, most: int) -> Array:
     return np.array(first[1:])[:, None] + np.arange(_BAND)
 
 
+def axes_of(turn: int) -> Array:
+    """Steps along the axes of a turned sensor, in the beam, as rows."""
+    return np.array([in_beam(p, turn, (1, 1)) - in_beam((0, 0), turn, (1, 1)) for p in np.eye(2)])
+
+
 def on_sensor(positions: Positions) -> Floats:
     """Shifts (n, 2) along the axes of the sensor, where all exposures are turned alike."""
-    turn = int(positions.rotation[0])
-    axes = [in_beam(unit, turn, (1, 1)) - in_beam((0, 0), turn, (1, 1)) for unit in np.eye(2)]
-    return np.asarray(positions.shifts @ np.array(axes).T)
+    return np.asarray(positions.shifts @ axes_of(int(positions.rotation[0])).T)
+
+
+def left_by(columns: Array, values: Array) -> tuple[Floats, int]:
+    """What least squares along columns leaves of values, and the rank of the columns."""
+    found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=None)
+    return np.asarray(values - columns @ found), int(rank)
 
 
 def testable(rows: Array, shifts: Floats, shape: tuple[int, int]) -> Floats:

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import Array, Floats
+from equipix._native import Fit
 from equipix.exposures.exposures import Exposures
-from equipix.exposures.positions import WIDEST, in_beam
-from equipix.fitting.residuals import Residuals, sampled
+from equipix.exposures.positions import WIDEST
+from equipix.fitting.residuals import Residuals, axes_of, left_by, sampled
 from equipix.fitting.weighted import Options, Weighted, weighted_fit
 from equipix.fitting.windows import misplaced
 from equipix.measured.noise import NoiseModel, chi2_tail, photon_transfer
@@ -53,7 +54,7 @@ class Contradiction(NamedTuple):
         )
 
 
-def widened(weighted: Weighted, options: Options) -> tuple[Weighted, list[Contradiction]]:
+def widened(weighted: Weighted, options: Options) -> Weighted:
     """Repeat a fit with wider priors where the data contradict those given.
 
     Notes
@@ -67,12 +68,13 @@ def widened(weighted: Weighted, options: Options) -> tuple[Weighted, list[Contra
     """
     found = [_explained(each, weighted, options) for each in contradictions(weighted)]
     if not found:
-        return weighted, []
+        return weighted
     exposures = weighted.exposures
     for each in found:
         exposures = _wider(exposures, each)
     fit = exposures.fit(options.fit, weighted.fit)
-    return weighted._replace(exposures=exposures, fit=fit), found
+    replaced = {**weighted.replaced, **{each.name: each.words for each in found}}
+    return weighted._replace(exposures=exposures, fit=fit, replaced=replaced)
 
 
 def contradictions(weighted: Weighted) -> list[Contradiction]:
@@ -123,7 +125,7 @@ def _contradiction(
     total, freedom = np.zeros(len(deviations)), 0
     for values, scale in zip(deviations.T, std.T, strict=True):
         known = scale > 0
-        left, unknowns = _rest(columns[known] / scale[known, None], values[known] / scale[known])
+        left, unknowns = left_by(columns[known] / scale[known, None], values[known] / scale[known])
         total[known] += left**2
         freedom += len(left) - unknowns
     if freedom < 1:
@@ -132,12 +134,6 @@ def _contradiction(
     if chi2_tail(float(total.sum()), freedom) >= _RARE or factor < _FACTOR:
         return None
     return Contradiction(name, factor, freedom, tuple(np.argsort(-total)[:2].tolist()))
-
-
-def _rest(columns: Array, values: Array) -> tuple[Floats, int]:
-    """What least squares along columns leaves, and their rank."""
-    found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=None)
-    return np.asarray(values - columns @ found), int(rank)
 
 
 def _wider(exposures: Exposures, found: Contradiction) -> Exposures:
@@ -198,18 +194,17 @@ def sampled_frames(variance: Array | None) -> float | None:
     return frames if abs(fourth - 1) < _LIKE else None
 
 
-def steadied(
-    exposures: Exposures, weighted: Weighted, options: Options
-) -> tuple[Weighted, float | None]:
-    """Fit with a noise model of each exposure, where the variances scatter like sample variances.
+def steady_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:
+    """Fit exposures, with a noise model of each if their variances scatter like sample variances.
 
-    Also returns the number of frames that they seem to be of; None where they are left as they are.
+    The fit begins from `start`.
     """
+    weighted = weighted_fit(exposures, options, start)
     is_given = exposures.knows_noise and not exposures.offset
     frames = sampled_frames(exposures.variance) if is_given else None
     variance = exposures.variance
     if frames is None or variance is None or _explains_residuals(weighted, options.fit.workers):
-        return weighted, None
+        return weighted
     usable, number, response = exposures.usable(), max(2, round(frames)), exposures.response
     period = (1, 1) if exposures.filters is None else exposures.filters.colours.period
     in_dn = (
@@ -220,7 +215,8 @@ def steadied(
         for k, (signal, each) in enumerate(in_dn)
     )
     exposures = dataclasses.replace(exposures, variance=None, noise=models)
-    return weighted_fit(exposures, options, weighted.fit), frames
+    steady = weighted_fit(exposures, options, weighted.fit)
+    return steady._replace(replaced={"variance": words(frames)})
 
 
 def _explains_residuals(weighted: Weighted, workers: int | None) -> bool:
@@ -287,7 +283,7 @@ def unrefined(weighted: Weighted, residuals: Residuals) -> Unrefined | None:
         if not lengths[1] <= _ON_A_LINE * lengths[0]:
             return None
         directions = directions[1:]
-    axes = [_axes(turn) for turn in positions.rotation.tolist()]
+    axes = [axes_of(turn).T for turn in positions.rotation.tolist()]
     slopes = np.einsum("da,nab,bnkrc->dnkrc", directions, axes, residuals.slopes)
     return Unrefined(slopes, np.sqrt(directions**2 @ np.square(positions.std).T))
 
@@ -337,10 +333,3 @@ def _with_prior(slopes: Floats, values: Floats, std: Floats, scale: float) -> tu
     spread = normal + normal @ np.diag(std**2) @ normal
     squares = product @ np.linalg.pinv(spread, hermitian=True) @ product
     return np.asarray(errors), float(squares)
-
-
-def _axes(turn: int) -> Array:
-    """Return A: a step along the sensor's axes in the beam."""
-    return np.stack(
-        [in_beam(p, turn, (1, 1)) - in_beam((0, 0), turn, (1, 1)) for p in np.eye(2)], 1
-    )

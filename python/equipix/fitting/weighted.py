@@ -98,7 +98,8 @@ class Weighted(NamedTuple):
 
     `dark_misfit` is what the noise of the dark adds to F on average, `sampled` what the arrays held
     that later questions read again. `excess` is the factor by which a beam that is finer than its
-    spline raises the variance of residuals above that given.
+    spline raises the variance of residuals above that given. `replaced` says why a variance or a
+    prior that was given was replaced, by the name of its argument.
     """
 
     exposures: Exposures
@@ -107,6 +108,7 @@ class Weighted(NamedTuple):
     dark_misfit: float = 0.0
     sampled: Mapping[str, Array] = MappingProxyType({})
     excess: float = 1.0
+    replaced: Mapping[str, str] = MappingProxyType({})
 
     @property
     def reduced_chi2(self) -> float:

@@ -26,7 +26,7 @@ from equipix.fitting.residuals import (
     sampled,
     tested,
 )
-from equipix.fitting.weighted import Weighted
+from equipix.fitting.weighted import Options, Weighted
 
 _Asked = ParamSpec("_Asked")
 
@@ -263,7 +263,7 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     window, fit = window_of(weighted.exposures, weighted.fit)
     part = weighted
     if fit is None:
-        part = with_dark_misfit(Weighted(window, window.fit(options), None), options)
+        part = with_dark_misfit(Weighted(window, window.fit(options), None), Options(options))
     right = simulated(part, options)
     other = Weighted(right, right.fit(options, part.fit), None)
     exact = sampled(other, workers=options.workers).inexactness <= EXACT

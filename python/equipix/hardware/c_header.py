@@ -1,9 +1,8 @@
 """Tables as C headers, with a function that applies them bit by bit."""
 
-from __future__ import annotations
-
 import hashlib
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -11,29 +10,11 @@ import numpy as np
 from equipix._check import Array
 from equipix.errors import FileError
 from equipix.hardware.table_files import DTYPES, Content, header, made, read_header
-from equipix.hardware.words import Format
+from equipix.hardware.words import STEPS, Format
 
 _FIRST = "/* equipix table: "
 
 _DIGEST = "SHA-256 of the lines above:"
-
-_TYPES = {"coarse": "uint16_t", "offset": "int16_t", "gain": "uint16_t", "flags": "uint32_t"}
-
-_NUMBERS = {
-    "adc_bits": "ADC_BITS",
-    "dac_bits": "COARSE_BITS",
-    "offset_bits": "OFFSET_BITS",
-    "gain_bits": "GAIN_BITS",
-    "out_bits": "OUT_BITS",
-    "adc": "ADC_STEP_EXPONENT",
-    "coarse": "COARSE_STEP_EXPONENT",
-    "offset": "OFFSET_STEP_EXPONENT",
-    "gain": "GAIN_STEP_EXPONENT",
-    "out": "OUT_STEP_EXPONENT",
-    "base": "BASE",
-    "zero": "ZERO",
-}
-"""Macro of each number of the format."""
 
 _A_LINE = 16
 """Words in a line."""
@@ -77,9 +58,12 @@ def to_c_header(content: Content, name: str) -> bytes:
 def _macros(content: Content, upper: str) -> list[str]:
     """Sizes of the sensor, widths, exponents of the steps, and constants."""
     rows, cols = content.gain.shape
-    numbers = {name: getattr(content.format, key) for key, name in _NUMBERS.items()}
-    everything = {"ROWS": rows, "COLS": cols} | numbers
-    return [f"#define {upper}_{name} ({value})" for name, value in everything.items()]
+    numbers = {"rows": rows, "cols": cols, **asdict(content.format)}
+    names = {step: f"{step}_step_exponent" for step in STEPS} | {"dac_bits": "coarse_bits"}
+    return [
+        f"#define {upper}_{names.get(name, name).upper()} ({value})"
+        for name, value in numbers.items()
+    ]
 
 
 def _arrays(content: Content, lower: str) -> list[str]:
@@ -87,7 +71,7 @@ def _arrays(content: Content, lower: str) -> list[str]:
     lines = []
     for name, values in content.arrays().items():
         texts = [str(value) for value in values.ravel().tolist()]
-        lines.append(f"static const {_TYPES[name]} {lower}_{name}[{values.size}] = {{")
+        lines.append(f"static const {values.dtype.name}_t {lower}_{name}[{values.size}] = {{")
         lines += [",".join(texts[i : i + _A_LINE]) + "," for i in range(0, len(texts), _A_LINE)]
         lines.append("};")
     return lines
@@ -116,9 +100,7 @@ def from_c_header(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     text = data.decode().replace("\r\n", "\n").rstrip()
     first = text.split("\n", 1)[0].rstrip()
-    if not first.startswith(_FIRST):
-        raise FileError(f"{path}: holds no table that equipix has written")
-    fields = read_header(path, first.removeprefix(_FIRST).removesuffix(" */"))
+    fields = read_header(path, first.removesuffix(" */"), _FIRST)
     guard = re.search(r"^#ifndef (\w+)_H\s*$", text, re.MULTILINE)
     above, newline, last = text.rpartition("\n")
     if guard is None or not last.startswith(f"#endif /* {guard[1]}_H"):

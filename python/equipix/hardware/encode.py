@@ -1,18 +1,18 @@
 """The line of each pixel as offset and gain words."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from equipix._check import Array, Bools, Floats
 from equipix._native import __version__
 from equipix.correction.protocol import Correction
 from equipix.errors import InputError
 from equipix.findings import set_bits, usable
-from equipix.hardware.words import WIDEST, Format, Words
+from equipix.hardware.table_files import Content
+from equipix.hardware.words import Format, Words
 
 _FINEST_GAIN = -40
 """Exponent of the finest step of a gain."""
@@ -44,22 +44,9 @@ class Steps(NamedTuple):
     out: int
 
 
-class Encoded(NamedTuple):
-    """Words of all pixels, 0 where a pixel must not be used, and what they stand for."""
-
-    format: Format
-    coarse: Array
-    offset: Array
-    gain: Array
-    flags: Array
-    largest_error: float
-    """Largest difference to the line of a usable pixel over the range of the ADC, in DN, before
-    the output is rounded."""
-
-
 def encode(
     line: tuple[Floats, Floats], flags: Array, widths: dict[str, int], steps: Steps, lowest: float
-) -> Encoded:
+) -> Content:
     """Make the words of the line of each pixel.
 
     Parameters
@@ -78,8 +65,10 @@ def encode(
 
     Returns
     -------
-    Encoded
-        The words.
+    Content
+        The words, 0 where a pixel must not be used. Its metadata are `lowest` and the largest
+        difference to the line of a usable pixel over the range of the ADC, in DN, before the output
+        is rounded.
 
     Raises
     ------
@@ -107,13 +96,13 @@ def encode(
     lost = fine - np.ldexp(float(base), steps.out) - np.ldexp(offset_words, exponent)
     exponents = {"adc": steps.adc, "coarse": coarse, "offset": exponent, "out": steps.out}
     found = Format(**widths, **exponents, gain=gain_exponent, base=base, zero=zero)
-    return Encoded(
+    return Content(
         found,
         _spread(coarse_words, used, np.uint16),
         _spread(offset_words, used, np.int16),
         _spread(gain_words, used, np.uint16),
         flags,
-        float((np.abs(lost) + np.abs(rounding)).max()),
+        {"lowest": lowest, "largest_error_dn": float((np.abs(lost) + np.abs(rounding)).max())},
     )
 
 
@@ -154,11 +143,7 @@ def _refuse_unresponsive(gain: Floats) -> None:
 
 
 def refuse_far_offsets(
-    found: Encoded,
-    line: tuple[Floats, Floats],
-    widths: dict[str, int],
-    steps: Steps,
-    lowest: float,
+    found: Content, line: tuple[Floats, Floats], widths: dict[str, int], steps: Steps, lowest: float
 ) -> None:
     """Refuse few offsets far from most that make the words of all the others coarse.
 
@@ -169,19 +154,19 @@ def refuse_far_offsets(
     InputError
         With their places, and what the largest error is without them.
     """
-    used, step = usable(found.flags), 2.0**steps.out
+    used, step, error = usable(found.flags), 2.0**steps.out, found.metadata["largest_error_dn"]
     away = np.abs(line[0] - np.median(line[0][used]))
     far = used & (away > _FAR * max(step, float(np.median(away[used]))))
     few = 0 < np.count_nonzero(far) <= _FEW * np.count_nonzero(used)
-    if steps.offset is not None or found.largest_error <= step or not few:
+    if steps.offset is not None or error <= step or not few:
         return
     flags = np.array(found.flags)
     set_bits(flags, "undetermined", far)
-    without = encode(line, flags, widths, steps, lowest).largest_error
-    if found.largest_error > _COSTLY * without:
+    without = encode(line, flags, widths, steps, lowest).metadata["largest_error_dn"]
+    if error > _COSTLY * without:
         raise InputError(
             f"'offset_bits' is {widths['offset_bits']}: the step that holds all offsets makes the "
-            f"largest error {found.largest_error:.3g} DN, without the {np.count_nonzero(far)} "
+            f"largest error {error:.3g} DN, without the {np.count_nonzero(far)} "
             f"offsets far from most {without:.3g} DN. Flag DO_NOT_USE their pixels: "
             f"{_places(far)}; or give an offset_step"
         )
@@ -205,20 +190,12 @@ def _refuse_extreme(words: Words, gain: Floats, used: Bools) -> None:
         far = gain >= min(words.limits[1] * float(np.median(gain)), gain.max())
     pixels = used.copy()
     pixels[used] = far
+    bits = words.wide_enough(gain, lambda wider: wider.finest(gain, _FINEST_GAIN))
     raise InputError(
         f"'gain_bits' is {words.bits}: no gain_step holds gains from {gain.min():.6g} to "
         f"{gain.max():.6g}, of which {float(np.median(gain)):.6g} is the median. Flag DO_NOT_USE "
-        f"the pixels far from it: {_places(pixels)}{_wider(words, gain)}"
+        f"the pixels far from it: {_places(pixels)}{f'; or take {bits} gain_bits' if bits else ''}"
     )
-
-
-def _wider(words: Words, gain: Floats) -> str:
-    """Say how many bits would hold all gains."""
-    for bits in range(words.bits + 1, WIDEST + 1):
-        wider = Words(words.name, bits, lowest=words.lowest)
-        if not wider.outside(gain, wider.finest(gain, _FINEST_GAIN)):
-            return f"; or take {bits} gain_bits"
-    return ""
 
 
 def _coarse(pedestal: Floats, bits: int, steps: Steps, lowest: float) -> tuple[Floats, int]:
@@ -269,7 +246,7 @@ _STEPS = 65
 
 def line_of(
     correction: Correction, linearise: tuple[float, float] | None
-) -> tuple[Floats, Floats, float]:
+) -> tuple[tuple[Floats, Floats], float]:
     """Offset and gain of each pixel, and the largest sag of a curve that a line replaces, in DN.
 
     The sag is the range of the difference between the curve and the line through its ends.
@@ -289,7 +266,7 @@ def line_of(
                 "order 1: fit a response of order 1, or give 'linearise' (--linearise), two raw "
                 "values in DN between which a straight line takes the place of the curve"
             )
-        return planes[0], planes[1], 0.0
+        return (planes[0], planes[1]), 0.0
     return _chord(planes, usable(correction.flags), *check_range(linearise))
 
 
@@ -311,22 +288,17 @@ def check_range(linearise: object) -> tuple[float, float]:
     return low, high
 
 
-def _chord(planes: Floats, used: Bools, low: float, high: float) -> tuple[Floats, Floats, float]:
+def _chord(
+    planes: Floats, used: Bools, low: float, high: float
+) -> tuple[tuple[Floats, Floats], float]:
     """Line parallel to the chord with the smallest largest deviation, and the largest sag."""
-    ends = [_curve(planes, value) for value in (low, high)]
+    ends = [np.asarray(polyval(value, planes)) for value in (low, high)]
     gain = (ends[1] - ends[0]) / (high - low)
     offset = ends[0] - gain * low
     lowest, highest = np.zeros(gain.shape), np.zeros(gain.shape)
     for value in np.linspace(low, high, _STEPS):
-        away = _curve(planes, value) - offset - gain * value
+        away = polyval(value, planes) - offset - gain * value
         lowest, highest = np.minimum(lowest, away), np.maximum(highest, away)
     sag = (highest - lowest)[used & np.isfinite(gain)]
     # Half of the sag is left on either side.
-    return offset + (lowest + highest) / 2, gain, float(sag.max(initial=0))
-
-
-def _curve(planes: Floats, raw: float) -> Floats:
-    total = np.zeros(planes.shape[1:])
-    for plane in planes[::-1]:
-        total = total * raw + plane
-    return total
+    return (offset + (lowest + highest) / 2, gain), float(sag.max(initial=0))

@@ -1,16 +1,13 @@
 """The adaptive loop with memories of whole numbers."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import Array, as_array, check_shape, positive_workers, read_only
+from equipix._check import Array, ArrayLike, as_array, check_shape, positive_workers, read_only
 from equipix._native import __version__
 from equipix.errors import InputError
 from equipix.hardware.table import Table
-from equipix.hardware.words import Format, check_width, exponent_of
+from equipix.hardware.words import STEPS, WIDTHS, Format, check_width, exponent_of
 
 _FINEST = 12
 """The finest step is 2^-12."""
@@ -66,11 +63,8 @@ class AdaptiveLoop:
         offset_bits: int = 16,
         step: float = 2**-6,
     ) -> None:
-        self._widths = [
-            check_width("adc_bits", adc_bits),
-            check_width("gain_bits", gain_bits),
-            check_width("offset_bits", offset_bits),
-        ]
+        widths = {"adc_bits": adc_bits, "gain_bits": gain_bits, "offset_bits": offset_bits}
+        self._widths = [check_width(name, bits) for name, bits in widths.items()]
         exponent = exponent_of("step", step)
         if not -_FINEST <= exponent <= -1:
             raise InputError(
@@ -152,21 +146,16 @@ class AdaptiveLoop:
             If a gain has fallen to 0.
         """
         adc, gain, offset = self._widths
-        made = Format(
-            adc_bits=adc,
-            dac_bits=8,
-            offset_bits=offset,
-            gain_bits=gain,
-            out_bits=adc,
-            adc=0,
-            coarse=0,
-            offset=adc - offset,
-            gain=1 - gain,
-            out=0,
-            base=0,
-        )
+        widths = zip(WIDTHS, (adc, 8, offset, gain, adc), strict=True)
+        steps = zip(STEPS, (0, 0, adc - offset, 1 - gain, 0), strict=True)
+        made = Format(**dict(widths), **dict(steps), base=0)
         blank = np.zeros(self._gain.shape, np.uint16)
-        metadata = {"equipix": __version__, "correction": "adaptive loop", "step": 2.0**-self._step}
+        metadata = {
+            "equipix": __version__,
+            "correction": "adaptive loop",
+            "step": 2.0**-self._step,
+            "leaves_offset": True,  # the mean offset is 0: that of raw frames stays
+        }
         return Table(
             made, blank, self._offset.copy(), self._gain.copy(), blank.astype(np.uint32), metadata
         )

@@ -1,20 +1,17 @@
 """How much quality C the words of a table cost, and which widths suffice."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Array, as_array, naming_memory, number
+from equipix._check import Array, ArrayLike, as_array, naming_memory, positive
 from equipix.correction.protocol import Correction
 from equipix.errors import InputError
 from equipix.findings import usable
 from equipix.hardware.table import Table
-from equipix.hardware.words import check_width
 from equipix.metrics import correctability
 from equipix.metrics.correctability import Correctability
 
@@ -84,10 +81,8 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     >>> narrow.added > 10 * wide.added
     True
     """
-    raw = as_array("frames", frames, ndim=3)
+    raw, exact, before = _level("frames", correction, frames)
     table = Table.of(correction, **options)
-    exact = correction.correct(raw, flagged="nan")
-    before = correctability(exact)
     words = table.digitise(raw)[:, usable(table.flags)]
     at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
     _refuse_clipped(raw, table, words, at_ends)
@@ -136,11 +131,7 @@ class Widths:
 
 @naming_memory("widths of a table")
 def smallest_widths(
-    correction: Correction,
-    levels: Sequence[ArrayLike],
-    *,
-    added: float = 0.1,
-    **options: Any,
+    correction: Correction, levels: Sequence[ArrayLike], *, added: float = 0.1, **options: Any
 ) -> Widths:
     """Find the smallest widths of the memories that cost no more than a share of the noise.
 
@@ -166,24 +157,29 @@ def smallest_widths(
     InputError
         As of `quality`; or if `options` names a width that is sought.
     """
-    if not number("added", added) > 0:
-        raise InputError(f"'added' is {added!r}, expected more than 0")
+    positive("added", added)
     sought = {"offset_bits", "gain_bits"} & set(options)
     if sought or not len(levels):
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
     Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
-    measured = [_level(correction, frames) for frames in levels]
+    measured = [_level("levels", correction, frames) for frames in levels]
 
     def worst(offset_bits: int, gain_bits: int) -> float:
-        widths = {"offset_bits": offset_bits, "gain_bits": gain_bits}
-        return _worst(correction, measured, widths | options)
+        """Most that words add over all levels; infinite where those of usable pixels do not fit."""
+        widths: dict[str, Any] = {"offset_bits": offset_bits, "gain_bits": gain_bits}
+        try:
+            table = Table.of(correction, **widths, **options)
+        except InputError:
+            # With 16 bits they fit.
+            return float("inf")
+        return max(_added(table.correct(raw), exact, before) for raw, exact, before in measured)
 
     found = {
         "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
         "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
         "both": {bits: worst(bits, bits) for bits in _WIDTHS},
     }
-    offset, gain, both = (_first(each.items(), added) for each in found.values())
+    offset, gain, both = (_first(each, added) for each in found.values())
     return Widths(offset, gain, both, found)
 
 
@@ -195,27 +191,13 @@ class _Level(NamedTuple):
     before: Correctability
 
 
-def _level(correction: Correction, frames: ArrayLike) -> _Level:
-    raw = as_array("levels", frames, ndim=3)
+def _level(name: str, correction: Correction, frames: ArrayLike) -> _Level:
+    raw = as_array(name, frames, ndim=3)
     exact = correction.correct(raw, flagged="nan")
     return _Level(raw, exact, correctability(exact))
 
 
-def _worst(correction: Correction, levels: list[_Level], options: dict[str, Any]) -> float:
-    """Most that words add over all levels; infinite where those of usable pixels do not fit."""
-    try:
-        table = Table.of(correction, **options)
-    except InputError:
-        # With 16 bits they fit.
-        return float("inf")
-    return max(_added(table.correct(raw), exact, before) for raw, exact, before in levels)
-
-
-def _first(found: Iterable[tuple[int, float]], limit: float) -> int | None:
+def _first(found: dict[int, float], limit: float) -> int | None:
     """Return the smallest width from which on none adds more than the limit."""
-    last = None
-    for bits, added in sorted(found, reverse=True):
-        if added > limit:
-            break
-        last = check_width("bits", bits)
-    return last
+    widths = takewhile(lambda bits: not found[bits] > limit, sorted(found, reverse=True))
+    return min(widths, default=None)

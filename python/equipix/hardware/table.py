@@ -2,48 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import (
     Array,
-    Bools,
+    ArrayLike,
     Flagged,
     Floats,
     ReadOnly,
-    as_array,
     naming_memory,
     number,
     positive_workers,
 )
-from equipix.correction.apply import apply
-from equipix.correction.protocol import Correction, cfa_of, check_correction
+from equipix.correction.apply import CorrectionBase, apply, checked_frames
+from equipix.correction.protocol import Correction, Dark, check_correction, with_dark
 from equipix.errors import FileError, InputError
-from equipix.findings import usable
-from equipix.hardware.c_header import from_c_header, to_c_header
+from equipix.findings import Finding, usable
+from equipix.hardware import c_header, table_files
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
-from equipix.hardware.table_files import (
-    Content,
-    check_words,
-    from_binary,
-    from_memory_image,
-    to_binary,
-    to_memory_image,
-)
-from equipix.hardware.words import Format, check_width, chosen_exponent, exponent_of
+from equipix.hardware.table_files import Content, check_words
+from equipix.hardware.words import WIDTHS, Format, check_width, chosen_exponent, exponent_of
 from equipix.io.paths import as_path, write_whole
 from equipix.measured.colour import Colours
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Table(ReadOnly):
+class Table(CorrectionBase):
     r"""Words of a correction: a coarse offset ahead of the ADC, fine offset and gain behind it.
 
     Attributes
@@ -97,6 +87,11 @@ class Table(ReadOnly):
     gain: Array
     flags: Array
     metadata: dict[str, Any] = field(default_factory=dict)
+    dark: ClassVar[None] = None
+    takes_dark: ClassVar[bool] = False
+    needs_dark: ClassVar[bool] = False
+    limits: ClassVar[None] = None
+    saturation: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
@@ -169,29 +164,49 @@ class Table(ReadOnly):
             If a width or a step is out of range, the correction is curved, or words of usable
             pixels do not fit; the message has their number and the width that would hold them.
         """
-        widths = {
-            "adc_bits": adc_bits,
-            "dac_bits": dac_bits,
-            "offset_bits": offset_bits,
-            "gain_bits": gain_bits,
-            "out_bits": out_bits,
-        }
-        steps = {
-            "dac_step": dac_step,
-            "offset_step": offset_step,
-            "gain_step": gain_step,
-            "out_step": out_step,
-        }
-        content = content_of(
-            correction, widths, steps, adc_step=adc_step, lowest=lowest, linearise=linearise
+        check_correction("correction", correction)
+        bits = zip(WIDTHS, (adc_bits, dac_bits, offset_bits, gain_bits, out_bits), strict=True)
+        widths = {name: check_width(name, width) for name, width in bits}
+        if not np.isfinite(number("lowest", lowest)):
+            raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
+        adc, out = exponent_of("adc_step", adc_step), chosen_exponent("out_step", out_step)
+        steps = Steps(
+            adc,
+            chosen_exponent("dac_step", dac_step),
+            chosen_exponent("offset_step", offset_step),
+            chosen_exponent("gain_step", gain_step),
+            adc + widths["adc_bits"] - widths["out_bits"] if out is None else out,
         )
-        return cls(*content)
+        with naming_memory("making a table"):
+            line, sag = line_of(correction, linearise)
+            found = encode(line, correction.flags, widths, steps, float(lowest))
+            refuse_far_offsets(found, line, widths, steps, float(lowest))
+        colours = correction.colours
+        metadata = {
+            **origin(correction),
+            **({} if colours is None else {"cfa": colours.rows}),
+            **({"leaves_offset": True} if correction.leaves_offset else {}),
+            **found.metadata,
+            "findings": [vars(each) for each in correction.findings],
+        }
+        if linearise is not None:
+            metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
+        return cls(*found._replace(metadata=metadata))
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.gain.shape
-        return rows, cols
+    def leaves_offset(self) -> bool:
+        """Whether words were made of a correction that leaves an offset."""
+        return bool(self.metadata.get("leaves_offset", False))
+
+    @property
+    def colours(self) -> Colours | None:
+        """Colour filters of the pixels, where they are known."""
+        return Colours.of(self.metadata.get("cfa"))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What limits the correction that it is of."""
+        return tuple(Finding(**each) for each in self.metadata.get("findings", ()))
 
     @property
     def coefficients(self) -> Floats:
@@ -222,8 +237,16 @@ class Table(ReadOnly):
         InputError
             If a shape does not fit, or a usable pixel is not finite.
         """
-        raw = self._frames(frames)
-        return digitised(raw, self.coarse, usable(self.flags), self.format)
+        raw, f, used = checked_frames(frames, self.shape), self.format, usable(self.flags)
+        pedestal = np.ldexp(self.coarse.astype(np.float64), f.coarse)
+        words = np.empty(raw.shape, np.uint16)
+        for source, target in zip(_each(raw), _each(words), strict=True):
+            lost = int(np.count_nonzero(~np.isfinite(source) & used))
+            if lost:
+                raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
+            steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
+            target[...] = np.clip(steps, 0, f.largest_word)
+        return words
 
     def apply(self, frames: ArrayLike, *, workers: int | None = None) -> Array:
         """Corrected words, bit by bit as the electronics gives them.
@@ -249,11 +272,31 @@ class Table(ReadOnly):
 
     def applied(self, frames: ArrayLike, *, workers: int | None = None) -> Applied:
         """Like `apply`, with the numbers of outputs that were limited."""
-        raw = self._frames(frames)
-        return applied(raw, self.gain, self.offset, self.format, positive_workers(workers))
+        raw = checked_frames(frames, self.shape)
+        if raw.dtype not in (np.uint8, np.uint16):
+            raise InputError(
+                f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
+                "table.digitise(frames) makes them of raw values"
+            )
+        words = np.ascontiguousarray(raw, np.uint16)
+        out, stack = np.empty(words.shape, np.uint16), (-1, *self.shape)
+        below, above = _native.apply_words(
+            words.reshape(stack),
+            np.ascontiguousarray(self.gain),
+            np.ascontiguousarray(self.offset),
+            out.reshape(stack),
+            self.format.arithmetic,
+            workers=positive_workers(workers),
+        )
+        return Applied(out, below, above)
 
     def correct(
-        self, frames: ArrayLike, *, flagged: Flagged = "nan", out: Array | None = None
+        self,
+        frames: ArrayLike,
+        *,
+        dark: Dark = "stored",
+        flagged: Flagged = "nan",
+        out: Array | None = None,
     ) -> Array:
         """Raw frames as amplifier, ADC and table correct them, in DN.
 
@@ -261,6 +304,8 @@ class Table(ReadOnly):
         ----------
         frames : array_like, shape (rows, cols) or (n, rows, cols)
             Raw frames in DN, as without the DAC.
+        dark : "stored"
+            No other: the offsets are words of the table.
         flagged : {"nan", "keep", "replace"}
             The value of pixels flagged ``DO_NOT_USE``: NaN, the code 0, or the mean of the nearest
             good pixels around.
@@ -275,15 +320,16 @@ class Table(ReadOnly):
         Raises
         ------
         InputError
-            If a shape does not fit, `flagged` is unknown, or a usable pixel is not finite.
+            If a shape does not fit, `flagged` is unknown, a usable pixel is not finite, or frames
+            are of another bit depth than the sensor.
         """
+        with_dark(self, dark)
 
-        def formula(frame: Array, corrected: Array) -> None:
+        def formula(frame: Array) -> Array:
             words = self.apply(self.digitise(frame))
-            corrected[...] = np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
+            return np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
 
-        cfa = Colours.of(self.metadata.get("cfa"))
-        return apply(frames, formula, flags=self.flags, flagged=flagged, out=out, cfa=cfa)
+        return apply(self, frames, dark, flagged, out, formula)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads bit by bit.
@@ -313,17 +359,11 @@ class Table(ReadOnly):
         arrays = (self.coarse, self.offset, self.gain, self.flags)
         return Content(self.format, *arrays, self.metadata)
 
-    def _frames(self, frames: ArrayLike) -> Array:
-        raw = as_array("frames", frames, ndim=(2, 3))
-        if raw.shape[-2:] != self.shape:
-            raise InputError(f"'frames' has shape {raw.shape}, the table {self.shape}")
-        return raw
-
 
 _FORMATS = {
-    ".bin": (to_binary, from_binary),
-    ".hex": (to_memory_image, from_memory_image),
-    ".h": (to_c_header, from_c_header),
+    ".bin": (table_files.to_binary, table_files.from_binary),
+    ".hex": (table_files.to_memory_image, table_files.from_memory_image),
+    ".h": (c_header.to_c_header, c_header.from_c_header),
 }
 
 SUFFIXES = tuple(_FORMATS)
@@ -358,95 +398,12 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-def content_of(
-    correction: Correction,
-    widths: Mapping[str, int],
-    steps: Mapping[str, float | None],
-    *,
-    adc_step: float,
-    lowest: float,
-    linearise: tuple[float, float] | None,
-) -> Content:
-    """Make the parts of a table, as `Table.of` describes them.
-
-    Raises
-    ------
-    InputError
-        As of `Table.of`.
-    """
-    check_correction("correction", correction)
-    bits = {name: check_width(name, width) for name, width in widths.items()}
-    if not np.isfinite(number("lowest", lowest)):
-        raise InputError(f"'lowest' is {lowest!r}, expected a corrected value in DN")
-    exponents = _exponents(exponent_of("adc_step", adc_step), steps, bits)
-    with naming_memory("making a table"):
-        offset, gain, sag = line_of(correction, linearise)
-        found = encode((offset, gain), correction.flags, bits, exponents, float(lowest))
-        refuse_far_offsets(found, (offset, gain), bits, exponents, float(lowest))
-    colours = cfa_of(correction)
-    metadata = {
-        **origin(correction),
-        **({} if colours is None else {"cfa": colours.rows}),
-        "lowest": float(lowest),
-        "largest_error_dn": found.largest_error,
-    }
-    if linearise is not None:
-        metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
-    return Content(found.format, found.coarse, found.offset, found.gain, found.flags, metadata)
-
-
-def _exponents(adc: int, steps: Mapping[str, float | None], bits: Mapping[str, int]) -> Steps:
-    """Exponents of the steps; unless given, the output has the range of the ADC."""
-    out = chosen_exponent("out_step", steps["out_step"])
-    return Steps(
-        adc,
-        chosen_exponent("dac_step", steps["dac_step"]),
-        chosen_exponent("offset_step", steps["offset_step"]),
-        chosen_exponent("gain_step", steps["gain_step"]),
-        adc + bits["adc_bits"] - bits["out_bits"] if out is None else out,
-    )
-
-
 class Applied(NamedTuple):
     """Corrected words, and how many outputs were limited to 0 and to the largest word."""
 
     words: Array
     below: int
     above: int
-
-
-def digitised(raw: Array, coarse: Array, used: Bools, f: Format) -> Array:
-    """Words of the ADC behind the subtracting amplifier, as `Table.digitise` describes them."""
-    pedestal = np.ldexp(coarse.astype(np.float64), f.coarse)
-    words = np.empty(raw.shape, np.uint16)
-    for source, target in zip(_each(raw), _each(words), strict=True):
-        lost = int(np.count_nonzero(~np.isfinite(source) & used))
-        if lost:
-            raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
-        steps = np.rint(np.ldexp(np.where(used, source, 0) - pedestal, -f.adc))
-        target[...] = np.clip(steps, 0, f.largest_word)
-    return words
-
-
-def applied(raw: Array, gain: Array, offset: Array, f: Format, workers: int | None) -> Applied:
-    """Correct words of the ADC, and count the outputs that were limited."""
-    if raw.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
-            "table.digitise(frames) makes them of raw values"
-        )
-    words = np.ascontiguousarray(raw, np.uint16)
-    out = np.empty(words.shape, np.uint16)
-    stack = (-1, *gain.shape)
-    below, above = _native.apply_words(
-        words.reshape(stack),
-        np.ascontiguousarray(gain),
-        np.ascontiguousarray(offset),
-        out.reshape(stack),
-        f.arithmetic,
-        workers=workers,
-    )
-    return Applied(out, below, above)
 
 
 def _each(stack: Array) -> Array:

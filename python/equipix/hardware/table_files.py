@@ -12,8 +12,6 @@ coarse offset, the fine offset in two's complement, and the gain; the address is
 Flags of a pixel follow its word as a comment.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib
@@ -30,6 +28,8 @@ from equipix.hardware.words import Format
 
 NEWEST = 1
 """Format number of the files that this version writes."""
+
+_FOREIGN = "holds no table that equipix has written"
 
 DTYPES = {"coarse": np.uint16, "offset": np.int16, "gain": np.uint16, "flags": np.uint32}
 """Type of each array, in the order of the files."""
@@ -58,21 +58,17 @@ def check_words(content: Content) -> None:
     InputError
         If a type or a size is another, or words do not fit their widths.
     """
-    for name, dtype in DTYPES.items():
-        array = content.arrays()[name]
+    for name, array in content.arrays().items():
+        dtype = DTYPES[name]
         if array.dtype != dtype or array.ndim != 2 or array.shape != content.gain.shape:
             raise InputError(
                 f"'{name}' is {array.dtype} of shape {array.shape}, expected "
                 f"{np.dtype(dtype)} of {content.gain.shape}"
             )
-    f = content.format
-    for name, bits in (
-        ("coarse", f.dac_bits),
-        ("offset", f.offset_bits - 1),
-        ("gain", f.gain_bits),
-    ):
+    for name, bits in content.format.stored.items():
         words = content.arrays()[name].astype(np.int32)
-        if np.any((words >= 2**bits) | (words < -(2**bits))):
+        end = 2 ** (bits - (name == "offset"))
+        if np.any((words >= end) | (words < -end)):
             raise InputError(f"'{name}' holds words of more than its width")
     if np.any((content.gain == 0) != ~usable(content.flags)):
         raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
@@ -105,7 +101,7 @@ def header(content: Content) -> str:
     return json.dumps(told).replace("*", "\\u002a").replace("?", "\\u003f")
 
 
-def read_header(path: Path, text: str) -> dict[str, Any]:
+def read_header(path: Path, text: str, first: str = "") -> dict[str, Any]:
     """Parse the line that `header` made.
 
     Raises
@@ -114,11 +110,11 @@ def read_header(path: Path, text: str) -> dict[str, Any]:
         If the file holds no table, or one of a newer version.
     """
     try:
-        told = json.loads(text)
+        told: Any = json.loads(text.removeprefix(first)) if text.startswith(first) else None
     except ValueError:
         told = None
     if not isinstance(told, dict) or told.get("kind") != "equipix table":
-        raise FileError(f"{path}: holds no table that equipix has written")
+        raise FileError(f"{path}: {_FOREIGN}")
     version = told.get("version")
     if version != NEWEST:
         raise FileError(
@@ -177,7 +173,7 @@ def to_binary(content: Content, _name: str) -> bytes:
 def from_binary(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     if data[:4] != _MAGIC:
-        raise FileError(f"{path}: holds no table that equipix has written")
+        raise FileError(f"{path}: {_FOREIGN}")
     if len(data) < _FIXED:
         raise FileError(f"{path}: holds {len(data)} bytes, less than the header: incomplete")
     start = _FIXED + int(_LENGTH.unpack_from(data, len(_MAGIC))[0])
@@ -203,11 +199,10 @@ def _aligned(size: int) -> int:
 
 def _stored(widths: Format) -> dict[str, np.dtype[np.generic]]:
     """Type of each array in the file."""
-    bits = {"coarse": widths.dac_bits, "offset": widths.offset_bits, "gain": widths.gain_bits}
     found = {}
     for name, dtype in DTYPES.items():
         full = np.dtype(dtype)
-        narrow = bits.get(name, 32) <= 8
+        narrow = widths.stored.get(name, 32) <= 8
         found[name] = np.dtype(f"{full.kind}1") if narrow else full.newbyteorder("<")
     return found
 
@@ -221,7 +216,7 @@ def to_memory_image(content: Content, _name: str) -> bytes:
     offset = content.offset.astype(np.int64) & (2**f.offset_bits - 1)
     packed = (content.coarse.astype(np.int64) << f.offset_bits | offset) << f.gain_bits
     packed |= content.gain
-    digits = -(-(f.dac_bits + f.offset_bits + f.gain_bits) // 4)
+    digits = -(-sum(f.stored.values()) // 4)
     lines = [f"{_FIRST}{header(content)}", f"// {_fields(f)}"]
     for word, flags in zip(packed.flat, content.flags.flat, strict=True):
         lines.append(f"{word:0{digits}x}" + (f" // {flags:08x}" if flags else ""))
@@ -231,14 +226,12 @@ def to_memory_image(content: Content, _name: str) -> bytes:
 def from_memory_image(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     first, *lines = data.decode().splitlines()
-    if not first.startswith(_FIRST):
-        raise FileError(f"{path}: holds no table that equipix has written")
-    told = read_header(path, first.removeprefix(_FIRST))
+    told = read_header(path, first, _FIRST)
     f = Format(**told["format"])
     parts = [line.partition("//") for line in lines if not line.startswith("//")]
     packed = np.array([int(word, 16) for word, _, _ in parts], np.int64)
     flags = np.array([int(flags or "0", 16) for _, _, flags in parts], np.int64)
-    if np.any(packed >= 2 ** (f.dac_bits + f.offset_bits + f.gain_bits)):
+    if np.any(packed >= 2 ** sum(f.stored.values())):
         raise FileError(f"{path}: holds words wider than its header says")
     offset = packed >> f.gain_bits & (2**f.offset_bits - 1)
     arrays: dict[str, Array] = {

@@ -1,17 +1,23 @@
 """Widths of words, the steps that they stand for, and how values become words."""
 
-from __future__ import annotations
-
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
-from equipix._check import Floats, number
+from equipix._check import Floats, is_whole, number
 from equipix.errors import InputError
 
 _NARROWEST, WIDEST = 8, 16
 """Widths of words, in bits."""
+
+WIDTHS = ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits")
+"""Names of the widths of a `Format`."""
+
+STEPS = ("adc", "coarse", "offset", "gain", "out")
+"""Names of the exponents of its steps."""
 
 _EXPONENT = 40
 """Steps are from 2^-40 to 2^40 DN."""
@@ -58,16 +64,15 @@ class Format:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        for name in ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits"):
+        for name in WIDTHS:
             check_width(name, getattr(self, name))
-        for name in ("adc", "coarse", "offset", "gain", "out"):
+        limits = dict.fromkeys(STEPS, _EXPONENT) | {"base": 2**31 - 1, "zero": 2**31 - 1}
+        for name, limit in limits.items():
             value = getattr(self, name)
-            if not isinstance(value, int) or abs(value) > _EXPONENT:
-                raise InputError(f"'{name}' is {value!r}, expected -{_EXPONENT} to {_EXPONENT}")
-        for name in ("base", "zero"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or abs(value) >= 2**31:
-                raise InputError(f"'{name}' is {value!r}, expected a whole number of 32 bits")
+            if not isinstance(value, int) or abs(value) > limit:
+                raise InputError(
+                    f"'{name}' is {value!r}, expected a whole number from -{limit} to {limit}"
+                )
         product, offset, out = self.shifts
         bits = max(32 + product, 16 + offset, out)
         if bits > _SUM_BITS:
@@ -80,15 +85,13 @@ class Format:
     @property
     def arithmetic(self) -> tuple[int, int, int, int, int, int, int]:
         """Numbers that the compiled part needs."""
-        return (
-            self.adc_bits,
-            self.out_bits,
-            self.adc,
-            self.offset,
-            self.gain,
-            self.out,
-            self.base,
-        )
+        return self.adc_bits, self.out_bits, self.adc, self.offset, self.gain, self.out, self.base
+
+    @property
+    def stored(self) -> dict[str, int]:
+        """Bits of the words of a pixel, by the names of a table's arrays."""
+        widths = (self.dac_bits, self.offset_bits, self.gain_bits)
+        return dict(zip(("coarse", "offset", "gain"), widths, strict=True))
 
     @property
     def shifts(self) -> tuple[int, int, int]:
@@ -104,8 +107,7 @@ class Format:
 
 def check_width(name: str, bits: object) -> int:
     """Refuse a width out of range."""
-    whole = isinstance(bits, int | np.integer) and not isinstance(bits, bool)
-    if not whole or not _NARROWEST <= bits <= WIDEST:  # type: ignore[operator]
+    if not is_whole(bits, _NARROWEST, WIDEST):
         raise InputError(f"'{name}' is {bits!r}, expected {_NARROWEST} to {WIDEST} bits")
     return int(bits)  # type: ignore[call-overload, no-any-return]
 
@@ -157,7 +159,7 @@ class Words:
     def finest(self, values: Floats, not_below: int) -> int:
         """Return the exponent of the finest step with which the largest values fit."""
         exponent, ends = not_below, np.array([values.min(), values.max()])
-        largest = Words(self.name, self.bits, self.signed, -(2**self.bits), self.floor)
+        largest = replace(self, lowest=-(2**self.bits))
         while exponent < _EXPONENT and largest.outside(ends, exponent):
             exponent += 1
         return exponent
@@ -179,13 +181,12 @@ class Words:
             )
         return self.rounded(values, exponent)
 
+    def wide_enough(self, values: Floats, step: Callable[[Self], int]) -> int:
+        """Bits that hold all values, in steps that follow from the wider words; 0 if none do."""
+        wider = (replace(self, bits=bits) for bits in range(self.bits + 1, WIDEST + 1))
+        return next((each.bits for each in wider if not each.outside(values, step(each))), 0)
+
     def _remedy(self, values: Floats, exponent: int) -> str:
-        wide = [
-            bits
-            for bits in range(self.bits + 1, WIDEST + 1)
-            if not Words(self.name, bits, self.signed, self.lowest, self.floor).outside(
-                values, exponent
-            )
-        ]
+        bits = self.wide_enough(values, lambda _: exponent)
         others = f"another {self.name}_step, or flag these pixels"
-        return f"{wide[0]} bits would hold them; or take {others}" if wide else f"take {others}"
+        return f"{bits} bits would hold them; or take {others}" if bits else f"take {others}"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from equipix.errors import FileError, InputError
 from equipix.io import npz, tiff
-from equipix.io.frames import frame_format
+from equipix.io.frames import Header, frame_format, header
 from equipix.io.paths import as_path, reading, write_whole
 
 _FORMATS = {".tif": tiff, ".tiff": tiff, ".npz": npz}
@@ -131,7 +131,11 @@ def saved_kind(path: Path) -> str | None:
     if suffix not in SUFFIXES or (suffix != ".npz" and frame_format(path)[1].kind != "f"):
         return None
     with reading(path):
-        kind = _parsed(_FORMATS[suffix].description(path)).get("kind")
+        return _kind(_FORMATS[suffix].description(path))
+
+
+def _kind(text: str) -> str | None:
+    kind = _parsed(text).get("kind")
     return kind if isinstance(kind, str) else None
 
 
@@ -143,7 +147,19 @@ def refuse_saved(path: Path) -> None:
     FileError
         With what the file holds.
     """
-    kind = saved_kind(path)
+    _refuse_kind(path, saved_kind(path))
+
+
+def _refuse_kind(path: Path, kind: str | None) -> None:
     if kind is not None:
         article = "" if kind.endswith("s") else "a "
         raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
+
+
+def raw_header(path: Path) -> Header:
+    """Shape, dtype and text of raw frames; what `save_pages` wrote is refused like there."""
+    if path.suffix.lower() == ".npz":
+        refuse_saved(path)
+    found = header(path)
+    _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)
+    return found

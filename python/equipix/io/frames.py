@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,8 +98,24 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     try:
         count, rows, cols, bits = _native.file_format(path)
     except UnsupportedFileError:
-        return tiff.frame_format(path)
+        return tiff.header(path)[:2]
     return (count, rows, cols), np.dtype(f"uint{bits}")
+
+
+class Header(NamedTuple):
+    """Shape (n, rows, cols) and dtype of the frames of a file, and the text stored with them."""
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    description: str
+
+
+def header(path: Path) -> Header:
+    """Read what a file says of its frames, a TIFF in one go; the errors are of `frame_format`."""
+    suffix = path.suffix.lower()
+    if suffix in (".tif", ".tiff"):
+        return Header(*tiff.header(path))
+    return Header(*frame_format(path), png.description(path) if suffix == ".png" else "")
 
 
 def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:

@@ -30,13 +30,16 @@ _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
 _TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that leave space for the directories
 
 
-def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
-    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded."""
+def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
+    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded; its text.
+
+    The text is stored with the first page; empty where there is none.
+    """
     with reading(path), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         _check_page(path, page, file.filehandle.size)
         count = max(len(file.pages), file.series[0].size // page.size)
-        return (count, *page.shape), page.dtype
+        return (count, *page.shape), page.dtype, str(page.description)
 
 
 def stream_frames(path: Path) -> Iterator[NDArray[Any]]:

@@ -9,20 +9,28 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Progress, as_array, as_floats, as_level, naming_memory, positive_workers
+from equipix._check import (
+    Progress,
+    as_array,
+    as_floats,
+    as_level,
+    as_mask,
+    naming_memory,
+    positive_workers,
+)
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
 from equipix.io.record import read_record
+from equipix.measured.saturation import level_of
 from equipix.measured.statistics import (
     FrameStatistics,
-    _check_mask,
     _masked,
     _step,
     _subtract,
@@ -112,22 +120,33 @@ def average(
     >>> result.mean, result.variance
     (array([[2., 2.]]), array([[2., 0.]]))
     """
-    workers = positive_workers(workers)
-    level, rejection = as_level(saturation), None if reject is None else Rejection(reject)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
+    how = _How(
+        as_level(saturation),
+        None if mask is None else as_array("mask", mask, ndim=2),
+        None if reject is None else Rejection(reject),
+        positive_workers(workers),
+        progress,
+    )
     taken = _paths_or_frames(frames)
-    out = None if mask is None else as_array("mask", mask, ndim=2)
     with naming_memory("averaging"):
         if isinstance(taken, list):
-            statistics = _average_files(taken, level, out, workers, progress, rejection)
+            statistics = _average_files(taken, how)
         else:
-            given = batches(taken)
-            statistics = _average_batches(
-                given, level, out, workers, progress, _length(frames), rejection
-            )
+            statistics = _average_batches(batches(taken), how, _length(frames))
         if reject is not None:
             statistics = dataclasses.replace(statistics, reject=float(reject))
-        return _masked(_subtract(statistics, offset), out)
+        return _masked(_subtract(statistics, offset), how.mask)
+
+
+class _How(NamedTuple):
+    """Options of an average, checked but for the shape of the mask."""
+
+    level: float | None
+    mask: NDArray[Any] | None
+    rejection: Rejection | None
+    workers: int | None
+    progress: Progress | None
 
 
 def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
@@ -152,36 +171,25 @@ def _length(source: Any) -> int:
     return len(source) if hasattr(source, "__len__") else 0
 
 
-def _average_files(
-    names: list[Any],
-    level: float | None,
-    mask: NDArray[Any] | None,
-    workers: int | None,
-    progress: Progress | None,
-    rejection: Rejection | None,
-) -> FrameStatistics:
+def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     paths = find_files(names)
     if any(path.suffix.lower() == ".npz" for path in paths):
-        return _saved(paths, level, mask, rejection)
-    if rejection is None:
+        return _saved(paths, how)
+    if how.rejection is None:
         with suppress(UnsupportedFileError):
-            if mask is not None:
-                _check_mask(mask, frame_format(paths[0])[0][1:])
-            maps = _native.average_files(paths, level, mask, workers, progress)
-            return _statistics(maps, frame_format(paths[0])[1], level)
+            if how.mask is not None:
+                as_mask(how.mask, frame_format(paths[0])[0][1:])
+            maps = _native.average_files(paths, how.level, how.mask, how.workers, how.progress)
+            dtype = frame_format(paths[0])[1]
+            return _statistics(maps, dtype, level_of(dtype, how.level))
     if any(saved_shape(path) for path in paths):
-        return _saved(paths, level, mask, rejection)
-    stream = stream_frames(paths, workers=workers)
+        return _saved(paths, how)
+    stream = stream_frames(paths, workers=how.workers)
     given = batches(frame for _, frames in stream for frame in frames)
-    return _average_batches(given, level, mask, workers, progress, len(paths), rejection)
+    return _average_batches(given, how, len(paths))
 
 
-def _saved(
-    paths: list[Path],
-    level: float | None,
-    mask: NDArray[Any] | None,
-    rejection: Rejection | None,
-) -> FrameStatistics:
+def _saved(paths: list[Path], how: _How) -> FrameStatistics:
     """Read the one average that is given in the place of frames."""
     path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
     if others:
@@ -189,16 +197,17 @@ def _saved(
             f"{path}: holds averaged frames, which cannot be averaged with other files: name one "
             "saved average alone, or the frames of all"
         )
-    if rejection is not None:
+    if how.rejection is not None:
         raise InputError(f"{path}: holds averaged frames, from which 'reject' cannot leave out any")
     statistics = read_record(path, FrameStatistics)
+    level = how.level
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
             f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
         )
-    _check_mask(mask, statistics.mean.shape)
-    return statistics if mask is None else dataclasses.replace(statistics, light_variance=None)
+    as_mask(how.mask, statistics.mean.shape)
+    return statistics if how.mask is None else dataclasses.replace(statistics, light_variance=None)
 
 
 def _statistics(
@@ -211,43 +220,28 @@ def _statistics(
         variance / count,
         count,
         saturated,
-        saturation=_level_of(dtype, level),
+        saturation=level,
         raw=dtype.kind in "iu",
         step=_step(mean, variance, count),
         light_variance=None if np.isnan(light_variance) else light_variance,
     )
 
 
-def _level_of(dtype: np.dtype[Any], level: float | None) -> float | None:
-    """Saturation level of samples of a dtype: the largest whole number, unless given."""
-    if level is None and dtype.kind in "iu":
-        return float(np.iinfo(dtype).max)
-    return level
-
-
-def _average_batches(
-    given: Iterator[NDArray[Any]],
-    level: float | None,
-    mask: NDArray[Any] | None,
-    workers: int | None,
-    progress: Progress | None,
-    total: int,
-    rejection: Rejection | None,
-) -> FrameStatistics:
+def _average_batches(given: Iterator[NDArray[Any]], how: _How, total: int) -> FrameStatistics:
     first = next(given)
-    dtype, level = sum_dtype(first), _level_of(first.dtype, level)
+    dtype, level = sum_dtype(first), level_of(first.dtype, how.level)
     everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
-    if rejection is not None:
-        dtype, everything = np.dtype(np.float64), rejection.cleaned(everything)
-    _check_mask(mask, first.shape[1:])
-    sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, workers)
+    if how.rejection is not None:
+        dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything)
+    mask = as_mask(how.mask, first.shape[1:])
+    sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, how.workers)
     done = 0
     for batch in everything:
         sums.add(np.ascontiguousarray(unmasked(batch, dtype), dtype=dtype))
         done += len(batch)
-        if progress is not None:
-            progress(done, max(done, total), "average")
+        if how.progress is not None:
+            how.progress(done, max(done, total), "average")
     maps = sums.finish()
-    if rejection is not None:
-        maps = (maps[0], maps[1] / rejection.variance_kept, *maps[2:])
+    if how.rejection is not None:
+        maps = (maps[0], maps[1] / how.rejection.variance_kept, *maps[2:])
     return _statistics(maps, first.dtype, level)

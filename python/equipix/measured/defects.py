@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from equipix._check import Array, Bools, Floats, ReadOnly, number
+from equipix._check import Array, Bools, ReadOnly, number
 from equipix.errors import InputError
-from equipix.measured.noise import NoiseModel, scatter_limit
+from equipix.measured.noise import ROBUST, NoiseModel, nanmedian, scatter_limit
 from equipix.measured.statistics import FrameStatistics, light_of
 
 SIGMAS = 6.0
@@ -136,7 +135,7 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
         or the variance beyond what noise and rounding explain.
     """
     excess = dark.mean - np.nanmedian(dark.mean)
-    spread = max(1.0, dark.step, 1.4826 * float(np.nanmedian(np.abs(excess))))
+    spread = max(1.0, dark.step, ROBUST * float(np.nanmedian(np.abs(excess))))
     hot: NDArray[Any] = excess > HOT_SIGMAS * spread
     frames = int(dark.count.max())
     if noise is not None and frames > 1:
@@ -215,6 +214,31 @@ def often_rejected(missing: Array, samples: int) -> Bools:
         share = (float(others.sum()) + 1) / (samples * others.size + 1)
         found = np.asarray(missing >= _binomial_limit(samples, share))
     return found
+
+
+def flickering_pixels(steps: Array, variance: Array, frames: int, sigmas: float) -> Bools:
+    """Find pixels whose noise is slower than white noise, by von Neumann's ratio.
+
+    Parameters
+    ----------
+    steps : ndarray, shape (rows, cols)
+        Sum of the squared differences of successive frames.
+    variance : ndarray, shape (rows, cols)
+        Sample variance.
+    frames : int
+        Number of frames.
+    sigmas : float
+        Standard deviations by which the ratio must lie below that of white noise.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        Where it does.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = steps / (variance * (frames - 1))
+    deviation = (ratio - 2) / 2 * np.sqrt((frames**2 - 1) / max(1, frames - 2))
+    return np.asarray(deviation < -sigmas)
 
 
 def _binomial_limit(samples: int, share: float) -> int:
@@ -315,7 +339,7 @@ def _usual(image: NDArray[Any]) -> NDArray[Any]:
     medians, reach = _medians(image), _AROUND // 2
     padded = np.pad(medians, reach, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_AROUND, _AROUND))
-    around = _nanmedian(windows, axis=(2, 3))
+    around = nanmedian(windows, axis=(2, 3))
     usual = _are_alike(windows, around[..., None, None]).sum(axis=(2, 3))
     most = 2 * usual > np.isfinite(windows).sum(axis=(2, 3))
     odd = most & ~_are_alike(medians, around)
@@ -355,19 +379,12 @@ def _medians(image: NDArray[Any]) -> NDArray[Any]:
     """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
     rows, cols = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
-    return _nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
+    return nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
 
 
 def _of_pixels(blocks: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """Spread values of blocks over their pixels."""
     return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[: shape[0], : shape[1]]
-
-
-def _nanmedian(values: NDArray[Any], axis: tuple[int, ...]) -> NDArray[Any]:
-    """Median of the values that are numbers; NaN where there is none."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=axis))
 
 
 _WELL_ABOVE = 10.0
@@ -475,21 +492,6 @@ def _median(values: Array) -> Array:
     squares = np.lib.stride_tricks.sliding_window_view(padded, (_WIDTH, _WIDTH))
     median: Array = np.median(squares[:, :, ::_EVERY, ::_EVERY], axis=(2, 3))
     return median
-
-
-def relative_response(rise: Floats, good: Bools) -> Floats:
-    """Response of each pixel over the array's, at each state."""
-    mean = rise[:, good].mean(axis=1)
-    scatter = rise[:, good].std(axis=1)
-    weak = np.flatnonzero(~(np.abs(mean) > scatter))
-    if weak.size:
-        k = int(weak[0])
-        raise InputError(
-            f"'black_bodies' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
-            f"{scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels see: "
-            "take black bodies further apart"
-        )
-    return np.asarray(rise / mean[:, None, None])
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -13,7 +12,7 @@ import numpy as np
 
 from equipix._check import Array, Bools, Floats
 from equipix.measured.colour import LARGEST_PERIOD, Colours
-from equipix.measured.noise import MEDIAN_SQUARE
+from equipix.measured.noise import MEDIAN_SQUARE, nanmedian
 
 _SAMPLED = 128
 """Rows and columns in the middle of the sensor in which a pattern is looked for."""
@@ -221,9 +220,7 @@ def _medians(part: Floats) -> Floats:
     """Medians of blocks, which single bad pixels do not move; NaN where there is no value."""
     size = _size(part)
     blocks = part.reshape(part.shape[0] // size, size, -1, size)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
-        return np.asarray(np.nanmedian(blocks, axis=(1, 3)))
+    return nanmedian(blocks, axis=(1, 3))
 
 
 class _Places(NamedTuple):

@@ -13,15 +13,8 @@ from numpy.typing import DTypeLike
 
 from equipix._check import EXPOSURES, Array, Bools, Floats, Words
 from equipix.errors import InputError
+from equipix.measured import defects
 from equipix.measured.colour import Colours, planes_of
-from equipix.measured.defects import (
-    BadPixels,
-    blind_pixels,
-    dead_pixels,
-    hot_pixels,
-    noisy_pixels,
-    often_rejected,
-)
 from equipix.measured.filters import Filters, mean_signal, pattern_of
 from equipix.measured.noise import NoiseModel, photon_transfer
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
@@ -64,6 +57,10 @@ class Averaged:
         Whether no dark was subtracted from averages of whole numbers.
     dark : FrameStatistics or None
         The dark frames that were subtracted.
+    frames : list of int
+        Number of frames of each exposure.
+    names : list of str
+        Name of each exposure; empty where it has none.
     step : float
         Largest step between the values of frames, in DN; 0 if they are not whole.
     light : list of Light
@@ -90,8 +87,8 @@ class Averaged:
         self.dark: FrameStatistics | None = None
         self.pedestal, self._is_counted = 0.0, False
         self._dtype = np.dtype(dtype)
-        self._frames: list[int] = []
-        self._names: list[str] = []
+        self.frames: list[int] = []
+        self.names: list[str] = []
         self._of_dark: list[float] = []
         self._points: list[Array] = []
         self._clipped: list[Clipping | None] = []
@@ -109,7 +106,9 @@ class Averaged:
         colours: Colours | None = None,
     ) -> Self:
         """Reduce the statistics of all exposures."""
-        averaged = cls(len(frames), words=words, colours=colours)
+        levels = {each.saturation for each in frames}
+        saturation = levels.pop() if len(levels) == 1 else None
+        averaged = cls(len(frames), saturation=saturation, words=words, colours=colours)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -123,7 +122,7 @@ class Averaged:
             If it has another shape than the first, another dark, or no finite value that does not
             saturate; with the first exposure, if its dark has none.
         """
-        exposure, shape = len(self._frames), frames.mean.shape
+        exposure, shape = len(self.frames), frames.mean.shape
         if exposure == 0:
             if frames.dark is not None:
                 self._refuse_saturated("'dark'", frames.dark)
@@ -157,8 +156,8 @@ class Averaged:
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
         count = int(frames.count.max())
-        self._frames.append(count)
-        self._names.append(name)
+        self.frames.append(count)
+        self.names.append(name)
         self._screen(frames)
         if self.dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
@@ -234,15 +233,10 @@ class Averaged:
         """Noise model of one frame that counts the rounding of these frames."""
         return noise if noise.step > 0 else dataclasses.replace(noise, step=self.step)
 
-    @property
-    def frames(self) -> tuple[int, ...]:
-        """Number of frames of each exposure."""
-        return tuple(self._frames)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Name of each exposure; empty where it has none."""
-        return tuple(self._names)
+    def raw_values(self, exposure: int) -> Array:
+        """Mean of an exposure before the dark was subtracted."""
+        values: Array = self.values[exposure]
+        return values if self.dark is None else values + self.dark.mean
 
     @property
     def unsteady(self) -> str:
@@ -252,7 +246,7 @@ class Averaged:
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
         if not self.light[worst].is_large:
             return ""
-        which = self._words.place(worst, self._names[worst])
+        which = self._words.place(worst, self.names[worst])
         return (
             f"{which}: {self.light[worst].words} (limit {NAMED:g}). It was "
             f"taken out of the noise model. See that all frames are of one {self._words.one}, let "
@@ -264,9 +258,9 @@ class Averaged:
         """A saturation level that was not given, if the values show one."""
         return highest(self._clipped)
 
-    def models(self, noise: NoiseModel) -> list[NoiseModel]:
+    def models(self, noise: NoiseModel) -> tuple[NoiseModel, ...]:
         """Noise model of each mean frame without that of the dark, from that of one frame."""
-        return [noise.of_mean(frames) for frames in self._frames]
+        return tuple(noise.of_mean(frames) for frames in self.frames)
 
     def dark_variance(self, noise: NoiseModel) -> Floats | None:
         """Variance of the dark that was subtracted from all, from the noise of one frame.
@@ -284,22 +278,24 @@ class Averaged:
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
-    def bad_pixels(self, noise: NoiseModel | None) -> BadPixels:
+    def bad_pixels(self, noise: NoiseModel | None) -> defects.BadPixels:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
             pairs = zip(self.light, self.values, strict=True)
             light = (of_light.variance(values) for of_light, values in pairs)
-            noisy = noisy_pixels(self._signals, self.variances, self._frames, noise, light=light)
+            noisy = defects.noisy_pixels(
+                self._signals, self.variances, self.frames, noise, light=light
+            )
             if self._screened:
-                noisy |= often_rejected(self._missing, self._screened)
+                noisy |= defects.often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
         if self.dark is not None:
-            hot = hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
+            hot = defects.hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
         dead = None
         if noise is not None or self.dark is not None:
             dead = self._dead(noise) & ~hot
-        return BadPixels(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
+        return defects.BadPixels(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
     def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
         saturates = frames.saturated > 0
@@ -310,9 +306,9 @@ class Averaged:
         models = None if noise is None else self._models_with_dark(noise)
         measured = np.isfinite(self.values).any(axis=0)
         usual = 1.0 if self.filters is None else self.filters.map_of(self.saturated.shape)
-        dead: Bools = dead_pixels(self._signals, models, usual)
+        dead: Bools = defects.dead_pixels(self._signals, models, usual)
         if models is not None:
-            dead |= blind_pixels(self._signals, models, usual)
+            dead |= defects.blind_pixels(self._signals, models, usual)
         return dead & measured
 
     @property
@@ -324,7 +320,7 @@ class Averaged:
         """Noise model of each mean frame less the dark, for one exposure by itself."""
         of_dark = self.dark_variance(noise)
         variance = 0.0 if of_dark is None else float(np.median(of_dark))
-        return [noise.of_mean(frames, dark_variance=variance) for frames in self._frames]
+        return [noise.of_mean(frames, dark_variance=variance) for frames in self.frames]
 
 
 def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass, field
+from typing import Any, Self, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import (
     EXPOSURES,
     Array,
     Bools,
     Floats,
+    ReadOnly,
     Words,
     as_array,
     as_floats,
@@ -25,31 +28,116 @@ from equipix.measured.colour import Colours
 from equipix.measured.defects import BadPixels
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
-from equipix.measured.saturation import Clipping, _largest, _saturated, clipping, highest, plateau
+from equipix.measured.saturation import (
+    Clipping,
+    clipping_at,
+    highest,
+    is_unsigned,
+    saturated_values,
+    saturation_level,
+)
 from equipix.measured.statistics import FrameStatistics
 
 
-class Measured(NamedTuple):
-    """Mean frames and what is known of them, from arrays or averages."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured(ReadOnly):
+    """Mean frames of several exposures or levels, as read-only arrays, and what is known of them.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, rows, cols), float32 or float64
+        Mean frames, the dark subtracted unless an offset is sought, in DN; what is not finite is
+        not used.
+    mask : ndarray of bool, shape (rows, cols) or (n, rows, cols), or None
+        True = do not use.
+    variance : ndarray, shape (n,) or (n, rows, cols), or None
+        Variance of the values, in DN²; None: all weights are 1.
+    noise : tuple of NoiseModel
+        Noise model of each mean frame, where the variance is to be evaluated at what a fit expects.
+    bad_pixels : BadPixels
+        Bad pixels found before the last fit.
+    saturation : float or None
+        Level of saturation in DN, where it was given.
+    clipped : Clipping or None
+        A saturation level that was not given, if the values show one.
+    dark : ndarray, shape (rows, cols), or None
+        The dark frame that was subtracted, in DN, where it is known.
+    dark_variance : ndarray, shape (rows, cols), float64, or None
+        Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are
+        without it. None where it is unknown, or where an offset is sought, which takes all of it.
+    raw : bool
+        Whether no dark was subtracted: from averages of whole numbers, or arrays of unsigned ones.
+    unsteady : str
+        Which exposure has light that varied between its frames, and by how much; empty if none has.
+    colours : Colours or None
+        Colour filters of the pixels, where they are given.
+    names : tuple of str
+        What the user calls each exposure, if anything.
+    """
 
     values: Array
-    mask: Bools | None
-    variance: Array | None
-    models: Sequence[NoiseModel]
-    bad_pixels: BadPixels
+    mask: Bools | None = None
+    variance: Array | None = None
+    noise: tuple[NoiseModel, ...] = ()
+    bad_pixels: BadPixels = field(default_factory=BadPixels)
+    saturation: float | None = None
+    clipped: Clipping | None = None
     dark: Array | None = None
     dark_variance: Floats | None = None
-    clipped: Clipping | None = None
     raw: bool = False
     unsteady: str = ""
     colours: Colours | None = None
     names: tuple[str, ...] = ()
 
+    def __len__(self) -> int:
+        """Return the number of exposures."""
+        return len(self.values)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sizes of the sensor (rows, cols)."""
+        rows, cols = self.values.shape[1:]
+        return rows, cols
+
+    def usable(self, exposure: int | slice = slice(None)) -> Bools:
+        """Return which measurements may be used, of all exposures or of one."""
+        usable: Bools = np.isfinite(self.values[exposure])
+        if self.mask is not None:
+            usable &= ~(self.mask[exposure] if self.mask.ndim == 3 else self.mask)
+        return usable
+
     def variance_of(self, exposure: int, signal: Array) -> Array | None:
         """Variance of the values of an exposure, where a model needs it at this signal."""
-        if self.models:
-            return self.models[exposure].variance(signal)
+        if self.noise:
+            return self.noise[exposure].variance(signal)
         return None if self.variance is None else np.asarray(self.variance[exposure])
+
+    def raw_values(self, exposure: int) -> Array:
+        """Values of an exposure before the dark was subtracted; NaN where they saturate."""
+        values: Array = self.values[exposure]
+        if self.mask is not None and self.mask.ndim == 3:
+            values = np.where(self.mask[exposure], np.nan, values)
+        return values if self.dark is None else values + self.dark
+
+    def weighted(self, variance: Array | None) -> Self:
+        """Return the exposures with other variances."""
+        return dataclasses.replace(self, variance=variance)
+
+    def without(self, mask: Bools) -> Self:
+        """Return the exposures without some measurements, besides those masked before."""
+        return dataclasses.replace(self, mask=union(mask, self.mask))
+
+    def chosen(self, exposures: NDArray[np.int64]) -> Self:
+        """Return some of the exposures."""
+        variance, mask = self.variance, self.mask
+        return dataclasses.replace(
+            self,
+            values=self.values[exposures],
+            variance=None if variance is None else variance[exposures],
+            mask=mask[exposures] if mask is not None and mask.ndim == 3 else mask,
+            noise=tuple(self.noise[k] for k in exposures) if self.noise else (),
+            names=tuple(self.names[k] for k in exposures) if self.names else (),
+        )
 
 
 def measured_of(
@@ -64,84 +152,21 @@ def measured_of(
 
     `words` are what messages call them, `colours` the filters of arrays or `FrameStatistics`.
     """
-    averaged = frames if isinstance(frames, Averaged) else _averaged(frames, words, colours)
+    averaged = averaged_of(frames, words, colours)
     if averaged is None:
-        measured = _of_arrays(cast("ArrayLike", frames), variance, saturation, words)
-        return measured._replace(colours=colours)
-    return _of_averaged(averaged, variance, saturation, words)
-
-
-def _of_averaged(
-    averaged: Averaged,
-    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
-    saturation: float | None,
-    words: Words,
-) -> Measured:
-    """Averaged frames: their noise model, or the variances that the caller gives."""
+        return _of_arrays(cast("ArrayLike", frames), variance, saturation, words, colours)
     if saturation is not None:
         raise InputError(
             f"'saturation' is for arrays, but {words.argument} are averages: their saturated "
             "samples are counted where equipix.average is given the level"
         )
-    noise = averaged.noise if variance is None else variance
-    if isinstance(noise, NoiseModel):
-        noise = averaged.rounded(noise)
-    models = as_models(noise, averaged.count)
-    if isinstance(noise, NoiseModel):
-        models = averaged.models(noise)
-    variances = None
-    if variance is not None and not models:
-        variances = as_variances(cast("ArrayLike", variance), averaged.values)
-    model = noise if isinstance(noise, NoiseModel) else None
-    bad_pixels = averaged.bad_pixels(model)
-    dark = averaged.dark
-    return Measured(
-        averaged.values,
-        union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy),
-        variances,
-        models,
-        bad_pixels,
-        None if dark is None else dark.mean.astype(averaged.values.dtype),
-        None if model is None else averaged.dark_variance(model),
-        averaged.clipped,
-        averaged.raw,
-        averaged.unsteady,
-        averaged.colours,
-        averaged.names,
-    )
+    return _of_averaged(averaged, variance, words)
 
 
-def _of_arrays(
-    frames: ArrayLike,
-    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
-    saturation: float | None,
-    words: Words,
-) -> Measured:
-    """Arrays: only what the caller gives is known of them."""
-    values = as_floats(words.argument.strip("'"), frames, ndim=3)
-    if 0 in values.shape:
-        raise InputError(
-            f"{words.argument} has shape {values.shape}, expected at least one {words.one} and one "
-            "pixel"
-        )
-    models = as_models(variance, len(values))
-    variances = None
-    if variance is not None and not models:
-        variances = as_variances(cast("ArrayLike", variance), values)
-    level = _largest(frames) if saturation is None else as_level(saturation)
-    if level is None:
-        clipped = highest(clipping(each) or plateau(each) for each in values)
-        return Measured(values, None, variances, models, BadPixels(), clipped=clipped)
-    saturated = _saturated(values, level, words)
-    clipped = highest(clipping(np.where(each < level, each, np.nan)) for each in values)
-    if saturation is None and not saturated.any():
-        return Measured(values, None, variances, models, BadPixels(), clipped=clipped)
-    bad_pixels = BadPixels(saturated=np.any(saturated, axis=0))
-    return Measured(values, saturated, variances, models, bad_pixels, clipped=clipped)
-
-
-def _averaged(frames: object, words: Words, colours: Colours | None) -> Averaged | None:
+def averaged_of(frames: object, words: Words, colours: Colours | None) -> Averaged | None:
     """Statistics of all exposures, reduced; None for arrays."""
+    if isinstance(frames, Averaged):
+        return frames
     if not isinstance(frames, list | tuple):
         return None
     statistics = [each for each in frames if isinstance(each, FrameStatistics)]
@@ -150,33 +175,105 @@ def _averaged(frames: object, words: Words, colours: Colours | None) -> Averaged
     return Averaged.of(statistics, words=words, colours=colours) if statistics else None
 
 
-def as_models(variance: object, count: int) -> list[NoiseModel]:
-    """Noise model of each of the values; none if variances are given as numbers, or not."""
+def _of_averaged(
+    averaged: Averaged,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
+    words: Words,
+) -> Measured:
+    """Averaged frames: their noise model, or the variances that the caller gives."""
+    model = averaged.noise if variance is None else variance
+    if isinstance(model, NoiseModel):
+        model = averaged.rounded(model)
+        noise, variances = averaged.models(model), None
+    else:
+        noise, variances = _noise_of(variance, averaged.values, words)
+        model = None
+    bad_pixels, dark = averaged.bad_pixels(model), averaged.dark
+    return Measured(
+        values=averaged.values,
+        mask=union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy),
+        variance=variances,
+        noise=noise,
+        bad_pixels=bad_pixels,
+        saturation=averaged.saturation,
+        clipped=averaged.clipped,
+        dark=None if dark is None else dark.mean.astype(averaged.values.dtype),
+        dark_variance=None if model is None else averaged.dark_variance(model),
+        raw=averaged.raw,
+        unsteady=averaged.unsteady,
+        colours=averaged.colours,
+        names=tuple(averaged.names),
+    )
+
+
+def _of_arrays(
+    frames: ArrayLike,
+    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
+    saturation: float | None,
+    words: Words,
+    colours: Colours | None,
+) -> Measured:
+    """Arrays: only what the caller gives is known of them."""
+    _refuse_shapes(frames, words)
+    values = as_floats(words.argument.strip("'"), frames, ndim=3)
+    if 0 in values.shape:
+        raise InputError(
+            f"{words.argument} has shape {values.shape}, expected at least one {words.one} and one "
+            "pixel"
+        )
+    noise, variances = _noise_of(variance, values, words)
+    given = frames if isinstance(frames, list | tuple) else [frames] * len(values)
+    levels = [saturation_level(each, saturation) for each in given]
+    saturated = saturated_values(values, levels, words)
+    return Measured(
+        values=values,
+        mask=saturated,
+        variance=variances,
+        noise=noise,
+        bad_pixels=BadPixels(saturated=None if saturated is None else np.any(saturated, axis=0)),
+        saturation=as_level(saturation),
+        clipped=highest(map(clipping_at, values, levels)),
+        raw=is_unsigned(frames),
+        colours=colours,
+    )
+
+
+def _refuse_shapes(frames: object, words: Words) -> None:
+    """Refuse arrays of several shapes, before they become one array."""
+    arrays = frames if isinstance(frames, list | tuple) else []
+    shapes = list(dict.fromkeys(each.shape for each in arrays if isinstance(each, np.ndarray)))
+    if len(shapes) > 1:
+        named = " and ".join(map(str, shapes[:2]))
+        raise InputError(f"{words.argument} holds arrays of shapes {named}, expected one shape")
+
+
+def _noise_of(
+    variance: Any, values: Array, words: Words
+) -> tuple[tuple[NoiseModel, ...], Array | None]:
+    """Noise model of each of the values, or their variances as the solver takes them."""
+    if variance is None:
+        return (), None
     if isinstance(variance, NoiseModel):
-        return [variance] * count
-    if not isinstance(variance, list | tuple):
-        return []
-    models = [each for each in variance if isinstance(each, NoiseModel)]
-    if models:
-        if len(models) != len(variance):
+        return (variance,) * len(values), None
+    if isinstance(variance, list | tuple):
+        models = tuple(each for each in variance if isinstance(each, NoiseModel))
+        if models and len(models) != len(variance):
             raise InputError("'variance' mixes noise models and numbers, expected either")
-        check_count("variance", len(models), count)
-    return models
-
-
-def as_variances(variance: ArrayLike, values: Array) -> Array:
-    """Variances in the shape and dtype that the solver takes."""
-    variances = as_array("variance", variance, ndim=(0, 1, 2, 3))
+        if models:
+            check_count("variance", len(models), len(values), words.one)
+            return models, None
+    numbers = as_array("variance", variance, ndim=(0, 1, 2, 3))
     shape = np.shape(variance)  # as_array makes one number an array of one
     if len(shape) == 1:
-        check_count("variance", len(variances), len(values))
-        return variances.astype(np.float64)
+        check_count("variance", len(numbers), len(values), words.one)
+        return (), numbers.astype(np.float64)
     if shape != values.shape:
         raise InputError(
-            f"'variance' has shape {shape}, expected {(len(values),)} or {values.shape}"
+            f"'variance' has shape {shape}, expected {(len(values),)}, one number for each "
+            f"{words.one}, or {values.shape}"
         )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
-        return variances.astype(values.dtype, copy=False)
+        return (), numbers.astype(values.dtype, copy=False)
 
 
 _FURTHER = 5.0
@@ -200,10 +297,6 @@ def check_levels(levels: object) -> None:
         )
     if isinstance(levels, np.ndarray):
         _refuse_last_axis(levels)
-    shapes = list(dict.fromkeys(each.shape for each in known))
-    if len(shapes) > 1:
-        named = " and ".join(map(str, shapes[:2]))
-        raise InputError(f"'levels' holds arrays of shapes {named}, expected one (rows, cols)")
 
 
 def _refuse_last_axis(levels: Array) -> None:
@@ -222,32 +315,3 @@ def _refuse_last_axis(levels: Array) -> None:
             "along the last axis: expected levels along the first one, numpy.moveaxis(levels, -1, "
             "0)"
         )
-
-
-def check_variance(variance: Any, count: int) -> None:
-    """Refuse what is not one noise model, or one of them or one number above 0 for each level."""
-    if variance is None or isinstance(variance, NoiseModel):
-        return
-    if isinstance(variance, list | tuple) and any(isinstance(e, NoiseModel) for e in variance):
-        _check_count(len(variance), count)
-        return
-    numbers = as_array("variance", variance, ndim=(0, 1, 2, 3)).astype(np.float64)
-    shape = np.shape(variance)  # as_array makes one number an array of one
-    if len(shape) != 1:
-        raise InputError(
-            f"'variance' has shape {shape}, expected ({count},), one number a level, or a "
-            "NoiseModel: a pixel's own sample variance makes weights noisy"
-        )
-    _check_count(len(numbers), count)
-    _refuse_below(numbers)
-
-
-def _check_count(got: int, count: int) -> None:
-    if got != count:
-        raise InputError(f"'variance' has {got} entries, expected {count}: one a level")
-
-
-def _refuse_below(numbers: Array) -> None:
-    wrong = numbers[~(np.isfinite(numbers) & (numbers > 0))]
-    if wrong.size:
-        raise InputError(f"'variance' holds {wrong[0]:g}, expected finite numbers above 0, in DN²")

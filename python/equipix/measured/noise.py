@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
@@ -537,6 +538,13 @@ def chi2_tail(value: float, freedom: int) -> float:
 
 ROBUST = 1.4826
 """Standard deviation over median absolute deviation, for normal noise."""
+
+
+def nanmedian(values: NDArray[Any], axis: int | tuple[int, ...]) -> NDArray[Any]:
+    """Median of the values that are numbers; NaN where there is none."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
 
 
 def nanmedian_abs(residuals: NDArray[np.floating]) -> Floats:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Words, as_level
 from equipix.errors import InputError
@@ -30,7 +29,7 @@ _FINE = 1000.0
 _RARE = 0.05
 """Largest share of pixels without scatter where its absence shows a level."""
 
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 """Relative rounding of means from which a dark was subtracted, and added again."""
 
 _SIGMAS = 6
@@ -70,7 +69,7 @@ def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Cli
     if known.size <= _MANY:
         return None
     top = float(known.max())
-    rounding = _ROUNDING * abs(top)
+    rounding = ROUNDING * abs(top)
     count = int(np.count_nonzero(known >= top - rounding))
     if count < _MANY or top <= 0:
         return None
@@ -80,8 +79,20 @@ def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Cli
     width = max(_BELOW * top, top - float(below.max()), step) + rounding
     if count <= crowded * np.count_nonzero(below >= top - width):
         return None
-    level = float(np.rint(top)) if abs(top - np.rint(top)) <= rounding else top
+    level = whole(top)
     return Clipping(level, count) if 2 * count < known.size or is_of_bits(level) else None
+
+
+def whole(top: float) -> float:
+    """The whole number that a mean is but for rounding, or the mean."""
+    return float(np.rint(top)) if abs(top - np.rint(top)) <= ROUNDING * abs(top) else top
+
+
+def clipping_at(values: Array, level: float | None) -> Clipping | None:
+    """Find the level that values of one exposure are clipped at, below one that is known."""
+    if level is None:
+        return clipping(values) or plateau(values)
+    return clipping(np.where(values < level, values, np.nan))
 
 
 def plateau(values: Array) -> Clipping | None:
@@ -115,7 +126,7 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     if found is None:
         return plateau(raw)
     steady = frames.variance == 0
-    others = np.isfinite(raw) & (raw < found.level * (1 - _ROUNDING))
+    others = np.isfinite(raw) & (raw < found.level * (1 - ROUNDING))
     if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:
         return found
     return clipping(raw, step=frames.step) or plateau(raw)
@@ -202,13 +213,19 @@ def refuse_saturated(
         )
 
 
-def _largest(frames: ArrayLike) -> float | None:
-    """Largest value of arrays of whole numbers, which counts as saturated unless given."""
-    dtype = _dtype(frames)
-    return float(np.iinfo(dtype).max) if dtype is not None and dtype.kind in "iu" else None
+def saturation_level(frames: object, given: float | None) -> float | None:
+    """Level given, or the largest value of the whole numbers that arrays hold."""
+    return level_of(_dtype(frames), as_level(given))
 
 
-def _is_unsigned(frames: object) -> bool:
+def level_of(dtype: np.dtype[Any] | None, given: float | None) -> float | None:
+    """Level given, or the largest value of whole numbers of a dtype."""
+    if given is not None or dtype is None or dtype.kind not in "iu":
+        return given
+    return float(np.iinfo(dtype).max)
+
+
+def is_unsigned(frames: object) -> bool:
     """Whether frames are arrays as cameras write them: a subtracted dark leaves values below 0."""
     dtype = _dtype(frames)
     return dtype is not None and dtype.kind == "u"
@@ -221,17 +238,14 @@ def _dtype(frames: object) -> np.dtype[Any] | None:
     return dtypes.pop() if len(dtypes) == 1 else None
 
 
-def _saturated(values: Array, level: float, words: Words) -> Bools:
-    """Which values reach the saturation level."""
-    saturated: Bools = values >= level
-    for k, each in enumerate(saturated):
-        refuse_saturated(words.place(k), values[k], each, level)
+def saturated_values(values: Array, levels: Sequence[float | None], words: Words) -> Bools | None:
+    """Which values of frames (n, rows, cols) reach the level of their frame; None if none does."""
+    known = [(k, level) for k, level in enumerate(levels) if level is not None]
+    reached = [(k, level) for k, level in known if np.fmax.reduce(values[k], axis=None) >= level]
+    if not reached:
+        return None
+    saturated = np.zeros(values.shape, bool)
+    for k, level in reached:
+        saturated[k] = values[k] >= level
+        refuse_saturated(words.place(k), values[k], saturated[k], level)
     return saturated
-
-
-def saturation_level(values: ArrayLike, saturation: float | None) -> float | None:
-    """Level given, or the largest value of the caller's integer dtype."""
-    if saturation is None:
-        dtype = np.asarray(values).dtype
-        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else None
-    return as_level(saturation)

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, check_maps
-from equipix.errors import InputError, InputWarning, warn
+from equipix.errors import InputError
+from equipix.findings import Rule
 from equipix.io.formats import refuse_saved, saved_kind
 from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.measured.noise import scatter_limit, step_of
@@ -121,19 +122,6 @@ def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> fl
     return step_of(means * np.where(variances > 0, counts, 1))
 
 
-def _check_mask(mask: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
-    """Refuse a mask of frames of that shape that is none, or leaves no pixel."""
-    if mask is None:
-        return
-    if mask.dtype != np.bool_ or mask.shape != shape:
-        raise InputError(
-            f"'mask' is {mask.dtype} of shape {mask.shape}, expected bool of shape {shape}, True "
-            f"= do not use{': give mask != 0' if mask.shape == shape else ''}"
-        )
-    if mask.all():
-        raise InputError("'mask' is True in every pixel, expected some pixels to use")
-
-
 def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStatistics:
     """Return averages without the pixels of a mask."""
     if mask is None:
@@ -175,18 +163,33 @@ def _subtract(
     )
 
 
-def warn_of_bright_dark(statistics: FrameStatistics) -> None:
-    """Warn of a dark that is not that of the frames, or was subtracted from them before."""
+def _on_bright_dark(statistics: FrameStatistics) -> str | None:
+    """Say that a dark is not that of the frames, or was subtracted from them before."""
     if statistics.dark is None or not np.isfinite(statistics.mean).any():
-        return
+        return None
     level, below = np.nanmedian(statistics.dark.mean), -np.nanmedian(statistics.mean)
     if level > 0 and below > DARKER * level:
-        warn(
+        return (
             f"the frames are darker than 'dark' by {below:.4g} of {level:.4g} DN in the median "
             f"(limit {DARKER:.0%}): see that frames and dark are not exchanged, and give frames "
-            "from which no dark was subtracted",
-            InputWarning,
+            "from which no dark was subtracted"
         )
+    return None
+
+
+def _on_light(statistics: FrameStatistics) -> str | None:
+    """Say that frames are of several levels of light."""
+    light = light_of(statistics)
+    if not light.over_noise > STRAY:
+        return None
+    return f"{light.words} (limit {STRAY:g}): see that all are of one measurement"
+
+
+AVERAGED: tuple[Rule[FrameStatistics], ...] = (
+    Rule("bright_dark", "input", _on_bright_dark),
+    Rule("light", "misfit", _on_light),
+)
+"""What is asked of an average."""
 
 
 def refuse_subtracted(dark: FrameStatistics, place: str = "'dark'") -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Iterable, Iterator
 from statistics import NormalDist
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, as_array, number
 from equipix.errors import InputError
+from equipix.measured.noise import ROBUST, nanmedian
 
 _BATCH = 16  # frames handed over at once
 
@@ -100,9 +100,6 @@ _OWN = 2.0
 
 _LEAST_OWN = 0.5
 """Least own noise that is followed, over the common one: of equal whole numbers it would be 0."""
-
-_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 _DENSITY = 0.4287
 """Density of ln|z|, z a standard normal variable, at its median: the slope that steps divide by."""
@@ -205,7 +202,7 @@ class Rejection:
                 of_mean = np.sqrt(1 + 1 / count)
             size = self._clean(frame, mean, _limit(common, own, index) * of_mean, index) / of_mean
             # A missing sample compares as below its median would: it must change nothing.
-            above = np.where(np.isfinite(size), (size > own / _MAD) - 0.5, 0.0)
+            above = np.where(np.isfinite(size), (size > own / ROBUST) - 0.5, 0.0)
             own = np.maximum(own * np.exp(above / (_DENSITY * (index + 1))), _LEAST_OWN * common)
             kept = np.isfinite(frame)
             count += kept
@@ -232,12 +229,10 @@ class Rejection:
 
     def _estimates(self, start: Floats, floor: float) -> tuple[Floats, Floats, Floats]:
         """Median of each pixel, the noise that pixels of its signal have in common, and its own."""
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
-            centre = np.nanmedian(start, axis=0)
-            deviation = start - centre
-            deviation -= np.nanmedian(deviation, axis=(1, 2), keepdims=True)
-            own = _MAD * np.nanmedian(np.abs(deviation), axis=0)
+        centre = nanmedian(start, axis=0)
+        deviation = start - centre
+        deviation -= nanmedian(deviation, axis=(1, 2))[:, None, None]
+        own = ROBUST * nanmedian(np.abs(deviation), axis=0)
         common = np.full(centre.shape, np.nan)
         pixels = np.flatnonzero(np.isfinite(centre))
         pixels = pixels[np.argsort(centre.flat[pixels])]

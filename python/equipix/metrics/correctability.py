@@ -8,9 +8,10 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, as_array, naming_memory, number
+from equipix._check import Bools, Floats, as_array, as_mask, naming_memory, number
 from equipix.errors import InputError
-from equipix.metrics.frame_noise import signed_root, stack_of, temporal_of, warn_of_drift
+from equipix.findings import ask, say
+from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,8 @@ def correctability(
     stack = stack_of("frames", frames)
     if not 0 < number("confidence", confidence) < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
-    found = temporal_of(stack, _as_mask(mask, stack.shape[1:]))
-    warn_of_drift(found)
+    found = temporal_of(stack, as_mask(mask, stack.shape[1:]))
+    say(*ask(STEADY, found))
     n, pixels = found.frames, int(np.count_nonzero(found.used))
     if pixels < 2:
         raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")
@@ -178,18 +179,6 @@ def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
         return float(when[0])
     share = (1 - values[first - 1]) / (values[first] - values[first - 1])
     return float(when[first - 1] + share * (when[first] - when[first - 1]))
-
-
-def _as_mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
-    """Mask of one sensor, checked."""
-    if mask is None:
-        return None
-    given = as_array("mask", mask, ndim=2)
-    if given.dtype != np.bool_ or given.shape != shape:
-        raise InputError(
-            f"'mask' is {given.dtype} of shape {given.shape}, expected bool of {shape}"
-        )
-    return given
 
 
 def _freedom(image: Floats, used: Bools) -> float:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix._check import Bools, Floats, as_array, check_type, naming_memory, number
-from equipix.errors import EquipixWarning, InputError, warn
+from equipix.errors import InputError
+from equipix.findings import Finding, say
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.frame_noise import Moments, moments, signed_root
 
@@ -341,7 +342,7 @@ def _refuse_falling(light: Floats, signal: Floats, linear: Bools) -> None:
         raise InputError(
             f"'light' is {light[before]:g} at level {before} and {light[after]:g} at level {after},"
             f" where the signal is {signal[before]:.6g} and {signal[after]:.6g} DN: expected light "
-            "that rises with the signal, one value for each level in the order of 'bright'"
+            "that rises with the signal, one value for each level in the order of 'frames'"
         )
 
 
@@ -349,12 +350,12 @@ def _efficiency(found: float) -> float:
     """Quantum efficiency, unless it is none."""
     if found <= _MOST_EFFICIENT:
         return found
-    warn(
+    words = (
         f"'light' gives a quantum efficiency of {found:.4g} (limit {_MOST_EFFICIENT:g}), so it is "
         "NaN: light in photons per pixel and exposure gives one; in another unit the responsivity "
-        "is in DN per that unit",
-        EquipixWarning,
+        "is in DN per that unit"
     )
+    say(Finding("unit", words, "input"))
     return float("nan")
 
 

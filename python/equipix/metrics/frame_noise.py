@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Floats, as_array, naming_memory
-from equipix.errors import EquipixWarning, InputError, MisfitWarning, warn
+from equipix.errors import InputError
+from equipix.findings import Finding, Rule, say
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
 _SIGMAS = 6.0
@@ -54,7 +55,7 @@ def stack_of(name: str, frames: ArrayLike) -> Array:
 
     Warns
     -----
-    EquipixWarning
+    InputWarning
         If the last axis seems to be that of the frames.
     """
     stack = as_array(name, frames, ndim=3)
@@ -84,13 +85,13 @@ def _warn_of_axes(name: str, stack: Array) -> None:
     length, count = stack.shape[2], stack.shape[0] * stack.shape[1]
     within = (every - length * lines) / (count * (length - 1)) if length > 1 else 0.0
     if length * lines / count > (1 + _SIGMAS * np.sqrt(2 / count)) * within:
-        warn(
+        words = (
             f"'{name}' has shape {stack.shape}, {len(stack)} frames of "
             f"{stack.shape[1]} x {length} pixels, and the noise of pixels is common along the last "
             "axis, which is the shortest: if it is that of the frames, give "
-            "numpy.moveaxis(frames, -1, 0)",
-            EquipixWarning,
+            "numpy.moveaxis(frames, -1, 0)"
         )
+        say(Finding("axis", words, "input"))
 
 
 def temporal_of(stack: Array, mask: Bools | None = None) -> Temporal:
@@ -130,16 +131,20 @@ def temporal_of(stack: Array, mask: Bools | None = None) -> Temporal:
     return Temporal(mean + levels.mean(), variance, steps, used, len(stack), drift)
 
 
-def warn_of_drift(found: Temporal) -> None:
-    """Warn of frame means that differ by so much that they are hardly of one level."""
+def _on_drift(found: Temporal) -> str | None:
+    """Say that frame means differ by so much that they are hardly of one level."""
     noise = float(np.sqrt(np.median(found.variance[found.used]))) if found.used.any() else 0.0
-    if found.drift > _MOST_DRIFT * noise:
-        warn(
-            f"the means of 'frames' scatter by {found.drift:.3g} DN, the noise of a pixel is "
-            f"{noise:.3g} DN: frames of one steady level are expected. Give those of one level, or "
-            "let the source settle; its gains make each pixel scatter with the light",
-            MisfitWarning,
-        )
+    if not found.drift > _MOST_DRIFT * noise:
+        return None
+    return (
+        f"the means of 'frames' scatter by {found.drift:.3g} DN, the noise of a pixel is "
+        f"{noise:.3g} DN: frames of one steady level are expected. Give those of one level, or "
+        "let the source settle; its gains make each pixel scatter with the light"
+    )
+
+
+STEADY: tuple[Rule[Temporal], ...] = (Rule("light", "misfit", _on_drift),)
+"""What is asked of frames of one level."""
 
 
 def moments(name: str, frames: ArrayLike | FrameStatistics) -> Moments:

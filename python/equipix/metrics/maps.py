@@ -50,7 +50,7 @@ def relative_error(
 
     Examples
     --------
-    >>> from equipix import simulate
+    >>> from equipix import metrics
     >>> metrics.relative_error([[2.0, 2.0]], [[3.0, 3.0]])
     array([[0., 0.]])
     """
@@ -345,7 +345,7 @@ def non_uniformity(frames: ArrayLike, span: float) -> float:
 
     Examples
     --------
-    >>> from equipix import bolometer
+    >>> from equipix import metrics
     >>> metrics.non_uniformity([[[1.0, 3.0]], [[4.0, 8.0]]], 100.0)
     0.015
     """

@@ -9,22 +9,16 @@ from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Floats, ReadOnly, check_type, naming_memory
 from equipix.correction.protocol import named_cfa
-from equipix.errors import InputError, MisfitWarning, warn
-from equipix.findings import set_bits, usable
+from equipix.errors import InputError
+from equipix.findings import Finding, ask, say, set_bits, usable
+from equipix.measured import defects, noise
 from equipix.measured.colour import Colours, planes_of
-from equipix.measured.defects import DefectLimits, noisy_pixels, often_rejected, response_outliers
+from equipix.measured.defects import DefectLimits
 from equipix.measured.filters import Filters
-from equipix.measured.noise import (
-    MEDIAN_SQUARE,
-    NoiseModel,
-    photon_transfer,
-    scatter_limit,
-    step_of,
-)
 from equipix.measured.statistics import FrameStatistics, Light, light_of
-from equipix.metrics.frame_noise import stack_of, temporal_of, warn_of_drift
+from equipix.metrics.frame_noise import STEADY, stack_of, temporal_of
 from equipix.nuc.curves import response_at
-from equipix.nuc.level_rules import warn_of_misfit
+from equipix.nuc.level_rules import CURVES, Curves
 from equipix.nuc.response import Response, common_misfit
 
 _SAMPLED = 4096
@@ -89,9 +83,10 @@ def of_frames(
     good: Bools,
     limits: DefectLimits,
     cfa: Colours | None = None,
-) -> dict[str, Bools]:
-    """Bad pixels by their noise; `good` are those whose curves are usable."""
+) -> tuple[dict[str, Bools], tuple[Finding, ...]]:
+    """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
     slow, light = None, Light()
+    said: tuple[Finding, ...] = ()
     if isinstance(frames, FrameStatistics):
         _check_shape(frames.mean.shape, good.shape)
         mean, variance, count = frames.mean, frames.variance, int(frames.count.max())
@@ -100,10 +95,10 @@ def of_frames(
         stack = stack_of("frames", frames)
         _check_shape(stack.shape[1:], good.shape)
         over_time = temporal_of(stack, ~good)
-        warn_of_drift(over_time)
+        said = say(*ask(STEADY, over_time))
         mean, variance, count = over_time.mean, over_time.variance, over_time.frames
-        step = step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
-        slow = _von_neumann(over_time.steps, variance, count) < -limits.correlation
+        step = noise.step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
+        slow = defects.flickering_pixels(over_time.steps, variance, count, limits.correlation)
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
     common = light.variance(mean)
@@ -112,12 +107,15 @@ def of_frames(
     noisy = flickering = np.zeros(good.shape, bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
-        flickering = noisy_pixels(*of_level)
-        noisy = noisy_pixels(*of_level, times=limits.noise, light=[common])
+        flickering = defects.noisy_pixels(*of_level)
+        noisy = defects.noisy_pixels(*of_level, times=limits.noise, light=[common])
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
-        noisy = noisy | often_rejected(missing, count)
-    return {"noisy": noisy} if slow is None else {"noisy": noisy, "flickering": flickering & slow}
+        noisy = noisy | defects.often_rejected(missing, count)
+    found = {"noisy": noisy}
+    if slow is not None:
+        found["flickering"] = flickering & slow
+    return found, said
 
 
 def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
@@ -133,15 +131,15 @@ def _dead(response: Response, slope: Floats, usual: Floats | float, least: float
         return np.zeros(slope.shape, bool)
     # Of a line; that of a higher order at 0, which is larger than that of the mean slope.
     std = np.sqrt(np.nan_to_num(response.variances[1])) / usual
-    return response_outliers(slope, lambda: std, least=least)[0]
+    return defects.response_outliers(slope, lambda: std, least=least)[0]
 
 
 def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
     """Pixels whose curve fits worse than noise, and the misfit of the array, explain."""
     found = np.zeros(response.shape, bool)
-    common = sigmas**2 * max(0.0, misfit - 1) / MEDIAN_SQUARE
+    common = sigmas**2 * max(0.0, misfit - 1) / noise.MEDIAN_SQUARE
     for freedom in np.unique(response.freedom[response.freedom > 0]):
-        limit = scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
+        limit = noise.scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
         found |= (response.freedom == freedom) & (response.reduced_chi2 > limit)
     return found
 
@@ -154,29 +152,22 @@ def _common_noise(
     step: float,
     light: Array,
     period: tuple[int, int],
-) -> NoiseModel | None:
+) -> noise.NoiseModel | None:
     """Noise that pixels of a signal have in common; None of equal frames that are not rounded."""
     known = good & np.isfinite(mean) & np.isfinite(variance)
     if not known.any():
         known = np.isfinite(mean) & np.isfinite(variance)
-    points = photon_transfer(mean, variance, known, count, step, light, period)
+    points = noise.photon_transfer(mean, variance, known, count, step, light, period)
     if not len(points):
         raise InputError("'frames' hold no value: they show no noise")
     if step == 0 and not points[:, 1].any():
         return None
-    return NoiseModel.fit(points, step=step)
+    return noise.NoiseModel.fit(points, step=step)
 
 
 def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:
     if found != shape:
         raise InputError(f"'frames' has frames of {found}, the sensor {shape}")
-
-
-def _von_neumann(steps: Floats, variance: Floats, count: int) -> Floats:
-    """Von Neumann's ratio of each pixel less 2, in its standard deviations."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = steps / (variance * (count - 1))
-    return np.asarray((ratio - 2) / 2 * np.sqrt((count**2 - 1) / max(1, count - 2)))
 
 
 PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)
@@ -204,6 +195,8 @@ class Defects(ReadOnly):
     not_determinable : dict of str to str
         Kinds that these frames are too few for, with the reason. Pixels that were found
         nevertheless are flagged.
+    findings : tuple of Finding
+        What limits the result, each also a warning.
     """
 
     flags: Array
@@ -212,6 +205,7 @@ class Defects(ReadOnly):
     misfit: float = float("nan")
     limits: DefectLimits = field(default_factory=DefectLimits)
     not_determinable: dict[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
 
 def find_defects(
@@ -297,9 +291,14 @@ def find_defects(
         misfit = common_misfit(response)
         slope = mean_slope(response)
         colours, filters = _filters(response, named_cfa(response, cfa), slope)
+        said: tuple[Finding, ...] = ()
+        if filters is not None and filters.words:
+            said = say(Finding("cfa", filters.words, "misfit"))
         found = of_response(response, slope, limits, misfit, filters)
         if frames is not None:
-            found |= of_frames(frames, usable(response.flags), limits, colours)
+            by_noise, more = of_frames(frames, usable(response.flags), limits, colours)
+            found |= by_noise
+            said += more
     flags = response.flags.copy()
     for kind, pixels in found.items():
         set_bits(flags, kind, pixels)
@@ -310,8 +309,8 @@ def find_defects(
     known = gain[np.isfinite(gain)]
     percentiles = np.percentile(known, PERCENTILES) if known.size else np.full(len(PERCENTILES), 0)
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
-    warn_of_misfit(response, misfit)
-    return Defects(flags, counts, named, misfit, limits, few)
+    said += say(*ask(CURVES, Curves(response, misfit)))
+    return Defects(flags, counts, named, misfit, limits, few, said)
 
 
 def _filters(
@@ -321,8 +320,4 @@ def _filters(
     if response.cfa is not None:
         return response.cfa, None
     filters = Filters.of(given, slope)
-    if filters is None:
-        return None, None
-    if filters.words:
-        warn(filters.words, MisfitWarning)
-    return filters.colours, filters
+    return (None, None) if filters is None else (filters.colours, filters)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,12 +12,12 @@ from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import Array, Bools, By, Floats, Order, naming_memory, positive_workers
-from equipix.findings import set_bits, usable
+from equipix.findings import ask, say, set_bits, usable
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel, median_of_noise
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import horner_inverse, least_slope
-from equipix.nuc.level_rules import inverse_finding, warn_of_misfit
+from equipix.nuc.level_rules import CURVES, INVERSE, Curves, inverse_error
 from equipix.nuc.levels import Levels, alike_pixels, levels_of
 from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
 from equipix.nuc.response import Response, common_misfit
@@ -153,8 +154,8 @@ def fitted(
         options: dict[str, Any] = {"order": order, "by": by}
         parts = _parts(given)
         if order == "auto":
-            found = [chosen_order(part, by, workers=workers) for _, part in parts]
-            chosen, options["prediction_errors"] = max(found, key=lambda each: each[0])
+            orders = [chosen_order(part, by, workers=workers) for _, part in parts]
+            chosen, options["prediction_errors"] = max(orders, key=lambda each: each[0])
         else:
             chosen = int(order)
         for _, part in parts:
@@ -169,10 +170,11 @@ def fitted(
         }
         curves = [(pixels, _curves(part, chosen, by, workers)) for pixels, part in parts]
         response = _response(given, _joined(curves), metadata | (provenance or {}))
+        found = ask(INVERSE, response)
         # One point is right at one level, whatever the others are; "auto" judged them all.
         if chosen > 0 or order == "auto":
-            warn_of_misfit(response, common_misfit(response))
-        return response
+            found += ask(CURVES, Curves(response, common_misfit(response)))
+        return replace(response, findings=response.findings + say(*found))
 
 
 def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:
@@ -238,7 +240,7 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
     finished = datetime.now(UTC).isoformat(timespec="seconds")
     flags = _flags(maps["deviation"], levels, maps.pop("rising"))
     error = maps["inverse_error"][usable(flags)]
-    metadata["inverse"] = inverse_finding(error, levels.frame_noise)
+    metadata["inverse"] = inverse_error(error, levels.frame_noise)
     return Response(
         **maps,
         flags=flags,
@@ -246,6 +248,7 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
         raw=levels.raw,
         saturation=levels.saturation,
         metadata=metadata | {"finished": finished},
+        findings=levels.findings,
         cfa=levels.cfa,
         colour_response=levels.filters.response if levels.cfa and levels.filters else None,
     )

@@ -1,4 +1,4 @@
-"""What levels or the curves fitted to them leave to say: saturation, inverse, misfit."""
+"""Rules on levels and on the curves fitted to them: saturation, inverse, misfit."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import Array, Bools
-from equipix.errors import InputError, InputWarning, MisfitWarning, warn
-from equipix.findings import usable
+from equipix.errors import InputError
+from equipix.findings import Rule, usable
 from equipix.measured.defects import SIGMAS
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured
 from equipix.measured.noise import inliers, scatter_limit
-from equipix.measured.saturation import Clipping, clipping_advice, is_of_bits
+from equipix.measured.saturation import ROUNDING, Clipping, clipping_advice, is_of_bits, whole
 from equipix.nuc.response import Response
 
 _MOST_AT_HIGHEST = 0.5
@@ -26,14 +26,17 @@ _WHOLE = 0.99
 _FEWEST_JUDGED = 16
 """Fewest pixels of an array whose spread is judged."""
 
-_ROUNDING = 1e-9
-"""Relative rounding of means from which a dark was subtracted, and added again."""
+
+class Given(NamedTuple):
+    """Levels as they were given: averages have noise, and the caller a mask."""
+
+    measured: Measured
+    averaged: Averaged | None
+    mask: Bools | None
 
 
-def check_saturation(
-    measured: Measured, averaged: Averaged | None = None, mask: Bools | None = None
-) -> None:
-    """Warn of levels that probably saturate, and refuse those that do so as a whole.
+def _on_saturation(given: Given) -> str | None:
+    """Say that levels probably saturate.
 
     Raises
     ------
@@ -44,9 +47,9 @@ def check_saturation(
     -----
     A level with most of its pixels at exactly the highest value saturates, if the pixels of another
     level differ, or the value is the largest number of some bits. If all levels are even without
-    it, they are no frames of a camera. Where no such value is found, the noise of averages shows
-    levels that a full well limits.
+    it, they are no frames of a camera.
     """
+    measured = given.measured
     top, shares = _at_highest(measured)
     crowded = [level for level, share in enumerate(shares) if share > _MOST_AT_HIGHEST]
     found = measured.clipped
@@ -55,23 +58,21 @@ def check_saturation(
         values = round(sum(shares) * measured.values[0].size)
         found = found or Clipping(top, values)
     if found is None:
-        if averaged is not None:
-            warn_of_full_wells(averaged, mask)
-        return
+        return None
     where = [level for level, share in enumerate(shares) if share > 0] if found.level == top else []
     named = f"{_named(shares, where)} of 'levels': " if where else ""
-    warn(named + clipping_advice(found, "levels.toml", "nuc.fit"), InputWarning)
+    return named + clipping_advice(found, "levels.toml", "nuc.fit")
 
 
 def _at_highest(measured: Measured) -> tuple[float, list[float]]:
     """Highest finite raw value of all levels, and the share of each level's pixels there."""
-    tops = [_highest(_raw_level(measured, level)) for level in range(len(measured.values))]
+    tops = [_highest(measured.raw_values(level)) for level in range(len(measured.values))]
     top = max(tops)
     if not np.isfinite(top) or top <= 0 or measured.values[0].size < _FEWEST_JUDGED:
         return top, [0.0] * len(tops)
-    least = top * (1 - _ROUNDING)
-    return _whole(top), [
-        _share(_raw_level(measured, level), least) if each >= least else 0.0
+    least = top * (1 - ROUNDING)
+    return whole(top), [
+        _share(measured.raw_values(level), least) if each >= least else 0.0
         for level, each in enumerate(tops)
     ]
 
@@ -88,17 +89,12 @@ def _share(raw: Array, least: float) -> float:
     return int(np.count_nonzero(known & (raw >= least))) / max(1, count)
 
 
-def _whole(top: float) -> float:
-    """The whole number that a mean is but for rounding, or the mean."""
-    return float(np.rint(top)) if abs(top - np.rint(top)) <= _ROUNDING * top else top
-
-
 def _others_differ(measured: Measured, crowded: Sequence[int]) -> bool:
     """Whether another level has most of its pixels below its highest value."""
     for level in set(range(len(measured.values))) - set(crowded):
-        raw = _raw_level(measured, level)
+        raw = measured.raw_values(level)
         top = _highest(raw)
-        if np.isfinite(top) and _share(raw, top - _ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
+        if np.isfinite(top) and _share(raw, top - ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
             return True
     return False
 
@@ -116,14 +112,6 @@ def _refuse_whole(top: float, shares: Sequence[float], crowded: Sequence[int]) -
 def _named(shares: Sequence[float], levels: Sequence[int]) -> str:
     """Name levels with their shares."""
     return " and ".join(f"{shares[each]:.1%} of the values of level {each}" for each in levels)
-
-
-def _raw_level(measured: Measured, level: int) -> Array:
-    """Values of a level before the dark was subtracted; NaN where they are known to saturate."""
-    values: Array = measured.values[level]
-    if measured.mask is not None and measured.mask.ndim == 3:
-        values = np.where(measured.mask[level], np.nan, values)
-    return values if measured.dark is None else values + measured.dark
 
 
 _SHARE = 0.5
@@ -146,8 +134,8 @@ class _Scatter(NamedTuple):
     """Lower bound of that of the pixels' own noise: a drift of the light is no part of it."""
 
 
-def warn_of_full_wells(averaged: Averaged, mask: Bools | None) -> None:
-    """Warn of levels that scatter less than a darker one, and say what to do.
+def _on_full_wells(given: Given) -> str | None:
+    """Say that levels scatter less than a darker one, and what to do.
 
     Notes
     -----
@@ -159,9 +147,12 @@ def warn_of_full_wells(averaged: Averaged, mask: Bools | None) -> None:
     ----------
     .. [1] European Machine Vision Association, "EMVA Standard 1288", release 4.0 linear, 2021.
     """
-    used = _used(averaged, mask)
+    averaged = given.averaged
+    if averaged is None:
+        return None
+    used = _used(averaged, given.mask)
     if np.count_nonzero(used) < _FEWEST_JUDGED:
-        return
+        return None
     lowest = averaged.values[int(np.argmin([each[used].mean() for each in averaged.values]))][used]
     scatters = [
         _scatter(averaged, level, used, lowest)
@@ -169,10 +160,11 @@ def warn_of_full_wells(averaged: Averaged, mask: Bools | None) -> None:
         if frames > 1
     ]
     full = [each for each in scatters if _noisier(each, scatters)]
-    if full:
-        first = min(full, key=lambda each: each.mean)
-        darker = max(_noisier(first, scatters), key=lambda each: each.variance)
-        warn(_words(full, first, darker) + _advice(averaged, used, full), InputWarning)
+    if not full:
+        return None
+    first = min(full, key=lambda each: each.mean)
+    darker = max(_noisier(first, scatters), key=lambda each: each.variance)
+    return _words(full, first, darker) + _advice(averaged, used, full)
 
 
 def _noisier(bright: _Scatter, scatters: list[_Scatter]) -> list[_Scatter]:
@@ -200,7 +192,7 @@ def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Sca
     kept = inliers(variances, scatter_limit(frames))
     common = _common(variances[kept], rise[kept], frames - 1)
     mean, variance = (
-        float(_raw_average(averaged, level)[used].mean()),
+        float(averaged.raw_values(level)[used].mean()),
         float(variances[kept].mean()),
     )
     return _Scatter(level, mean, variance, variance - common)
@@ -232,12 +224,6 @@ def _by_rise(variances: Array, rise: Array) -> float:
     return covariance**2 / steepness
 
 
-def _raw_average(averaged: Averaged, level: int) -> Array:
-    """Mean values of a level before the dark was subtracted."""
-    values: Array = averaged.values[level]
-    return values if averaged.dark is None else values + averaged.dark.mean
-
-
 def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
     """Say which levels saturate, with the numbers of the darkest of them."""
     named = " and ".join(f"level {each.level}" for each in full)
@@ -259,10 +245,8 @@ def _advice(averaged: Averaged, used: Bools, full: list[_Scatter]) -> str:
         return ""  # less a dark that was not kept
     saturate = [each.level for each in full]
     free = [level for level in range(averaged.count) if level not in saturate]
-    low = min(float(np.quantile(_raw_average(averaged, level)[used], _TAIL)) for level in saturate)
-    highest = max(
-        float(np.quantile(_raw_average(averaged, level)[used], 1 - _TAIL)) for level in free
-    )
+    low = min(float(np.quantile(averaged.raw_values(level)[used], _TAIL)) for level in saturate)
+    highest = max(float(np.quantile(averaged.raw_values(level)[used], 1 - _TAIL)) for level in free)
     if np.floor(low) <= highest:
         return ""
     level = f"{np.floor(low):.10g}"
@@ -279,12 +263,35 @@ _LEAST = 0.5
 """Mean of reduced χ² below which the noise is less than stated."""
 
 
-def warn_of_misfit(response: Response, misfit: float) -> None:
-    """Warn of a misfit that noise does not explain, or of less than noise, and say what to do."""
-    if misfit < _LEAST:
-        _warn_of_large_noise(response)
+class Curves(NamedTuple):
+    """Response curves, and the misfit that they leave half of the pixels."""
+
+    response: Response
+    misfit: float
+
+
+def _on_large_noise(curves: Curves) -> str | None:
+    """Say that residuals are smaller than the noise, of which not all pixels have few."""
+    response = curves.response
+    if not curves.misfit < _LEAST:
+        return None
+    judged = usable(response.flags) & (response.freedom > 0)
+    chi2 = float(response.reduced_chi2[judged].mean())
+    if not chi2 < _LEAST:
+        return None
+    return (
+        f"the residuals of the curves are smaller than the noise predicts (reduced "
+        f"chi-square {chi2:.3g}, expected 1, limit {_LEAST:g}): standard deviations are too "
+        "large, and bad pixels may be missed. Check that the light was steady while the "
+        "frames of a level were taken, and that the noise was as stated"
+    )
+
+
+def _on_misfit(curves: Curves) -> str | None:
+    """Say that noise does not explain a misfit, and what to do."""
+    response, misfit = curves
     if not misfit > _MOST:
-        return
+        return None
     order, levels = response.order, len(response.levels)
     higher = ""
     if response.metadata["options"]["order"] == "auto":
@@ -292,38 +299,23 @@ def warn_of_misfit(response: Response, misfit: float) -> None:
     elif order < 3:
         more = "fit with" if order < levels - 2 else "give more levels and fit with"
         higher = f"{more} order={order + 1} or order='auto', "
-    warn(
+    return (
         f"curves of order {order} leave half of the pixels a misfit of {misfit:.3g} or more times "
         f"that of noise: {higher}check that the source was steady and that the noise was as "
         "stated. find_defects flags pixels that deviate from the others, not what all have in "
-        "common",
-        MisfitWarning,
+        "common"
     )
-
-
-def _warn_of_large_noise(response: Response) -> None:
-    """Warn of residuals that are smaller than the noise, of which not all pixels have few."""
-    judged = usable(response.flags) & (response.freedom > 0)
-    chi2 = float(response.reduced_chi2[judged].mean())
-    if chi2 < _LEAST:
-        warn(
-            f"the residuals of the curves are smaller than the noise predicts (reduced "
-            f"chi-square {chi2:.3g}, expected 1, limit {_LEAST:g}): standard deviations are too "
-            "large, and bad pixels may be missed. Check that the light was steady while the "
-            "frames of a level were taken, and that the noise was as stated",
-            MisfitWarning,
-        )
 
 
 _LARGEST_DIFFERENCE = 0.3
 """Largest difference, over the noise of a frame, that passes: it adds 4 % to the noise."""
 
 _MOST_BEYOND = 1e-3
-"""Largest share of the usable pixels that may differ by more, without a warning."""
+"""Largest share of the usable pixels that may differ by more, without a finding."""
 
 
-def inverse_finding(difference: Array, noise: float | None) -> dict[str, float | int | None]:
-    """Compare the error of the cubic with the noise of a frame, and warn where it is large.
+def inverse_error(difference: Array, noise: float | None) -> dict[str, float | int | None]:
+    """Compare the error of the cubic with the noise of a frame.
 
     Parameters
     ----------
@@ -339,12 +331,35 @@ def inverse_finding(difference: Array, noise: float | None) -> dict[str, float |
     """
     largest = float(np.max(difference, initial=0.0))
     beyond = 0 if noise is None else int(np.count_nonzero(difference > _LARGEST_DIFFERENCE * noise))
-    if beyond > _MOST_BEYOND * difference.size:
-        warn(
-            f"the cubic that inverts the curves differs from their inverse by up to {largest:.2g} "
-            f"DN, and in {beyond} of {difference.size} pixels by more than {_LARGEST_DIFFERENCE:g} "
-            f"of the noise of a frame, {noise:.2g} DN: correct(exact=True), or fit a lower order "
-            "or a smaller range of levels",
-            MisfitWarning,
-        )
     return {"largest_error_dn": largest, "noise_dn": noise, "pixels_beyond": beyond}
+
+
+def _on_inverse(response: Response) -> str | None:
+    """Say that the cubic misses the inverse of the curves in many pixels."""
+    largest, noise, beyond = response.metadata["inverse"].values()
+    count = int(np.count_nonzero(usable(response.flags)))
+    if not beyond > _MOST_BEYOND * count:
+        return None
+    return (
+        f"the cubic that inverts the curves differs from their inverse by up to {largest:.2g} "
+        f"DN, and in {beyond} of {count} pixels by more than {_LARGEST_DIFFERENCE:g} "
+        f"of the noise of a frame, {noise:.2g} DN: correct(exact=True), or fit a lower order "
+        "or a smaller range of levels"
+    )
+
+
+GIVEN: tuple[Rule[Given], ...] = (
+    Rule("saturation", "input", _on_saturation),
+    Rule("full_well", "input", _on_full_wells, unless=frozenset({"saturation"})),
+    Rule("light", "misfit", lambda given: given.measured.unsteady),
+)
+"""What is asked of levels as they were given."""
+
+INVERSE: tuple[Rule[Response], ...] = (Rule("inverse", "misfit", _on_inverse),)
+"""What is asked of a response."""
+
+CURVES: tuple[Rule[Curves], ...] = (
+    Rule("variance", "misfit", _on_large_noise),
+    Rule("misfit", "misfit", _on_misfit),
+)
+"""What is asked of curves that are fitted to more levels than they need."""

@@ -12,15 +12,16 @@ from numpy.typing import ArrayLike
 
 from equipix import _native
 from equipix._check import Array, Bools, Floats, ReadOnly, Words, as_mask, union
-from equipix.errors import InputError, InputWarning, MisfitWarning, warn
+from equipix.errors import InputError
+from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours
 from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
 from equipix.measured.filters import Filters
 from equipix.measured.means import Averaged
-from equipix.measured.measured import Measured, check_levels, check_variance, measured_of
+from equipix.measured.measured import Measured, averaged_of, check_levels, measured_of
 from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
 from equipix.measured.statistics import FrameStatistics
-from equipix.nuc.level_rules import check_saturation
+from equipix.nuc.level_rules import GIVEN, Given
 
 _LEVELS = Words("'levels'", "level")
 
@@ -73,6 +74,8 @@ class Levels(ReadOnly):
         given; None if it is unknown.
     filters : Filters or None
         Colour filters of the pixels, where they are given or stand out of the levels.
+    findings : tuple of Finding
+        What limits them.
     """
 
     values: Array
@@ -86,6 +89,7 @@ class Levels(ReadOnly):
     saturation: float | None = None
     frame_noise: float | None = None
     filters: Filters | None = None
+    findings: tuple[Finding, ...] = ()
 
     @property
     def cfa(self) -> Colours | None:
@@ -186,28 +190,24 @@ def levels_of(
 ) -> Levels:
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
     check_levels(levels)
-    colours = Colours.of(cfa)
-    averaged = _averaged(levels, colours)
+    averaged = averaged_of(levels, _LEVELS, Colours.of(cfa))
     if averaged is not None and averaged.raw and averaged.count > 1:
         averaged = averaged.counted_from_lowest()
     source = levels if averaged is None else averaged
-    if (count := _count(source)) is not None:
-        check_variance(variance, count)
-    measured = measured_of(source, variance, saturation, words=_LEVELS)
-    given = None if mask is None else as_mask(mask, measured.values.shape)
-    check_saturation(measured, averaged, given)
-    pedestal = 0.0 if averaged is None else averaged.pedestal
-    if measured.unsteady:
-        warn(measured.unsteady, MisfitWarning)
-    noise = _noise_of(measured, pedestal)
-    values = _used(measured, given)
-    filters = _filters(values, colours if averaged is None else averaged.colours)
+    measured = measured_of(source, variance, saturation, words=_LEVELS, colours=Colours.of(cfa))
+    if measured.variance is not None:
+        _check_variance(measured.variance)
+    given = as_mask(mask, measured.values.shape)
+    said = say(*ask(GIVEN, Given(measured, averaged, given)))
+    noise = _noise_of(measured, 0.0 if averaged is None else averaged.pedestal)
+    # Arrays hold values where they saturate, averages NaN.
+    excluded = given if averaged is not None else union(given, measured.mask)
+    values = measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
+    filters = _filters(values, measured.colours)
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
     usable = _usable(values, bad_pixels, given)
-    if measured.dark is not None:
-        _warn_of_bright_dark(values, usable, noise, measured.dark_variance)
     references = _references(values, usable)
-    return Levels(
+    checked = Levels(
         values=values,
         references=references,
         usable=usable,
@@ -215,11 +215,24 @@ def levels_of(
         bad_pixels=bad_pixels,
         dark=measured.dark,
         dark_variance=measured.dark_variance,
-        raw=measured.raw,
-        saturation=_saturation_of(levels, saturation),
+        raw=measured.raw and averaged is not None,
+        saturation=measured.saturation,
         frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
         filters=filters,
     )
+    return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
+
+
+def _check_variance(variance: Array) -> None:
+    """Refuse variances that are not one number above 0 for each level."""
+    if variance.ndim != 1:
+        raise InputError(
+            f"'variance' has shape {variance.shape}, expected ({len(variance)},), one number a "
+            "level, or a NoiseModel: a pixel's own sample variance makes weights noisy"
+        )
+    wrong = variance[~(np.isfinite(variance) & (variance > 0))]
+    if wrong.size:
+        raise InputError(f"'variance' holds {wrong[0]:g}, expected finite numbers above 0, in DN²")
 
 
 def _filters(values: Array, colours: Colours | None) -> Filters | None:
@@ -229,23 +242,12 @@ def _filters(values: Array, colours: Colours | None) -> Filters | None:
         return None if colours is None else Filters.of(colours, values[0])
     medians = [float(np.nanmedian(each)) for each in values]
     low, high = int(np.argmin(medians)), int(np.argmax(medians))
-    found = Filters.of(colours, values[high] - values[low] if high != low else values[0])
-    if found is not None and found.words:
-        warn(found.words, MisfitWarning)
-    return found
+    return Filters.of(colours, values[high] - values[low] if high != low else values[0])
 
 
 def _references(values: Array, usable: Bools) -> Floats:
     """Mean V̄ of each level over usable pixels."""
     return np.array([each[usable].mean(dtype=np.float64) for each in values])
-
-
-def _count(source: object) -> int | None:
-    """Number of levels given; None where they are no sequence, which is refused later."""
-    if isinstance(source, Averaged):
-        return source.count
-    known = isinstance(source, list | tuple) or (isinstance(source, np.ndarray) and source.ndim > 0)
-    return len(source) or None if known else None  # type: ignore[arg-type]
 
 
 def _frame_noise(
@@ -259,40 +261,14 @@ def _frame_noise(
     return None if noise is None else float(np.sqrt(noise[lowest].variance(references[lowest])))
 
 
-def _saturation_of(levels: object, given: float | None) -> float | None:
-    """Return the level of saturation given, or that of averages where all have one."""
-    if isinstance(levels, Averaged):
-        return levels.saturation
-    if given is not None or not isinstance(levels, list | tuple):
-        return given
-    known = {getattr(each, "saturation", None) for each in levels}
-    return known.pop() if len(known) == 1 else None
-
-
-def _averaged(levels: object, colours: Colours | None) -> Averaged | None:
-    """Statistics of all levels, reduced; None for arrays."""
-    if isinstance(levels, Averaged):
-        return levels
-    if not isinstance(levels, list | tuple) or not levels:
-        return None
-    if not all(isinstance(each, FrameStatistics) for each in levels):
-        return None
-    averaged = Averaged(
-        len(levels), saturation=_saturation_of(levels, None), words=_LEVELS, colours=colours
-    )
-    for each in levels:
-        averaged.add(each)
-    return averaged
-
-
 def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | None:
     """Noise of each mean frame, from noise models or one variance a level.
 
     What rounding leaves in a mean is that at the median of the level, less what all pixels have in
     common, which V̄ takes.
     """
-    if measured.models:
-        pairs = zip(measured.models, measured.values, strict=True)
+    if measured.noise:
+        pairs = zip(measured.noise, measured.values, strict=True)
         return tuple(_level_noise(model, values, pedestal) for model, values in pairs)
     if measured.variance is None:
         return None
@@ -304,13 +280,6 @@ def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNois
     slope = model.gain / model.frames
     common = float(model.rounding(signal)) - model.rounding_apart(signal, values)
     return LevelNoise(float(model.variance(signal)) - common - slope * signal, slope, pedestal)
-
-
-def _used(measured: Measured, mask: Bools | None) -> Array:
-    """Values with NaN where the caller masks them or, of arrays, where they saturate."""
-    saturated = measured.mask if measured.mask is not None and measured.mask.ndim == 3 else None
-    excluded = union(mask, saturated)
-    return measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
 
 
 def _with_odd_responses(
@@ -363,8 +332,6 @@ def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     wanted = np.ones_like(usable)
     if mask is not None:
         wanted &= ~mask.reshape(-1, *usable.shape).all(axis=0)
-    if not wanted.any():
-        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
     share = float(usable.sum() / int(wanted.sum()))
     if share < FEWEST_VALID or not usable.any():
         missing = [1 - np.mean(each[wanted]) for each in known]
@@ -376,36 +343,40 @@ def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     return usable
 
 
-def _warn_of_bright_dark(
-    values: Array,
-    usable: Bools,
-    noise: tuple[LevelNoise, ...] | None,
-    dark_variance: Floats | None,
-) -> None:
-    """Warn of levels whose median less the dark is below 0 by more than the noise of a value.
+def _on_bright_dark(levels: Levels) -> str | None:
+    """Say that the median of a level less the dark is below 0 by more than the noise of a value.
 
     Where no noise is known the scatter of the level takes its place. Medians are those of a sample
     of the usable pixels.
     """
-    sample = np.flatnonzero(usable)
+    if levels.dark is None:
+        return None
+    sample = np.flatnonzero(levels.usable)
     sample = sample[_spread(len(sample))]
-    of_dark = 0.0 if dark_variance is None else float(np.median(dark_variance))
+    of_dark = 0.0 if levels.dark_variance is None else float(np.median(levels.dark_variance))
     below = []
-    for level, every in enumerate(values):
+    for level, every in enumerate(levels.values):
         each = every.reshape(-1)[sample]
         median = float(np.median(each))
-        if noise is None:
+        if levels.noise is None:
             sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)
         else:
-            sigma = np.sqrt(float(noise[level].variance(median)) + of_dark)
+            sigma = np.sqrt(float(levels.noise[level].variance(median)) + of_dark)
         if median < -SIGMAS * sigma:
             below.append(f"{median:.6g} DN at level {level}")
-    if below:
-        warn(
-            f"the dark is brighter than a level of 'levels': the median less the dark is "
-            f"{' and '.join(below)}. Give the dark frames of these levels, or none",
-            InputWarning,
-        )
+    if not below:
+        return None
+    return (
+        f"the dark is brighter than a level of 'levels': the median less the dark is "
+        f"{' and '.join(below)}. Give the dark frames of these levels, or none"
+    )
+
+
+_CHECKED: tuple[Rule[Levels], ...] = (
+    Rule("cfa", "misfit", lambda levels: levels.filters.words if levels.filters else None),
+    Rule("bright_dark", "input", _on_bright_dark),
+)
+"""What is asked of levels that can be fitted."""
 
 
 def _cause(values: Array, missing: Sequence[float], odd: float) -> str:

@@ -6,7 +6,7 @@ from typing import get_args
 
 import numpy as np
 
-from equipix._check import Array, By, Floats, Order, check_word, described
+from equipix._check import Array, By, Floats, Order, check_word, described, is_whole
 from equipix.errors import InputError
 from equipix.nuc.curves import response_at
 from equipix.nuc.levels import Levels, alike_pixels
@@ -31,8 +31,7 @@ def form_of(order: int, by: By) -> str:
 
 def check_order(order: object, by: object) -> None:
     """Refuse an unknown order, an unknown `by`, and a `by` that an order does not have."""
-    whole = isinstance(order, int | np.integer) and not isinstance(order, bool)
-    if not (whole or isinstance(order, str)) or order not in get_args(Order):
+    if not (is_whole(order) or isinstance(order, str)) or order not in get_args(Order):
         raise InputError(f"'order' is {described(order)}, expected one of {get_args(Order)}")
     check_word("by", by, get_args(By))
     if by == "gain" and order != 0:

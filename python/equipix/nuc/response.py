@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix._check import Array, Bools, Flagged, Floats, as_array, naming_memory
-from equipix.correction.apply import apply, apply_polynomial, dark_frame, is_stored
-from equipix.correction.protocol import cfa_of, depth_of, named_cfa
+from equipix.correction.apply import CorrectionBase, apply, checked_frames
+from equipix.correction.protocol import Dark, named_cfa, with_dark
 from equipix.errors import InputError
-from equipix.findings import usable
+from equipix.findings import Finding, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
-from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import counted_from, exact_inverse, response_at
 
 _LARGEST = int(np.iinfo(np.uint32).max)
@@ -24,7 +23,7 @@ _LARGEST = int(np.iinfo(np.uint32).max)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Response(Record, kind="response", version=2):
+class Response(CorrectionBase, Record, kind="response", version=2):
     """Response curves of all pixels, the result of `equipix.nuc.fit`; its arrays are read-only.
 
     Attributes
@@ -68,6 +67,8 @@ class Response(Record, kind="response", version=2):
         Colour filters of the pixels, where they were given.
     colour_response : dict of str to float, or None
         Response of each colour to the source, of mean 1 over the pixels.
+    findings : tuple of Finding
+        What limits the result, each also a warning of the fit.
 
     Notes
     -----
@@ -91,6 +92,9 @@ class Response(Record, kind="response", version=2):
     metadata: dict[str, Any] = field(default_factory=dict)
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
+    findings: tuple[Finding, ...] = ()
+    takes_dark: ClassVar[bool] = True
+    needs_dark: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Refuse numbers of coefficients that do not fit together, and filters that are none."""
@@ -104,10 +108,14 @@ class Response(Record, kind="response", version=2):
         Colours.of(self.cfa)
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        rows, cols = self.flags.shape
-        return rows, cols
+    def leaves_offset(self) -> bool:
+        """Whether corrected frames keep the mean offset of raw levels."""
+        return self.raw
+
+    @property
+    def colours(self) -> Colours | None:
+        """Colour filters of the pixels, also where the sensor in `metadata` alone has them."""
+        return self.cfa or super().colours
 
     @property
     def order(self) -> int:
@@ -150,12 +158,11 @@ class Response(Record, kind="response", version=2):
             f"<Response of {rows} x {cols} pixels, order {self.order}, {len(self.levels)} levels>"
         )
 
-    @naming_memory("correcting")
     def correct(
         self,
         frames: ArrayLike,
         *,
-        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
+        dark: Dark = "stored",
         flagged: Flagged = "nan",
         exact: bool = False,
         out: Array | None = None,
@@ -192,40 +199,22 @@ class Response(Record, kind="response", version=2):
             If a shape does not fit, `flagged` is unknown, frames are of another bit depth, or a
             dark is given to a response without one.
         """
-        offset, depth = self._offset(dark), depth_of(self)
         if not exact:
-            own = () if self.dark is None or offset is None else (self.dark,)
-            return apply_polynomial(
-                frames,
-                lambda: self.inverse if offset is None else counted_from(self.inverse, offset),
-                sources=(self.inverse, *own, self.flags) if offset is self.dark else None,
-                flags=self.flags,
-                flagged=flagged,
-                out=out,
-                depth=depth,
-                cfa=cfa_of(self),
-            )
+            return super().correct(frames, dark=dark, flagged=flagged, out=out)
+        offset = with_dark(self, dark).dark
         zero = np.zeros(self.shape) if offset is None else offset
 
-        def formula(frame: Array, corrected: Array) -> None:
-            corrected[...] = exact_inverse(self._rising, frame - zero, self.limits)
+        def formula(frame: Array) -> Array:
+            return exact_inverse(self._rising, frame - zero, self.limits)
 
-        return apply(
-            frames,
-            formula,
-            flags=self.flags,
-            flagged=flagged,
-            out=out,
-            depth=depth,
-            cfa=cfa_of(self),
-        )
+        return apply(self, frames, dark, flagged, out, formula)
 
     @naming_memory("finding extrapolated values")
     def extrapolated(
         self,
         frames: ArrayLike,
         *,
-        dark: Literal["stored"] | FrameStatistics | ArrayLike | None = "stored",
+        dark: Dark = "stored",
     ) -> Bools:
         """Which values lie outside the range that the levels cover, so their correction is a guess.
 
@@ -247,10 +236,8 @@ class Response(Record, kind="response", version=2):
         InputError
             If a shape does not fit.
         """
-        raw = as_array("frames", frames, ndim=(2, 3))
-        if raw.shape[-2:] != self.shape:
-            raise InputError(f"'frames' has shape {raw.shape}, the sensor {self.shape}")
-        offset = self._offset(dark)
+        raw = checked_frames(frames, self.shape)
+        offset = with_dark(self, dark).dark
         low, high = self.valid_range if offset is None else self.valid_range + offset
         return np.asarray(~((raw >= low) & (raw <= high)))
 
@@ -297,19 +284,6 @@ class Response(Record, kind="response", version=2):
     def _rising(self) -> Floats:
         """Coefficients of the curves that have an inverse, NaN elsewhere."""
         return np.where(np.isnan(self.inverse[0]), np.nan, self.deviation)
-
-    def _offset(self, dark: Literal["stored"] | FrameStatistics | ArrayLike | None) -> Array | None:
-        """Dark frame to subtract, if any."""
-        if is_stored(dark):
-            return self.dark
-        if dark is None:
-            return None
-        if self.raw:
-            raise InputError(
-                "'dark' is given, but the offsets of this response are part of its curves: it was "
-                "fitted to levels from which no dark was subtracted"
-            )
-        return dark_frame(dark, self.shape)
 
 
 def common_misfit(response: Response) -> float:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-
+from equipix._check import Array
 from equipix.errors import EquipixError, InputError
 from equipix.io.paths import write_whole
 
-CALIBRATION, FLAT_FIELD, PREDICTION = "C0", "C1", "black"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CALIBRATION, PREDICTION = "C0", "black"
 """Colours of what is drawn in several pictures."""
 
 
@@ -33,7 +34,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def check_picture(path: Path) -> None:
+def check_picture(path: Path | None) -> None:
     """Refuse a picture that cannot be drawn, before the work starts.
 
     Raises
@@ -43,6 +44,8 @@ def check_picture(path: Path) -> None:
     InputError
         If the suffix is unknown.
     """
+    if path is None:
+        return
     formats = new_figure(1, 1).canvas.get_supported_filetypes()
     if path.suffix.lower().removeprefix(".") not in formats:
         raise InputError(
@@ -63,12 +66,7 @@ def save_figure(figure: Figure, path: Path, *, force: bool = False) -> None:
 
 
 def draw_map(
-    axes: Axes,
-    title: str,
-    image: NDArray[Any],
-    limits: tuple[float, float],
-    cmap: str,
-    step: int = 1,
+    axes: Axes, title: str, image: Array, limits: tuple[float, float], cmap: str, step: int = 1
 ) -> None:
     """Draw an image with its scale; a pixel of it is `step` pixels wide and high."""
     rows, cols = (step * size for size in image.shape)

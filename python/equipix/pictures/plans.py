@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from equipix._check import Array
 from equipix.pictures.canvas import CALIBRATION, draw_map, new_figure
 from equipix.plan.budget import ErrorBudget
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def draw_plans(budgets: list[ErrorBudget]) -> Figure:
@@ -43,7 +45,7 @@ def draw_plans(budgets: list[ErrorBudget]) -> Figure:
     return figure
 
 
-def _thinned(image: NDArray[Any]) -> tuple[NDArray[Any], int]:
+def _thinned(image: Array) -> tuple[Array, int]:
     """Leave out rows and columns of a map that no picture could show."""
     step = max(1, max(image.shape) // 1000)
     return image[::step, ::step], step

@@ -1,27 +1,19 @@
 """The error budget of a planned calibration: noise, lamp drift, errors of the shifts."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, as_shifts, check_shape, number, per_exposure
-from equipix.errors import IdentifiabilityWarning, InputError, MisfitWarning, warn
+from equipix._check import ArrayLike, Floats, Ints, as_shifts, check_shape, per_exposure, positive
+from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
+from equipix.findings import Finding, Rule, ask, say
+from equipix.plan import pattern_errors
 from equipix.plan.components import identify, is_connected
 from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
-from equipix.plan.pattern_errors import (
-    Spectrum,
-    factor,
-    local_variance,
-    shift_error_effect,
-    smallest_near,
-    spectrum,
-)
+from equipix.plan.pattern_errors import Spectrum
 
 _WHOLE = 0.02
 """Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
@@ -57,6 +49,8 @@ class ErrorBudget:
         that is distinct from a tilt: see `advise_order`.
     components : int
         Number of connected components; of more than one, the errors are those within each.
+    findings : tuple of Finding
+        What limits the pattern, each also a warning.
     """
 
     shape: tuple[int, int]
@@ -67,7 +61,8 @@ class ErrorBudget:
     spectrum: Spectrum
     distinct_trend: float
     components: int
-    _noise: _Noise
+    _variances: Callable[[], Iterable[Floats]]
+    findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
         """Short form: the errors by cause."""
@@ -75,38 +70,20 @@ class ErrorBudget:
         return f"<ErrorBudget of {len(self.shifts)} exposures: {self.rms:.1e} rms ({causes})>"
 
     @cached_property
-    def noise_map(self) -> NDArray[np.float64]:
+    def noise_map(self) -> Floats:
         """Standard deviation of M from noise, shape (rows, cols); inf where not determined.
 
         By halves of the sensor it is within 10 % of simulation; within 25 % where a few long or
         nearly periodic waves make up most of the error, as with shifts of one pixel.
         """
-        return np.asarray(np.sqrt(np.concatenate(list(self._noise.variances()))))
+        return np.asarray(np.sqrt(np.concatenate(list(self._variances()))))
 
 
-@dataclass(frozen=True, eq=False)
-class _Noise:
-    """Data for the map of errors from noise, which is computed on demand."""
-
-    shape: tuple[int, int]
-    positions: NDArray[np.int64]
-    powers: Floats
-    width: float | None
-    scale: float
-
-    def variances(self) -> Iterator[Floats]:
-        """Blocks of rows of the map of variances."""
-        for block in local_variance(self.shape, self.positions, self.powers, self.width):
-            yield self.scale * block
-
-    def rms(self) -> float:
-        """Root mean square over the pixels that are determined."""
-        sums = [
-            (np.sum(block, where=np.isfinite(block)), np.isfinite(block).sum())
-            for block in self.variances()
-        ]
-        total, count = np.sum(sums, axis=0)
-        return float(np.sqrt(total / count)) if count else np.inf
+def _rms(blocks: Iterable[Floats]) -> float:
+    """Root of the mean of variances over the pixels that are determined."""
+    sums = [(np.sum(each, where=np.isfinite(each)), np.isfinite(each).sum()) for each in blocks]
+    total, count = np.sum(sums, axis=0)
+    return float(np.sqrt(total / count)) if count else np.inf
 
 
 def error_budget(
@@ -189,42 +166,42 @@ def error_budget(
     if not (np.isfinite(powers).all() and (powers > 0).all()):
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
     positions = whole_moves(exact)
-    waves = spectrum(exact, powers)
-    components = _components(sizes, positions, _between_pixels(exact, waves))
-    scale = noise**2 * factor(sizes, positions, powers)
-    predicted = _Noise(sizes, positions, powers, beam_width, scale)
+    waves = pattern_errors.spectrum(exact, powers)
+    components = _components(sizes, positions, _between_pixels(exact))
+    scale = noise**2 * pattern_errors.factor(sizes, positions, powers)
+    variances = partial(
+        pattern_errors.local_variance, sizes, positions, powers, beam_width, scale=scale
+    )
     drift_tilt = tilt_of_fluxes(sizes, exact, drift)
-    moved: tuple[float, tuple[float, float]] = (0.0, (0.0, 0.0))
+    moved, moved_tilt = 0.0, (0.0, 0.0)
     if beam_width is not None and shift_error:
-        moved = shift_error_effect(sizes, exact, powers, beam_width, shift_error)
+        moved, moved_tilt = pattern_errors.shift_error_effect(
+            sizes, exact, powers, beam_width, shift_error
+        )
     causes = {
-        "noise": predicted.rms(),
+        "noise": _rms(variances()),
         "drift": float(tilt_rms(drift_tilt)),
-        "shift_error": moved[0],
+        "shift_error": moved,
     }
-    warn_of_drift(causes)
-    return ErrorBudget(
+    budget = ErrorBudget(
         shape=sizes,
         shifts=exact,
         rms=float(np.linalg.norm(list(causes.values()))),
         rms_by_cause=causes,
         tilt_by_cause={
             "drift": (float(drift_tilt[0]), float(drift_tilt[1])),
-            "shift_error": moved[1],
+            "shift_error": moved_tilt,
         },
         spectrum=waves,
         distinct_trend=distinct_trend(exact),
         components=components,
-        _noise=predicted,
+        _variances=variances,
     )
+    return replace(budget, findings=say(*ask(_RULES, budget)))
 
 
 def check_causes(
-    shape: tuple[int, int],
-    noise: float,
-    drift: float,
-    shift_error: float,
-    beam_width: float | None,
+    shape: tuple[int, int], noise: float, drift: float, shift_error: float, beam_width: float | None
 ) -> None:
     """Refuse a sensor of one pixel, and causes of errors that are not numbers.
 
@@ -234,62 +211,70 @@ def check_causes(
         raise InputError(
             f"'shape' is {shape}, expected at least two pixels: one cannot be compared with another"
         )
-    _positive("noise", noise)
-    _positive("drift", drift, zero=True)
-    _positive("shift_error", shift_error, zero=True)
+    positive("noise", noise)
+    positive("drift", drift, zero=True)
+    positive("shift_error", shift_error, zero=True)
     if beam_width is not None:
-        _positive("beam_width", beam_width)
+        positive("beam_width", beam_width)
 
 
-def _positive(name: str, value: float, *, zero: bool = False) -> None:
-    """Check a number that is above 0, or may be 0."""
-    checked = number(name, value)
-    if not (0 < checked < np.inf or (zero and checked == 0)):
-        raise InputError(f"'{name}' is {value!r}, expected a number above 0{' or 0' * zero}")
-
-
-def _between_pixels(shifts: Floats, waves: Spectrum) -> bool:
-    """Whether shifts lie between pixels; warns if a wave is periodic in all of them.
+def _between_pixels(shifts: Floats) -> bool:
+    """Whether shifts lie between pixels.
 
     Such shifts compare each pixel with parts of several cells, so no part of the sensor is
     unconnected; but a wave of the same phase in all exposures is undetermined.
     """
     moves = shifts - shifts[0]
-    if np.abs(moves - np.rint(moves)).max() <= _WHOLE:
-        return False
-    if np.isfinite(waves.worst).all() and smallest_near(waves, shifts) < _UNDETERMINED:
-        row, col = waves.worst
-        warn(
-            f"the shifts do not constrain a wave of ({row:.3f}, {col:.3f}) cycles per pixel, which "
-            "has the same phase in all exposures: choose less regular shifts "
-            "(equipix.plan.suggest)",
-            IdentifiabilityWarning,
-        )
-    return True
+    return bool(np.abs(moves - np.rint(moves)).max() > _WHOLE)
 
 
-def _components(shape: tuple[int, int], positions: NDArray[np.int64], between: bool) -> int:
-    """Count the components, and warn of more than one."""
+def _components(shape: tuple[int, int], positions: Ints, between: bool) -> int:
+    """Count the components."""
     fits = np.all(np.abs(positions) < shape)
-    components = 1
-    if not (fits and (between or is_connected(shape, positions))):
-        components = identify(shape, positions).components
-    if components > 1 and not between:
-        warn(
-            f"the shifts leave {components} parts of the sensor unconnected: the errors are those "
-            "within a part: choose other shifts (equipix.plan.suggest)",
-            IdentifiabilityWarning,
-        )
-    return components
+    if fits and (between or is_connected(shape, positions)):
+        return 1
+    return identify(shape, positions).components
 
 
-def warn_of_drift(causes: dict[str, float], place: str = "") -> None:
-    """Warn of a tilt from drift that exceeds the noise, of the pattern that `place` names."""
-    if causes["drift"] > causes["noise"] > 0:
-        warn(
-            f"{place}lamp drift will tilt the sensitivity by {causes['drift']:.1e} rms, "
-            f"{causes['drift'] / causes['noise']:.1f} times the error by noise, and leaves no "
-            "residual: measure the flux, turn one exposure, or use larger shifts "
-            "(equipix.plan.suggest)",
-            MisfitWarning,
-        )
+def _on_wave(budget: ErrorBudget) -> str | None:
+    """Say that a wave is periodic in all of shifts between pixels."""
+    waves = budget.spectrum
+    if not (_between_pixels(budget.shifts) and np.isfinite(waves.worst).all()):
+        return None
+    if not pattern_errors.smallest_near(waves, budget.shifts) < _UNDETERMINED:
+        return None
+    row, col = waves.worst
+    return (
+        f"the shifts do not constrain a wave of ({row:.3f}, {col:.3f}) cycles per pixel, which "
+        "has the same phase in all exposures: choose less regular shifts (equipix.plan.suggest)"
+    )
+
+
+def _on_components(budget: ErrorBudget) -> str | None:
+    """Say that shifts of whole pixels leave parts of the sensor unconnected."""
+    if budget.components <= 1 or _between_pixels(budget.shifts):
+        return None
+    return (
+        f"the shifts leave {budget.components} parts of the sensor unconnected: the errors are "
+        "those within a part: choose other shifts (equipix.plan.suggest)"
+    )
+
+
+def _on_drift(budget: ErrorBudget) -> str | None:
+    """Say that the tilt from drift exceeds the noise."""
+    drift, noise = (budget.rms_by_cause[cause] for cause in ("drift", "noise"))
+    if not drift > noise > 0:
+        return None
+    return (
+        f"lamp drift will tilt the sensitivity by {drift:.1e} rms, {drift / noise:.1f} times the "
+        "error by noise, and leaves no residual: measure the flux, turn one exposure, or use "
+        "larger shifts (equipix.plan.suggest)"
+    )
+
+
+_RULES: tuple[Rule[ErrorBudget], ...] = (
+    Rule("pattern", "identifiability", _on_wave),
+    Rule("components", "identifiability", _on_components),
+    Rule("drift", "misfit", _on_drift),
+)
+"""What is asked of a pattern of shifts."""

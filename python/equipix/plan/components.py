@@ -1,17 +1,16 @@
 """Which pixels a pattern of shifts compares."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import as_mask, as_shifts, check_shape, naming_memory
-from equipix.errors import InputError, InputWarning, warn
+from equipix._check import Array, Ints, as_mask, as_shifts, check_shape, naming_memory, union
+from equipix.errors import InputError
 from equipix.exposures.positions import as_rotation, round_shifts, whole_moves
+from equipix.findings import Finding, say
 from equipix.measured.colour import Colours
 
 
@@ -38,7 +37,7 @@ class Identifiability:
     """
 
     components: int
-    labels: NDArray[Any]
+    labels: Array
     largest: int
     equations: int
     unknowns: int
@@ -121,55 +120,29 @@ def identify(
     whole, rounding = whole_moves(exact), round_shifts(exact)[1]
     if rounding is not None:
         first = np.round(exact[0], 3).tolist()
-        warn(
-            f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels",
-            InputWarning,
-        )
-    masked = None if mask is None else as_mask(mask, (len(whole), *sizes))
+        words = f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels"
+        say(Finding("rounding", words, "input"))
+    masked = as_mask(mask, (len(whole), *sizes))
     turns = as_rotation(rotation, len(whole))
     colours = Colours.of(cfa)
     with naming_memory("identifying"):
-        labels, counts, seen = _native.planned_components(
-            sizes, whole, rotation=turns.tolist(), mask=masked
-        )
-        alone = None if colours is None else _alone(colours, whole, turns, masked, sizes)
+        find = partial(_native.planned_components, sizes, whole, rotation=turns.tolist())
+        labels, counts, seen = find(mask=masked)
+        # Components of each colour where it alone is measured.
+        planes = {} if colours is None else dict(colours.planes(sizes))
+        alone = {label: len(find(mask=union(masked, ~plane))[1]) for label, plane in planes.items()}
+    unused = np.broadcast_to(False if masked is None else masked, (len(whole), *sizes))
     return Identifiability(
         components=len(counts),
         labels=labels,
         largest=max(counts, default=0),
-        equations=_equations(sizes, len(whole), masked),
+        equations=unused.size - int(np.count_nonzero(unused)),
         unknowns=sum(counts) + seen,
-        by_colour=alone,
+        by_colour=None if colours is None else alone,
     )
 
 
-def _alone(
-    colours: Colours,
-    positions: NDArray[np.int64],
-    turns: NDArray[np.int64],
-    masked: NDArray[np.bool_] | None,
-    shape: tuple[int, int],
-) -> dict[str, int]:
-    """Count the components of each colour where it alone is measured."""
-    found = {}
-    for label, plane in colours.planes(shape):
-        mask = ~plane if masked is None else masked | ~plane
-        parts = _native.planned_components(shape, positions, rotation=turns.tolist(), mask=mask)
-        found[label] = len(parts[1])
-    return found
-
-
-def _equations(shape: tuple[int, int], count: int, mask: NDArray[np.bool_] | None) -> int:
-    """Count the measurements that the mask leaves."""
-    if mask is None:
-        return count * shape[0] * shape[1]
-    used = mask.size - int(np.count_nonzero(mask))
-    return used if mask.ndim == 3 else count * used
-
-
-def is_connected(
-    shape: tuple[int, int], positions: NDArray[np.int64], colours: Colours | None = None
-) -> bool:
+def is_connected(shape: tuple[int, int], positions: Ints, colours: Colours | None = None) -> bool:
     """Whether whole shifts compare all pixels of a sensor, by a part of it three spans wide.
 
     A part that is connected by itself proves it: such parts cover the sensor, overlap, and stay

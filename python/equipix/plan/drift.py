@@ -4,22 +4,18 @@ Errors of ln c that are affine in the shifts d, a + s·d, leave no residual: the
 slope, and M the slope s.
 """
 
-from __future__ import annotations
-
 from itertools import permutations
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, as_array, as_shifts, per_exposure
+from equipix._check import Array, ArrayLike, Floats, Ints, as_array, as_shifts, per_exposure
 from equipix.errors import InputError
 
 _ON_A_LINE = 1e-12
 """Share of the variance of shifts along an axis, 1 − ρ², below which only rounding is left."""
 
 
-def slope_std(shifts: NDArray[Any], flux_std: ArrayLike) -> Floats:
+def slope_std(shifts: Array, flux_std: ArrayLike) -> Floats:
     r"""Standard deviation of the slope of ln M, per pixel, that errors of the fluxes leave.
 
     Parameters
@@ -59,7 +55,7 @@ def slope_std(shifts: NDArray[Any], flux_std: ArrayLike) -> Floats:
     return np.asarray(found)
 
 
-def slope_covariance(shifts: NDArray[Any], flux_std: float, times: ArrayLike | None) -> Floats:
+def slope_covariance(shifts: Array, flux_std: float, times: ArrayLike | None) -> Floats:
     """Covariance of the slope of ln M, per pixel, that independent errors of the fluxes leave.
 
     Parameters
@@ -80,7 +76,7 @@ def slope_covariance(shifts: NDArray[Any], flux_std: float, times: ArrayLike | N
     return np.asarray(flux_std**2 * np.linalg.inv(columns.T @ columns)[1:3, 1:3])
 
 
-def affine_columns(shifts: NDArray[Any], times: ArrayLike | None) -> Floats:
+def affine_columns(shifts: Array, times: ArrayLike | None) -> Floats:
     """Columns of ln c that leave no residual: 1, the shifts, and times if a trend is fitted."""
     columns = [np.ones(len(shifts)), *shifts.T]
     if times is not None:
@@ -88,7 +84,7 @@ def affine_columns(shifts: NDArray[Any], times: ArrayLike | None) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def tilt_of_fluxes(shape: tuple[int, int], shifts: NDArray[Any], flux_std: ArrayLike) -> Floats:
+def tilt_of_fluxes(shape: tuple[int, int], shifts: Array, flux_std: ArrayLike) -> Floats:
     """Standard deviation of the tilt of ln M, edge to edge, that errors of the fluxes leave.
 
     Parameters
@@ -140,13 +136,13 @@ def distinct_trend(shifts: ArrayLike, times: ArrayLike | None = None) -> float:
     return float(1 - np.sum((unit_times(when) @ tilt_basis(positions)) ** 2))
 
 
-def tilt_basis(shifts: NDArray[Any]) -> Floats:
+def tilt_basis(shifts: Array) -> Floats:
     """Orthonormal basis of what is linear in the shifts, their mean removed, (n, 0 to 2)."""
     axes, lengths, _ = np.linalg.svd(shifts - shifts.mean(axis=0), full_matrices=False)
     return np.asarray(axes[:, lengths > 1e-9 * max(lengths.max(initial=0), 1e-300)])
 
 
-def unit_times(times: NDArray[Any]) -> Floats:
+def unit_times(times: Array) -> Floats:
     """Times less their mean, of norm 1; 0 where all are equal."""
     centred = times - np.mean(times)
     return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-300))
@@ -210,7 +206,7 @@ def tilt_std(
         variance += np.square(_each("shift_std", shift_std, (count, 2)) * slope).sum(axis=1)
     if np.linalg.matrix_rank(positions - positions.mean(axis=0)) < 2:
         return np.full(2, np.inf)
-    return np.asarray(slope_std(positions, np.sqrt(variance)) * shape)
+    return tilt_of_fluxes(shape, positions, np.sqrt(variance))
 
 
 def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
@@ -233,7 +229,7 @@ _TIE = 12
 """Decimals beyond which shares of a trend differ by rounding only."""
 
 
-def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
+def advise_order(shifts: ArrayLike) -> Ints:
     """Order of exposures in which a linear drift of the lamp is least degenerate with a tilt.
 
     Parameters
@@ -278,16 +274,12 @@ def advise_order(shifts: ArrayLike) -> NDArray[np.int64]:
     return np.argsort(ranks[best]).astype(np.int64)
 
 
-def _hidden_share(
-    ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _hidden_share(ranks: Ints, basis: Floats, times: Floats) -> Floats:
     """Share of a trend without a residual, in orders (m, n); differences by rounding count as 0."""
     return np.asarray(np.round(np.sum((times[ranks] @ basis) ** 2, axis=1), _TIE))
 
 
-def _exchanged(
-    ranks: NDArray[np.int64], basis: NDArray[np.float64], times: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _exchanged(ranks: Ints, basis: Floats, times: Floats) -> Ints:
     """Exchange the pair of exposures that reduces the share most, until none does."""
     first, second = np.triu_indices(len(ranks), 1)
     apart = basis[first] - basis[second]

@@ -1,18 +1,17 @@
 """Errors of a pattern of shifts: by noise, by frequency, by errors of the shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
-from numpy.typing import NDArray
 
-from equipix._check import Floats
-from equipix.exposures.exposures import exposures_of
+from equipix._check import Array, Floats, Ints
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
+from equipix.measured.measured import measured_of
 
 _BLOCK = 64
 """Rows at a time, at least."""
@@ -29,7 +28,12 @@ _NOISE, _TOLERANCE = 1e-3, 1e-4
 
 
 def local_variance(
-    shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats, width: float | None
+    shape: tuple[int, int],
+    positions: Ints,
+    powers: Floats,
+    width: float | None,
+    *,
+    scale: float = 1.0,
 ) -> Iterator[Floats]:
     """Variance of M for noise of variance 1, but for a factor near 1 over the whole sensor.
 
@@ -62,22 +66,24 @@ def local_variance(
             returning += powers2[k] * weight / seen[row : row + len(weight), col : col + cols]
         # Alone in all its cells, a pixel is compared with nothing.
         rest = weights - returning
-        yield np.divide(1, rest, where=rest > 1e-9 * weights, out=np.full_like(rest, np.inf))
+        yield scale * np.divide(
+            1, rest, where=rest > 1e-9 * weights, out=np.full_like(rest, np.inf)
+        )
 
 
-def _seen_by(size: int, places: NDArray[np.int64]) -> Floats:
+def _seen_by(size: int, places: Ints) -> Floats:
     """Whether exposure l covers row (or column) i of the beam, counted from the first: (i, l)."""
     away = np.arange(size + places.max())[:, None] - places
     return ((away >= 0) & (away < size)).astype(np.float64)
 
 
-def _light(size: int, positions: NDArray[np.int64], width: float | None) -> Floats:
+def _light(size: int, positions: Ints, width: float | None) -> Floats:
     """Square of a Gaussian beam's factor along one axis, at each row (or column): (k, i)."""
     places = np.arange(size) + positions[:, None] - (size - 1) / 2
     return np.ones(places.shape) if width is None else np.exp(-2 * (places / width) ** 2)
 
 
-def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats) -> float:
+def factor(shape: tuple[int, int], positions: Ints, powers: Floats) -> float:
     """What `local_variance` must be multiplied by, from draws of noise.
 
     It counts the longer ways, and nearly periodic waves with them. It falls with the size of the
@@ -95,7 +101,8 @@ def factor(shape: tuple[int, int], positions: NDArray[np.int64], powers: Floats)
         frames = light + _NOISE * rng.standard_normal(light.shape)
         # A bare fit, without the test of the sign. One thread: on so small a part two are slower.
         options = FitOptions(tolerance=_TOLERANCE, workers=1)
-        solved = exposures_of(frames, positions, flux=powers).fit(options)
+        measured, flux = measured_of(frames), Flux.of(powers, None, None, len(powers))
+        solved = Exposures.of(measured, Positions.of(positions), flux).fit(options)
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
         ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))
@@ -109,15 +116,6 @@ _NODES = 10
 """Of the quadrature along an axis: exact for products of two such polynomials and more."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Nodes:
-    """Quadrature nodes on the sensor, as flat arrays."""
-
-    rows: Floats
-    cols: Floats
-    weights: Floats
-
-
 def shift_error_effect(
     shape: tuple[int, int], shifts: Floats, powers: Floats, width: float, error: float
 ) -> tuple[float, tuple[float, float]]:
@@ -127,55 +125,48 @@ def shift_error_effect(
     of it is smooth: minimise Σ_k ∫ c_k² L² [h_k(p) − g(p) − f(p + d_k)]² over polynomials g on
     the sensor and f on the beam, for each h_k that one exposure's error along one axis makes.
     """
-    nodes = _nodes(shape)
+    places, weights = _nodes(shape)
     low = shifts.min(axis=0) - 0.5
     extent = np.ptp(shifts, axis=0) + shape
-    on_sensor = _basis(nodes.rows, nodes.cols, np.array([-0.5, -0.5]), np.array(shape, float))
+    on_sensor = _basis(places, np.array([-0.5, -0.5]), np.array(shape, float))
     count, centre = len(shifts), (np.array(shape) - 1) / 2
-    equations, causes = [], np.zeros((2 * count, count, len(nodes.rows)))
+    equations, causes = [], np.zeros((2 * count, count, len(weights)))
     for k, (shift, power) in enumerate(zip(shifts, powers, strict=True)):
-        rows, cols = nodes.rows + shift[0], nodes.cols + shift[1]
-        away = rows - centre[0], cols - centre[1]
+        seen = places + shift[:, None]
+        away = seen - centre[:, None]
         light = power * np.exp(-(away[0] ** 2 + away[1] ** 2) / width**2)
-        root = np.sqrt(nodes.weights) * light
-        on_beam = _basis(rows, cols, low, extent)
-        equations.append(root[:, None] * np.hstack([on_sensor, on_beam]))
-        causes[2 * k, k] = root * (-2 * error / width**2) * away[0]
-        causes[2 * k + 1, k] = root * (-2 * error / width**2) * away[1]
+        root = np.sqrt(weights) * light
+        equations.append(root[:, None] * np.hstack([on_sensor, _basis(seen, low, extent)]))
+        causes[2 * k : 2 * k + 2, k] = root * (-2 * error / width**2) * away
     matrix = np.concatenate(equations)
     found = np.linalg.lstsq(matrix, causes.reshape(2 * count, -1).T, rcond=1e-10)[0]
     errors = on_sensor @ found[: on_sensor.shape[1]]
-    errors -= nodes.weights @ errors
+    errors -= weights @ errors
     # Least-squares slopes: the two axes of the sensor are orthogonal.
-    tilt = [_slope(axis, errors, nodes) for axis in (nodes.rows, nodes.cols)]
-    sizes = [size if size > 1 else 0 for size in shape]
-    rms = np.sqrt(np.sum(nodes.weights @ errors**2))
-    return float(rms), (float(sizes[0] * tilt[0]), float(sizes[1] * tilt[1]))
+    slopes = []
+    for axis in places:
+        lever = weights * (axis - weights @ axis)
+        slopes.append(float(np.linalg.norm(lever @ errors) / (lever @ axis)))
+    tilt = [size * slope if size > 1 else 0.0 for size, slope in zip(shape, slopes, strict=True)]
+    return float(np.sqrt(np.sum(weights @ errors**2))), (tilt[0], tilt[1])
 
 
-def _nodes(shape: tuple[int, int]) -> _Nodes:
-    """Gauss-Legendre nodes over the area of the pixels; the weights add up to 1."""
+def _nodes(shape: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Gauss-Legendre nodes over the area of the pixels, (2, m), and weights that add up to 1."""
     nodes, weights = leggauss(_NODES)
     rows, cols = ((size - 1 + size * nodes) / 2 for size in shape)
-    return _Nodes(
-        np.repeat(rows, _NODES), np.tile(cols, _NODES), np.outer(weights, weights).ravel() / 4
-    )
+    places = np.stack([np.repeat(rows, _NODES), np.tile(cols, _NODES)])
+    return places, np.outer(weights, weights).ravel() / 4
 
 
-def _basis(rows: Floats, cols: Floats, low: Floats, extent: Floats) -> Floats:
+def _basis(places: Floats, low: Floats, extent: Floats) -> Floats:
     """Products of Legendre polynomials on a rectangle: (places, functions)."""
     across = [
-        legvander(2 * (places - start) / length - 1, _DEGREE)
-        for places, start, length in zip((rows, cols), low, extent, strict=True)
+        legvander(2 * (along - start) / length - 1, _DEGREE)
+        for along, start, length in zip(places, low, extent, strict=True)
     ]
     products = across[0][:, :, None] * across[1][:, None, :]
-    return np.asarray(products.reshape(len(rows), -1))
-
-
-def _slope(places: Floats, errors: Floats, nodes: _Nodes) -> float:
-    """Root of the summed squares of the slopes of several errors along an axis."""
-    lever = nodes.weights * (places - nodes.weights @ places)
-    return float(np.linalg.norm(lever @ errors) / (lever @ places))
+    return np.asarray(products.reshape(places.shape[1], -1))
 
 
 _FINER = 64
@@ -205,9 +196,9 @@ class Spectrum:
         λ there.
     """
 
-    rows: NDArray[np.float64]
-    cols: NDArray[np.float64]
-    values: NDArray[Any]
+    rows: Floats
+    cols: Floats
+    values: Array
     worst: tuple[float, float]
     smallest: float
 
@@ -219,7 +210,7 @@ class Spectrum:
         )
 
 
-def spectrum(shifts: NDArray[Any], powers: NDArray[np.float64]) -> Spectrum:
+def spectrum(shifts: Array, powers: Floats) -> Spectrum:
     """Evaluate λ(q) = Σ c² − |Σ c² e^{iq·d}|² / Σ c², which is n − |Σ e^{iq·d}|²/n for c = 1."""
     rows = np.linspace(0, 0.5, _FREQUENCIES + 1)
     cols = np.linspace(-0.5, 0.5, 2 * _FREQUENCIES + 1)
@@ -243,7 +234,7 @@ def spectrum(shifts: NDArray[Any], powers: NDArray[np.float64]) -> Spectrum:
     return Spectrum(rows, cols, values, worst, float(values[row, col]))
 
 
-def smallest_near(found: Spectrum, shifts: NDArray[Any]) -> float:
+def smallest_near(found: Spectrum, shifts: Array) -> float:
     """Refine the smallest λ between the frequencies of the spectrum, for fluxes of 1.
 
     Shifts between pixels may make a wave periodic whose frequency is none of the grid's.

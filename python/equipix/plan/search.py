@@ -1,18 +1,17 @@
 """Patterns of shifts that leave little error, sought by exchanging one position at a time."""
 
-from __future__ import annotations
-
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import Floats, Progress, as_array, check_progress, check_shape, positive_count
-from equipix.errors import InputError, MisfitWarning
+from equipix.errors import EquipixWarning, InputError
+from equipix.findings import say
 from equipix.measured.colour import Colours
-from equipix.plan.budget import ErrorBudget, check_causes, error_budget, warn_of_drift
+from equipix.plan.budget import ErrorBudget, check_causes, error_budget
 from equipix.plan.components import is_connected
 from equipix.plan.drift import advise_order, tilt_of_fluxes, tilt_rms
 
@@ -166,12 +165,12 @@ def suggest(
     for count in counts:
         starts = _starts(count, travel // period, random)
         if colours is not None:
-            starts = [_coloured(start, sizes, travel, colours, random) for start in starts]
+            starts = [_coloured(start, score, colours, random) for start in starts]
         stage = f"searching {count} positions"
         ends = []
         for done, start in enumerate(starts):
             report(done, len(starts), stage)
-            ends.append(_improved(start, sizes, travel, score, random, colours))
+            ends.append(_improved(start, score, random, colours))
         report(len(starts), len(starts), stage)
         found = _distinct([end for end in ends if end is not None], score)
         if found:
@@ -183,25 +182,20 @@ def suggest(
             f"{'' if colours is None else ' of each colour alone'}; allow more of either"
         )
     suggestions = []
+    causes: dict[str, Any] = {"noise": noise, "shift_error": shift_error, "beam_width": beam_width}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MisfitWarning)
+        warnings.simplefilter("ignore", EquipixWarning)
         finalists = found[: max(wanted, _FINALISTS)]
         for done, points in enumerate(finalists, start=1):
             shifts = points - points.min(axis=0)
             shifts = shifts[advise_order(shifts)]
-            budget = error_budget(
-                sizes,
-                shifts,
-                noise=noise,
-                drift=lamp,
-                shift_error=shift_error,
-                beam_width=beam_width,
-            )
+            budget = error_budget(sizes, shifts, drift=lamp, **causes)
             suggestions.append(Suggestion(shifts, budget))
             report(done, len(finalists), "judging patterns")
     suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
     for number, suggestion in enumerate(suggestions[:wanted], start=1):
-        warn_of_drift(suggestion.budget.rms_by_cause, f"pattern {number}: ")
+        found_of = suggestion.budget.findings
+        say(*(replace(each, message=f"pattern {number}: {each.message}") for each in found_of))
     return suggestions[:wanted]
 
 
@@ -228,7 +222,7 @@ class _Score:
     """
 
     def __init__(self, shape: tuple[int, int], travel: Points, noise: float, drift: float) -> None:
-        self._shape, self._noise, self._drift = shape, noise, drift
+        self.shape, self.travel, self._noise, self._drift = shape, travel, noise, drift
         # Points of a Kronecker sequence cover the half plane of waves evenly.
         steps = np.arange(1, _WAVES + 1)[:, None] * np.array([0.7548776662, 0.5698402910])
         waves = (steps % 1 - [0, 0.5]) * [np.pi, 2 * np.pi]
@@ -250,12 +244,12 @@ class _Score:
         if len(visible) > _WAVES:
             inverse *= 1 + _PERIODIC / visible[_WAVES:].min(axis=0)
         noise = self._noise**2 * inverse * (1 - 1 / count) * rest
-        drift = tilt_rms(tilt_of_fluxes(self._shape, patterns, self._drift))
+        drift = tilt_rms(tilt_of_fluxes(self.shape, patterns, self._drift))
         return np.asarray(np.sqrt(noise + drift**2))
 
     def _cells(self, spans: Points, count: int) -> Floats:
         """Beam cells over pixels: the trace of K of `local_variance`, times n."""
-        cells = np.prod((np.array(self._shape) + spans) / self._shape, axis=1)
+        cells = np.prod((np.array(self.shape) + spans) / self.shape, axis=1)
         return np.asarray(np.minimum(cells, count * (1 - 1e-3)))
 
     def _visible(self, others: Points, places: Points) -> Floats:
@@ -279,7 +273,7 @@ def _periods(travel: Points) -> Floats:
     return np.asarray(2 * np.pi * numbers / np.maximum(travel, 1))
 
 
-def _starts(count: int, travel: Points, rng: np.random.Generator) -> list[Points]:
+def _starts(count: int, travel: Points, rng: Random) -> list[Points]:
     """Patterns to begin with: surely connected, a few pixels apart and far, near the corners."""
     nearest = np.array([(0, 0), (0, 1), (1, 0)])[:count]
     far = rng.integers(0, travel, (max(count - 3, 0), 2), endpoint=True)
@@ -298,9 +292,7 @@ def _starts(count: int, travel: Points, rng: np.random.Generator) -> list[Points
     return starts
 
 
-def _coloured(
-    start: Points, shape: tuple[int, int], travel: Points, colours: Colours, rng: Random
-) -> Points:
+def _coloured(start: Points, score: _Score, colours: Colours, rng: Random) -> Points:
     """Stretch a pattern to whole periods, and move positions until pixels of all colours meet.
 
     Positions whole periods apart compare equal places of the period alone. What lies between two
@@ -310,6 +302,7 @@ def _coloured(
     cells = [np.argwhere(once == label) for label in range(len(colours.labels))]
     apart = np.concatenate([(each[:, None] - each).reshape(-1, 2) for each in cells])
     whole = start * colours.period
+    shape, travel = score.shape, score.travel
     points = np.minimum(whole, travel)
     for _ in range(_PHASES):
         if is_connected(shape, points, colours):
@@ -320,21 +313,15 @@ def _coloured(
     return np.asarray(points)
 
 
-def _improved(
-    points: Points,
-    shape: tuple[int, int],
-    travel: Points,
-    score: _Score,
-    rng: np.random.Generator,
-    colours: Colours | None = None,
-) -> Points | None:
+def _improved(points: Points, score: _Score, rng: Random, colours: Colours | None) -> Points | None:
     """Move positions one by one while the error decreases; None if no pattern is connected."""
+    shape = score.shape
     best = _whole_score(points, score) if is_connected(shape, points, colours) else np.inf
     period = 1 if colours is None else np.array(colours.period)
     unmoved, k = 0, 0
     while unmoved < 2 * len(points):
         others = np.delete(points, k, axis=0)
-        places = _places(points[k], travel, rng)
+        places = _places(points[k], score.travel, rng)
         # A move by whole periods keeps what each colour has in common with the other positions.
         # They are counted towards the position, which is within the travel.
         places = points[k] + np.fix((places - points[k]) / period).astype(np.int64) * period
@@ -352,7 +339,7 @@ def _improved(
     return points if np.isfinite(best) else None
 
 
-def _places(place: Points, travel: Points, rng: np.random.Generator) -> Points:
+def _places(place: Points, travel: Points, rng: Random) -> Points:
     """Places that a position might move to: around it at several distances, and anywhere."""
     distances = rng.choice([1.0, 3.0, 10.0], (_NEAR, 1))
     near = np.rint(place + distances * rng.standard_normal((_NEAR, 2))).astype(np.int64)

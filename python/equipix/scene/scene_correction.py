@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from equipix._check import Array, Bools, as_array, as_level, check_shape, number, positive_workers
+from equipix._check import (
+    Array,
+    Bools,
+    as_array,
+    as_level,
+    check_shape,
+    is_whole,
+    number,
+    positive_workers,
+)
 from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
-from equipix.errors import InputError, InputWarning, warn
-from equipix.findings import set_bits
+from equipix.errors import InputError
+from equipix.findings import Rule, ask, say, set_bits
 from equipix.io.record import Record
 from equipix.measured.defects import unresponsive
 
@@ -21,16 +30,16 @@ DataRange = tuple[float, float]
 """Lowest and highest raw value in DN."""
 
 _FEW = 0.1
-"""Share of the frames that counted below which `result` warns."""
+"""Share of the frames that counted below which it is a finding."""
 
 _STILL = 0.25
-"""Share of the field above which `result` warns that it never moved."""
+"""Share of the field that never moved above which it is a finding."""
 
 _USED = 0.3
-"""Share of the range below which `result` warns that the frames do not use it."""
+"""Share of the range that frames use below which it is a finding."""
 
 _SPREAD = 0.3
-"""Standard deviation of the gains above which `result` warns."""
+"""Standard deviation of the gains above which it is a finding."""
 
 _FIRST_MASK = 64
 """Frames after which pixels that do not respond are masked for the first time."""
@@ -237,12 +246,10 @@ class SceneCorrection:
         Warns
         -----
         InputWarning
-            If less than a tenth of the usable frames counted.
+            If less than a tenth of the usable frames counted, a quarter of the field never moved,
+            the frames use less than a third of the range, or the gains spread too far.
         """
         self.check_learned()
-        self._warn_of_few()
-        self._warn_of_still()
-        self._warn_of_range()
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
         low, high = self._range
         flags = np.zeros(self._shape, np.uint32)
@@ -260,41 +267,12 @@ class SceneCorrection:
                 "floor_dn": self.floor,
             }
         }
-        _warn_of_spread(gain[flags == 0])
+        counts, still = (self.frames, self.frames_taken), self._native.still()
+        learned = _Learned(*counts, still, self._range, self._peak, gain[flags == 0])
+        said = say(*ask(_RULES, learned))
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
-        return Polynomial(coefficients, flags, metadata)
-
-    def _warn_of_few(self) -> None:
-        """Warn where so few frames counted that the scene moved hardly, or was not seen to."""
-        if self.frames < _FEW * self.frames_taken:
-            warn(
-                f"{self.frames} of {self.frames_taken} frames counted: the scene moved hardly, or "
-                "its contrast is too low for its motion to be seen beside the pattern",
-                InputWarning,
-            )
-
-    def _warn_of_still(self) -> None:
-        """Warn where much of the field never moved: its scene became part of the pattern."""
-        still = self._native.still()
-        if still is not None and still > _STILL:
-            warn(
-                f"in {still:.0%} of the field (limit {_STILL:.0%}) nothing moves from frame to "
-                "frame: a scene that stands still there, or frames that do not follow one another, "
-                "became part of the pattern; take a scene that moves over the whole field",
-                InputWarning,
-            )
-
-    def _warn_of_range(self) -> None:
-        """Warn where the range is far wider than the frames: thresholds are shares of it."""
-        low, high = self._range
-        if self._peak is not None and self._peak < low + _USED * (high - low):
-            bits = max(int(np.ceil(np.log2(max(self._peak, 1) + 1))), 1)
-            warn(
-                f"the largest value is {self._peak:g} DN, less than {_USED:.0%} of the range "
-                f"({low:g}, {high:g}): thresholds are shares of it. Give data_range=(0, "
-                f"{2**bits - 1}), on the command line --bit-depth {bits}",
-                InputWarning,
-            )
+        # The mean of the offsets is 0, so that of raw frames stays.
+        return Polynomial(coefficients, flags, metadata, self._saturation, True, said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `equipix.load` goes on with the same bytes.
@@ -340,20 +318,75 @@ def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
     return masked
 
 
-def _warn_of_spread(gain: Array) -> None:
-    """Warn where gains spread further than those of cameras."""
-    if gain.size and not np.std(gain) <= _SPREAD:
-        warn(
-            f"the gains spread by {np.std(gain):.2g} (limit {_SPREAD:g}), from {gain.min():.2g} to "
-            f"{gain.max():.2g}: the scene does not determine them; take a scene of more contrast, "
-            "or less noise",
-            InputWarning,
-        )
+class _Learned(NamedTuple):
+    """What was learned: from how many frames, of which motion and values; the gains."""
+
+    frames: int
+    taken: int
+    still: float | None
+    data_range: DataRange
+    peak: float | None
+    gain: Array
+
+
+def _on_few(e: _Learned) -> str | None:
+    """Say that few frames counted: the scene moved hardly, or was not seen to."""
+    if e.frames >= _FEW * e.taken:
+        return None
+    return (
+        f"{e.frames} of {e.taken} frames counted: the scene moved hardly, or "
+        "its contrast is too low for its motion to be seen beside the pattern"
+    )
+
+
+def _on_still(e: _Learned) -> str | None:
+    """Say that much of the field never moved: its scene became part of the pattern."""
+    if e.still is None or e.still <= _STILL:
+        return None
+    return (
+        f"in {e.still:.0%} of the field (limit {_STILL:.0%}) nothing moves from frame to "
+        "frame: a scene that stands still there, or frames that do not follow one another, "
+        "became part of the pattern; take a scene that moves over the whole field"
+    )
+
+
+def _on_range(e: _Learned) -> str | None:
+    """Say that the range is far wider than the frames: thresholds are shares of it."""
+    (low, high), peak = e.data_range, e.peak
+    if peak is None or peak >= low + _USED * (high - low):
+        return None
+    bits = max(int(np.ceil(np.log2(max(peak, 1) + 1))), 1)
+    return (
+        f"the largest value is {peak:g} DN, less than {_USED:.0%} of the range "
+        f"({low:g}, {high:g}): thresholds are shares of it. Give data_range=(0, "
+        f"{2**bits - 1}), on the command line --bit-depth {bits}"
+    )
+
+
+def _on_spread(e: _Learned) -> str | None:
+    """Say that gains spread further than those of cameras."""
+    gain = e.gain
+    if not gain.size or np.std(gain) <= _SPREAD:
+        return None
+    return (
+        f"the gains spread by {np.std(gain):.2g} (limit {_SPREAD:g}), from {gain.min():.2g} to "
+        f"{gain.max():.2g}: the scene does not determine them; take a scene of more contrast, "
+        "or less noise"
+    )
+
+
+_RULES: tuple[Rule[_Learned], ...] = (
+    Rule("unused", "input", _on_few),
+    Rule("still", "input", _on_still),
+    Rule("range", "input", _on_range),
+    Rule("spread", "input", _on_spread),
+)
+"""What is asked of a correction from the scene."""
 
 
 def whole_number(name: str, value: int) -> int:
     """A whole number from 0, checked."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+    if not is_whole(value, 0):
         raise InputError(f"'{name}' is {value!r}, expected a whole number")
     return int(value)
 

@@ -12,8 +12,8 @@ import numpy as np
 from equipix._check import Array, Progress, check_progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
-from equipix.io.formats import refuse_saved
-from equipix.io.frames import frame_format, stream_frames
+from equipix.io.formats import raw_header
+from equipix.io.frames import Header, stream_frames
 from equipix.io.paths import find_files, refuse_inputs, write_whole
 from equipix.io.tiff import write_frames
 from equipix.metrics.maps import roughness
@@ -57,9 +57,7 @@ def sequence_format(source: list[str]) -> tuple[tuple[int, int], np.dtype[Any]]:
     FileError
         If it cannot be read, or is no file of raw frames.
     """
-    first = find_files(source)[0]
-    refuse_saved(first)
-    (_, rows, cols), dtype = frame_format(first)
+    (_, rows, cols), dtype, _ = raw_header(find_files(source)[0])
     return (rows, cols), dtype
 
 
@@ -116,9 +114,9 @@ def run_sequence(
     """
     check_progress(progress)
     files = find_files(source)
-    warn_of_corrected(files, "")
-    counts = [_count(file, method.shape) for file in files]
-    record = _Record(sum(counts))
+    headers = {file: _header(file, method.shape) for file in files}
+    warn_of_corrected({file: header.description for file, header in headers.items()}, "")
+    record = _Record(sum(header.shape[0] for header in headers.values()))
     frames = _corrected(method, files, record, progress)
     if output is None:
         for _ in frames:
@@ -133,13 +131,12 @@ def run_sequence(
     return record.sequence()
 
 
-def _count(file: Path, shape: tuple[int, int]) -> int:
-    """Count the frames of a file, which must be raw and of the sensor's shape."""
-    refuse_saved(file)
-    (count, *held), _ = frame_format(file)
-    if tuple(held) != shape:
-        raise FileError(f"{file}: holds frames of shape {tuple(held)}, expected {shape}")
-    return count
+def _header(file: Path, shape: tuple[int, int]) -> Header:
+    """Read what a file says of its frames, which must be raw and of the sensor's shape."""
+    found = raw_header(file)
+    if found.shape[1:] != shape:
+        raise FileError(f"{file}: holds frames of shape {found.shape[1:]}, expected {shape}")
+    return found
 
 
 class _Record:

@@ -1,13 +1,10 @@
 """Error of the sensitivity that noise alone leaves at the optimum."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, as_array, as_shifts
+from equipix._check import ArrayLike, Floats, Ints, Rng, as_array, as_shifts
 from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
 from equipix.metrics.maps import rms_at_both_scales
@@ -113,7 +110,7 @@ class ReducedSystem:
         First beam cell (row, col) of each exposure; the smallest is (0, 0).
     """
 
-    def __init__(self, weights: Floats, corners: NDArray[np.int64]) -> None:
+    def __init__(self, weights: Floats, corners: Ints) -> None:
         rows, cols = weights.shape[1:]
         self._windows = [np.s_[r : r + rows, c : c + cols] for r, c in corners.tolist()]
         self._grid = (rows + int(corners[:, 0].max()), cols + int(corners[:, 1].max()))

@@ -4,15 +4,12 @@ A beam is a function of real (row, column) coordinates: those of the pixels of t
 shift 0. Beams are evaluated, never resampled, so fractional shifts are exact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Floats, Rng, as_array, as_shifts
+from equipix._check import ArrayLike, Floats, Rng, as_array, as_shifts
 from equipix.errors import InputError
 from equipix.measured.colour import Colours
 
@@ -165,6 +162,12 @@ def gaussian_beam(
     return beam
 
 
+def _on_gaussian(shape: tuple[int, int], width: float, pattern: Beam) -> Beam:
+    """Gaussian beam times a pattern."""
+    gaussian = gaussian_beam(shape, width=width)
+    return lambda rows, cols: gaussian(rows, cols) * pattern(rows, cols)
+
+
 def striped_beam(
     shape: tuple[int, int], *, width: float = 1000.0, period: float = 60.0, contrast: float = 0.1
 ) -> Beam:
@@ -186,14 +189,12 @@ def striped_beam(
     callable
         The beam, a function of arrays of row and column coordinates.
     """
-    gaussian = gaussian_beam(shape, width=width)
     wave = 2 * np.pi / period * np.array([0.6, 0.8])
 
-    def beam(rows: Floats, cols: Floats) -> Floats:
-        stripes: Floats = 1 + contrast * np.cos(wave[0] * rows + wave[1] * cols)
-        return gaussian(rows, cols) * stripes
+    def stripes(rows: Floats, cols: Floats) -> Floats:
+        return np.asarray(1 + contrast * np.cos(wave[0] * rows + wave[1] * cols))
 
-    return beam
+    return _on_gaussian(shape, width, stripes)
 
 
 def tilted_beam(
@@ -215,13 +216,12 @@ def tilted_beam(
     callable
         The beam, a function of arrays of row and column coordinates.
     """
-    gaussian = gaussian_beam(shape, width=width)
 
-    def beam(rows: Floats, cols: Floats) -> Floats:
+    def ramp(rows: Floats, cols: Floats) -> Floats:
         along_rows = slope[0] * ((rows + 0.5) / shape[0] - 0.5)
-        return gaussian(rows, cols) * (1 + along_rows + slope[1] * ((cols + 0.5) / shape[1] - 0.5))
+        return 1 + along_rows + slope[1] * ((cols + 0.5) / shape[1] - 0.5)
 
-    return beam
+    return _on_gaussian(shape, width, ramp)
 
 
 def wavy_beam(
@@ -257,15 +257,14 @@ def wavy_beam(
     k_row = 2 * np.pi * frequency * np.sin(direction)
     k_col = 2 * np.pi * frequency * np.cos(direction)
     amplitude = contrast * float(np.sqrt(2 / waves))
-    gaussian = gaussian_beam(shape, width=width)
 
-    def beam(rows: Floats, cols: Floats) -> Floats:
+    def waves_at(rows: Floats, cols: Floats) -> Floats:
         structure: Floats = np.zeros(np.broadcast_shapes(np.shape(rows), np.shape(cols)))
         for kr, kc, start in zip(k_row, k_col, phase, strict=True):
             structure += np.cos(kr * rows + kc * cols + start)
-        return gaussian(rows, cols) * (1 + amplitude * structure)
+        return 1 + amplitude * structure
 
-    return beam
+    return _on_gaussian(shape, width, waves_at)
 
 
 def exposures(

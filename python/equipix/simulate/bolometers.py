@@ -1,18 +1,15 @@
 """A simulated array of uncooled bolometers: bridge, thermal balance, self-heating by the bias."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, as_array, check_bit_depth, check_shape, number
+from equipix._check import Array, ArrayLike, Floats, Rng, check_shape, positive
 from equipix.detector.photons import exitance, integrated, kelvin_of
 from equipix.errors import InputError
+from equipix.simulate.camera import PixelArray
 
 _REFERENCE_K = 300.0
 """Temperature of the resistances that are given."""
@@ -26,15 +23,6 @@ _MOST_PERIODS = 10_000
 _SETTLED_K = 1e-9
 """How far the temperature before a pulse may be from its steady state, in K."""
 
-_MAPS = (
-    "resistance_ohm",
-    "b_k",
-    "conductance_w_per_k",
-    "capacity_j_per_k",
-    "absorption",
-    "reference_ohm",
-)
-
 _SPREADS = {
     "resistance_ohm": 0.01,
     "b_k": 0.02,
@@ -46,7 +34,7 @@ _SPREADS = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BolometerArray:
+class BolometerArray(PixelArray):
     r"""An array of microbolometers, each in a bridge with an arm heat-sunk to the substrate.
 
     Each property of a pixel is a map of shape (rows, cols), or one number for all pixels.
@@ -115,6 +103,8 @@ class BolometerArray:
     270 µV
     """
 
+    _names = (*_SPREADS, "reference_ohm")
+
     shape: tuple[int, int]
     resistance_ohm: ArrayLike = 1e5
     b_k: ArrayLike = 1800.0
@@ -136,32 +126,16 @@ class BolometerArray:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        check_shape(self.shape)
-        check_bit_depth(self.bit_depth)
-        for name in (
-            *("reference_b_k", "bias_v", "pulse_s", "frame_s", "pitch_m", "f_number"),
-            *("bandwidth_hz", "dn_per_v"),
-        ):
-            if not 0 < number(name, getattr(self, name)) < np.inf:
-                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
+        self._check_numbers("reference_b_k", "bias_v", "pulse_s", "frame_s", "pitch_m", "f_number")
+        self._check_numbers("bandwidth_hz", "dn_per_v")
         if self.frame_s <= self.pulse_s:
             raise InputError(
                 f"'frame_s' is {self.frame_s!r}, expected more than 'pulse_s', {self.pulse_s}"
             )
         if not 0 < self.band_um[0] < self.band_um[1] < np.inf:
             raise InputError(f"'band_um' is {self.band_um!r}, expected (shortest, longest)")
-        for name in _MAPS:
-            self._check_map(name, as_array(name, getattr(self, name), ndim=(0, 1, 2)))
-
-    def _check_map(self, name: str, values: NDArray[Any]) -> None:
-        """Refuse a map of another shape, or with values that no array has."""
-        if values.shape not in ((), (1,), self.shape):
-            raise InputError(
-                f"'{name}' has shape {values.shape}, expected one number or {self.shape}"
-            )
-        wrong = values[~(np.isfinite(values) & (values > 0))]
-        if wrong.size:
-            raise InputError(f"'{name}' holds {wrong.flat[0]:g}, expected finite numbers above 0")
+        for name in self._names:
+            self._check_map(name, np.nextafter(0, 1), np.inf, " above 0")
 
     @classmethod
     def of(cls, shape: tuple[int, int], *, rng: Rng) -> Self:
@@ -197,11 +171,6 @@ class BolometerArray:
                     f"'{name}' is no attribute of a BolometerArray: expected {', '.join(known)}"
                 )
         return replace(self, **properties)
-
-    @property
-    def full_scale(self) -> int:
-        """Largest digital number."""
-        return int(2**self.bit_depth - 1)
 
     def mean(
         self, substrate_c: float, *, scene_c: float | None = None, bias_v: float | None = None
@@ -259,9 +228,7 @@ class BolometerArray:
         """
         substrate = kelvin_of("substrate_c", substrate_c)
         scene = substrate if scene_c is None else kelvin_of("scene_c", scene_c)
-        bias = number("bias_v", self.bias_v if bias_v is None else bias_v)
-        if not 0 < bias < np.inf:
-            raise InputError(f"'bias_v' is {bias_v!r}, expected volts above 0")
+        bias = positive("bias_v", self.bias_v if bias_v is None else bias_v)
         light = self._light(substrate, scene)
         rest = substrate + light / self._maps["conductance_w_per_k"]
         time = self._maps["capacity_j_per_k"] / self._maps["conductance_w_per_k"]
@@ -286,7 +253,7 @@ class BolometerArray:
         rng: Rng,
         scene_c: float | None = None,
         bias_v: float | None = None,
-    ) -> Iterator[NDArray[Any]]:
+    ) -> Iterator[Array]:
         """Make frames of a steady state, one at a time.
 
         Parameters
@@ -307,13 +274,11 @@ class BolometerArray:
         ndarray, shape (rows, cols), uint8 up to 8 bits, else uint16
             The next frame, in DN.
         """
-        rng = np.random.default_rng(rng)
         mean = self.mean(substrate_c, scene_c=scene_c, bias_v=bias_v)
         sigma = self.dn_per_v * self.johnson_v(substrate_c)
-        for _ in range(count):
-            whole = np.rint(mean + sigma * rng.standard_normal(self.shape))
-            limited = np.clip(whole, 0, self.full_scale)
-            yield limited.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+        return self._frames(
+            lambda random: mean + sigma * random.standard_normal(self.shape), count, rng
+        )
 
     def johnson_v(self, substrate_c: float) -> Floats:
         """Johnson noise √(4kTR·bandwidth) of each pixel at the substrate's temperature, in volts.
@@ -353,14 +318,6 @@ class BolometerArray:
         """
         frames = [self.mean(own, scene_c=scene) for own in substrate_c for scene in scene_c]
         return float(max(each.max() for each in frames) - min(each.min() for each in frames))
-
-    @cached_property
-    def _maps(self) -> dict[str, Floats]:
-        """Each property as a map of all pixels."""
-        return {
-            name: np.broadcast_to(np.asarray(getattr(self, name), np.float64), self.shape)
-            for name in _MAPS
-        }
 
     def _resistance(self, kelvin: Floats) -> Floats:
         change = self._maps["b_k"] * (1 / kelvin - 1 / _REFERENCE_K)

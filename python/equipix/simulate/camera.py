@@ -1,16 +1,14 @@
 """A virtual camera: photons to digital numbers, one frame at a time."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, as_array, check_bit_depth
+from equipix._check import Array, Floats, Rng, as_array, check_bit_depth, check_shape, positive
 from equipix.errors import InputError
 
 Pixels: TypeAlias = "NDArray[np.int64]"
@@ -32,8 +30,64 @@ def _no_pixels() -> Pixels:
     return np.empty(0, np.int64)
 
 
+class Digitised:
+    """What all virtual cameras share: the ADC, and the loop that makes frames."""
+
+    bit_depth: int
+
+    @property
+    def full_scale(self) -> int:
+        """Largest digital number."""
+        return int(2**self.bit_depth - 1)
+
+    def _frames(
+        self, drawn: Callable[[np.random.Generator], Array], count: int, rng: Rng
+    ) -> Iterator[Array]:
+        """Make frames one at a time: values in DN, which may be overwritten, as whole numbers."""
+        random = np.random.default_rng(rng)
+        for _ in range(count):
+            values = drawn(random)
+            np.rint(values, out=values)
+            np.clip(values, 0, self.full_scale, out=values)
+            yield values.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+
+class PixelArray(Digitised):
+    """A virtual camera that maps describe, each of shape (rows, cols) or one number."""
+
+    shape: tuple[int, int]
+    _names: ClassVar[tuple[str, ...]]
+    """Names of the maps."""
+
+    def _check_numbers(self, *above_0: str) -> None:
+        """Refuse sizes and numbers that no array has."""
+        check_shape(self.shape)
+        check_bit_depth(self.bit_depth)
+        for name in above_0:
+            positive(name, getattr(self, name))
+
+    def _check_map(self, name: str, low: float, high: float, wanted: str) -> None:
+        """Refuse a map of another shape, or with values beyond limits."""
+        values = as_array(name, getattr(self, name), ndim=(0, 1, 2))
+        if values.shape not in ((1,), self.shape):
+            raise InputError(
+                f"'{name}' has shape {values.shape}, expected one number or {self.shape}"
+            )
+        wrong = values[~(np.isfinite(values) & (values >= low) & (values <= high))]
+        if wrong.size:
+            raise InputError(f"'{name}' holds {wrong.flat[0]:g}, expected finite numbers{wanted}")
+
+    @cached_property
+    def _maps(self) -> dict[str, Floats]:
+        """Each map with a value for each pixel."""
+        return {
+            name: np.broadcast_to(np.asarray(getattr(self, name), np.float64), self.shape)
+            for name in self._names
+        }
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Camera:
+class Camera(Digitised):
     """A camera with photon and read noise, a dark level, an ADC and bad pixels.
 
     Attributes
@@ -79,11 +133,10 @@ class Camera:
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         check_bit_depth(self.bit_depth)
-        for name in ("gain_dn_per_e", "full_well_e"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
-        if not self.read_noise_e >= 0:
-            raise InputError(f"'read_noise_e' is {self.read_noise_e!r}, expected 0 or more")
+        positive("gain_dn_per_e", self.gain_dn_per_e)
+        positive("read_noise_e", self.read_noise_e, zero=True)
+        if not self.full_well_e > 0:
+            raise InputError(f"'full_well_e' is {self.full_well_e!r}, expected a number above 0")
         sensitivity = as_array("sensitivity", self.sensitivity, ndim=2)
         for name, pixels in (("dead", self.dead), ("hot", self.hot)):
             if pixels.size and (pixels.min() < 0 or pixels.max() >= sensitivity.size):
@@ -96,11 +149,6 @@ class Camera:
         """Shape (rows, cols) of the sensor."""
         rows, cols = self.response.shape
         return rows, cols
-
-    @property
-    def full_scale(self) -> int:
-        """Largest digital number."""
-        return int(2**self.bit_depth - 1)
 
     @cached_property
     def response(self) -> Floats:
@@ -123,12 +171,12 @@ class Camera:
         good.flat[np.concatenate([self.dead, self.hot])] = False
         return good
 
-    def variance(self, light: Floats) -> Floats:
+    def variance(self, light_e: Floats) -> Floats:
         """Variance of one frame, saturation aside.
 
         Parameters
         ----------
-        light : ndarray, shape (rows, cols)
+        light_e : ndarray, shape (rows, cols)
             Mean photoelectrons of a pixel of sensitivity 1.
 
         Returns
@@ -136,14 +184,14 @@ class Camera:
         ndarray, shape (rows, cols), float64
             In DN²: gain²·(light·M + read noise²) + 1/12; the last term is the rounding.
         """
-        return self.gain_dn_per_e**2 * (light * self.response + self.read_noise_e**2) + 1 / 12
+        return self.gain_dn_per_e**2 * (light_e * self.response + self.read_noise_e**2) + 1 / 12
 
-    def frames(self, light: Floats, count: int, *, rng: Rng) -> Iterator[NDArray[Any]]:
+    def frames(self, light_e: Floats, count: int, *, rng: Rng) -> Iterator[Array]:
         """Make frames of a steady light, one at a time.
 
         Parameters
         ----------
-        light : ndarray, shape (rows, cols)
+        light_e : ndarray, shape (rows, cols)
             Mean photoelectrons of a pixel of sensitivity 1; 0 for dark frames.
         count : int
             Number of frames.
@@ -158,7 +206,7 @@ class Camera:
         Raises
         ------
         InputError
-            With the first frame, if light is below 0 anywhere, or is no number.
+            If light is below 0 anywhere, or is no number.
 
         Notes
         -----
@@ -167,11 +215,10 @@ class Camera:
         their place: a quarter of the time, for a skewness of 0.03 at most. Values are computed in
         float32, which rounds them by less than 0.005 DN at 16 bits.
         """
-        rng = np.random.default_rng(rng)
-        electrons = light * self.response
+        electrons = light_e * self.response
         if not (electrons >= 0).all():
             raise InputError(
-                f"'light' goes down to {np.min(electrons):.3g} electrons, expected 0 or more "
+                f"'light_e' goes down to {np.min(electrons):.3g} electrons, expected 0 or more "
                 "everywhere: is the beam below 0, as one of a large contrast?"
             )
         normal = self._is_normal(electrons)
@@ -179,21 +226,18 @@ class Camera:
         level = np.float32(self.gain_dn_per_e * mean + self.offset)
         noise = np.float32(self.gain_dn_per_e * np.sqrt(mean + self.read_noise_e**2))
         counted = np.flatnonzero((electrons != 0) & ~normal)
-        for _ in range(count):
-            frame = rng.standard_normal(self.shape, dtype=np.float32)
+
+        def drawn(random: np.random.Generator) -> NDArray[np.float32]:
+            frame = random.standard_normal(self.shape, dtype=np.float32)
             frame *= noise
             frame += level
-            collected = np.minimum(rng.poisson(electrons.flat[counted]), self.full_well_e)
+            collected = np.minimum(random.poisson(electrons.flat[counted]), self.full_well_e)
             frame.flat[counted] += self.gain_dn_per_e * collected
-            yield self._digitised(frame)
+            return frame
+
+        return self._frames(drawn, count, rng)
 
     def _is_normal(self, electrons: Floats) -> NDArray[np.bool_]:
         """Whether the number of photons is nearly normally distributed, far below the full well."""
         room = self.full_well_e - electrons
         return (electrons >= MANY_E) & (room > WELL_MARGIN * np.sqrt(electrons))
-
-    def _digitised(self, values: NDArray[np.float32]) -> NDArray[Any]:
-        """Convert to whole DN; `values` is overwritten."""
-        np.rint(values, out=values)
-        np.clip(values, 0, self.full_scale, out=values)
-        return values.astype(np.uint8 if self.bit_depth == 8 else np.uint16)

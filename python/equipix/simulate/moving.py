@@ -1,16 +1,13 @@
 """A scene that moves over an array with gain and offset of its own in each pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Floats, check_shape
+from equipix._check import ArrayLike, Floats, check_shape
 from equipix.errors import InputError
 
 _FIELD = 1024

@@ -1,17 +1,14 @@
 """A virtual calibration experiment: a camera on a stage in a steady beam, and a hole."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Progress, Rng, as_array, as_shifts
+from equipix._check import Array, ArrayLike, Floats, Progress, Rng, as_array, as_shifts
 from equipix.errors import InputError
 from equipix.io.paths import as_path
 from equipix.measured.colour import Colours
@@ -19,7 +16,7 @@ from equipix.measured.noise import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.beams import Beam, filtered, window
 from equipix.simulate.camera import Camera, Pixels
-from equipix.simulate.recording import Recording, Stream, write_experiment
+from equipix.simulate.recording import Stream, write_experiment
 
 FULL_SCALE_E = 20_000.0
 """Electrons that fill the range of the ADC where no gain is given."""
@@ -99,36 +96,27 @@ class VirtualExperiment:
     @property
     def truth(self) -> Truth:
         """What a calibration should find."""
-        camera = self.camera
-        return Truth(
-            sensitivity=camera.response,
-            shifts=self.positions,
-            dead=camera.dead,
-            hot=camera.hot,
-            dark=camera.offset,
-            gain_dn_per_e=camera.gain_dn_per_e,
-        )
+        c = self.camera
+        return Truth(c.response, self.positions, c.dead, c.hot, c.offset, c.gain_dn_per_e)
 
-    def frames(self, k: int) -> Iterator[NDArray[Any]]:
+    def frames(self, k: int) -> Iterator[Array]:
         """Make the frames of exposure `k`, one at a time."""
         return self._stream(self.beam, k, self.count, _FRAMES, k)
 
-    def dark(self) -> Iterator[NDArray[Any]]:
+    def dark(self) -> Iterator[Array]:
         """Make the dark frames, one at a time."""
         rng = np.random.default_rng([self.entropy, _DARK])
         return self.camera.frames(np.zeros(self.camera.shape), self.dark_count, rng=rng)
 
-    def aperture_before(self, k: int) -> Iterator[NDArray[Any]]:
+    def aperture_before(self, k: int) -> Iterator[Array]:
         """Make the frames of the hole before the move to exposure `k`, from 1 on."""
         return self._stream(self.hole, k - 1, self.aperture_count, _BEFORE, k)
 
-    def aperture_after(self, k: int) -> Iterator[NDArray[Any]]:
+    def aperture_after(self, k: int) -> Iterator[Array]:
         """Make the frames of the hole after the move to exposure `k`, from 1 on."""
         return self._stream(self.hole, k, self.aperture_count, _AFTER, k)
 
-    def _stream(
-        self, beam: Beam, position: int, count: int, kind: int, k: int
-    ) -> Iterator[NDArray[Any]]:
+    def _stream(self, beam: Beam, position: int, count: int, kind: int, k: int) -> Iterator[Array]:
         light = window(beam, self.camera.shape, self.positions[position])
         rng = np.random.default_rng([self.entropy, kind, k])
         return self.camera.frames(light, count, rng=rng)
@@ -206,23 +194,22 @@ class VirtualExperiment:
         InputError
             If `folder` is not the name of a folder.
         """
-        path = as_path("folder", folder)
-        return write_experiment(self._recording(), path, force=force, progress=progress)
-
-    def _recording(self) -> Recording:
-        """All streams, with what else the folder holds."""
-        each, hole = range(len(self.positions)), self.aperture_count
-        return Recording(
-            bit_depth=self.camera.bit_depth,
-            frame_bytes=self.camera.response.size * (1 if self.camera.bit_depth == 8 else 2),
-            dark=Stream(self.dark(), self.dark_count),
-            exposures=[Stream(self.frames(k), self.count) for k in each],
-            moves=[
-                (Stream(self.aperture_before(k), hole), Stream(self.aperture_after(k), hole))
-                for k in each[1:]
-            ],
+        camera, hole = self.camera, self.aperture_count
+        streams = {"dark/dark.tif": Stream(self.dark, self.dark_count)}
+        for k in range(len(self.positions)):
+            streams[f"frames/p{k}.tif"] = Stream(partial(self.frames, k), self.count)
+        for k in range(1, len(self.positions)):
+            streams[f"aperture/p{k}-before.tif"] = Stream(partial(self.aperture_before, k), hole)
+            streams[f"aperture/p{k}-after.tif"] = Stream(partial(self.aperture_after, k), hole)
+        cfa = None if self.cfa is None else self.cfa.written
+        return write_experiment(
+            as_path("folder", folder),
+            streams,
+            frame_bytes=camera.response.size * (1 if camera.bit_depth == 8 else 2),
+            sensor={"name": "virtual", "bit_depth": camera.bit_depth, "cfa": cfa},
             truth=vars(self.truth),
-            cfa=None if self.cfa is None else self.cfa.written,
+            force=force,
+            progress=progress,
         )
 
 

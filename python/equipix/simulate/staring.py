@@ -1,19 +1,17 @@
 """A virtual staring array: why pixels answer the same light differently, cause by cause."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Floats, Rng, as_array, check_bit_depth, check_shape
+from equipix._check import Array, ArrayLike, Floats, Rng, check_bit_depth, check_shape
 from equipix.detector.photons import band_photons
 from equipix.errors import InputError
 from equipix.simulate.beams import filtered
+from equipix.simulate.camera import PixelArray
 
 _REFERENCE_K = 300.0
 """Temperature of a black body at which the mean light is given."""
@@ -27,21 +25,9 @@ _NOT_BELOW_0 = ("sensitivity", "area", "dark_e", "amplification", "read_noise_e"
 _STEEPEST = 0.5
 """Curvature at which the response stops rising when the well is full."""
 
-_MAPS = (
-    "sensitivity",
-    "area",
-    "dark_e",
-    "curvature",
-    "cutoff_um",
-    "offset_dn",
-    "amplification",
-    "read_noise_e",
-    "drift_dn",
-)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StaringArray:
+class StaringArray(PixelArray):
     """A focal plane array whose pixels differ in what they are made of.
 
     Each cause is a map of shape (rows, cols), or one number for all pixels.
@@ -111,6 +97,8 @@ class StaringArray:
     True
     """
 
+    _names = (*_NOT_BELOW_0, "curvature", "cutoff_um", "offset_dn")
+
     shape: tuple[int, int]
     sensitivity: ArrayLike = 1.0
     area: ArrayLike = 1.0
@@ -130,34 +118,16 @@ class StaringArray:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        check_shape(self.shape)
-        check_bit_depth(self.bit_depth)
+        self._check_numbers("doubling_k", "well_e", "band_start_um")
         if self.cfa is not None:
             filtered(np.ones((1, 1)), self.cfa)
-        for name in ("doubling_k", "well_e", "band_start_um"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"'{name}' is {getattr(self, name)!r}, expected more than 0")
-        for name in _MAPS:
-            values = as_array(name, getattr(self, name), ndim=(0, 1, 2))
-            if values.shape not in ((1,), self.shape):
-                raise InputError(
-                    f"'{name}' has shape {values.shape}, expected one number or {self.shape}"
-                )
-            self._check_values(name, values)
-
-    def _check_values(self, name: str, values: NDArray[Any]) -> None:
-        """Refuse values of a map that no array has."""
-        low, high, wanted = -np.inf, np.inf, "finite numbers"
-        if name in _NOT_BELOW_0:
-            low, wanted = 0.0, "finite numbers not below 0"
-        elif name == "curvature":
-            high, wanted = _STEEPEST, f"finite numbers up to {_STEEPEST}"
-        elif name == "cutoff_um":
-            low = float(np.nextafter(self.band_start_um, np.inf))
-            wanted = f"finite numbers above 'band_start_um', {self.band_start_um:g}"
-        wrong = values[~(np.isfinite(values) & (values >= low) & (values <= high))]
-        if wrong.size:
-            raise InputError(f"'{name}' holds {wrong.flat[0]:g}, expected {wanted}")
+        for name in _NOT_BELOW_0:
+            self._check_map(name, 0, np.inf, " not below 0")
+        self._check_map("offset_dn", -np.inf, np.inf, "")
+        self._check_map("curvature", -np.inf, _STEEPEST, f" up to {_STEEPEST}")
+        start = self.band_start_um
+        above = f" above 'band_start_um', {start:g}"
+        self._check_map("cutoff_um", np.nextafter(start, np.inf), np.inf, above)
 
     @classmethod
     def of(cls, material: str, shape: tuple[int, int], *, rng: Rng) -> Self:
@@ -185,12 +155,12 @@ class StaringArray:
         """
         if material not in MATERIALS:
             raise InputError(f"'material' is {material!r}, expected one of {tuple(MATERIALS)}")
-        rng, (start, spreads) = np.random.default_rng(rng), MATERIALS[material]
+        rng, (start, means, spreads) = np.random.default_rng(rng), MATERIALS[material]
         rows, cols = check_shape(shape)
         columns = rng.standard_normal(cols)
         maps: dict[str, Any] = {
             name: mean + spread * rng.standard_normal((rows, cols))
-            for name, (mean, spread) in spreads.items()
+            for name, mean, spread in zip(_SPREAD, means, spreads, strict=True)
         }
         maps["amplification"] = np.broadcast_to(1 + 0.005 * columns, (rows, cols))
         maps["dark_e"] = np.maximum(maps["dark_e"], 0)
@@ -212,19 +182,6 @@ class StaringArray:
             if finer != 1
         }
         return replace(self, **scaled | causes)
-
-    @cached_property
-    def _maps(self) -> dict[str, Floats]:
-        """Each cause as a map of all pixels."""
-        return {
-            name: np.broadcast_to(np.asarray(getattr(self, name), np.float64), self.shape)
-            for name in _MAPS
-        }
-
-    @property
-    def full_scale(self) -> int:
-        """Largest digital number."""
-        return int(2**self.bit_depth - 1)
 
     @property
     def gain_dn_per_e(self) -> float:
@@ -311,7 +268,7 @@ class StaringArray:
         rng: Rng,
         warmer_k: float = 0.0,
         time_s: float | None = None,
-    ) -> Iterator[NDArray[Any]]:
+    ) -> Iterator[Array]:
         """Make frames of a steady light, one at a time.
 
         Parameters
@@ -338,13 +295,13 @@ class StaringArray:
         distribution: wells of infrared arrays hold millions. A full well loses what exceeds it, so
         only the read noise is left.
         """
-        rng = np.random.default_rng(rng)
         n = self.electrons(light_e, warmer_k=warmer_k)
         sigma, offset = self._noise_e(n), self._offset(time_s)
-        for _ in range(count):
-            values = offset + self._converted(n + sigma * rng.standard_normal(self.shape))
-            whole = np.clip(np.rint(values), 0, self.full_scale)
-            yield whole.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+        def drawn(random: np.random.Generator) -> Floats:
+            return offset + self._converted(n + sigma * random.standard_normal(self.shape))
+
+        return self._frames(drawn, count, rng)
 
     def temporal_noise(self, light_e: ArrayLike) -> Floats:
         """Standard deviation of one frame, in DN, rounding included, curvature left out."""
@@ -381,42 +338,24 @@ class StaringArray:
         return frequencies, rng.uniform(0, 2 * np.pi, shape)
 
 
-MATERIALS: dict[str, tuple[float, dict[str, tuple[float, float]]]] = {
+_SPREAD = ("sensitivity", "area", "dark_e", "curvature", "cutoff_um", "offset_dn", "drift_dn")
+"""Causes in the order of the columns of `MATERIALS`."""
+
+MATERIALS = {
     "PtSi": (
         3.0,
-        {
-            "sensitivity": (1.0, 0.005),
-            "area": (1.0, 0.002),
-            "dark_e": (1e5, 2e3),
-            "curvature": (0.002, 0.0002),
-            "cutoff_um": (5.0, 0.0),
-            "offset_dn": (300.0, 20.0),
-            "drift_dn": (0.2, 0.0),
-        },
+        (1.0, 1.0, 1e5, 0.002, 5.0, 300.0, 0.2),
+        (0.005, 0.002, 2e3, 0.0002, 0.0, 20.0, 0.0),
     ),
     "InSb": (
         3.0,
-        {
-            "sensitivity": (1.0, 0.02),
-            "area": (1.0, 0.005),
-            "dark_e": (2e5, 1e4),
-            "curvature": (0.005, 0.0005),
-            "cutoff_um": (5.3, 0.002),
-            "offset_dn": (300.0, 40.0),
-            "drift_dn": (0.6, 0.0),
-        },
+        (1.0, 1.0, 2e5, 0.005, 5.3, 300.0, 0.6),
+        (0.02, 0.005, 1e4, 0.0005, 0.002, 40.0, 0.0),
     ),
     "HgCdTe": (
         8.0,
-        {
-            "sensitivity": (1.0, 0.05),
-            "area": (1.0, 0.01),
-            "dark_e": (1e6, 1e5),
-            "curvature": (0.04, 0.008),
-            "cutoff_um": (10.0, 0.03),
-            "offset_dn": (300.0, 60.0),
-            "drift_dn": (2.0, 0.0),
-        },
+        (1.0, 1.0, 1e6, 0.04, 10.0, 300.0, 2.0),
+        (0.05, 0.01, 1e5, 0.008, 0.03, 60.0, 0.0),
     ),
 }
-"""Shortest wavelength in µm, then mean and standard deviation over the pixels of each cause."""
+"""Shortest wavelength in µm, then means and standard deviations over the pixels."""

@@ -6,19 +6,20 @@
 //! c_0 + y (c_1 + y (c_2 + y c_3))
 //! ```
 //!
-//! in single precision, by Horner's scheme. For whole numbers it is rounded, half to even, and limited
-//! to what the type, or the camera's bits, can hold. Of bytes that must move, a frame of 16 bits with
+//! in single or double precision, by Horner's scheme. For whole numbers it is rounded, half to even, and
+//! limited to what the type, or the camera's bits, can hold. Of bytes that must move, a frame of 16 bits with
 //! gain and offset has 12 a pixel: two of the frame, two of the result, eight of the coefficients.
 //!
 //! The product and the sum are rounded one by one, not fused: the same bytes come out on every
 //! processor.
 
 use std::cell::RefCell;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::ops::{Add, Div, Mul};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::control::Control;
 use crate::error::{Error, Result};
-use crate::frames::{Shape, Stack};
+use crate::frames::{Real, Shape, Stack};
 use crate::parallel::Workers;
 
 /// Pixels that a thread corrects at a time.
@@ -36,28 +37,56 @@ const PLANES: usize = 4;
 /// low bits.
 const WHOLE: f32 = 8_388_608.0;
 
+/// The precision in which values are corrected: single or double.
+pub trait Precision:
+    Real + Raw<Self> + Corrected<Self> + Add<Output = Self> + Mul<Output = Self> + Div<Output = Self>
+{
+    /// Bits of a number, as a whole number with a sign.
+    type Bits: Ord + Copy + Default;
+
+    /// What is not a number.
+    const NAN: Self;
+
+    /// The difference between 1 and the next larger number.
+    const EPSILON: f64;
+
+    /// The number of this precision that is nearest.
+    fn nearest(value: f64) -> Self;
+
+    /// Bits of the number, which for numbers from 0 on have their order and for others are not above
+    /// 0; what is not a number is 0. A maximum of them is found in vector registers, one of numbers is
+    /// not.
+    fn order(self) -> Self::Bits;
+
+    /// The number of these bits.
+    fn ordered(bits: Self::Bits) -> f64;
+
+    /// Whether it is not a number.
+    fn is_nan(self) -> bool;
+}
+
 /// A raw value as a frame has it.
-pub trait Raw: Copy + Send + Sync {
-    /// The value in single precision.
-    fn value(self) -> f32;
+pub trait Raw<T>: Copy + Send + Sync {
+    /// The value in the precision of the correction.
+    fn value(self) -> T;
 }
 
 /// A corrected value.
-pub trait Corrected: Copy + Send + Sync {
+pub trait Corrected<T>: Copy + Send + Sync {
     /// The value of `corrected`, at most `largest`, and whether it had to be changed for that.
-    fn of(corrected: f32, largest: f32) -> (Self, bool);
+    fn of(corrected: T, largest: T) -> (Self, bool);
 }
 
 macro_rules! whole_numbers {
     ($($kind:ty),*) => {$(
-        impl Raw for $kind {
+        impl Raw<f32> for $kind {
             #[inline(always)]
             fn value(self) -> f32 {
                 f32::from(self)
             }
         }
 
-        impl Corrected for $kind {
+        impl Corrected<f32> for $kind {
             #[inline(always)]
             fn of(corrected: f32, largest: f32) -> (Self, bool) {
                 // What is not a number becomes 0 here, and counts as changed.
@@ -71,19 +100,53 @@ macro_rules! whole_numbers {
 
 whole_numbers!(u8, u16);
 
-impl Raw for f32 {
-    #[inline(always)]
-    fn value(self) -> f32 {
-        self
-    }
+macro_rules! precisions {
+    ($($kind:ident as $bits:ty),*) => {$(
+        impl Precision for $kind {
+            type Bits = $bits;
+
+            const NAN: Self = $kind::NAN;
+
+            const EPSILON: f64 = $kind::EPSILON as f64;
+
+            #[inline(always)]
+            fn nearest(value: f64) -> Self {
+                value as $kind
+            }
+
+            #[inline(always)]
+            fn order(self) -> $bits {
+                if self.is_nan() { 0 } else { self.to_bits().cast_signed() }
+            }
+
+            #[inline(always)]
+            fn ordered(bits: $bits) -> f64 {
+                $kind::from_bits(bits.cast_unsigned()).into()
+            }
+
+            #[inline(always)]
+            fn is_nan(self) -> bool {
+                self.is_nan()
+            }
+        }
+
+        impl Raw<$kind> for $kind {
+            #[inline(always)]
+            fn value(self) -> $kind {
+                self
+            }
+        }
+
+        impl Corrected<$kind> for $kind {
+            #[inline(always)]
+            fn of(corrected: $kind, _: $kind) -> (Self, bool) {
+                (corrected, false)
+            }
+        }
+    )*};
 }
 
-impl Corrected for f32 {
-    #[inline(always)]
-    fn of(corrected: f32, _: f32) -> (Self, bool) {
-        (corrected, false)
-    }
-}
+precisions!(f32 as i32, f64 as i64);
 
 /// What becomes of pixels that must not be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -123,7 +186,7 @@ pub struct Counts {
     /// Values that were corrected to below the lowest or above the highest level of their pixel.
     pub extrapolated: u64,
     /// The largest raw value; 0 where none is above 0.
-    pub highest: f32,
+    pub highest: f64,
 }
 
 /// Counts to which several threads add.
@@ -132,7 +195,7 @@ struct Tally {
     limited: AtomicU64,
     extrapolated: AtomicU64,
     /// Bits of a number that is not negative: their order is that of the numbers.
-    highest: AtomicU32,
+    highest: AtomicU64,
 }
 
 impl Tally {
@@ -146,77 +209,73 @@ impl Tally {
         Counts {
             limited: self.limited.into_inner(),
             extrapolated: self.extrapolated.into_inner(),
-            highest: f32::from_bits(self.highest.into_inner()),
+            highest: f64::from_bits(self.highest.into_inner()),
         }
     }
 }
 
 /// Lowest and highest level that a correction was measured at.
 #[derive(Debug)]
-struct Range {
+struct Range<T> {
     /// Of the pixel with the most levels.
-    widest: [f32; 2],
+    widest: [T; 2],
     /// Pixels with fewer levels, and their own.
-    narrower: Vec<(u32, [f32; 2])>,
+    narrower: Vec<(u32, [T; 2])>,
 }
 
-impl Range {
-    const EVERYTHING: Self =
-        Self { widest: [f32::NEG_INFINITY, f32::INFINITY], narrower: Vec::new() };
+impl<T: Precision> Range<T> {
+    /// That of all numbers.
+    fn everything() -> Self {
+        Self { widest: [f64::NEG_INFINITY, f64::INFINITY].map(T::nearest), narrower: Vec::new() }
+    }
 
     /// From the levels of each pixel, all lowest ones first; what is not a number has no range.
     fn of(levels: &[f32], size: usize) -> Self {
         let (low, high) = levels.split_at(size);
-        let each = || low.iter().zip(high).map(|(&low, &high)| widened([low, high]));
-        let union = |[low, high]: [f32; 2], [l, h]: [f32; 2]| [low.min(l), high.max(h)];
-        let widest = each().fold([f32::INFINITY, f32::NEG_INFINITY], union);
+        let each = || low.iter().zip(high).map(|(&low, &high)| widened([low, high].map(f64::from)));
+        let union = |[low, high]: [f64; 2], [l, h]: [f64; 2]| [low.min(l), high.max(h)];
+        let widest = each().fold([f64::INFINITY, f64::NEG_INFINITY], union);
         let own = (0..).zip(each()).filter(|(_, range)| *range != widest && range[0] <= range[1]);
-        Self { widest, narrower: own.collect() }
+        let narrower = own.map(|(pixel, range)| (pixel, range.map(T::nearest))).collect();
+        Self { widest: widest.map(T::nearest), narrower }
     }
 }
 
 /// A range with the roundings of a polynomial in single precision, so that a value at a level is in it.
-fn widened([low, high]: [f32; 2]) -> [f32; 2] {
-    let rounding = 8.0 * f32::EPSILON * low.abs().max(high.abs());
-    [low - rounding, high + rounding]
+fn widened([low, high]: [f64; 2]) -> [f64; 2] {
+    let rounding = 8.0 * <f32 as Precision>::EPSILON * low.abs().max(high.abs());
+    [low - rounding, high + rounding].map(|end| f64::from(end as f32))
 }
 
 /// Whether a value is outside; what is not a number is not.
 #[inline(always)]
-fn is_outside(value: f32, [low, high]: [f32; 2]) -> bool {
+fn is_outside<T: Precision>(value: T, [low, high]: [T; 2]) -> bool {
     (value < low) | (value > high)
-}
-
-/// Bits of a number, which for numbers from 0 on have their order and for others are not above 0; what
-/// is not a number is 0. A maximum of them is found in vector registers, one of numbers is not.
-#[inline(always)]
-fn order_of(value: f32) -> i32 {
-    if value.is_nan() { 0 } else { value.to_bits().cast_signed() }
 }
 
 thread_local! {
     /// Values of replaced pixels of the frame at hand, kept so that no frame allocates.
-    static REPAIRED: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+    static REPAIRED: RefCell<Vec<f64>> = const { RefCell::new(Vec::new()) };
 }
 
 /// A correction prepared for many frames.
 #[derive(Debug)]
-pub struct Corrector {
+pub struct Corrector<T = f32> {
     shape: Shape,
-    coefficients: Vec<f32>,
+    coefficients: Vec<T>,
     planes: usize,
     repairs: Repairs,
-    range: Range,
+    range: Range<T>,
 }
 
-impl Corrector {
+impl<T: Precision> Corrector<T> {
     /// Prepares coefficients, one plane a power of y, lowest first.
     ///
     /// # Errors
     /// [`Error::Shape`] if there are more than four planes, or `unusable` or the colours are of another
     /// size.
     pub fn new(
-        coefficients: Stack<'_, f32>,
+        coefficients: Stack<'_, T>,
         unusable: &[bool],
         then: Unusable,
         alike: Alike<'_>,
@@ -240,11 +299,11 @@ impl Corrector {
         if then != Unusable::Kept {
             for pixel in (0..shape.len()).filter(|&pixel| unusable[pixel]) {
                 coefficients.iter_mut().skip(pixel).step_by(shape.len()).for_each(|each| {
-                    *each = f32::NAN;
+                    *each = T::NAN;
                 });
             }
         }
-        Ok(Self { shape, coefficients, planes, repairs, range: Range::EVERYTHING })
+        Ok(Self { shape, coefficients, planes, repairs, range: Range::everything() })
     }
 
     /// Counts values that are corrected to outside of these levels: the lowest of each pixel, then
@@ -275,11 +334,11 @@ impl Corrector {
     /// # Errors
     /// [`Error::Shape`] if an array holds no whole number of frames, or the two differ in size;
     /// [`Error::Cancelled`].
-    pub fn apply<I: Raw, O: Corrected>(
+    pub fn apply<I: Raw<T>, O: Corrected<T>>(
         &self,
         frames: &[I],
         out: &mut [O],
-        largest: f32,
+        largest: T,
         workers: &Workers,
         control: &Control,
     ) -> Result<Counts> {
@@ -321,16 +380,16 @@ impl Corrector {
     }
 
     /// Coefficients of power `power` from pixel `at` on.
-    fn plane(&self, power: usize, at: usize, length: usize) -> &[f32] {
+    fn plane(&self, power: usize, at: usize, length: usize) -> &[T] {
         &self.coefficients[power * self.shape.len() + at..][..length]
     }
 
-    fn correct_block<I: Raw, O: Corrected>(
+    fn correct_block<I: Raw<T>, O: Corrected<T>>(
         &self,
         at: usize,
         frame: &[I],
         out: &mut [O],
-        largest: f32,
+        largest: T,
     ) -> Counts {
         let plane = |power| self.plane(power, at, frame.len());
         let (arch, range) = (pulp::Arch::new(), self.range.widest);
@@ -349,19 +408,19 @@ impl Corrector {
     }
 
     /// The corrected value of one pixel.
-    fn value<I: Raw>(&self, frame: &[I], pixel: usize) -> f32 {
+    fn value<I: Raw<T>>(&self, frame: &[I], pixel: usize) -> T {
         let y = frame[pixel].value();
-        (0..self.planes)
-            .rev()
-            .fold(0.0, |sum, power| sum * y + self.coefficients[power * self.shape.len() + pixel])
+        (0..self.planes).rev().fold(T::nearest(0.0), |sum, power| {
+            sum * y + self.coefficients[power * self.shape.len() + pixel]
+        })
     }
 
     /// Replaces pixels of a frame whose blocks are corrected, and counts what the blocks cannot.
-    fn finish<I: Raw, O: Corrected>(
+    fn finish<I: Raw<T>, O: Corrected<T>>(
         &self,
         frame: &[I],
         out: &mut [O],
-        largest: f32,
+        largest: T,
         tally: &Tally,
     ) {
         let narrower = self.range.narrower.iter().filter(|(pixel, range)| {
@@ -371,18 +430,18 @@ impl Corrector {
         tally.extrapolated.fetch_add(narrower.count() as u64, Ordering::Relaxed);
         tally.limited.fetch_add(self.repair(frame, out, largest), Ordering::Relaxed);
         // Their coefficients are not numbers, and so were their values in the blocks.
-        let before = u64::from(O::of(f32::NAN, largest).1) * self.repairs.pixels.len() as u64;
+        let before = u64::from(O::of(T::NAN, largest).1) * self.repairs.pixels.len() as u64;
         tally.limited.fetch_sub(before, Ordering::Relaxed);
     }
 
     /// Replaces pixels by the means of their sources; gives the number of values limited.
-    fn repair<I: Raw, O: Corrected>(&self, frame: &[I], out: &mut [O], largest: f32) -> u64 {
+    fn repair<I: Raw<T>, O: Corrected<T>>(&self, frame: &[I], out: &mut [O], largest: T) -> u64 {
         REPAIRED.with_borrow_mut(|repaired| {
             repaired.clear();
             let mut limited = 0;
             for (index, &pixel) in self.repairs.pixels.iter().enumerate() {
                 let mean = self.mean_of(self.repairs.sources(index), frame, repaired);
-                repaired.push(mean);
+                repaired.push(mean.to_f64());
                 let (value, changed) = O::of(mean, largest);
                 out[pixel as usize] = value;
                 limited += u64::from(changed);
@@ -393,37 +452,39 @@ impl Corrector {
 
     /// Mean of the sources of a pixel. A value that is not a number does not count, so it does not
     /// spread.
-    fn mean_of<I: Raw>(&self, sources: &[Source], frame: &[I], repaired: &[f32]) -> f32 {
-        let (mut sum, mut count) = (0.0, 0_u32);
+    fn mean_of<I: Raw<T>>(&self, sources: &[Source], frame: &[I], repaired: &[f64]) -> T {
+        let (mut sum, mut count) = (T::nearest(0.0), 0_u32);
         for source in sources {
             let value = match *source {
                 Source::Pixel(pixel) => self.value(frame, pixel as usize),
-                Source::Repaired(before) => repaired[before as usize],
+                Source::Repaired(before) => T::nearest(repaired[before as usize]),
             };
             if !value.is_nan() {
-                sum += value;
+                sum = sum + value;
                 count += 1;
             }
         }
-        sum / count as f32
+        sum / T::nearest(count.into())
     }
 }
 
 /// Pixels of one block, with their coefficients.
-struct Block<'s, I, O, const N: usize> {
+struct Block<'s, T, I, O, const N: usize> {
     frame: &'s [I],
-    planes: [&'s [f32]; N],
+    planes: [&'s [T]; N],
     out: &'s mut [O],
-    largest: f32,
-    range: [f32; 2],
+    largest: T,
+    range: [T; 2],
 }
 
-impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, O, N> {
+impl<T: Precision, I: Raw<T>, O: Corrected<T>, const N: usize> pulp::NullaryFnOnce
+    for Block<'_, T, I, O, N>
+{
     type Output = Counts;
 
     #[inline(always)]
     fn call(self) -> Counts {
-        let (mut limited, mut extrapolated, mut highest) = (0_u32, 0_u32, 0);
+        let (mut limited, mut extrapolated, mut highest) = (0_u32, 0_u32, T::Bits::default());
         let length = self.out.len();
         let (frame, planes) = (&self.frame[..length], self.planes.map(|plane| &plane[..length]));
         for (i, out) in self.out.iter_mut().enumerate() {
@@ -436,12 +497,12 @@ impl<I: Raw, O: Corrected, const N: usize> pulp::NullaryFnOnce for Block<'_, I, 
             *out = value;
             limited += u32::from(changed);
             extrapolated += u32::from(is_outside(sum, self.range));
-            highest = highest.max(order_of(y));
+            highest = highest.max(y.order());
         }
         Counts {
             limited: limited.into(),
             extrapolated: extrapolated.into(),
-            highest: f32::from_bits(highest.cast_unsigned()),
+            highest: T::ordered(highest),
         }
     }
 }

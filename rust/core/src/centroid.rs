@@ -48,20 +48,19 @@
 //! - Vibration. Lamp flicker moves nothing, but scatters the frames: σ comes out too large.
 
 mod detect;
+mod image;
 mod patch;
 mod region;
 mod surface;
 
-use self::detect::{BLOCKS, Detection, RIM};
+use self::detect::{Detection, RIM};
+use self::image::Image;
 use self::patch::Patch;
 use self::region::Region;
 use self::surface::{Point, Surface, Terms, dot, solve_by_elimination, terms};
 use crate::control::Control;
-use crate::error::{Error, Result, SpotProblem};
-use crate::frames::{Sample, Shape, Stack};
-
-/// Values stay below this, so that no sum of squares overflows.
-const LARGEST: f64 = 1e100;
+use crate::error::{Result, SpotProblem};
+use crate::frames::{Sample, Stack};
 
 /// Where a spot is, (row, column) in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,9 +74,10 @@ pub struct Spot {
 /// Finds the one spot in the mean of `frames`, called `argument` in errors.
 ///
 /// # Errors
-/// [`Error::Spot`] for a spot that is missing, cut by the edge, doubled, or has samples that reach
-/// `saturation`; [`Error::Shape`] without frames or with images below 16×16 pixels;
-/// [`Error::Value`] for values that are not finite, or 1e100 and more; [`Error::Cancelled`].
+/// [`Error::Spot`](crate::Error::Spot) for a spot that is missing, cut by the edge, doubled, or has
+/// samples that reach `saturation`; [`Error::Shape`](crate::Error::Shape) without frames or with images
+/// below 16×16 pixels; [`Error::Value`](crate::Error::Value) for values that are not finite, or 1e100 and
+/// more; [`Error::Cancelled`](crate::Error::Cancelled).
 pub fn locate<T: Sample>(
     argument: &'static str,
     frames: Stack<'_, T>,
@@ -106,57 +106,6 @@ pub fn locate<T: Sample>(
     };
     let [row, col] = [0, 1].map(|axis| aperture.centroid(axis, &variance));
     Ok(Spot { position: [row.0, col.0], std: [row.1, col.1] })
-}
-
-/// An image, with the name that errors give it.
-#[derive(Debug)]
-struct Image {
-    argument: &'static str,
-    values: Vec<f64>,
-    shape: Shape,
-}
-
-impl Image {
-    /// The mean of frames whose values are all below [`LARGEST`] in size.
-    fn mean<T: Sample>(
-        argument: &'static str,
-        frames: Stack<'_, T>,
-        control: &Control,
-    ) -> Result<Self> {
-        let shape = frames.shape();
-        if frames.count() == 0 || shape.rows.min(shape.cols) < BLOCKS {
-            return Err(Error::Shape {
-                argument,
-                got: format!("({}, {}, {})", frames.count(), shape.rows, shape.cols),
-                wanted: format!("at least one frame of {BLOCKS} rows and columns"),
-            });
-        }
-        let mut values = vec![0.0; shape.len()];
-        for index in 0..frames.count() {
-            for (row, sums) in values.chunks_mut(shape.cols).enumerate() {
-                control.check()?;
-                for (col, (sum, value)) in sums.iter_mut().zip(frames.row(index, row)).enumerate() {
-                    let value = value.to_f64();
-                    if value.is_nan() || value.abs() >= LARGEST {
-                        let place = format!("is {value} at frame {index}, row {row}, column {col}");
-                        let wanted = format!(": numbers below {LARGEST:e} in size are wanted");
-                        return Err(Error::value(argument, place + &wanted));
-                    }
-                    *sum += value;
-                }
-            }
-        }
-        values.iter_mut().for_each(|sum| *sum /= frames.count() as f64);
-        Ok(Self { argument, values, shape })
-    }
-
-    fn missing(&self, level: f64, wanted: f64) -> Error {
-        self.problem(SpotProblem::Missing { level, wanted })
-    }
-
-    fn problem(&self, problem: SpotProblem) -> Error {
-        Error::Spot { argument: self.argument, problem }
-    }
 }
 
 /// Refuses a window in which any frame reaches the saturation level, mended pixels aside.

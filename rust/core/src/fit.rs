@@ -185,7 +185,7 @@ pub struct Solution<'s> {
 }
 
 impl Solution<'_> {
-    /// Checks that it is one of as many exposures of the same sensor.
+    /// Checks that it is one of as many exposures of the same sensor, and what it lost too.
     pub(crate) fn check<T: Real>(&self, exposures: &Exposures<'_, T>) -> Result<()> {
         let (count, pixels) = (exposures.count(), exposures.sensor().len());
         if self.flux.len() == count
@@ -193,7 +193,7 @@ impl Solution<'_> {
             && self.sensitivity.len() == pixels
             && self.flags.len() == pixels
         {
-            return Ok(());
+            return self.check_lost(count, pixels);
         }
         Err(Error::Shape {
             argument: "start",
@@ -202,12 +202,27 @@ impl Solution<'_> {
         })
     }
 
+    fn check_lost(&self, count: usize, pixels: usize) -> Result<()> {
+        let of = self.lost.len();
+        if of != 0 && of != count {
+            let problem = format!("has lost measurements of {of} exposures, expected {count}");
+            return Err(Error::value("start", problem));
+        }
+        match self.lost.iter().copied().flatten().find(|&&pixel| pixel >= pixels) {
+            None => Ok(()),
+            Some(pixel) => {
+                let problem = format!("has lost pixel {pixel}, expected 0 to {}", pixels - 1);
+                Err(Error::value("start", problem))
+            }
+        }
+    }
+
     /// D = Σ w c² L² of each pixel, over the measurements used; light that is not known counts for
     /// nothing.
     ///
     /// # Errors
-    /// [`Error::Shape`] if it belongs to other exposures, [`Error::Cancelled`] if `control` asks to
-    /// stop.
+    /// [`Error::Shape`] if it belongs to other exposures, [`Error::Value`] if it lost measurements of others,
+    /// [`Error::Cancelled`] if `control` asks to stop.
     pub fn information<T: Real>(
         &self,
         exposures: &Exposures<'_, T>,

@@ -40,7 +40,7 @@ mod tests;
 mod tiles;
 mod unknowns;
 mod waves;
-mod weak;
+mod weak_light;
 mod wide;
 mod workspace;
 

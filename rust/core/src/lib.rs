@@ -122,10 +122,11 @@
 //! joint           the linear problem with the pixels eliminated: beam, fluxes and shifts
 //! reduced         the linear problem with the beam eliminated
 //! sweep           a sweep of coordinate descent, the method of the paper
-//! coarse          hats on a coarse grid, and the matrix of a problem in them
 //! convergence     how far M still is from the minimum, large scales included
 //! ritz            the smallest Ritz value, from conjugate gradients
 //! beam            the light that a sensor sees of the beam from any position
+//! weak_light      the prior of M where light is weak: what decides it, and its part of a linear problem
+//! coarse          hats on a coarse grid, and the matrix of a problem in them
 //! connectivity    what the measurements can compare; connected pixels
 //! information     the information D = Σ w c² L² of each pixel on M: its inverse variance with a known beam
 //! exposures       measurements, weights, positions, fluxes; the one check of their values
@@ -140,7 +141,7 @@
 //! frames          views of frame stacks, pixel types, flag bits; the checks of shapes
 //! error           what can go wrong
 //!
-//! response        response curves from levels of a uniform source  (uses parallel and below)
+//! curves          response curves from levels of a uniform source  (uses parallel and below)
 //! scene           gain and offset from a moving scene  (uses geometry and below)
 //! statistics      streaming mean and variance of frames         (uses parallel and below)
 //! io              frames from image files, feature `io`         (uses statistics)
@@ -157,7 +158,7 @@
 //!   [`solve`] and [`convergence`].
 //! - To **average or read frames**: [`statistics::Accumulator`], and `io` for files.
 //! - To **work on this crate**: ARCHITECTURE.md and CONTRIBUTING.md of the repository; a new kernel
-//!   starts from the NumPy reference in `python/equipix/reference`.
+//!   starts from the NumPy reference in `tests/reference`.
 //!
 //! # References
 //!
@@ -185,6 +186,7 @@ mod coarse;
 pub mod connectivity;
 pub mod control;
 pub mod convergence;
+pub mod curves;
 pub mod error;
 pub mod exposures;
 pub mod fit;
@@ -203,10 +205,8 @@ mod padded;
 pub mod parallel;
 #[doc(hidden)]
 pub mod parts;
-mod prior;
 mod random;
 mod reduced;
-pub mod response;
 mod ritz;
 pub mod scene;
 pub mod solve;
@@ -215,6 +215,7 @@ pub mod sweep;
 #[cfg(test)]
 mod testing;
 pub mod uncertainty;
+mod weak_light;
 
 pub use beam::Beam;
 pub use control::Control;

@@ -24,13 +24,11 @@ mod dark_noise;
 mod kernel;
 mod noise;
 mod operator;
-mod smallest;
 mod two_level;
 mod two_level_kernel;
-mod weak;
-mod weak_operator;
+mod weak_light;
 
-pub(crate) use conjugate_gradients::{ConjugateGradients, bytes_needed};
+pub(crate) use conjugate_gradients::{ConjugateGradients, Smallest, bytes_needed};
 pub(crate) use operator::{Draw, Reduced, Scale};
-pub(crate) use smallest::Smallest;
 pub(crate) use two_level::TwoLevel;
+pub(crate) use weak_light::Whole;

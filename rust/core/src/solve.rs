@@ -1,28 +1,24 @@
 //! From exposures to a fit: the choice of the solver, and its three loops.
 //!
 //! ```text
-//! calibrate    what runs, and the result in its gauge
+//! calibrate    what runs, the fit of M and L alone at whole shifts, and the result in its gauge
 //! refuse       what does not go together
-//! whole        M and L alone, at whole shifts: by descent or multiscale
 //! descent      the method of the paper, sweep by sweep
 //! multiscale   Gauss-Newton steps on all scales at once, with the beam eliminated
 //! joint        Gauss-Newton steps in beam, fluxes and shifts, with the pixels eliminated
-//! response     pixels that do not respond to light
-//! weak         pixels in weak light, and the prior of their M
+//! dead_pixels  pixels that do not respond to light
 //! ```
 
 mod calibrate;
 mod course;
+mod dead_pixels;
 mod descent;
 mod found;
 mod joint;
 mod multiscale;
 mod options;
 mod refuse;
-mod response;
 mod start;
-mod weak;
-mod whole;
 
 pub use calibrate::calibrate;
 pub(crate) use multiscale::minimise as multiscale;

@@ -7,6 +7,7 @@
 //! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
 //! | functionals, dark_variance | float64, 3 and 2 | `&[f64]` | view |
 //! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view |
+//! | lost, an array for each exposure | uintp, 1 | `Vec<&[usize]>` | view |
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;

@@ -10,13 +10,13 @@ mod apply;
 mod arrays;
 mod average;
 mod centroid;
+mod curves;
 mod data;
 mod errors;
 mod exposures;
 mod fit;
 mod fixed_point;
 mod plan;
-mod response;
 mod run;
 mod scene;
 
@@ -35,6 +35,8 @@ mod _native {
     #[pymodule_export]
     use crate::centroid::locate_spots;
     #[pymodule_export]
+    use crate::curves::fit_response;
+    #[pymodule_export]
     use crate::exposures::{PyExposures, common_fraction, needs_whole_shifts};
     #[pymodule_export]
     use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
@@ -42,8 +44,6 @@ mod _native {
     use crate::fixed_point::{adapt_words, apply_words};
     #[pymodule_export]
     use crate::plan::planned_components;
-    #[pymodule_export]
-    use crate::response::fit_response;
     #[pymodule_export]
     use crate::scene::PySceneCorrection;
 

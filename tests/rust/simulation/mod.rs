@@ -173,7 +173,7 @@ impl Experiment {
         self
     }
 
-    /// Variances that differ threefold from measurement to measurement, and one in sixty masked, but for pixels
+    /// Variances that differ threefold from measurement to measurement, and one in 67 masked, but for pixels
     /// of which that would leave so few that they leave the search. On sensors so small, more gaps would lose
     /// so many others that pixels leave it for those.
     pub(crate) fn uneven(mut self) -> Self {

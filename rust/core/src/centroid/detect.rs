@@ -2,16 +2,13 @@
 
 use std::f64::consts::PI;
 
-use super::Image;
+use super::image::{BLOCKS, Image};
 use super::region::Region;
 use super::surface::{Point, Surface, Terms, dot, median, robust_deviation, terms};
 use crate::connectivity::{NONE, label_pixels};
 use crate::control::Control;
 use crate::error::{Result, SpotProblem};
 use crate::frames::Shape;
-
-/// Background and noise are taken from this many blocks along each axis.
-pub(super) const BLOCKS: usize = 16;
 
 /// A spot has at least this many pixels: its level is that of the lowest of its brightest 16.
 const SPOT_PIXELS: usize = 16;

@@ -2,13 +2,23 @@
 //!
 //! Along the edge of a mask some cells of a spline are seen by few measurements. These do not determine them, the
 //! penalty does not reach all of them, and coefficients of 1e8 fit as well, which the search follows for thousands of
-//! passes. So a cell counts as determined where a measurement in a block sees it, or [`ENOUGH`] others. A block is as
-//! many pixels of an exposure as one of them sees cells, side by side. Only pixels count that stay in the search and
-//! are measured at least twice. All other measurements are lost where they see a cell that is not determined.
+//! passes. So a cell counts as determined where a measurement in a block sees it, or [`ENOUGH`] others. A block is a
+//! square of 4×4 pixels that one exposure measures: as many as one of them sees cells. Only pixels count that stay in
+//! the search and are measured at least twice. All other measurements are lost where they see a cell that is not
+//! determined.
 //!
 //! Wide parts of the sensor are no edges. Where most pixels of one are measured twice, and no others see their cells,
-//! they are treated as an experiment of two exposures. And where most measurements of an exposure are in no block, or
-//! many in a part of it, as behind a mask like a chessboard, they count as if they were.
+//! they are treated as an experiment of two exposures. And where at least half of the measurements of an exposure are
+//! in no block, or many in a part of it ([`SPARSE`]), as behind a mask like a chessboard, they count as if they were.
+//!
+//! What the rule does not do:
+//!
+//! - Blocks are found once, from all measurements that are used. Those of pixels that leave the search later form
+//!   blocks too.
+//! - Measurements are only ever lost, never taken back. So the search for them ends.
+//! - No exposure is emptied. One that would lose all the measurements that it has left keeps them.
+//! - An exposure that holds nothing but a ragged crescent has few blocks. All of its measurements count as blocks then,
+//!   and none is lost but of pixels that leave the search or are measured once.
 
 use std::ops::Range;
 
@@ -22,18 +32,25 @@ use crate::geometry::{Rotation, TAPS};
 /// Measurements of a pixel that are few where there are more exposures.
 pub(super) const FEW: u8 = 2;
 
-/// Side of a block.
-const BLOCK: usize = TAPS;
-
 /// Measurements outside blocks that determine a cell: as many as one of them sees cells.
 const ENOUGH: u8 = (TAPS * TAPS) as u8;
 
-/// Side in pixels of a part of the sensor that may be an experiment of two exposures, and the share of its pixels that
-/// then are measured twice.
-const WIDE: (usize, f64) = (32, 0.5);
-/// Side in pixels of a part of an exposure where measurements outside of blocks count as blocks, and the share of its
-/// pixels that have one: more than along a ragged edge, less than of a chessboard.
-const SPARSE: (usize, f64) = (64, 0.3);
+/// Squares of so many pixels a side, of which at least a share is set.
+#[derive(Clone, Copy)]
+struct Squares {
+    side: usize,
+    share: f64,
+}
+
+/// Measurements all of which are used.
+const BLOCKS: Squares = Squares { side: TAPS, share: 1.0 };
+
+/// Parts of the sensor that may be an experiment of two exposures: so many of their pixels are measured twice.
+const WIDE: Squares = Squares { side: 32, share: 0.5 };
+
+/// Parts of an exposure where measurements outside of blocks count as blocks: so many of their pixels have one, more
+/// than along a ragged edge, less than of a chessboard.
+const SPARSE: Squares = Squares { side: 64, share: 0.3 };
 
 /// The columns of lost measurements, by exposure and row; empty if there are none.
 #[derive(Debug, Default)]
@@ -111,13 +128,11 @@ impl<'e, 'a, T: Real> Survey<'e, 'a, T> {
     ) -> Result<Self> {
         let positions = exposures.positions();
         let windows = grid.windows(&positions.on_grid(&positions.shifts));
-        let blocks = blocks(exposures, grid.is_spline(), control)?;
-        let mut used = vec![0; exposures.count()];
-        exposures.for_each_stretch(control, |k, _, cols| used[k] += cols.len())?;
+        let (blocks, used) = blocks(exposures, grid.is_spline(), control)?;
         Ok(Self { exposures, grid, control, lost: Lost::default(), windows, used, blocks })
     }
 
-    /// Loses these measurements too, but for exposures that would have none left; whether there were more.
+    /// Loses these measurements too, but none of exposures that would have none left; whether there were more.
     pub(super) fn lose(&mut self, found: &Lost) -> bool {
         if found.is_empty() {
             return false;
@@ -273,39 +288,44 @@ pub(super) fn wide(
     Ok(wide)
 }
 
-/// Whether each measurement is in a block, or counts as one; all do where a cell is its own value.
+/// Whether each measurement is in a block, or counts as one; all do where a cell is its own value. And how many
+/// measurements each exposure has.
 fn blocks<T: Real>(
     exposures: &Exposures<'_, T>,
     is_spline: bool,
     control: &Control,
-) -> Result<Vec<bool>> {
+) -> Result<(Vec<bool>, Vec<usize>)> {
     let (sensor, count) = (exposures.sensor(), exposures.count());
-    let mut used = vec![false; count * sensor.len()];
+    let (mut blocks, mut counts) = (vec![false; count * sensor.len()], vec![0; count]);
     exposures.for_each_stretch(control, |k, row, cols| {
-        used[k * sensor.len() + row * sensor.cols..][cols].fill(true);
+        counts[k] += cols.len();
+        blocks[k * sensor.len() + row * sensor.cols..][cols].fill(true);
     })?;
     let is_masked = |k: &usize| is_spline && exposures.uniform_weight(*k).is_none();
     for k in (0..count).filter(is_masked) {
-        let used = &mut used[k * sensor.len()..][..sensor.len()];
-        let blocks = in_squares(used, sensor, (BLOCK, 1.0), control)?;
-        let apart: Vec<bool> =
-            used.iter().zip(&blocks).map(|(used, block)| used & !block).collect();
-        let count = |image: &[bool]| image.iter().filter(|is_set| **is_set).count();
-        if 2 * count(&apart) < count(used) {
-            let sparse = in_squares(&apart, sensor, SPARSE, control)?;
-            for (pixel, used) in used.iter_mut().enumerate() {
-                *used = blocks[pixel] | (apart[pixel] & sparse[pixel]);
-            }
-        }
+        blocks_of(&mut blocks[k * sensor.len()..][..sensor.len()], counts[k], sensor, control)?;
     }
-    Ok(used)
+    Ok((blocks, counts))
 }
 
-/// The pixels in squares of so many a side, or as many as there are along an axis, of which at least a share is set.
+/// Leaves those of the measurements of an exposure, of which there are so many, that are in a block or count as one.
+fn blocks_of(used: &mut [bool], count: usize, sensor: Shape, control: &Control) -> Result<()> {
+    let blocks = in_squares(used, sensor, BLOCKS, control)?;
+    let apart: Vec<bool> = used.iter().zip(&blocks).map(|(used, block)| used & !block).collect();
+    if 2 * apart.iter().filter(|is_apart| **is_apart).count() < count {
+        let sparse = in_squares(&apart, sensor, SPARSE, control)?;
+        for (pixel, used) in used.iter_mut().enumerate() {
+            *used = blocks[pixel] | (apart[pixel] & sparse[pixel]);
+        }
+    }
+    Ok(())
+}
+
+/// The pixels in such squares, which have as many pixels along an axis as the image where that has fewer.
 fn in_squares(
     image: &[bool],
     Shape { rows, cols }: Shape,
-    (side, share): (usize, f64),
+    Squares { side, share }: Squares,
     control: &Control,
 ) -> Result<Vec<bool>> {
     let (height, width) = (rows.min(side), cols.min(side));

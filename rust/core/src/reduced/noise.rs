@@ -140,9 +140,9 @@ mod tests {
     use crate::frames::Stack;
     use crate::geometry::{Rotation, View};
     use crate::parallel::Workers;
-    use crate::prior::Prior;
     use crate::reduced::ConjugateGradients;
     use crate::testing::{SENSOR, assert_unit_and_independent};
+    use crate::weak_light::Prior;
 
     const SHIFTS: [[f64; 2]; 3] = [[0.0, 0.0], [2.0, 3.0], [-1.0, 1.0]];
     /// So that no weight, and no root of one, is 1.

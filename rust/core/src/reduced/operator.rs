@@ -2,7 +2,6 @@
 
 use super::dark::Dark;
 use super::kernel::{Diagonal, Divide, Gather, Line, Scatter, Weigh, Weight};
-use super::weak::Weak;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -10,7 +9,7 @@ use crate::frames::Real;
 use crate::geometry::{Placement, View};
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
-use crate::prior::Prior;
+use crate::weak_light::{Prior, Term};
 
 /// Pixels whose D is sampled.
 const SAMPLES: usize = 1024;
@@ -40,7 +39,7 @@ pub(crate) struct Reduced<'m, 'a, T> {
     /// The least D above 0 and that of a bright pixel, without the prior.
     pub(crate) range: [f64; 2],
     /// The prior of M, where light is weak.
-    pub(crate) weak: Option<Weak>,
+    pub(super) weak: Option<Term>,
     /// (L/scale)² in each view; 0 where unobserved.
     pub(super) light: Vec<Vec<f32>>,
     /// h in each view: a buffer for the first half of a product.
@@ -136,7 +135,8 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
             padding.copy(beam, view.shape.cols, workers, light, square);
             control.check()?;
         }
-        self.weak = prior.map(|prior| self.weigh_prior(prior, sensitivity));
+        let slope = scale.slope();
+        self.weak = prior.map(|prior| Term::new(prior, slope, sensitivity, &self.site()));
         self.invert_diagonal(control)
     }
 
@@ -174,7 +174,7 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         );
         debug_assert!(bands.len() == rows.div_ceil(BAND));
         control.check()?;
-        let of_prior = self.add_prior(x, product);
+        let of_prior = self.weak.as_ref().map_or(0.0, |term| term.add(&self.site(), x, product));
         Ok(bands.into_iter().sum::<f64>() + of_prior)
     }
 

@@ -1,7 +1,6 @@
 //! Coordinate descent: sweeps until M has converged.
 
 use super::options::Options;
-use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::convergence::{Ended, FEWEST_ITERATIONS, History, Look};
 use crate::error::Result;
@@ -9,8 +8,9 @@ use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
-use crate::reduced::{ConjugateGradients, Scale, Smallest};
+use crate::reduced::{ConjugateGradients, Scale, Smallest, Whole};
 use crate::sweep::{Estimate, Plain};
+use crate::weak_light::WeakLight;
 
 /// Fewest sweeps between two estimates of the error, each of which costs about as much.
 const CHECK_EVERY: u64 = 16;
@@ -43,11 +43,11 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     let mut looks: Vec<Look> = Vec::new();
     // Sweeps without a prior would fit noise.
     estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
-    weak.update(&mut estimate, &mut search, control)?;
+    weak.update(&mut Whole { estimate: &mut estimate, search: &mut search }, control)?;
     let mut next_look = limit.min(CHECK_EVERY / 2);
     let mut sweep = 0;
     loop {
-        let mut objective = weak::sweep(&mut estimate, &mut search, control)?;
+        let mut objective = one_sweep(&mut estimate, &mut search, control)?;
         sweep += 1;
         if sweep < next_look {
             continue;
@@ -75,17 +75,35 @@ pub(super) fn minimise<'m, 'a, T: Real>(
     }
 }
 
+/// A sweep of coordinate descent; returns F + R before it where there is a prior, else F after it.
+pub(super) fn one_sweep<T: Real>(
+    estimate: &mut Estimate<'_, '_, T>,
+    search: &mut ConjugateGradients<'_, '_, T>,
+    control: &Control,
+) -> Result<f64> {
+    if estimate.prior.is_none() {
+        return estimate.sweep(control);
+    }
+    let slope = search.reduced.scale.slope();
+    let objective = estimate.slopes::<Plain>(slope, &mut search.residual, control)?;
+    let (m, prior) = (&estimate.sensitivity, estimate.prior.as_ref());
+    search.reduced.linearise(m, estimate.beams(), prior, control)?;
+    search.sweep_step();
+    estimate.advance::<Plain>(&search.x, 1.0);
+    Ok(objective)
+}
+
 /// F + R with L at its closed form for the M of a sweep, which is that of the result, and the estimated
 /// error.
-fn look<T: Real>(
-    estimate: &mut Estimate<'_, '_, T>,
+fn look<'m, 'a, T: Real>(
+    estimate: &mut Estimate<'m, 'a, T>,
     scale: Scale,
     weak: &mut WeakLight,
-    search: &mut ConjugateGradients<'_, '_, T>,
+    search: &mut ConjugateGradients<'m, 'a, T>,
     control: &Control,
 ) -> Result<(f64, f64)> {
     let mut misfit = estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
-    if weak.update(estimate, search, control)? {
+    if weak.update(&mut Whole { estimate, search }, control)? {
         misfit = estimate.slopes::<Plain>(scale.slope(), &mut search.residual, control)?;
     }
     search.start(&estimate.sensitivity, estimate.beams(), estimate.prior.as_ref(), control)?;

@@ -4,7 +4,6 @@ use super::course::Course;
 use super::found::Found;
 use super::options::Options;
 use super::start;
-use super::weak::WeakLight;
 use crate::beam::Beam;
 use crate::connectivity::NONE;
 use crate::control::Control;
@@ -19,6 +18,7 @@ use crate::gauge::FluxGauge;
 use crate::joint::{self, ConjugateGradients, Directions, Preconditioner, ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
+use crate::weak_light::WeakLight;
 
 /// Upper limit on products.
 const MOST_PRODUCTS: u64 = 5000;
@@ -151,7 +151,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         if self.corrects_length(&linear.1) {
             return Ok(None);
         }
-        let is_weighed_anew = self.weak.update_joint(&mut self.system, control)?;
+        let is_weighed_anew = self.weak.update(&mut self.system, control)?;
         if is_weighed_anew || (self.looks.len() < SETTLING && self.system.prior.is_some()) {
             self.system.renew_mean();
             linear = self.system.linearise(control)?;

@@ -9,9 +9,9 @@
 //! it comes to M at once where others take steps that are short at first. All others are linear in M. With
 //! M → M·eᵍ a dead pixel whose best M is below 0 would never get there.
 
+use super::descent::one_sweep;
 use super::options::Options;
 use super::start;
-use super::weak::{self, WeakLight};
 use crate::control::Control;
 use crate::convergence::{
     Ended, FEWEST_ITERATIONS, History, Look, MOST_HALVINGS, rounding, stalled_since,
@@ -21,8 +21,9 @@ use crate::exposures::Exposures;
 use crate::fit::Solution;
 use crate::frames::Real;
 use crate::parallel::Workers;
-use crate::reduced::{ConjugateGradients, Scale, Smallest};
+use crate::reduced::{ConjugateGradients, Scale, Smallest, Whole};
 use crate::sweep::{Difference, Estimate, Logarithmic, Plain};
+use crate::weak_light::WeakLight;
 
 /// Upper limit on products: an experiment that needs more cannot be solved by this method.
 const MOST_PRODUCTS: u64 = 100_000;
@@ -136,7 +137,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         let stuck = self.halvings > MOST_HALVINGS;
         self.halvings = 0;
-        if !first && self.weak.update(&mut self.estimate, &mut self.search, control)? {
+        if !first && self.weighs_anew(control)? {
             objective = self.slopes::<Plain>(control)?;
             // That of another S.
             self.smallest = Smallest::default();
@@ -159,11 +160,18 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.estimate.slopes::<D>(self.scale, &mut self.search.residual, control)
     }
 
+    /// Takes the prior that follows from the residuals; whether it is another one.
+    fn weighs_anew(&mut self, control: &Control) -> Result<bool> {
+        let mut problem = Whole { estimate: &mut self.estimate, search: &mut self.search };
+        self.weak.update(&mut problem, control)
+    }
+
     /// Starts again without logarithms if their step raised F or the light is weak: those of noise say
     /// nothing.
     fn gives_up_logarithms(&mut self, fell: bool, control: &Control) -> Result<bool> {
         let may_stay = !self.by_logarithms || self.looks.len() != 1;
-        if may_stay || (fell && !self.weak.may_be(&self.estimate, &self.search, control)?) {
+        let mut problem = Whole { estimate: &mut self.estimate, search: &mut self.search };
+        if may_stay || (fell && !self.weak.may_be(&mut problem, control)?) {
             return Ok(false);
         }
         self.by_logarithms = false;
@@ -230,7 +238,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.rescues += 1;
         self.smallest.stuck = false;
         for _ in 0..RESCUE_SWEEPS.min(self.limit.saturating_sub(self.products)) {
-            weak::sweep(&mut self.estimate, &mut self.search, control)?;
+            one_sweep(&mut self.estimate, &mut self.search, control)?;
             self.products += 1;
         }
         self.search.forget(control);

@@ -1,6 +1,6 @@
 //! Where the loops start: at equal pixels, or at another fit.
 
-use super::weak::{self, WeakLight};
+use super::descent::one_sweep;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -9,8 +9,9 @@ use crate::frames::Real;
 use crate::geometry::nearest_whole;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
 use crate::parallel::Workers;
-use crate::reduced::ConjugateGradients;
+use crate::reduced::{ConjugateGradients, Whole};
 use crate::sweep::{Estimate, Plain};
+use crate::weak_light::WeakLight;
 
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
@@ -60,9 +61,10 @@ fn swept<T: Real>(
     let mut estimate = estimate(exposures, None, workers, control)?;
     let mut search = ConjugateGradients::new(exposures, workers, control);
     estimate.slopes::<Plain>(1.0, &mut search.residual, control)?;
-    WeakLight::new().update(&mut estimate, &mut search, control)?;
+    let mut problem = Whole { estimate: &mut estimate, search: &mut search };
+    WeakLight::new().update(&mut problem, control)?;
     for _ in 0..FIRST_SWEEPS {
-        weak::sweep(&mut estimate, &mut search, control)?;
+        one_sweep(&mut estimate, &mut search, control)?;
     }
     drop(search);
     let (geometry, positions) = (exposures.geometry(), exposures.positions());

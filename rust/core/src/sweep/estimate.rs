@@ -13,7 +13,7 @@ use crate::information;
 use crate::median::median;
 use crate::padded::Padding;
 use crate::parallel::Workers;
-use crate::prior::{self, Prior};
+use crate::weak_light::{self, Prior};
 
 /// Rows that a thread works on at a time.
 const BAND: usize = 8;
@@ -247,7 +247,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         }
         let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
         let used = self.exposures.used();
-        prior::variance(squares, used, used as f64 - (pixels + cells) as f64, freed)
+        weak_light::variance(squares, used, used as f64 - (pixels + cells) as f64, freed)
     }
 
     /// Takes M as given; what is not a number becomes 1.

@@ -35,8 +35,8 @@ use crate::geometry::View;
 use crate::memory;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
-use crate::prior::Prior;
 use crate::reduced::{self, ConjugateGradients, Draw, Smallest};
+use crate::weak_light::Prior;
 
 /// The covariance at a fit of M and L alone, of its linear problem at the solution.
 pub(super) struct ReducedCovariance<'m, 'a, T> {

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.reference.descent import best_beam
-from equipix.reference.model import problem
+from reference.descent import best_beam
+from reference.model import problem
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -43,11 +43,11 @@ def weak_light_prior(
     Parameters
     ----------
     frames, shifts : array_like
-        As for `equipix.reference.model.problem`.
+        As for `reference.model.problem`.
     unit : float
         Variance σ² of a measurement of weight 1.
     variance, mask, flux, rotation : array_like
-        As for `equipix.reference.model.problem`.
+        As for `reference.model.problem`.
 
     Returns
     -------

@@ -1,16 +1,4 @@
-//! The prior of M in weak light.
-//!
-//! In a pixel whose light is below its noise the measurements do not determine M, nor the cells of L that
-//! such pixels see: M L fits noise at any M, and F has no minimum. So there
-//!
-//! ```text
-//! R = Σ_p λ_p (M_p/μ − 1)²,   λ = σ²/A² · (1 − D/D₀)²   where D < D₀, else 0
-//! ```
-//!
-//! is added to F, with the mean μ of M over the piece of connected pixels, σ² the variance of a measurement of
-//! weight 1 and D = Σ w c² L². It acts on weak pixels alone: D₀ is 100 σ², but no more than a sixteenth of a
-//! bright pixel's D. A prior on all pixels would count N of them as N measurements of a mean, and bias patterns
-//! of the sensor's own size. Where M is not known to 50 % it has a prior however even the light.
+//! The prior of M: its weights λ, what they leave open, and its slope at an M.
 
 use std::sync::Arc;
 
@@ -21,7 +9,7 @@ use crate::median::{MEDIAN_OF_SQUARES, median};
 /// one noise is fitted by M L at the price of M = 0, and the minimum is not at M near its mean.
 const SPREAD: f64 = 0.2;
 /// D of a pixel that needs no prior, in units of σ²: its M is known to 10 %.
-pub(crate) const LIT: f64 = 100.0;
+pub(super) const LIT: f64 = 100.0;
 /// D of a pixel that needs one in any light, in units of σ²: its M is not known to 50 %.
 const UNKNOWN: f64 = 4.0;
 /// D of the faintest reliable pixel in weak light, in units of σ²: its M is known to 4 %.
@@ -51,7 +39,7 @@ pub(crate) struct Prior {
 }
 
 /// λ of each pixel at this D.
-pub(crate) fn weights(information: &[f64], variance: f64) -> Arc<[f64]> {
+pub(super) fn weights(information: &[f64], variance: f64) -> Arc<[f64]> {
     let weak = bright(information, variance) / WEAK;
     let enough = (LIT * variance).min(weak.max(UNKNOWN * variance));
     let weight = |&d: &f64| {
@@ -95,7 +83,7 @@ pub(crate) fn variance(
 
 /// The pixels that have a prior, or light so weak beside others' that M is not reliable; D is that where the
 /// mean of M is 1.
-pub(crate) fn held(weights: &[f64], information: &[f64], variance: f64) -> Vec<usize> {
+pub(super) fn held(weights: &[f64], information: &[f64], variance: f64) -> Vec<usize> {
     let reliable = (RELIABLE * variance).min(bright(information, variance) / WEAK);
     let is_held = |(weight, d): (&f64, &f64)| *weight > 0.0 || (*d > 0.0 && *d < reliable);
     let pixels = weights.iter().zip(information).enumerate();
@@ -110,7 +98,7 @@ pub(crate) fn held(weights: &[f64], information: &[f64], variance: f64) -> Vec<u
 /// ```
 ///
 /// that is 1 − h where M scatters as the prior supposes.
-pub(crate) fn freed(weights: &[f64], information: &[f64], variance: f64, scatter: f64) -> f64 {
+pub(super) fn freed(weights: &[f64], information: &[f64], variance: f64, scatter: f64) -> f64 {
     // Pixels without D are no unknowns of the search.
     let pixels = weights.iter().zip(information).filter(|(weight, d)| **weight > 0.0 && **d > 0.0);
     let open = pixels.map(|(weight, d)| {
@@ -122,7 +110,7 @@ pub(crate) fn freed(weights: &[f64], information: &[f64], variance: f64, scatter
 
 /// The standard deviation of M about its mean, relative to that, in pixels without a prior; at most what the
 /// prior supposes.
-pub(crate) fn scatter(weights: &[f64], sensitivity: &[f64], mean: f64) -> f64 {
+pub(super) fn scatter(weights: &[f64], sensitivity: &[f64], mean: f64) -> f64 {
     let free = sensitivity.iter().zip(weights).filter(|(_, weight)| **weight == 0.0);
     let mut squares: Vec<f64> = free.map(|(m, _)| (m / mean - 1.0).powi(2)).collect();
     let found = median(&mut squares, f64::total_cmp).unwrap_or(f64::INFINITY);

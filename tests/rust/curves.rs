@@ -1,6 +1,6 @@
 //! Response curves against polynomials that are known, and against the dense formula.
 
-use equipix_core::response::{Form, LevelNoise, Levels, fit};
+use equipix_core::curves::{Form, LevelNoise, Levels, fit};
 use equipix_core::{Control, Shape, Stack, Workers};
 
 const SHAPE: Shape = Shape::new(3, 4);

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.reference.least_squares import gradient, prior_rows
-from equipix.reference.model import problem
+from reference.least_squares import gradient, prior_rows
+from reference.model import problem
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -30,15 +30,15 @@ def covariance(
     Parameters
     ----------
     frames, shifts : array_like
-        As for `equipix.reference.model.problem`; of the frames only their NaN count.
+        As for `reference.model.problem`; of the frames only their NaN count.
     sensitivity : ndarray, shape (rows, cols)
         M, of mean 1 over the pixels that are not NaN, which are one component.
     beam : ndarray, shape of the padded grid
         L.
     variance, mask, flux, rotation : array_like, optional
-        As for `equipix.reference.model.problem`.
+        As for `reference.model.problem`.
     prior : ndarray, shape (rows, cols), optional
-        Weights λ of a prior of M, as for `equipix.reference.solve_dense`: each counts as a
+        Weights λ of a prior of M, as for `reference.solve_dense`: each counts as a
         measurement.
 
     Returns

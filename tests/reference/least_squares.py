@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.reference.connectivity import components
-from equipix.reference.descent import Solution, best_beam, best_sensitivity, gauged
-from equipix.reference.model import Problem, exposures, objective, problem
+from reference.connectivity import components
+from reference.descent import Solution, best_beam, best_sensitivity, gauged
+from reference.model import Problem, exposures, objective, problem
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -33,7 +33,7 @@ def solve_dense(
     Parameters
     ----------
     frames, shifts, variance, mask, flux, rotation : array_like
-        As for `equipix.reference.model.problem`.
+        As for `reference.model.problem`.
     prior : array_like, shape (rows, cols), optional
         Weights λ of the prior R = Σ λ (M/μ − 1)², μ being the mean of M over the component, which
         is added to F; none unless given.

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equipix.reference.connectivity import components
-from equipix.reference.model import Problem, objective, problem
+from reference.connectivity import components
+from reference.model import Problem, objective, problem
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -54,7 +54,7 @@ def coordinate_descent(
     Parameters
     ----------
     frames, shifts, variance, mask, flux, rotation : array_like
-        As for `equipix.reference.model.problem`.
+        As for `reference.model.problem`.
     sweeps : int
         Number of sweeps.
 

@@ -7,7 +7,7 @@
 
 use std::num::NonZeroUsize;
 
-use equipix_core::response::{Form, LevelNoise, Levels, ResponseFit, fit};
+use equipix_core::curves::{Form, LevelNoise, Levels, ResponseFit, fit};
 use equipix_core::{Error, Real, Shape, Workers};
 use numpy::{
     Element, IntoPyArray, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray3,

@@ -1,12 +1,54 @@
 //! Weak light in a joint fit: R, the information that decides on the prior of M, and the noise.
 
+use std::sync::Arc;
+
+use super::outcome::freedom;
 use super::system::System;
-use crate::exposures::Stretch;
+use super::unknowns;
+use crate::connectivity::NONE;
+use crate::control::Control;
+use crate::error::Result;
+use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
-use crate::prior;
+use crate::sweep::Estimate;
+use crate::weak_light::{self, Prior, Problem};
 
 /// Rows and columns whose residuals are sampled.
 const SAMPLED: usize = 64;
+
+impl<T: Real> Problem<T> for System<'_, '_, T> {
+    fn exposures(&self) -> &Exposures<'_, T> {
+        self.pass.exposures
+    }
+
+    fn variance(&self, _: &mut Option<usize>, freed: f64, _: &Control) -> Result<Option<f64>> {
+        Ok(self.noise(freedom(self), freed))
+    }
+
+    fn range(&mut self, _: &Control) -> Result<[f64; 2]> {
+        let square = self.mean * self.mean;
+        Ok(weak_light::range(&self.information()).map(|d| d * square))
+    }
+
+    fn first_information(&self, control: &Control) -> Result<Vec<f64>> {
+        Estimate::first_information(self.pass.exposures, self.pass.workers, control)
+    }
+
+    fn pieces(&self, information: &[f64], _: &Control) -> Result<Arc<[i32]>> {
+        let piece = |d: &f64| if *d > 0.0 { 0 } else { NONE };
+        Ok(information.iter().map(piece).collect())
+    }
+
+    fn take(&mut self, prior: Option<Prior>) -> bool {
+        let mean = self.mean;
+        self.prior = prior.map(|prior| {
+            let mut weights: Vec<f64> = prior.weights.iter().map(|w| w / (mean * mean)).collect();
+            self.pass.few.lost_pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
+            unknowns::Prior { weights, mean }
+        });
+        true
+    }
+}
 
 impl<T: Real> System<'_, '_, T> {
     /// R = Σ λ (M − μ)².
@@ -40,7 +82,7 @@ impl<T: Real> System<'_, '_, T> {
 
     /// The variance of a measurement of weight 1 from a sample of residuals, with so many degrees of
     /// freedom and `freed` unknowns left to a prior; `None` with nearly none.
-    pub(crate) fn variance(&self, freedom: f64, freed: f64) -> Option<f64> {
+    pub(crate) fn noise(&self, freedom: f64, freed: f64) -> Option<f64> {
         let Shape { rows, cols } = self.pass.exposures.sensor();
         let count = self.pass.exposures.count();
         let (mut squares, mut scratch) = (Vec::new(), vec![0.0; cols]);
@@ -65,7 +107,7 @@ impl<T: Real> System<'_, '_, T> {
                 }
             }
         }
-        prior::variance(squares, self.used(), freedom, freed)
+        weak_light::variance(squares, self.used(), freedom, freed)
     }
 
     /// Takes the mean of M over lit pixels as that of the prior, which in a joint fit is held between steps;
