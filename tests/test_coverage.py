@@ -10,7 +10,7 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
-from equipix.calibration import coverage
+from equipix.diagnosis import coverage
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)
 
@@ -156,7 +156,9 @@ def test_a_fit_far_from_its_minimum_is_written_only_if_asked(manifest, tmp_path,
 )
 def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended, remedy):
     fit = SimpleNamespace(ended=ended, error_estimate=np.array([2.0]), lost=[])
-    plain = coverage._far(fit)
+    evidence = SimpleNamespace(fit=fit)
+    plain = coverage.too_far(evidence)
     assert remedy in plain
     fit.lost = [[3], [1, 4]]
-    assert coverage._far(fit).startswith(f"{plain}. Besides, 3 measurements along ragged edges")
+    more = coverage.too_far(evidence)
+    assert more.startswith(f"{plain}. Besides, 3 measurements along ragged edges")
