@@ -13,9 +13,9 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, errors, metrics, simulate
-from equipix.bolometer import DynamicCorrection
-from equipix.io.formats import load_pages, save_pages
+from equipix.loading import load_correction
 from equipix.simulate import BolometerArray
+from records import rewrite
 
 EPS = np.finfo(np.float64).eps
 SHAPE = (24, 32)
@@ -281,7 +281,7 @@ class TestFiles:
     def test_a_saved_one_is_the_same(self, simulated, both, tmp_path, suffix, gain):
         kept = both if gain else bolometer.fit(simulated.shutter, *simulated.at.T, order=2)
         kept.save(tmp_path / f"kept{suffix}")
-        read = DynamicCorrection.load(tmp_path / f"kept{suffix}")
+        read = equipix.load(tmp_path / f"kept{suffix}")
         assert (read.axes, read.gain_axes, read.metadata) == (
             kept.axes,
             kept.gain_axes,
@@ -292,10 +292,10 @@ class TestFiles:
             assert one.tobytes() == other.tobytes()
         assert repr(read) == repr(kept)
 
-    def test_load_says_how_to_read_it(self, both, tmp_path):
+    def test_in_the_place_of_a_correction_it_says_how_to_get_one(self, both, tmp_path):
         both.save(tmp_path / "kept.tif")
-        with pytest.raises(errors.FileError, match="holds dynamic correction, .*at\\(...\\) gives"):
-            equipix.load(tmp_path / "kept.tif")
+        with pytest.raises(errors.FileError, match="DynamicCorrection, expected a correction"):
+            load_correction(tmp_path / "kept.tif")
 
     def test_inspect_shows_it(self, both, tmp_path, run):
         both.save(tmp_path / "kept.tif")
@@ -308,21 +308,19 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"format": 2}, "has format 2, this version of equipix reads up to 1"),
-            ({"kind": "response"}, "holds response, expected dynamic correction"),
-            (
-                {"level": [1.0]},
-                r"damaged or incomplete dynamic correction: .*'level' has shape \(1,\)",
-            ),
-            ({"axes": {}}, "damaged or incomplete dynamic correction: KeyError.'substrate_c'"),
+            ({"version": 3}, "of version 3, this version of equipix reads version 2"),
+            ({"kind": "response"}, "is damaged: .* holds offset, .*expected deviation"),
+            ({"arrays": {"level": np.ones(1)}}, r"is damaged: array 'level' is .*shape \(1,\)"),
+            ({"fields": {"axes": {}}}, "is damaged: 'axes' holds , expected substrate_c, "),
+            ({"fields": {"axes.regressor": "3"}}, "is damaged: 'axes.regressor' is '3', expected"),
+            ({"fields": {"axes.order": 3}}, "is damaged: 'offset' has shape .*expected"),
         ],
     )
     def test_damaged_files_are_refused(self, both, tmp_path, change, message):
         both.save(tmp_path / "kept.npz")
-        pages, content = load_pages(tmp_path / "kept.npz")
-        save_pages(tmp_path / "kept.npz", pages, content | change, force=True)
+        rewrite(tmp_path / "kept.npz", **change)
         with pytest.raises(errors.FileError, match=message):
-            DynamicCorrection.load(tmp_path / "kept.npz")
+            equipix.load(tmp_path / "kept.npz")
 
 
 class TestRefusals:

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import FrameStatistics, average, cli, simulate
+from equipix import average, cli, simulate
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
-from equipix.measured.statistics import load_statistics
 
 SHAPE = (64, 80)
 
@@ -174,8 +173,8 @@ def test_inspect_shows_an_average(run, experiment, tmp_path):
     told = json.loads(out)
     assert status == 0
     assert (told["shape"], told["frames"], told["saturation"]) == (list(SHAPE), 6, 4095)
-    assert told["dark_frames"] == FrameStatistics.load(mean).dark.count.max()
-    assert told["mean"] == pytest.approx(FrameStatistics.load(mean).mean.mean())
+    assert told["dark_frames"] == equipix.load(mean).dark.count.max()
+    assert told["mean"] == pytest.approx(equipix.load(mean).mean.mean())
     assert "saturated pixels" in run("inspect", mean)[1]
     run("average", frames, "-o", mean, "--force")
     assert re.search(r"\nsaturation +65535\n", run("inspect", mean)[1])
@@ -207,7 +206,7 @@ def test_average_writes_statistics(run, experiment, tmp_path):
     assert status == 0
     assert json.loads(out)["frames"] == 12
     expected = average([frames / "p0.tif", frames / "p1.tif"], dark=average(dark), saturation=4095)
-    saved = load_statistics(output)
+    saved = equipix.load(output)
     for name, values in expected.maps.items():
         np.testing.assert_array_equal(getattr(saved, name), values)
 
@@ -274,7 +273,7 @@ def test_photon_transfer_gain_of_a_real_camera(run, data_dir, tmp_path):
         output, offset = tmp_path / f"{k}.npz", tmp_path / f"{k}-dark.npz"
         assert run("average", *frames, *with_dark(darks), "-o", output)[0] == 0
         assert run("average", *darks, "-o", offset)[0] == 0
-        signal, dark_signal = load_statistics(output), load_statistics(offset)
+        signal, dark_signal = equipix.load(output), equipix.load(offset)
         means.append(signal.mean.mean())
         variances.append(signal.variance.mean() - dark_signal.variance.mean())
     means, variances = np.array(means), np.array(variances)
@@ -372,7 +371,7 @@ def test_force_replaces(run, experiment, tmp_path):
     output.write_text("old")
     frames = experiment.parent / "frames/p0.tif"
     assert run("average", frames, "-o", output, "--force")[0] == 0
-    assert load_statistics(output).mean.shape == SHAPE
+    assert equipix.load(output).mean.shape == SHAPE
 
 
 def test_an_input_is_never_replaced(run, experiment, calibration, tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -220,17 +219,3 @@ def bspline(x):
     """The cubic B-spline, centred at 0."""
     x = abs(x)
     return 2 / 3 - x**2 + x**3 / 2 if x < 1 else max(2 - x, 0.0) ** 3 / 6
-
-
-@pytest.mark.parametrize("suffix", ["tif", "npz"])
-def test_files_of_format_1_are_read(suffix):
-    """Written by the release before: the beam without its coefficients, `rejected` in two axes."""
-    read = equipix.load(Path(__file__).parent / f"data/calibration-format-1.{suffix}")
-    assert read.converged
-    assert read.shifts[1].tolist() == [0.25, 5.5]
-    assert read.rejected.shape == (5, 24, 32)
-    assert read.rejected[1, 3, 4]
-    assert read.beam_coefficients is None
-    assert read.findings == ()
-    assert np.isfinite(read.predict((0, 0))).all()
-    assert np.nanmedian(read.sensitivity_std) == pytest.approx(5.8e-4, rel=0.05)

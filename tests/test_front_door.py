@@ -134,23 +134,19 @@ def test_averages_with_two_darks_are_refused():
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_saved_averages_keep_their_dark(tmp_path, suffix):
-    from equipix.measured.statistics import load_statistics, save_statistics
-
     each = statistics_of(virtual_experiment(6), 255)[0]
-    save_statistics(tmp_path / f"mean{suffix}", each)
-    read = load_statistics(tmp_path / f"mean{suffix}")
+    each.save(tmp_path / f"mean{suffix}")
+    read = equipix.load(tmp_path / f"mean{suffix}")
     for name, values in each.dark.maps.items():
         np.testing.assert_array_equal(read.dark.maps[name], values)
 
 
 def test_averages_saved_and_loaded_one_by_one_calibrate(tmp_path):
     """Each file holds the dark; equal darks are one."""
-    from equipix.measured.statistics import load_statistics, save_statistics
-
     found = statistics_of(virtual_experiment(7), 255)
     for k, each in enumerate(found):
-        save_statistics(tmp_path / f"{k}.npz", each)
-    read = [load_statistics(tmp_path / f"{k}.npz") for k in range(len(found))]
+        each.save(tmp_path / f"{k}.npz")
+    read = [equipix.load(tmp_path / f"{k}.npz") for k in range(len(found))]
     again, first = (equipix.calibrate(each, SHIFTS) for each in (read, found))
     np.testing.assert_array_equal(again.sensitivity, first.sensitivity)
 

@@ -14,7 +14,6 @@ import pytest
 import equipix
 import reference
 from equipix import Flag, Polynomial, errors, hardware, nuc
-from equipix.hardware.table import read as read_table
 from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 
@@ -193,7 +192,7 @@ def test_files_come_back_bit_by_bit(made, tmp_path, suffix, bits):
     assert table.offset.min() < 0 < table.offset.max()
     path = tmp_path / f"table{suffix}"
     table.save(path)
-    assert same(read_table(path), table)
+    assert same(equipix.load(path), table)
     with pytest.raises(errors.FileError, match="exists already"):
         table.save(path)
     table.save(path, force=True)
@@ -278,7 +277,7 @@ def test_no_name_of_a_sensor_breaks_a_comment(tmp_path, sensor):
     table = hardware.Table.of(kept)
     for suffix in SUFFIXES:
         table.save(tmp_path / f"table{suffix}")
-        assert read_table(tmp_path / f"table{suffix}").metadata["sensor"]["name"] == sensor
+        assert equipix.load(tmp_path / f"table{suffix}").metadata["sensor"]["name"] == sensor
     compiled(tmp_path, FILTER.format(name="table", upper="TABLE"))
 
 
@@ -291,7 +290,7 @@ def test_damaged_files_are_refused_by_name(made, tmp_path, suffix):
     def refused(data, words):
         path.write_bytes(data)
         with pytest.raises(errors.FileError, match=rf"table\{suffix}: .*{words}"):
-            read_table(path)
+            equipix.load(path)
 
     refused(whole.replace(b'"version": 1', b'"version": 2'), "version 2, .* reads version 1")
     refused(whole.replace(b'"rows": 24', b'"rows": 25'), "another size")
@@ -319,10 +318,10 @@ def test_an_edited_c_header_is_refused(made, tmp_path, written, edited):
     assert written in text
     path.write_text(text.replace(written, edited, 1))
     with pytest.raises(errors.FileError, match=r"table\.h: was edited.*SHA-256.*write the table"):
-        read_table(path)
+        equipix.load(path)
     # Line ends of another system are no edit.
     path.write_bytes(text.replace("\n", "\r\n").encode())
-    assert same(read_table(path), hardware.Table.of(made[1], out_bits=13))
+    assert same(equipix.load(path), hardware.Table.of(made[1], out_bits=13))
 
 
 def test_a_c_header_without_a_digest_is_not_called_edited(made, tmp_path):
@@ -331,7 +330,7 @@ def test_a_c_header_without_a_digest_is_not_called_edited(made, tmp_path):
     text = path.read_text()
     path.write_text(re.sub(r", SHA-256 of the lines above: \w+", "", text))
     with pytest.raises(errors.FileError, match="no SHA-256 .* an older version wrote it, or the"):
-        read_table(path)
+        equipix.load(path)
 
 
 def test_a_far_offset_is_named(made):
@@ -361,9 +360,9 @@ def test_a_file_cut_anywhere_is_refused_by_name(tmp_path, suffix):
     for size in range(least):
         path.write_bytes(whole[:size])
         with pytest.raises(errors.FileError, match=rf"table\{suffix}: "):
-            read_table(path)
+            equipix.load(path)
     path.write_bytes(whole[:least])
-    assert same(read_table(path), table)
+    assert same(equipix.load(path), table)
 
 
 @pytest.mark.parametrize("bits", [8, 12])
@@ -385,14 +384,14 @@ def test_memories_of_a_binary_file_are_aligned(made, tmp_path, bits):
         assert np.array_equal(np.frombuffer(data, dtype, 35, at).reshape(5, 7), words)
         at += -(-35 * dtype.itemsize // 16) * 16
     assert at == len(data)
-    assert same(read_table(path), table)
+    assert same(equipix.load(path), table)
 
 
 def test_other_suffixes_are_refused(made, tmp_path):
     with pytest.raises(errors.InputError, match=r"ends in none of \.bin, \.hex, \.h"):
         hardware.Table.of(made[1]).save(tmp_path / "table.txt")
     with pytest.raises(errors.FileError, match="cannot be read"):
-        read_table(tmp_path / "none.bin")
+        equipix.load(tmp_path / "none.bin")
 
 
 @pytest.mark.parametrize(
@@ -556,7 +555,7 @@ def test_the_command_writes_a_table(made, tmp_path, run):
     status, out, _ = run(*command, "--gain-bits", 12, "--lowest", 100, "--json")
     assert status == 0
     told = json.loads(out)
-    table = read_table(tmp_path / "table.hex")
+    table = equipix.load(tmp_path / "table.hex")
     assert same(table, hardware.Table.of(response, gain_bits=12, lowest=100.0))
     assert told["bits"]["gain"] == 12
     assert told["steps"]["gain"] == 2.0**table.format.gain

@@ -23,13 +23,13 @@ import tifffile
 from PIL import Image
 
 import equipix
-from equipix import FrameStatistics, io, simulate
+from equipix import FrameStatistics, simulate
 from equipix.errors import FileError, InputError
 from equipix.io.formats import load_pages, save_pages, saved_kind
 from equipix.io.frames import read_frames
 from equipix.io.paths import find_files
-from equipix.io.record import check_pages, checksum
-from equipix.measured.statistics import load_statistics, save_statistics
+from equipix.io.tiff import stream_frames as tiff_frames
+from records import rewrite
 
 RNG = np.random.default_rng(20)
 WIDE = RNG.integers(0, 65536, (5, 23, 37), dtype=np.uint16)
@@ -70,7 +70,7 @@ def test_tiff(
     )
     assert_averages(path, frames)
     np.testing.assert_array_equal(equipix._native.read_file(path, None), frames)
-    np.testing.assert_array_equal(np.concatenate(list(io.tiff.stream_frames(path))), frames)
+    np.testing.assert_array_equal(np.concatenate(list(tiff_frames(path))), frames)
 
 
 @pytest.mark.parametrize("frames", [NARROW, WIDE], ids=["8", "16"])
@@ -396,7 +396,7 @@ def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: st
     save_pages(path, PAGES, metadata)
     pages, found = load_pages(path)
     assert found == metadata
-    assert list(pages) == list(PAGES)
+    assert pages.keys() == PAGES.keys()
     for name, array in PAGES.items():
         assert (pages[name].dtype, pages[name].shape) == (array.dtype, array.shape)
         np.testing.assert_array_equal(pages[name], array)
@@ -404,20 +404,15 @@ def test_pages_come_back_with_dtype_name_and_metadata(tmp_path: Path, suffix: st
         with tifffile.TiffFile(path) as file:
             assert file.pages[1].tags["PageName"].value == "labels"
             described = json.loads(file.pages[0].description)
-            assert described.pop("crc32") == checksum(PAGES, metadata)
+            assert described.pop("crc32") == zlib.crc32(json.dumps(metadata).encode())
             assert described == metadata
             # Any viewer shows the images of a stack one by one.
             stack = [page for page in file.pages if page.tags["PageName"].value == "stack"]
             assert [page.tags["PageNumber"].value for page in stack] == [(0, 3), (1, 3), (2, 3)]
-            assert not any("PageNumber" in page.tags for page in file.pages[:4])
-
-
-@pytest.mark.parametrize("shape", [(4,), (0, 5), (0, 4, 5), (2, 0, 5), (1, 2, 4, 5)])
-def test_pages_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    for suffix in (".tif", ".npz"):
-        with pytest.raises(InputError, match="page 'bad' is float64 of shape .* a stack"):
-            save_pages(tmp_path / f"a{suffix}", {"bad": np.zeros(shape)}, {})
-    assert list(tmp_path.iterdir()) == []
+            named = [page for page in file.pages if "stack" not in page.tags["PageName"].value]
+            assert not any("PageNumber" in page.tags for page in named)
+            # Sizes that differ come last: tifffile compares the first pages with the last one.
+            assert [page.shape for page in file.pages].index((2, 3)) == len(file.pages) - 1
 
 
 @pytest.mark.parametrize(
@@ -437,17 +432,6 @@ def test_a_stack_that_lacks_an_image_is_refused(
         load_pages(path)
 
 
-def test_stacks_are_checked_against_the_maps() -> None:
-    pages = {"map": np.ones((4, 5)), "stack": np.ones((3, 4, 5))}
-    check_pages("a.tif", pages, {"map": np.floating}, {"stack": np.floating})
-    for stack in (np.ones((3, 4, 6)), np.ones((4, 5)), np.ones((3, 4, 5), np.uint8)):
-        changed = pages | {"stack": stack}
-        with pytest.raises(FileError, match=r"'stack' is .* in three dimensions, as large as 'm"):
-            check_pages("a.tif", changed, {"map": np.floating}, {"stack": np.floating})
-    with pytest.raises(FileError, match="lacks the page 'other'"):
-        check_pages("a.tif", pages, {"map": np.floating}, {"other": np.floating})
-
-
 def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "out.tif"
     save_pages(path, PAGES, {})
@@ -455,8 +439,8 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"out\.tif: exists already; force=True"):
         save_pages(path, PAGES, {})
     broken = {**PAGES, "bad": np.array([object()])}
-    for target in (path, tmp_path / "new.tif"):
-        with pytest.raises(InputError, match="page 'bad' is object"):
+    for target in (path, tmp_path / "new.tif", tmp_path / "new.npz"):
+        with pytest.raises((TypeError, ValueError)):
             save_pages(target, broken, {}, force=True)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -488,38 +472,27 @@ def test_the_longest_name_can_be_written_by_many_at_once(tmp_path: Path) -> None
     path = tmp_path / f"{'n' * 250}.tif"
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda _: save_pages(path, PAGES, {}, force=True), range(40)))
-    assert list(load_pages(path)[0]) == list(PAGES)
+    assert load_pages(path)[0].keys() == PAGES.keys()
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
-def test_statistics_come_back(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"dark{suffix}"
-    wanted = equipix.average(WIDE)
-    save_statistics(path, wanted)
-    for name, values in load_statistics(path).maps.items():
-        np.testing.assert_array_equal(values, getattr(wanted, name))
-        assert values.dtype == getattr(wanted, name).dtype
-
-
-@pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    pages = equipix.average(WIDE).maps
-    good = {"kind": "frame statistics", "format": 1}
-    for changed, metadata, message in (
-        ({}, good | {"format": "2"}, "format is '2'"),
-        ({}, good | {"format": None}, "format is None"),
-        ({"mean": pages["mean"].astype(np.int64)}, good, "'mean' is int64"),
-        ({"count": pages["count"][1:]}, good, r"'count' is uint32 of shape \(22, 37\)"),
+    path, average = tmp_path / f"a{suffix}", equipix.average(WIDE)
+    for changed, message in (
+        ({"version": "2"}, "of version 2, this version of equipix reads version 2: make"),
+        ({"version": None}, "of version None"),
+        ({"arrays": {"mean": average.mean.astype(np.int64)}}, "damaged: array 'mean' is int64"),
+        (
+            {"arrays": {"count": average.count[1:]}},
+            r"damaged: array 'count' is uint32 of shape \(22, 37\)",
+        ),
+        ({"arrays": {"saturated": None}}, "damaged: array 'saturated' is missing"),
     ):
-        save_pages(path, pages | changed, metadata, force=True)
-        with pytest.raises(FileError, match=f"is damaged: .*{message}"):
-            load_statistics(path)
-    del pages["saturated"]
-    save_pages(path, pages, good, force=True)
-    with pytest.raises(FileError, match="is damaged: lacks the page 'saturated'"):
-        load_statistics(path)
+        average.save(path, force=True)
+        rewrite(path, **changed)  # type: ignore[arg-type]
+        with pytest.raises(FileError, match=rf"a\{suffix}: .*{message}"):
+            equipix.load(path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
@@ -529,106 +502,72 @@ def test_damaged_calibrations_are_refused(tmp_path: Path, suffix: str) -> None:
     frames = simulate.exposures(np.ones((8, 9)), simulate.gaussian_beam((8, 9)), shifts)
     cal = equipix.calibrate(frames, shifts)
     left_out = np.zeros((4, 8, 9), bool)
-    dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out).save(path)
-    pages, content = load_pages(path)
+    whole = dataclasses.replace(cal, dark=np.zeros((8, 9), np.float32), rejected=left_out)
     for name, page in (
-        ("sensitivity", pages["sensitivity"].astype(np.int32)),
-        ("flags", pages["flags"].astype(np.int32)),
-        ("flags", pages["flags"][1:]),
-        ("component_labels", pages["component_labels"][:, 1:]),
-        ("dark", pages["dark"][1:]),
-        ("rejected", pages["rejected"][:, 1:]),
-        ("rejected", pages["rejected"][0]),
-        ("rejected", pages["rejected"].astype(np.int8)),
+        ("sensitivity", whole.sensitivity.astype(np.int32)),
+        ("flags", whole.flags.astype(np.int32)),
+        ("flags", whole.flags[1:]),
+        ("component_labels", whole.component_labels[:, 1:]),
+        ("dark", whole.dark[1:]),
+        ("rejected", left_out[:, 1:]),
+        ("rejected", left_out[0]),
+        ("rejected", left_out.astype(np.int8)),
     ):
-        save_pages(path, pages | {name: page}, content, force=True)
-        with pytest.raises(FileError, match=f"is damaged: page '{name}' is"):
+        whole.save(path, force=True)
+        rewrite(path, arrays={name: page})
+        with pytest.raises(FileError, match=f"is damaged: array '{name}' is"):
             equipix.load(path)
-    for number in ("2", None, True):
-        save_pages(path, pages, content | {"format": number}, force=True)
-        with pytest.raises(FileError, match="is damaged: its format is"):
-            equipix.load(path)
-    save_pages(path, pages, content, force=True)
+    whole.save(path, force=True)
     assert equipix.load(path).dark is not None
-    # A page of format 1 whose height is no multiple of the sensor's.
-    odd = pages | {"rejected": np.zeros((31, 9), np.uint8)}
-    save_pages(path, odd, content | {"format": 1}, force=True)
-    with pytest.raises(FileError, match="damaged or incomplete calibration"):
-        equipix.load(path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with pytest.raises(FileError, match=f"a{suffix}"):
-        load_statistics(path)
+        equipix.load(path)
     save_pages(path, PAGES, {"kind": "something"})
-    with pytest.raises(FileError, match="holds something, expected frame statistics"):
-        load_statistics(path)
-    save_pages(path, PAGES, {"kind": "frame statistics", "format": 99}, force=True)
-    with pytest.raises(FileError, match=r"has format 99.*install a newer one"):
-        load_statistics(path)
-    save_statistics(path, equipix.average(WIDE), force=True)
+    with pytest.raises(FileError, match="holds something, expected .* or frame statistics or .*na"):
+        equipix.load(path)
+    save_pages(path, PAGES, {"kind": "frame statistics", "version": 99}, force=True)
+    with pytest.raises(FileError, match=r"of version 99, .* reads version 2: .* install"):
+        equipix.load(path)
+    equipix.average(WIDE).save(path, force=True)
     whole = path.read_bytes()
     for size in range(0, len(whole) - 1, len(whole) // 40):
         path.write_bytes(whole[:size])
         with pytest.raises(FileError, match=f"a{suffix}"):
-            load_statistics(path)
+            equipix.load(path)
     tifffile.imwrite(tmp_path / "plain.tif", WIDE[0])
     with pytest.raises(FileError, match=r"plain\.tif"):
         load_pages(tmp_path / "plain.tif")
 
 
-def same_content(path: Path, wanted: tuple[dict[str, np.ndarray], dict[str, object]]) -> bool:
-    """Whether a file is refused by its name, or has the arrays and metadata that were written."""
-    try:
-        pages, metadata = load_pages(path)
-    except FileError as error:
-        return str(path) in str(error)
-    same = [
-        pages[name].tobytes() == array.tobytes() and pages[name].dtype == array.dtype
-        for name, array in wanted[0].items()
-    ]
-    # A flip in the name of the checksum leaves a number that nothing reads.
-    known = {key: metadata.get(key) for key in wanted[1]}
-    return all(same) and list(pages) == list(wanted[0]) and known == wanted[1]
-
-
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
-def test_a_flipped_byte_is_refused_or_changes_nothing(tmp_path: Path, suffix: str) -> None:
+def test_changed_metadata_differ_from_their_checksum(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"kept{suffix}"
     metadata = {"format": 1, "kind": "response", "levels": [1.5, 2.25], "name": "Müller"}
     save_pages(path, PAGES, metadata)
     whole, rng = path.read_bytes(), np.random.default_rng(4)
-    text = whole.find(b'{"format"')
-    places = [*rng.integers(0, len(whole), 150), *range(text, text + len(json.dumps(metadata)))]
-    for place in places:
+    text = whole.find(b'{"format"') if suffix == ".tif" else whole.find("{".encode("utf-32-le"))
+    for place in range(text, text + len(json.dumps(metadata))):
         changed = bytearray(whole)
         changed[place] ^= 1 << rng.integers(8)
         path.write_bytes(changed)
-        assert same_content(path, (PAGES, metadata)), int(place)
+        try:
+            found = load_pages(path)[1]
+        except FileError as error:
+            assert str(path) in str(error)
+        else:
+            assert found == metadata, place
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".npz"])
-def test_changed_arrays_or_metadata_differ_from_the_checksum(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"kept{suffix}"
-    save_pages(path, PAGES, {"level": 1.5})
-    whole = path.read_bytes()
-    pixel = PAGES["mean"].tobytes()[:8]
-    for old, new in ((pixel, bytes(8)), (b"labels", b"labelz")):
-        assert whole.count(old) >= 1
-        path.write_bytes(whole.replace(old, new))
-        with pytest.raises(FileError, match=f"kept{suffix}: "):
-            load_pages(path)
-    path.write_bytes(whole)
-    assert load_pages(path)[1] == {"level": 1.5}
-
-
-def test_a_file_without_a_checksum_is_read(tmp_path: Path) -> None:
+def test_a_file_without_a_checksum_is_refused(tmp_path: Path) -> None:
     with tifffile.TiffWriter(tmp_path / "old.tif") as file:
         tags = [(285, "s", 0, "mean", True)]
         file.write(PAGES["mean"], metadata=None, description='{"format": 1}', extratags=tags)
-    assert load_pages(tmp_path / "old.tif")[1] == {"format": 1}
+    with pytest.raises(FileError, match=r"old\.tif: .*equipix did not write it"):
+        load_pages(tmp_path / "old.tif")
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])

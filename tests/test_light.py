@@ -44,7 +44,7 @@ def test_the_variance_of_frame_means_is_kept(dtype, tmp_path):
         assert equipix.average(tmp_path / "f.tif").light_variance == found
     for name in ("a.npz", "a.tif"):
         equipix.average(frames).save(tmp_path / name)
-        assert equipix.FrameStatistics.load(tmp_path / name).light_variance == found
+        assert equipix.load(tmp_path / name).light_variance == found
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.2])

@@ -12,7 +12,6 @@ import tifffile
 import equipix
 from equipix import Experiment, Flag, cli, errors, simulate
 from equipix.io.frames import read_mask
-from equipix.measured.statistics import load_statistics
 
 SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
 
@@ -128,7 +127,7 @@ def test_the_command_line_takes_a_mask(manifest, tmp_path, mask, capsys):
     frames, mean = manifest.parent / "frames/p0.tif", tmp_path / "mean.tif"
     assert run("average", frames, "-o", mean, "--mask", file, "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    saved = load_statistics(mean)
+    saved = equipix.load(mean)
     np.testing.assert_array_equal(np.isnan(saved.mean), mask)
     assert found["mean"] == pytest.approx(np.nanmean(saved.mean))
     assert run("average", frames, "-o", file, "--mask", file, "--force") == 1

@@ -221,7 +221,8 @@ class TestAnyPattern:
     def check(frames, shifts, **options):
         cal = equipix.calibrate(frames, shifts, tolerance=1e-8, max_sweeps=20_000, **options)
         assert cal.converged == (cal.error_estimate <= 1e-8)
-        assert (np.diff(cal.history.objective) <= 1e-12 * cal.history.objective[:-1] + 1e-20).all()
+        objective = cal.history["objective"]
+        assert (np.diff(objective) <= 1e-12 * objective[:-1] + 1e-20).all()
         if cal.converged:
             # A sweep of coordinate descent leaves the minimum where it is.
             assert TestAnyPattern.slope(cal, frames, shifts, **options) < 10 * 1e-8

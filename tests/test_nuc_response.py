@@ -12,9 +12,9 @@ import pytest
 
 import equipix
 from equipix import Flag, cli, errors, nuc
-from equipix.io.formats import load_pages, save_pages
 from equipix.io.frames import read_frames, stream_frames
 from equipix.io.tiff import write_frames
+from records import rewrite
 
 SHAPE = (24, 32)
 LEVELS = (200.0, 1000.0, 2000.0, 3000.0)
@@ -71,32 +71,28 @@ class TestFile:
         response.save(tmp_path / "r.npz", force=True)
 
     @pytest.mark.parametrize(
-        ("change", "message"),
+        ("fields", "content", "message"),
         [
-            ({"format": 2}, "install a newer one"),
-            ({"levels": "many"}, "damaged"),
-            ({"saturation": "full"}, "damaged"),
+            ({}, {"version": 3}, "holds response of version 3, this version .* reads version 2"),
+            ({"levels": "many"}, {}, "damaged"),
+            ({"saturation": "full"}, {}, "damaged: 'saturation' is 'full', expected float"),
+            ({"raw": 1}, {}, "damaged: 'raw' is 1, expected bool"),
+            ({"cfa": {"pattern": []}}, {}, "damaged: 'cfa' is"),
         ],
     )
-    def test_with_other_metadata_is_refused(self, response, tmp_path, change, message):
+    def test_with_other_metadata_is_refused(self, response, tmp_path, fields, content, message):
         path = tmp_path / "r.npz"
         response.save(path)
-        pages, content = load_pages(path)
-        save_pages(path, pages, content | change, force=True)
+        rewrite(path, fields, **content)
         with pytest.raises(errors.FileError, match=message):
             equipix.load(path)
 
     @pytest.mark.parametrize("name", ["deviation", "variances", "inverse", "limits", "flags"])
     def test_with_a_page_missing_or_cut_is_refused(self, response, tmp_path, name):
-        path = tmp_path / "r.npz"
-        response.save(path)
-        pages, content = load_pages(path)
-        for changed in (None, pages[name][:-1], pages[name][..., :-1]):
-            if changed is not None and changed.size == 0:
-                continue  # no file holds an empty page
-            rest = {key: page for key, page in pages.items() if key != name}
-            cut = rest if changed is None else rest | {name: changed}
-            save_pages(path, cut, content, force=True)
+        path, page = tmp_path / "r.npz", getattr(response, name)
+        for changed in (None, page[:-1], page[..., :-1]):
+            response.save(path, force=True)
+            rewrite(path, arrays={name: changed})
             with pytest.raises(errors.FileError, match="damaged"):
                 equipix.load(path)
 

@@ -12,7 +12,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.exposures.positions import Orientation
-from equipix.measured.statistics import FrameStatistics, load_statistics, save_statistics
+from equipix.measured.statistics import FrameStatistics
 from given import exposures_of
 
 SHAPE, CROSS = (24, 32), equipix.cross_pattern(3, 5)
@@ -40,6 +40,9 @@ def arrays(instance):
         value = getattr(instance, field.name)
         if isinstance(value, np.ndarray):
             found[field.name] = value
+        elif isinstance(value, dict):
+            held = ((key, each) for key, each in value.items() if isinstance(each, np.ndarray))
+            found |= {f"{field.name}.{key}": each for key, each in held}
         elif dataclasses.is_dataclass(value):
             inner = arrays(value).items()
             found |= {f"{field.name}.{name}": array for name, array in inner}
@@ -92,12 +95,12 @@ def test_what_a_calibration_computes_is_the_callers():
 def test_frame_statistics_are_read_only(tmp_path):
     raw = np.random.default_rng(2).normal(100, 3, (4, *SHAPE))
     found = equipix.average(raw, dark=equipix.average(raw / 50))
-    save_statistics(tmp_path / "mean.npz", found)
+    found.save(tmp_path / "mean.npz")
     for each in (
         found,
         pickle.loads(pickle.dumps(found)),
         copy.deepcopy(found),
-        load_statistics(tmp_path / "mean.npz"),
+        equipix.load(tmp_path / "mean.npz"),
     ):
         assert "dark.mean" in arrays(each)
         assert writeable(each) == []

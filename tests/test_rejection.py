@@ -150,7 +150,7 @@ def test_an_iterator_and_files_give_the_same(tmp_path):
     with pytest.raises(SystemExit) as end:
         cli.main(["average", str(tmp_path / "frames.tif"), "-o", output, "--reject", "5"])
     assert not end.value.code
-    loaded = equipix.FrameStatistics.load(tmp_path / "mean.npz")
+    loaded = equipix.load(tmp_path / "mean.npz")
     np.testing.assert_array_equal(loaded.mean, wanted.mean)
     other = str(tmp_path / "other.npz")
     arguments = ["average", str(tmp_path / "frames.tif"), "-o", other, "--reject", "5"]

@@ -14,7 +14,6 @@ import equipix
 from equipix import Flag, NoiseModel, errors, metrics, simulate
 from equipix.fitting import weighted as weights
 from equipix.fitting.outliers import rejected
-from equipix.io.formats import load_pages, save_pages
 
 pytestmark = [
     # Frames with dust that is not left out, and variances that are wrong on purpose.
@@ -226,13 +225,6 @@ def test_what_was_left_out_is_saved(tmp_path, suffix):
     np.testing.assert_array_equal(read.rejected, cal.rejected)
     assert read.rejected.dtype == np.bool_
     assert read.metadata["rejected"][2] >= 12
-    # In format 1 the images stood one below the other.
-    pages, content = load_pages(tmp_path / f"cal{suffix}")
-    assert pages["rejected"].shape == frames.shape
-    below = pages | {"rejected": pages["rejected"].reshape(-1, frames.shape[2])}
-    save_pages(tmp_path / f"old{suffix}", below, content | {"format": 1})
-    old = equipix.load(tmp_path / f"old{suffix}")
-    np.testing.assert_array_equal(old.rejected, cal.rejected)
     assert equipix.calibrate(frames, CROSS).rejected is None
 
 

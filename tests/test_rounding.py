@@ -79,7 +79,7 @@ def test_averages_keep_the_step(tmp_path, suffix):
     average = equipix.average(frames, dark=equipix.average(frames[:2]))
     assert (average.step, average.dark.step) == (16, 16)
     average.save(tmp_path / f"a.{suffix}")
-    loaded = equipix.FrameStatistics.load(tmp_path / f"a.{suffix}")
+    loaded = equipix.load(tmp_path / f"a.{suffix}")
     assert (loaded.step, loaded.dark.step) == (16, 16)
     assert equipix.average(0.3 * frames).step == 0
 

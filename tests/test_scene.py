@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, errors, scene
-from equipix.io.formats import load_pages, save_pages
-from equipix.scene.methods import METHODS
-from equipix.scene.methods import load as load_state
+from equipix import Flag, errors
+from equipix.io.formats import load_pages
+from equipix.io.record import read_record
+from equipix.loading import load_correction
+from equipix.scene.methods import METHODS, resumed
+from equipix.scene.scene_correction import SceneState
 from equipix.simulate import MovingScene
+from records import rewrite
 from reference import scene as reference
 
 SHAPE = (48, 64)
@@ -225,7 +228,8 @@ class TestEveryMethod:
         for value in values[:75]:
             method.update(value)
         method.save(tmp_path / f"state{suffix}")
-        loaded = type(method).load(tmp_path / f"state{suffix}", shape=SHAPE)
+        loaded = equipix.load(tmp_path / f"state{suffix}")
+        assert type(loaded) is type(method)
         assert loaded.options == method.options
         for value in values[75:]:
             np.testing.assert_array_equal(method.update(value), loaded.update(value))
@@ -284,35 +288,30 @@ class TestEveryMethod:
             result.correct(values[-1]), method.update(values[-1]), atol=4 * 8000 * 2.0**-23
         )
 
-    def test_a_state_of_another_size_or_version_is_refused(self, name, tmp_path, monkeypatch):
+    def test_a_state_of_another_version_or_in_the_place_of_a_correction_is_refused(
+        self, name, tmp_path
+    ):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        with pytest.raises(
-            errors.FileError, match=r"state.npz: holds a state of a sensor \(48, 64\)"
-        ):
-            load_state(tmp_path / "state.npz", shape=(64, 64))
-        other = METHODS[NAMES[NAMES.index(name) - 1]]
-        with pytest.raises(errors.FileError, match=rf"holds a state of '{name}', expected"):
-            other.load(tmp_path / "state.npz")
-        with pytest.raises(errors.FileError, match=r"equipix.scene.load reads it"):
+        with pytest.raises(errors.FileError, match=r"expected a correction: its correction\(\)"):
+            load_correction(tmp_path / "state.npz")
+        rewrite(tmp_path / "state.npz", version=SceneState.VERSION + 1)
+        with pytest.raises(errors.FileError, match=r"state.npz: holds state .* of version 6"):
             equipix.load(tmp_path / "state.npz")
-        monkeypatch.setattr("equipix.scene.scene_correction.FORMAT", 5)
-        method.save(tmp_path / "newer.npz")
-        monkeypatch.undo()
-        with pytest.raises(errors.FileError, match=r"newer.npz: has format 5"):
-            load_state(tmp_path / "newer.npz")
 
     def test_a_damaged_state_is_refused(self, name, tmp_path):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        pages, content = load_pages(tmp_path / "state.npz")
-        lacking = {key: page for key, page in pages.items() if key != "offset"}
-        cut = pages | {"gain": pages["gain"][:-1]}
-        wrong = pages | {"gain": pages["gain"] + np.float32(np.nan)}
-        for damaged, message in ((lacking, "lacks the map 'offset'"), (cut, "47"), (wrong, "NaN")):
-            save_pages(tmp_path / "damaged.npz", damaged, content, force=True)
+        gain = load_pages(tmp_path / "state.npz")[0]["maps.gain"]
+        for name_of, damaged, message in (
+            ("maps.offset", None, "array 'maps.offset' is missing"),
+            ("maps.gain", gain[:-1], "47"),
+            ("maps.gain", gain + np.float32(np.nan), "NaN"),
+        ):
+            method.save(tmp_path / "damaged.npz", force=True)
+            rewrite(tmp_path / "damaged.npz", arrays={name_of: damaged})
             with pytest.raises(errors.FileError, match=f"damaged.npz: is damaged: .*{message}"):
-                load_state(tmp_path / "damaged.npz")
+                equipix.load(tmp_path / "damaged.npz")
 
     def test_another_shape_is_refused(self, name):
         with pytest.raises(errors.InputError, match=r"'frame' is float64 of shape \(64, 48\)"):
@@ -448,7 +447,7 @@ def settled(tmp_path_factory):
 def test_foreign_frames_leave_what_registered_has_learned(settled, kind):
     moving, given, path = settled
     random = np.random.default_rng(3)
-    plain, method = scene.Registered.load(path), scene.Registered.load(path)
+    plain, method = equipix.load(path), equipix.load(path)
     for index, frame in enumerate(given[600:]):
         plain.update(frame.values)
         values = foreign(kind, moving, random) if index == 5 else frame.values.copy()
@@ -478,7 +477,7 @@ def test_unrelated_frames_are_no_pairs(side):
 def test_a_lasting_change_of_the_frames_is_taken_in_the_end(settled):
     """Ten times the difference: refused at first, until the usual difference has grown."""
     _, _, path = settled
-    method = scene.Registered.load(path)
+    method = equipix.load(path)
     before = method.frames
     other = MovingScene(seed=1, shape=(64, 64), gain_spread=0.2, offset_spread=0.2)
     for frame in other.frames(60):
@@ -569,7 +568,7 @@ def test_a_dead_pixel_is_flagged_and_does_not_change_the_others(name, stuck, noi
         dead[20, 30] = stuck + noise * random.standard_normal()
         other.update(dead)
     other.save(tmp_path / "state.npz")
-    for result in (other.correction(), load_state(tmp_path / "state.npz").result()):
+    for result in (other.correction(), equipix.load(tmp_path / "state.npz").correction()):
         assert result.flags[20, 30] == Flag.DEAD | Flag.DO_NOT_USE
         assert np.count_nonzero(result.flags) == 1
     assert not good.correction().flags.any()
@@ -620,37 +619,35 @@ def test_a_finite_value_beyond_single_precision_is_refused():
 class TestDamagedStates:
     """Metadata that no `save` wrote."""
 
-    def refused(self, tmp_path, monkeypatch, message, name="kalman", maps=None, **content):
-        method = made(name)
+    def refused(self, tmp_path, message, name="kalman", arrays=None, **fields):
         path = tmp_path / "state.npz"
-        write = scene.scene_correction.write_state
-
-        def damaged(path, pages, held, *, force):
-            held["counts"] |= content.pop("counts", {})
-            write(path, pages | (maps or {}), held | content, force=force)
-
-        monkeypatch.setattr("equipix.scene.scene_correction.write_state", damaged)
-        method.save(path)
+        made(name).save(path, force=True)
+        rewrite(path, {key.replace("__", "."): each for key, each in fields.items()}, arrays)
         with pytest.raises(errors.FileError, match=message):
-            load_state(path)
+            equipix.load(path)
 
     @pytest.mark.parametrize("shape", [5, None, [48], [48.5, 64]])
-    def test_shapes(self, tmp_path, monkeypatch, shape):
-        self.refused(tmp_path, monkeypatch, "is damaged: 'shape' is", shape=shape)
+    def test_shapes(self, tmp_path, shape):
+        self.refused(tmp_path, "is damaged: ", shape=shape)
 
-    def test_a_method_that_is_no_name(self, tmp_path, monkeypatch):
-        self.refused(tmp_path, monkeypatch, "is damaged: 'method' is", method=["kalman"])
+    def test_a_method_that_is_no_name(self, tmp_path):
+        self.refused(tmp_path, "is damaged: 'method' is", method=["kalman"])
+        self.refused(tmp_path, "is damaged: 'another'", method="another")
+
+    def test_options_of_another_method(self, tmp_path):
+        self.refused(tmp_path, "is damaged: .*'step'", options={"step": 0.1})
 
     @pytest.mark.parametrize("count", [50, 999, 1.7, -1, True])
-    def test_counts(self, tmp_path, monkeypatch, count):
-        self.refused(tmp_path, monkeypatch, "is damaged: .*'count'", counts={"count": count})
+    def test_counts(self, tmp_path, count):
+        self.refused(tmp_path, "is damaged: .*(count|negative)", counts__count=count)
 
-    def test_negative_variances(self, tmp_path, monkeypatch):
-        maps = {"history_variance": np.full(SHAPE, -1, np.float32)}
-        self.refused(tmp_path, monkeypatch, "holds -1 in the map", maps=maps)
+    def test_negative_variances(self, tmp_path):
+        maps = {"maps.history_variance": np.full(SHAPE, -1, np.float32)}
+        self.refused(tmp_path, "holds -1 in the map", arrays=maps)
 
 
-def test_workers_are_checked_before_the_file(tmp_path):
+def test_workers_are_checked_before_the_state(tmp_path):
     made("gated").save(tmp_path / "state.npz")
+    state = read_record(tmp_path / "state.npz", SceneState)
     with pytest.raises(errors.InputError, match="'workers' is 0"):
-        load_state(tmp_path / "state.npz", workers=0)
+        resumed("state.npz", state, workers=0)

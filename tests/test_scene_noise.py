@@ -7,10 +7,12 @@ import warnings
 import numpy as np
 import pytest
 
+import equipix
 from equipix import errors, scene
+from equipix.findings import ask, say
 from equipix.io.formats import load_pages, save_pages
 from equipix.scene.methods import METHODS
-from equipix.scene.methods import load as load_state
+from equipix.scene.scene_correction import _RULES, _Learned
 from equipix.simulate import MovingScene
 
 SHAPE = (64, 64)
@@ -238,14 +240,15 @@ def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_
     for frame in MovingScene(seed=1, shape=SHAPE).frames(20):
         method.update(np.clip(np.rint(16383 * frame.values), 0, 16383).astype(np.uint16))
     method.save(tmp_path / "state.npz")
-    for each in (method, load_state(tmp_path / "state.npz")):
+    for each in (method, equipix.load(tmp_path / "state.npz")):
         with pytest.warns(errors.InputWarning, match=r"data_range=\(0, 16383\).*--bit-depth 14"):
             each.correction()
 
 
 def test_gains_that_spread_are_named():
+    gains = np.array([-0.04, 1.0, 50.0])
     with pytest.warns(errors.InputWarning, match=r"the gains spread by 23 \(limit 0.3\)"):
-        scene.scene_correction._warn_of_spread(np.array([-0.04, 1.0, 50.0]))
+        say(*ask(_RULES, _Learned(100, 100, None, (0, 1), None, gains)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -256,11 +259,8 @@ def test_a_state_of_which_a_value_was_changed_is_refused(name, page, tmp_path):
         method.update(frame.values)
     method.save(tmp_path / "state.npz")
     pages, content = load_pages(tmp_path / "state.npz")
-    changed = pages[page].copy()
+    changed = pages[f"maps.{page}"].copy()
     changed[3, 4] += np.float32(0.5)
-    save_pages(tmp_path / "changed.npz", pages | {page: changed}, content)
-    with pytest.raises(errors.FileError, match=r"changed.npz: is damaged"):
-        load_state(tmp_path / "changed.npz")
-    save_pages(tmp_path / "range.npz", pages, content | {"data_range": [0, 2]})
-    with pytest.raises(errors.FileError, match=r"range.npz: is damaged: 'digest'"):
-        load_state(tmp_path / "range.npz")
+    save_pages(tmp_path / "changed.npz", pages | {f"maps.{page}": changed}, content)
+    with pytest.raises(errors.FileError, match=f"changed.npz: is damaged: .*maps.{page}"):
+        equipix.load(tmp_path / "changed.npz")

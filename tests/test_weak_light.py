@@ -267,7 +267,7 @@ class TestTheMinimum:
         slope, weight = self.slope(fast, frames)
         # A sweep moves no M by more than the tolerance, right within a factor 10.
         assert abs(slope / weight).max() < 10 * 1e-8
-        assert (np.diff(fast.history.objective) <= 1e-12 * fast.history.objective[:-1]).all()
+        assert (np.diff(fast.history["objective"]) <= 1e-12 * fast.history["objective"][:-1]).all()
 
     @pytest.mark.parametrize("seed", range(3))
     def test_it_is_that_of_dense_algebra_and_of_sweeps(self, seed):
@@ -291,7 +291,7 @@ class TestTheMinimum:
         # Both estimates are right within a factor 10.
         np.testing.assert_allclose(fast.sensitivity, dense, rtol=0, atol=10 * 1e-9)
         np.testing.assert_allclose(swept.sensitivity, dense, rtol=0, atol=20 * 1e-9)
-        objective = swept.history.objective
+        objective = swept.history["objective"]
         assert (np.diff(objective) <= 1e-12 * objective[:-1]).all()
 
     def test_the_prior_follows_from_the_noise_not_from_the_unit(self):

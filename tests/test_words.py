@@ -10,7 +10,6 @@ import pytest
 
 import equipix
 from equipix import Experiment, cli, errors, simulate
-from equipix.measured.statistics import load_statistics
 
 SHAPE, CROSS = (48, 64), equipix.cross_pattern(5, 7)
 
@@ -161,7 +160,7 @@ def test_inspect_names_the_file(tmp_path, capsys):
     assert "cal.png: ends in '.png', expected a .tif or .npz file" in said
     assert "'path'" not in said
     with pytest.raises(errors.InputError, match="ends in"):
-        load_statistics(tmp_path / "mean.fits")
+        equipix.load(tmp_path / "mean.fits")
 
 
 def test_a_picture_is_no_folder_of_corrected_frames(manifest, tmp_path, capsys):

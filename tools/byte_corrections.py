@@ -17,8 +17,6 @@ import tifffile
 import equipix
 from byte_scenes import Scene, given_experiment
 from equipix import bolometer, hardware, lens, metrics, nuc, scene, simulate
-from equipix.hardware.table import read as read_table
-from equipix.scene.methods import load as load_scene
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -74,11 +72,11 @@ def mask(shape: tuple[int, ...] = SHAPE) -> NDArray[Any]:
     return np.random.default_rng(3).random(shape) < 0.05
 
 
-def reread(found: Any, read: Callable[[str], Any] = equipix.load, *more: str) -> dict[str, Any]:
+def reread(found: Any, *more: str) -> dict[str, Any]:
     """A result as read from the files that it was written to."""
     for suffix in more or (".tif", ".npz"):
         found.save(f"saved{suffix}", force=True)
-    return {suffix: read(f"saved{suffix}") for suffix in more or (".tif", ".npz")}
+    return {suffix: equipix.load(f"saved{suffix}") for suffix in more or (".tif", ".npz")}
 
 
 def corrected(correction: Any, frames: Any, types: Any = OUT, **options: Any) -> dict[str, Any]:
@@ -172,7 +170,7 @@ def dynamic(*, bodies: bool = True, averaged: bool = False, **options: Any) -> A
         "inside": inside,
         "outside": found.correction(70.0, 2.0, extrapolate=True),
         "corrected": corrected(inside, np.array([stack[4, 0] for stack in stacks])),
-        "files": reread(found, bolometer.DynamicCorrection.load),
+        "files": reread(found),
     }
 
 
@@ -217,7 +215,7 @@ def learned(kind: Any, dtype: str = "uint16", **options: Any) -> Any:
     frames = moving_frames().astype(dtype)
     method = kind(SHAPE, (0.0, 16383.0), saturation=16383.0, **options)
     seen = [method.update(frame) for frame in frames[:60]]
-    resumed = reread(method, load_scene, ".tif") | reread(method, load_scene, ".npz")
+    resumed = reread(method)
     seen += [method.update(frame) for frame in frames[60:]]
     for other in resumed.values():
         for frame in frames[60:]:
@@ -329,7 +327,7 @@ def table_of(table: Any) -> Any:
         "": table,
         "words": [words, *table.applied(words)],
         "corrected": [table.correct(FRAMES, flagged=way) for way in FLAGGED],
-        "files": reread(table, read_table, ".bin", ".hex", ".h"),
+        "files": reread(table, ".bin", ".hex", ".h"),
     }
 
 
@@ -370,9 +368,9 @@ def averaged_files() -> Any:
         "plain": equipix.average("part*.tif"),
         "listed": equipix.average(["part2.tif", "part0.tif"], dark=DARK, **options),
         "floats": equipix.average(raw_frames(5000.0, 5).astype(np.float32)),
-        "command": equipix.FrameStatistics.load("mean.tif"),
+        "command": equipix.load("mean.tif"),
     }
-    read = {name: reread(each, equipix.FrameStatistics.load) for name, each in found.items()}
+    read = {name: reread(each) for name, each in found.items()}
     return found | {"files": read}
 
 
@@ -410,8 +408,8 @@ def written() -> Any:
     command("hardware", "nuc.npz", "-o", "words.bin", "--linearise", "900", "9000", "--force")
     return {
         "corrections": [equipix.load(f"{name}.npz") for name in ("nuc", "given", "scene")],
-        "scene": [tifffile.imread("seen.tif"), load_scene("state.npz")],
-        "hardware": read_table("words.bin"),
+        "scene": [tifffile.imread("seen.tif"), equipix.load("state.npz")],
+        "hardware": equipix.load("words.bin"),
     }
 
 

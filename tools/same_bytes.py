@@ -66,7 +66,6 @@ FIELDS = {
     "Frame": "values level moving",
     "FrameStatistics": "mean variance variance_of_mean count saturated saturation raw reject step "
     "light_variance dark",
-    "History": "sweep objective error_estimate",
     "Identifiability": "components labels largest equations unknowns by_colour",
     "Kalman": "gain offset frames frames_taken frames_foreign floor gain_std offset_std",
     "LensFalloff": "centre focal_length coefficients std reach",
@@ -170,7 +169,8 @@ def parts(value: Any) -> Iterator[tuple[object, Any]]:
             for word in FIELDS[kind.__name__].split():
                 field, _, attribute = word.partition(":")
                 part = getattr(value, attribute or field)
-                yield field, list(part.values()) if isinstance(part, dict) else part
+                named = field == "history" or not isinstance(part, dict)
+                yield field, part if named else list(part.values())
             return
     yield from value.items() if isinstance(value, dict) else enumerate(value)
 

@@ -61,16 +61,19 @@ class ReadOnly:
     def __post_init__(self) -> None:
         """Replace each array by a read-only view of it."""
         fields = vars(self)
-        fields |= {
-            name: read_only(value)
-            for name, value in fields.items()
-            if isinstance(value, np.ndarray)
-        }
+        fields |= {name: _guarded(value) for name, value in fields.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickle: NumPy makes arrays writeable again."""
         vars(self).update(state)
         ReadOnly.__post_init__(self)
+
+
+def _guarded(value: Any) -> Any:
+    """Return a value with its arrays read-only, those in a mapping too."""
+    if isinstance(value, dict):
+        return {key: _guarded(each) for key, each in value.items()}
+    return read_only(value) if isinstance(value, np.ndarray) else value
 
 
 def read_only(array: Array) -> Array:

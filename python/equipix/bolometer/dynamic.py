@@ -1,21 +1,18 @@
-"""Corrections that follow temperature and bias, and files of them."""
+"""Corrections that follow temperature and bias."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from os import PathLike
-from typing import Any, get_args
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 
-from equipix._check import Array, Floats, ReadOnly, number
-from equipix.bolometer.states import Axes, Regressor
+from equipix._check import Floats, number
+from equipix.bolometer.states import Axes
 from equipix.correction.polynomial import Polynomial
-from equipix.errors import FileError, InputError
+from equipix.errors import InputError
 from equipix.findings import Finding, set_bits
-from equipix.io.formats import load_pages, save_pages
-from equipix.io.record import check_format, check_pages
+from equipix.io.record import Counts, Record
 from equipix.measured.defects import DEAD_RESPONSE
 
 _ROUNDING = 1e-9
@@ -23,7 +20,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DynamicCorrection(ReadOnly):
+class DynamicCorrection(Record, kind="dynamic correction", version=2):
     """Offset and gain of each pixel against substrate temperature and bias, the result of `fit`.
 
     Attributes
@@ -60,18 +57,18 @@ class DynamicCorrection(ReadOnly):
     pixels then have the same value before the shutter and the same response.
     """
 
-    offset: Floats
-    gain: Floats | None
-    level: Floats
+    offset: Annotated[Floats, "float64", "terms rows cols"]
+    gain: Annotated[Floats, "float64", "gain_terms rows cols"] | None
+    level: Annotated[Floats, "float64", "terms"]
     axes: Axes
     gain_axes: Axes
-    flags: Array
+    flags: Counts
     metadata: dict[str, Any] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""
-        ReadOnly.__post_init__(self)
+        super().__post_init__()
         found = {name: getattr(self, name) for name in ("offset", "gain", "level")}
         wanted = {
             "offset": (self.axes.terms, *self.flags.shape),
@@ -150,58 +147,9 @@ class DynamicCorrection(ReadOnly):
         set_bits(flags, "non_responding", response < DEAD_RESPONSE)
         return Polynomial(planes, flags, metadata, leaves_offset=True, findings=self.findings)
 
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `DynamicCorrection.load` reads.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        """
-        save_fields(path, vars(self), force=force)
-
-    @staticmethod
-    def load(path: str | PathLike[str]) -> DynamicCorrection:
-        """Read what `save` wrote.
-
-        Parameters
-        ----------
-        path : str or path
-            A .tif or .npz file.
-
-        Returns
-        -------
-        DynamicCorrection
-            As it was saved, bit by bit.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be read, holds something else, or was written in a newer format.
-        """
-        pages, content = load_pages(path)
-        try:
-            return read_dynamic(path, pages, content)
-        except (ArithmeticError, KeyError, TypeError, ValueError) as error:
-            raise FileError(f"{path}: damaged or incomplete {KIND}: {error!r}") from error
-
     def _middle_bias(self) -> float:
         low, high = self.axes.bias_v
         return low if low == high else float(np.sqrt((low**2 + high**2) / 2))
-
-
-def read_dynamic(
-    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
-) -> DynamicCorrection:
-    """Make a correction of the arrays and metadata of the file that `save` wrote."""
-    return DynamicCorrection(**read_fields(path, pages, content))
 
 
 def _check_inside(
@@ -215,67 +163,3 @@ def _check_inside(
             f"'{name}' is {value:g} {unit}, but the references cover {ends[0]:g} to {ends[1]:g} "
             f"{unit}: take references there, or set extrapolate=True"
         )
-
-
-KIND = "dynamic correction"
-"""The kind in the metadata of the file."""
-
-FORMAT = 1
-"""Number of the file format; a file with a higher one is refused."""
-
-
-def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
-    """Write the attributes of a `DynamicCorrection`; see its `save`."""
-    pages = {"offset": fields["offset"], "flags": fields["flags"]}
-    if fields["gain"] is not None:
-        pages["gain"] = fields["gain"]
-    content = {
-        "format": FORMAT,
-        "kind": KIND,
-        "level": fields["level"].tolist(),
-        "axes": asdict(fields["axes"]),
-        "gain_axes": asdict(fields["gain_axes"]),
-        "metadata": fields["metadata"],
-        "findings": [vars(each) for each in fields["findings"]],
-    }
-    save_pages(path, pages, content, force=force)
-
-
-def read_fields(
-    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
-) -> dict[str, Any]:
-    """Make the attributes of a `DynamicCorrection` of what `save_fields` wrote.
-
-    Raises
-    ------
-    FileError
-        If the format is newer than `FORMAT`, or a page is missing or does not fit.
-    KeyError, TypeError, ValueError
-        If a number is missing or is something else.
-    """
-    check_format(path, content, KIND, FORMAT)
-    stacks = dict.fromkeys({"offset", "gain"} & {"offset", *pages}, np.float64)
-    check_pages(path, pages, {"flags": np.uint32}, stacks)
-    return {
-        "offset": pages["offset"],
-        "gain": pages.get("gain"),
-        "level": np.array(content["level"], dtype=np.float64),
-        "axes": _axes(content["axes"]),
-        "gain_axes": _axes(content["gain_axes"]),
-        "flags": pages["flags"],
-        "metadata": content["metadata"],
-        "findings": tuple(Finding(**each) for each in content["findings"]),
-    }
-
-
-def _axes(content: dict[str, Any]) -> Axes:
-    (low, high), (least, most) = content["substrate_c"], content["bias_v"]
-    if content["regressor"] not in get_args(Regressor):
-        raise ValueError(f"a regressor {content['regressor']!r}, expected {get_args(Regressor)}")
-    return Axes(
-        (float(low), float(high)),
-        (float(least), float(most)),
-        int(content["order"]),
-        int(content["bias_order"]),
-        content["regressor"],
-    )

@@ -1,12 +1,11 @@
-"""The result of a calibration, and files of it."""
+"""The result of a calibration."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from os import PathLike
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +15,6 @@ from equipix._check import (
     Bools,
     Floats,
     Progress,
-    ReadOnly,
     ShiftSign,
     as_array,
     check_count,
@@ -30,21 +28,26 @@ from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
-from equipix.exposures.positions import ROUNDING, Orientation, Positions
+from equipix.exposures.positions import ROUNDING, Positions
 from equipix.findings import Finding, determined
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged, sampled_arrays
-from equipix.io.formats import save_pages
-from equipix.io.record import check_format, check_pages
+from equipix.io.record import UNSAVED, Counts, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.measured import Measured, measured_of
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.maps import slope_pixels, tilt
 
+Grid = Annotated[Floats, "float64", "beam_rows beam_cols"]
+
+Places = Annotated[Floats, "float64", "exposures 2"]
+
+Pair = Annotated[Floats, "float64", "2"]
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(CorrectionBase):
+class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     """Calibrated sensor, the result of `calibrate`; its arrays are read-only.
 
     Attributes
@@ -61,8 +64,8 @@ class Calibration(CorrectionBase):
         ``beam_origin + shift`` whole, but for rounding, in each exposure.
     beam_coefficients : ndarray, shape of the padded grid, float64, or None
         Coefficients of the cubic B-spline that the beam is where shifts differ by parts of pixels;
-        None where it is known at the cells alone, and in a file of format 1. Between the cells of
-        such a beam polynomials of degree 5 interpolate.
+        None where it is known at the cells alone: between the cells of such a beam polynomials of
+        degree 5 interpolate.
     beam_tilt : ndarray, shape (2,), float64
         Slope β of ln L (row, col) per cell that the gauge put into the coefficients a:
         L(u) = Σ_j a_j exp(β·(u − j)) B(u − j).
@@ -98,8 +101,12 @@ class Calibration(CorrectionBase):
     error_estimate : float
         Estimate (not a bound) of the largest remaining solver error of `sensitivity` at any
         spatial scale; noise is not included.
-    history : History
-        Objective and error estimate along the way.
+    history : dict of str to ndarray, shape (looks,)
+        State after some of the sweeps: ``sweep``, the number of sweeps that had been made (uint64);
+        ``objective``, F with penalty and priors where a fit has them, which never rises but for
+        rounding, and while such a fit still finds their weights; ``error_estimate``, the estimated
+        largest relative error of the sensitivity. In coordinate descent F is that after a sweep;
+        `objective` is smaller by the one update of the beam that follows the last.
     dark : ndarray, shape (rows, cols), or None
         The dark frame in DN, if it is part of the calibration.
     dark_is_fitted : bool
@@ -132,8 +139,7 @@ class Calibration(CorrectionBase):
         Whether the data confirm the signs and the order of the shifts' axes, contradict them, or do
         neither, as those of a Gaussian beam, whatever its width; see `calibrate`.
     orientation : OrientationTest or None
-        The same for each axis, with the best orientation and, in ``words``, what to do; None if
-        read from a file of an older version.
+        The same for each axis, with the best orientation and, in ``words``, what to do.
     drift : Drift or None
         What the data say of fluxes that were given: the size of the lamp's drift about them, its
         standard error, the degrees of freedom, and the tilt that it hides, which is part of
@@ -147,31 +153,31 @@ class Calibration(CorrectionBase):
         it is what pixels give for one light. NaN for a colour that is undetermined.
     """
 
-    sensitivity: NDArray[Any]
-    beam: NDArray[Any]
+    sensitivity: Map
+    beam: Grid
     beam_origin: tuple[float, float]
-    beam_coefficients: NDArray[Any] | None
-    beam_tilt: NDArray[Any]
-    flags: NDArray[Any]
-    shifts: NDArray[Any]
-    rotation: NDArray[Any]
-    flux: NDArray[Any]
+    beam_coefficients: Grid | None
+    beam_tilt: Pair
+    flags: Counts
+    shifts: Places
+    rotation: Annotated[NDArray[np.int64], "int64", "exposures"]
+    flux: Annotated[Floats, "float64", "exposures"]
     objective: float
     reduced_chi2: float
     components: int
-    component_labels: NDArray[Any]
+    component_labels: Annotated[Array, "int32", "rows cols"]
     sweeps: int
     converged: bool
     error_estimate: float
-    history: History
-    dark: NDArray[Any] | None = None
+    history: dict[str, Annotated[Array, "uint64|float64", "looks"]]
+    dark: Map | None = None
     dark_is_fitted: bool = False
     metadata: dict[str, Any] = field(default_factory=dict)
-    sensitivity_std: NDArray[Any] | None = None
-    tilt_std: NDArray[Any] | None = None
-    shift_std: NDArray[Any] | None = None
-    weighted: Weighted | None = field(default=None, compare=False)
-    rejected: NDArray[np.bool_] | None = None
+    sensitivity_std: Map | None = None
+    tilt_std: Pair | None = None
+    shift_std: Places | None = None
+    weighted: Weighted | None = field(default=None, metadata=UNSAVED)
+    rejected: Annotated[Bools, "bool", "exposures rows cols"] | None = None
     shift_sign: ShiftSign = "undetermined"
     orientation: OrientationTest | None = None
     drift: Drift | None = None
@@ -182,6 +188,18 @@ class Calibration(CorrectionBase):
     limits: ClassVar[None] = None
     saturation: ClassVar[None] = None
     leaves_offset: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse places that cannot be those of a calibration, and filters that are none."""
+        super().__post_init__()
+        grid, origin = self.beam.shape, np.array(self.beam_origin)
+        if not set(self.rotation.tolist()) <= {0, 90, 180, 270}:
+            raise InputError(f"'rotation' is {self.rotation}, expected 0, 90, 180 or 270 degrees")
+        if not _is_inside(origin, grid):
+            raise InputError(f"'beam_origin' is {self.beam_origin}, expected a place on {grid}")
+        if not (_are_whole(origin) or _are_whole(origin + self.shifts)):
+            raise InputError(f"'beam_origin' is {self.beam_origin}, expected exposures in cells")
+        Colours.of(self.cfa)
 
     @classmethod
     def of(
@@ -213,7 +231,11 @@ class Calibration(CorrectionBase):
             sweeps=int(fit.sweeps[-1]),
             converged=fit.ended == "converged",
             error_estimate=float(fit.error_estimate[-1]),
-            history=History(fit.sweeps, fit.objective, fit.error_estimate),
+            history={
+                "sweep": fit.sweeps,
+                "objective": fit.objective,
+                "error_estimate": fit.error_estimate,
+            },
             dark=exposures.dark if offset is None else scaled(offset, exposures.response, dtype),
             dark_is_fitted=exposures.offset,
             metadata=metadata,
@@ -485,51 +507,11 @@ class Calibration(CorrectionBase):
         tilt = self.beam_tilt.tolist()
         return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
 
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.load` reads.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        InputError
-            If the suffix is unknown.
-        """
-        save_fields(path, vars(self), force=force)
-
 
 def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:
     """Return a place on the grid with whole numbers as int, as indices are."""
     row, col = (int(each) if each.is_integer() else each for each in place)
     return row, col
-
-
-@dataclass(frozen=True, eq=False)
-class History(ReadOnly):
-    """The course of a calibration: its state after some of its sweeps.
-
-    Attributes
-    ----------
-    sweep : ndarray, shape (looks,), uint64
-        How many sweeps had been made.
-    objective : ndarray, shape (looks,), float64
-        Objective F, with penalty and priors where a fit has them; it never rises but for rounding,
-        and while such a fit still finds their weights. In coordinate descent it is F after a sweep;
-        `Calibration.objective` is smaller by the one update of the beam that follows the last.
-    error_estimate : ndarray, shape (looks,), float64
-        The estimated largest relative error of the sensitivity.
-    """
-
-    sweep: NDArray[Any]
-    objective: NDArray[Any]
-    error_estimate: NDArray[Any]
 
 
 class Place(NamedTuple):
@@ -574,113 +556,6 @@ def subtract_signals(
                 out[k] /= np.sqrt(variance)
 
 
-KIND = "calibration"
-"""The kind in the metadata of the file."""
-
-FORMAT = 2
-"""Number of the file format; a file with a higher one is refused. Format 1 held no coefficients of
-the beam and no findings, rotations only among the options, and the images of ``rejected`` one below
-the other in one page."""
-
-_MAPS: dict[str, type] = {
-    "sensitivity": np.floating,
-    "flags": np.uint32,
-    "component_labels": np.integer,
-}
-
-_PLAIN = (
-    "objective",
-    "components",
-    "sweeps",
-    "converged",
-    "error_estimate",
-    "dark_is_fitted",
-)
-"""Fields that are JSON values as they are."""
-
-_MAYBE, _SPLINE = {"dark", "sensitivity_std"}, {"beam_coefficients"}
-
-_OPTIONAL = _MAYBE | _SPLINE
-
-
-def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
-    """Write the attributes of a `Calibration` to a file; see `Calibration.save`."""
-    content = {
-        "format": FORMAT,
-        "kind": KIND,
-        "calibration": _numbers(fields),
-        "metadata": fields["metadata"],
-    }
-    save_pages(path, _pages(fields), content, force=force)
-
-
-def read_fields(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
-) -> dict[str, Any]:
-    """Make the attributes of a `Calibration` of the arrays and metadata that `save_fields` wrote.
-
-    ``history`` holds the attributes of a `History`.
-
-    Raises
-    ------
-    FileError
-        If the format is newer than `FORMAT`, or a page is missing or does not fit.
-    KeyError, TypeError, ValueError
-        If a number is missing or is something else.
-    """
-    check_format(path, content, KIND, FORMAT)
-    check_pages(path, pages, _MAPS | dict.fromkeys(_MAYBE & pages.keys(), np.floating))
-    check_pages(path, pages, dict.fromkeys(["beam", *sorted(_SPLINE & pages.keys())], np.float64))
-    if content["format"] == 1 and "rejected" in pages:
-        images = pages["rejected"].reshape(-1, *pages["sensitivity"].shape)
-        pages = {**pages, "rejected": images}
-    stacks = dict.fromkeys({"rejected"} & pages.keys(), np.uint8)
-    check_pages(path, pages, {"sensitivity": np.floating}, stacks)
-    numbers = content["calibration"]
-    if content["format"] == 1:
-        options = content["metadata"]["options"]
-        former = {"rotation": options["rotation"], "dark_is_fitted": options["dark"] == "fit"}
-        numbers = {**numbers, **former, "findings": [], "beam_tilt": [0.0, 0.0]}
-    chi2, rejected = numbers["reduced_chi2"], pages.get("rejected")
-    _check_numbers(numbers, pages["beam"].shape)
-    row, col = numbers["beam_origin"]
-    return {
-        **{name: pages[name] for name in ("sensitivity", "beam", "flags", "component_labels")},
-        **{name: pages.get(name) for name in _OPTIONAL},
-        **{name: numbers[name] for name in _PLAIN},
-        **{name: _array(numbers[name]) for name in ("shifts", "flux", "beam_tilt")},
-        **{name: _array(numbers.get(name)) for name in ("tilt_std", "shift_std")},
-        "beam_origin": (row, col),
-        "rotation": np.array(numbers["rotation"], dtype=np.int64),
-        "findings": numbers["findings"],
-        "reduced_chi2": float("nan") if chi2 is None else chi2,
-        "shift_sign": numbers.get("shift_sign", "undetermined"),
-        "orientation": numbers.get("orientation"),
-        "drift": numbers.get("drift"),
-        "cfa": Colours.of(numbers.get("cfa")),
-        "colour_response": _responses(numbers.get("colour_response")),
-        "history": _history(numbers["history"]),
-        "rejected": None if rejected is None else rejected.astype(bool),
-        "metadata": content["metadata"],
-    }
-
-
-def _check_numbers(numbers: Mapping[str, Any], grid: tuple[int, ...]) -> None:
-    """Refuse numbers that cannot be those of a calibration."""
-    count = len(numbers["flux"])
-    if np.shape(numbers["shifts"]) != (count, 2) or len(numbers["rotation"]) != count:
-        raise ValueError(f"shifts and rotations, expected those of {count} exposures")
-    if not set(numbers["rotation"]) <= {0, 90, 180, 270}:
-        raise ValueError(f"rotation {numbers['rotation']}, expected 0, 90, 180 or 270 degrees")
-    origin = np.array(numbers["beam_origin"])
-    if origin.shape != (2,) or origin.dtype.kind not in "if" or not _is_inside(origin, grid):
-        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected a place on {grid}")
-    if not (_are_whole(origin) or _are_whole(origin + numbers["shifts"])):
-        raise ValueError(f"beam_origin {numbers['beam_origin']}, expected exposures in cells")
-    if np.shape(numbers["beam_tilt"]) != (2,):
-        raise ValueError(f"beam_tilt {numbers['beam_tilt']}, expected two numbers")
-
-
 def _is_inside(place: NDArray[Any], grid: tuple[int, ...]) -> bool:
     """Whether a place is in a cell of a grid, which reaches half of its side around it."""
     return bool(np.all((place >= -0.5) & (place <= np.subtract(grid, 0.5))))
@@ -689,117 +564,6 @@ def _is_inside(place: NDArray[Any], grid: tuple[int, ...]) -> bool:
 def _are_whole(places: NDArray[Any]) -> bool:
     """Whether places are whole numbers, but for rounding."""
     return bool(np.all(np.abs(places - np.rint(places)) < ROUNDING))
-
-
-def _pages(fields: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Collect the arrays of the size of the sensor, and the beam."""
-    names = ("beam", *_MAPS, *sorted(_OPTIONAL))
-    pages = {name: fields[name] for name in names if fields[name] is not None}
-    if fields["rejected"] is not None:
-        pages["rejected"] = fields["rejected"].astype(np.uint8)
-    return pages
-
-
-def _numbers(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect the rest as JSON values, which have neither NaN nor infinity."""
-    chi2, tilt_std, shift_std = (fields[name] for name in ("reduced_chi2", "tilt_std", "shift_std"))
-    history, orientation, drift = (fields[name] for name in ("history", "orientation", "drift"))
-    if orientation is not None:
-        changes = {"best": vars(orientation.best)}
-        if orientation.hidden is not None:
-            changes["hidden"] = vars(orientation.hidden)
-        orientation = vars(orientation) | changes
-    return {
-        "beam_origin": list(fields["beam_origin"]),
-        "shifts": fields["shifts"].tolist(),
-        "flux": fields["flux"].tolist(),
-        **{name: fields[name] for name in _PLAIN},
-        "rotation": fields["rotation"].tolist(),
-        "beam_tilt": fields["beam_tilt"].tolist(),
-        "reduced_chi2": chi2 if np.isfinite(chi2) else None,
-        "findings": [vars(finding) for finding in fields["findings"]],
-        "shift_sign": fields["shift_sign"],
-        "orientation": orientation,
-        "drift": None if drift is None else _lists(vars(drift)),
-        **_colours(fields),
-        "tilt_std": None
-        if tilt_std is None
-        else [std if np.isfinite(std) else str(std) for std in tilt_std.tolist()],
-        "shift_std": None if shift_std is None else shift_std.tolist(),
-        "history": {
-            "sweep": history.sweep.tolist(),
-            "objective": history.objective.tolist(),
-            "error_estimate": history.error_estimate.tolist(),
-        },
-    }
-
-
-def _colours(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect the pattern of the filters and the responses of the colours, where there are any."""
-    if fields["cfa"] is None:
-        return {}
-    found = fields["colour_response"].items()
-    return {
-        "cfa": fields["cfa"].rows,
-        "colour_response": {label: value if value == value else None for label, value in found},
-    }
-
-
-def _responses(content: Mapping[str, float | None] | None) -> dict[str, float] | None:
-    if content is None:
-        return None
-    return {label: float("nan") if value is None else value for label, value in content.items()}
-
-
-def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace arrays by lists."""
-    return {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in fields.items()
-    }
-
-
-def _history(numbers: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    return {
-        "sweep": np.array(numbers["sweep"], dtype=np.uint64),
-        "objective": np.array(numbers["objective"]),
-        "error_estimate": np.array(numbers["error_estimate"]),
-    }
-
-
-def _array(values: Any) -> NDArray[np.float64] | None:
-    return None if values is None else np.array(values, dtype=np.float64)
-
-
-def read_calibration(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
-) -> Calibration:
-    """Make a calibration of the arrays and metadata of the file that `Calibration.save` wrote."""
-    fields = read_fields(path, pages, content)
-    findings = tuple(Finding(**each) for each in fields["findings"])
-    made = {
-        "history": History(**fields["history"]),
-        "orientation": _read_orientation(fields["orientation"]),
-        "drift": _read_drift(fields["drift"]),
-        "findings": findings,
-    }
-    return Calibration(**{**fields, **made})
-
-
-def _read_orientation(content: dict[str, Any] | None) -> OrientationTest | None:
-    if content is None:
-        return None
-    ways = {name: content.get(name) for name in ("best", "hidden")}
-    made = {name: Orientation(**way) for name, way in ways.items() if way is not None}
-    return OrientationTest(**{**content, **made})
-
-
-def _read_drift(content: dict[str, Any] | None) -> Drift | None:
-    if content is None:
-        return None
-    names = ("slope_covariance", "tilt_std", "trend_tilt")
-    arrays = {name: np.array(content[name]) for name in names}
-    return Drift(**{**content, **arrays})
 
 
 def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:

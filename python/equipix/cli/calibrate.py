@@ -16,7 +16,8 @@ from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
-from equipix.loading import load_any, load_calibration
+from equipix.io.record import read_record
+from equipix.loading import load
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
 
@@ -80,7 +81,7 @@ def inspect(
     as_json: terminal.Json = False,
 ) -> None:
     """Show what a file of a correction, or of averaged frames, holds."""
-    content = load_any(file)
+    content = load(file)
     result = {"file": str(file), **summary(content)}
     if as_json and hasattr(content, "metadata"):
         result["metadata"] = content.metadata
@@ -99,7 +100,7 @@ def compare(
     """Show how far calibrations of one sensor agree."""
     check_picture(output)
     terminal.check_output(output, calibrations, force=force)
-    loaded = [load_calibration(file) for file in calibrations]
+    loaded = [read_record(file, Calibration) for file in calibrations]
     _refuse_equal(calibrations, loaded)
     result = compare_calibrations(loaded)
     if output is not None:

@@ -13,7 +13,7 @@ from equipix.experiment.image_files import origin_of, refuse_repeated_files
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.loading import load
+from equipix.loading import load_correction
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
 
@@ -93,7 +93,7 @@ def correct(
     terminal.check_output(output, [correction], force=force, folder=is_folder(output))
     with terminal.working() as (progress, _):
         done = correct_files(
-            load(correction),
+            load_correction(correction),
             frames,
             output,
             sensor=sensor,

@@ -13,7 +13,7 @@ from equipix.findings import usable
 from equipix.hardware.quality import quality, smallest_widths
 from equipix.hardware.table import SUFFIXES, Table
 from equipix.hardware.words import STEPS
-from equipix.loading import load
+from equipix.loading import load_correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""
@@ -61,7 +61,7 @@ def hardware(
 ) -> None:
     """Write a correction as words for a camera's electronics."""
     terminal.check_output(output, [result], force=force, suffixes=SUFFIXES)
-    correction = load(result)
+    correction = load_correction(result)
     check_sensor(correction, sensor)
     table = Table.of(correction, **options)
     cost = _cost(correction, frames, options) if frames else {}

@@ -16,10 +16,12 @@ from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
-from equipix.loading import load, load_response
+from equipix.io.record import read_record
+from equipix.loading import load_correction
 from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
 from equipix.nuc.bad_pixels import find_defects
+from equipix.nuc.response import Response
 
 commands = typer.Typer()
 
@@ -102,7 +104,7 @@ def defects(
     """Find bad pixels by response curves and by frames of one level."""
     terminal.check_output(output, [response], force=force, suffixes=SUFFIXES)
     limits = DefectLimits(**{name.removesuffix("_limit"): each for name, each in options.items()})
-    curves = load_response(response)
+    curves = read_record(response, Response)
     check_sensor(curves, sensor)
     with naming_memory("finding bad pixels"):
         raw = None if not frames else terminal.raw_frames(frames, response)
@@ -132,7 +134,7 @@ def quality(
 
     Behind colour filters that of each plane: of the correction's, or of --cfa, where it names none.
     """
-    loaded = load(correction)
+    loaded = load_correction(correction)
     check_sensor(loaded, sensor)
     colours = named_cfa(loaded, cfa)
     with naming_memory("measuring quality"):

@@ -8,14 +8,15 @@ import numpy as np
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import told
-from equipix.errors import InputError
+from equipix.cli.summary import of_scene, told
+from equipix.errors import FileError, InputError
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
+from equipix.io.record import read_record
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_sequence
-from equipix.scene.methods import METHODS, load
-from equipix.scene.scene_correction import SceneCorrection
+from equipix.scene.methods import METHODS, resumed
+from equipix.scene.scene_correction import SceneCorrection, SceneState
 from equipix.scene.sequence import SequenceResult, check_range, run_sequence, sequence_format
 
 commands = typer.Typer()
@@ -120,11 +121,16 @@ def _method(
                 "--bit-depth, --mask, --saturation, --step, --width, --threshold, --motion, "
                 "--least-motion and --block"
             )
-        found = load(resume, shape=shape, workers=workers)
-        if found.method != name:
-            raise InputError(f"{resume}: is of --method {found.method}, not of {name}: name that")
-        check_range(found.data_range, dtype, resume)
-        return found
+        state = read_record(resume, SceneState)
+        if state.shape != shape:
+            raise FileError(
+                f"{resume}: holds a state of a sensor {state.shape}, expected {shape}: name the "
+                "state of this sensor"
+            )
+        if state.method != name:
+            raise InputError(f"{resume}: is of --method {state.method}, not of {name}: name that")
+        check_range(state.data_range, dtype, resume)
+        return resumed(resume, state, workers=workers)
     if data_range is None and dtype.kind != "u":
         raise InputError(
             f"the frames are {dtype}, whose range is unknown: give 'data_range' (--data-range "
@@ -142,14 +148,8 @@ def _summary(output: Path, method: SceneCorrection, done: SequenceResult) -> dic
     points = [*range(0, len(done.points) - 1, every), len(done.points) - 1]
     return {
         "output": str(output),
-        "method": method.method,
         "frames": done.frames,
-        "usable_frames": method.frames_taken,
-        "frames_that_counted": method.frames,
-        "frames_foreign": method.frames_foreign,
-        "floor_dn": method.floor,
-        "gain_rms": float(np.std(method.gain)),
-        "offset_rms": float(np.std(method.offset)),
+        **of_scene(method),
         "roughness": [
             {
                 "frame": done.points[i],

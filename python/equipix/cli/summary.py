@@ -13,6 +13,8 @@ from equipix.correction.protocol import Correction, sensor_of
 from equipix.findings import Finding, Flag, usable
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
+from equipix.scene.methods import METHODS
+from equipix.scene.scene_correction import SceneCorrection
 
 _Figures: TypeAlias = Callable[[Any], dict[str, Any]]
 
@@ -20,7 +22,9 @@ _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
 
 
-def summary(content: Correction | DynamicCorrection | FrameStatistics) -> dict[str, Any]:
+def summary(
+    content: Correction | DynamicCorrection | FrameStatistics | SceneCorrection,
+) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     figures: _Figures = _FIGURES.get(type(content), _of_correction)
     return figures(content)
@@ -119,6 +123,21 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
     }
 
 
+def of_scene(method: SceneCorrection) -> dict[str, Any]:
+    """Collect the main figures of a correction that learns from the scene."""
+    return {
+        "shape": list(method.shape),
+        "scene_method": method.method,
+        "scene_data_range": list(method.data_range),
+        "usable_frames": method.frames_taken,
+        "frames_that_counted": method.frames,
+        "frames_foreign": method.frames_foreign,
+        "floor_dn": method.floor,
+        "gain_rms": float(np.std(method.gain)),
+        "offset_rms": float(np.std(method.offset)),
+    }
+
+
 def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
     """Collect the main figures of averaged frames."""
     several = (frames.count > 1).any()
@@ -209,5 +228,6 @@ _FIGURES: dict[type, _Figures] = {
     Calibration: of_calibration,
     Response: of_response,
     DynamicCorrection: of_dynamic,
+    **dict.fromkeys(METHODS.values(), of_scene),
 }
 """What collects the main figures of each kind of result."""

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from os import PathLike
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from equipix._check import Array, ReadOnly, check_type
+from equipix._check import Array, check_type
 from equipix.correction.apply import CorrectionBase
 from equipix.correction.protocol import Correction, check_correction, sensor_table
 from equipix.errors import InputError
 from equipix.findings import Finding
-from equipix.io.formats import save_pages
-from equipix.io.record import check_format, check_pages
-
-_KIND, _FORMAT = "polynomial", 1
+from equipix.io.record import Counts, Record
 
 _MOST = 4
 """Most coefficients that the compiled part applies."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Polynomial(CorrectionBase):
+class Polynomial(CorrectionBase, Record, kind="polynomial", version=2):
     """A correction Σ c_j y^j of raw values y, such as two corrections combined.
 
     Attributes
@@ -49,8 +44,8 @@ class Polynomial(CorrectionBase):
         If the shapes do not fit.
     """
 
-    coefficients: Array
-    flags: Array
+    coefficients: Annotated[Array, "float32|float64", "terms rows cols"]
+    flags: Counts
     metadata: dict[str, Any] = field(default_factory=dict)
     saturation: float | None = None
     leaves_offset: bool = False
@@ -64,7 +59,7 @@ class Polynomial(CorrectionBase):
         """Refuse arrays that do not fit together."""
         for name in ("coefficients", "flags"):
             check_type(name, getattr(self, name), np.ndarray, "an array")
-        ReadOnly.__post_init__(self)
+        super().__post_init__()
         planes, shape = self.coefficients.shape[:1], self.coefficients.shape[1:]
         if shape != self.flags.shape or not 2 <= planes[0] <= _MOST or len(shape) != 2:
             raise InputError(
@@ -76,49 +71,6 @@ class Polynomial(CorrectionBase):
         """Short form: sizes and order."""
         rows, cols = self.shape
         return f"<Polynomial of {rows} x {cols} pixels, order {len(self.coefficients) - 1}>"
-
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.load` reads.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        """
-        pages = {"coefficients": self.coefficients, "flags": self.flags}
-        content = {
-            "format": _FORMAT,
-            "kind": _KIND,
-            "saturation": self.saturation,
-            "leaves_offset": self.leaves_offset,
-            "metadata": self.metadata,
-            "findings": [vars(each) for each in self.findings],
-        }
-        save_pages(path, pages, content, force=force)
-
-
-def read_polynomial(
-    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
-) -> Polynomial:
-    """Make a correction of the arrays and metadata of the file that `Polynomial.save` wrote."""
-    check_format(path, content, _KIND, _FORMAT)
-    check_pages(path, pages, {"flags": np.uint32}, {"coefficients": np.floating})
-    level = content.get("saturation")
-    return Polynomial(
-        pages["coefficients"],
-        pages["flags"],
-        content["metadata"],
-        None if level is None else float(level),
-        bool(content.get("leaves_offset", False)),
-        tuple(Finding(**each) for each in content["findings"]),
-    )
 
 
 def combine(first: Correction, then: Correction) -> Polynomial:

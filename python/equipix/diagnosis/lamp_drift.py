@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -55,9 +56,9 @@ class Drift(ReadOnly):
     flux_std: float
     degrees_of_freedom: int
     probability: float
-    slope_covariance: Floats
-    tilt_std: Floats
-    trend_tilt: Floats
+    slope_covariance: Annotated[Floats, "float64", "2 2"]
+    tilt_std: Annotated[Floats, "float64", "2"]
+    trend_tilt: Annotated[Floats, "float64", "2"]
 
     @property
     def is_added(self) -> bool:

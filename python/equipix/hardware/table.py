@@ -332,7 +332,7 @@ class Table(CorrectionBase):
         return apply(self, frames, dark, flagged, out, formula)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.hardware.read` reads bit by bit.
+        """Write to a file that `equipix.load` reads bit by bit.
 
         Parameters
         ----------
@@ -348,7 +348,11 @@ class Table(CorrectionBase):
         InputError
             If the suffix is another.
         """
-        write(self._content, path, force=force)
+        file = as_path("path", path)
+        encode_file, _ = _FORMATS[_suffix(file)]
+        data = encode_file(self._content, file.stem)
+        with write_whole(path, force=force) as temporary:
+            temporary.write_bytes(data)
 
     @property
     def _content(self) -> Content:
@@ -366,33 +370,25 @@ SUFFIXES = tuple(_FORMATS)
 """Suffixes of files of tables."""
 
 
-def write(content: Content, path: str | PathLike[str], *, force: bool) -> None:
-    """Write a file, which appears whole or not at all."""
-    file = as_path("path", path)
-    data = _FORMATS[_suffix(file)][0](content, file.stem)
-    with write_whole(path, force=force) as temporary:
-        temporary.write_bytes(data)
-
-
-def read_content(path: str | PathLike[str]) -> Content:
-    """Read what `write` wrote.
+def read_table(path: str | PathLike[str]) -> Table:
+    """Read a table from the file that `Table.save` wrote, bit by bit.
 
     Raises
     ------
     FileError
-        If the file cannot be read, holds something else, or is incomplete or of another version.
+        If the file cannot be read, holds something else, or is incomplete, damaged or of another
+        version.
     """
     file = as_path("path", path)
-    decoded = _FORMATS[_suffix(file)][1]
+    _, decode_file = _FORMATS[_suffix(file)]
     try:
-        content = decoded(file, file.read_bytes())
+        return Table(*decode_file(file, file.read_bytes()))
     except FileError:
         raise
     except OSError as error:
         raise FileError(f"{file}: cannot be read: {error}") from error
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise FileError(f"{file}: is damaged or incomplete: {error}") from error
-    return content
 
 
 def _suffix(path: Path) -> str:
@@ -400,33 +396,6 @@ def _suffix(path: Path) -> str:
     if suffix not in _FORMATS:
         raise InputError(f"'{path}' ends in none of {', '.join(SUFFIXES)}, which name the format")
     return suffix
-
-
-def read(path: str | PathLike[str]) -> Table:
-    """Read a table from the file that `Table.save` wrote, bit by bit.
-
-    Parameters
-    ----------
-    path : str or path
-        The file; its suffix, .bin, .hex or .h, names the format.
-
-    Returns
-    -------
-    Table
-        As it was saved.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, holds something else, or is of another size or version.
-    InputError
-        If the suffix is another.
-    """
-    content = read_content(path)
-    try:
-        return Table(*content)
-    except InputError as error:
-        raise FileError(f"{path}: is damaged: {error}") from error
 
 
 class Applied(NamedTuple):

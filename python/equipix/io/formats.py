@@ -1,23 +1,32 @@
-"""Files of named arrays with metadata: formats by suffix."""
+"""Files of named arrays with metadata: the formats by suffix."""
 
 from __future__ import annotations
 
 import json
 import os
-import zipfile
+import zlib
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from equipix.errors import FileError, InputError
-from equipix.io import tiff
+from equipix.io import npz, tiff
 from equipix.io.frames import Header, frame_format, header
 from equipix.io.paths import as_path, reading, write_whole
-from equipix.io.record import KEY, _check_sum, checksum
+
+_FORMATS = {".tif": tiff, ".tiff": tiff, ".npz": npz}
+"""The module of each format: ``write_pages``, ``read_pages`` and ``description``."""
+
+SUFFIXES = tuple(_FORMATS)
+
+_SEPARATORS = (", ", " : ")
+"""Of the JSON text: tifffile takes one that holds ``"shape":`` for its own."""
+
+_CRC = "crc32"
+"""Key of the checksum of the metadata."""
 
 
 def save_pages(
@@ -37,8 +46,7 @@ def save_pages(
         Arrays by name, each kept in its own dtype: of shape (rows, cols), or a stack of shape
         (n, rows, cols), whose images are pages of their own in a TIFF.
     metadata : mapping
-        JSON values; in a TIFF they are the first page's description. A checksum of arrays and
-        metadata is added to them.
+        JSON values; in a TIFF they are the first page's description. Their checksum is added.
     force : bool, optional
         Replace a file that is there.
 
@@ -47,22 +55,14 @@ def save_pages(
     FileError
         If the file exists and `force` is not set, or cannot be written.
     InputError
-        If the suffix is unknown or a page is not an array of numbers in two or three dimensions.
+        If the suffix is unknown.
     """
-    write = _WRITERS.get(as_path("path", path).suffix.lower())
-    if write is None:
+    kind = _FORMATS.get(as_path("path", path).suffix.lower())
+    if kind is None:
         raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
-    for name, array in pages.items():
-        if array.ndim not in (2, 3) or array.dtype.kind not in "iuf" or array.size == 0:
-            raise InputError(
-                f"page '{name}' is {array.dtype} of shape {array.shape}, expected numbers in two"
-                " dimensions or a stack of such images"
-            )
-    if KEY in metadata:
-        raise InputError(f"'metadata' has a key {KEY!r}, which is that of the checksum: rename it")
-    description = json.dumps({**metadata, KEY: checksum(pages, metadata)})
+    text = json.dumps({**metadata, _CRC: _checksum(metadata)}, separators=_SEPARATORS)
     with write_whole(path, force=force) as temporary:
-        write(temporary, pages, description)
+        kind.write_pages(temporary, pages, text)
 
 
 def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
@@ -83,53 +83,43 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
     Raises
     ------
     FileError
-        If the file is not readable, was not written by `save_pages`, or differs from its checksum.
-        A file written before there were checksums has none.
+        If the file is not readable, was not written by `save_pages`, or its metadata differ from
+        their checksum.
     InputError
         If the suffix is unknown.
     """
     path = as_path("path", path)
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
+    kind = _FORMATS.get(path.suffix.lower())
+    if kind is None:
         raise InputError(
             f"{path}: ends in '{path.suffix}', expected a .tif or .npz file that equipix has saved"
         )
     with reading(path):
-        pages, description = read(path)
-    try:
-        metadata = json.loads(description)
-    except ValueError as error:
+        pages, text = kind.read_pages(path)
+    metadata = _parsed(text)
+    if _CRC not in metadata:
         raise FileError(
             f"{path}: holds neither a correction nor frame statistics: equipix did not write it"
-        ) from error
-    if isinstance(metadata, dict) and KEY in metadata:
-        _check_sum(path, pages, metadata, metadata.pop(KEY))
+        )
+    if metadata.pop(_CRC) != _checksum(metadata):
+        raise FileError(
+            f"{path}: is damaged: its metadata differ from their checksum: use a copy, or make it "
+            "again"
+        )
     return pages, metadata
 
 
-def kind_of(path: Path) -> str | None:
-    """Kind of content in a file that `save_pages` wrote, of which no array is read; else None.
-
-    Raises
-    ------
-    FileError
-        If the file is not readable.
-    """
-    read = _DESCRIPTIONS.get(path.suffix.lower())
-    if read is None:
-        return None
-    with reading(path):
-        return _kind(read(path))
+def _checksum(metadata: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(dict(metadata)).encode())
 
 
-def _kind(description: str) -> str | None:
-    """Kind of content that the text of a file names."""
+def _parsed(text: str) -> dict[str, Any]:
+    """Return the metadata in a text; empty where it is none of `save_pages`."""
     try:
-        content = json.loads(description)
+        content = json.loads(text)
     except ValueError:
-        return None
-    kind = content.get("kind") if isinstance(content, dict) else None
-    return kind if isinstance(kind, str) else None
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def saved_kind(path: Path) -> str | None:
@@ -140,7 +130,13 @@ def saved_kind(path: Path) -> str | None:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES or (suffix != ".npz" and frame_format(path)[1].kind != "f"):
         return None
-    return kind_of(path)
+    with reading(path):
+        return _kind(_FORMATS[suffix].description(path))
+
+
+def _kind(text: str) -> str | None:
+    kind = _parsed(text).get("kind")
+    return kind if isinstance(kind, str) else None
 
 
 def refuse_saved(path: Path) -> None:
@@ -167,43 +163,3 @@ def raw_header(path: Path) -> Header:
     found = header(path)
     _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)
     return found
-
-
-def _write_npz(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
-    with path.open("wb") as file:
-        np.savez(file, allow_pickle=False, metadata=np.array(description), **pages)
-
-
-def _check_npz(path: Path) -> None:
-    """Refuse another kind of file before NumPy takes it for pickled objects."""
-    if not path.exists():
-        raise FileError(f"{path}: does not exist")
-    if not zipfile.is_zipfile(path):
-        raise FileError(f"{path}: is no .npz file, whatever its name says")
-
-
-def _read_npz(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
-    _check_npz(path)
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        pages = {name: file[name] for name in file.files}
-    return pages, str(pages.pop("metadata", ""))
-
-
-def _description_of_npz(path: Path) -> str:
-    _check_npz(path)
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        return str(file["metadata"]) if "metadata" in file.files else ""
-
-
-SUFFIXES = (".tif", ".tiff", ".npz")
-"""Formats of `save_pages`."""
-
-_WRITERS = {".tif": tiff.write_pages, ".tiff": tiff.write_pages, ".npz": _write_npz}
-
-_READERS = {".tif": tiff.read_pages, ".tiff": tiff.read_pages, ".npz": _read_npz}
-
-_DESCRIPTIONS = {
-    ".tif": tiff.description,
-    ".tiff": tiff.description,
-    ".npz": _description_of_npz,
-}

@@ -1,102 +1,291 @@
-"""Checks of saved arrays and metadata: format, names, dtypes, shapes, checksums."""
+"""Results as records: dataclasses to named arrays and JSON values, and back.
+
+A class of results is a frozen dataclass with the base `Record`. The annotations of its fields
+state all that is stored. An array has its types and its axes beside it::
+
+    Map = Annotated[Array, "float32|float64", "rows cols"]
+
+    @dataclass(frozen=True, eq=False)
+    class Gain(Record, kind="gain", version=1):
+        gain: Map
+        variance: Map | None
+        source: dict[str, Any]
+
+An axis is a number, or a name that stands for one size in the whole record; ``*`` has any size.
+Other fields become JSON values: numbers, texts, literals, tuples, mappings, dataclasses and named
+tuples of these or of arrays, each of them or None. There the place of an array holds its type,
+shape and CRC-32.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
+import typing
 import zlib
-from collections.abc import Mapping
+from functools import cache
 from os import PathLike
-from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from equipix.errors import FileError
+from equipix._check import Array, Floats, ReadOnly
+from equipix._native import __version__
+from equipix.errors import FileError, InputError
+from equipix.io.formats import load_pages, save_pages
 
-KEY = "crc32"
-"""Name of the checksum in the metadata of a file."""
+Map = Annotated[Array, "float32|float64", "rows cols"]
 
+Doubles = Annotated[Floats, "float64", "rows cols"]
 
-def checksum(pages: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> int:
-    """CRC-32 of the metadata, and of the name, type, shape and bytes of each array.
+Counts = Annotated[Array, "uint32", "rows cols"]
+"""Counts or flags of the pixels."""
 
-    Bytes count in little-endian order, which the type of another machine does not change.
-    """
-    total = zlib.crc32(json.dumps(dict(metadata)).encode())
-    for name, array in pages.items():
-        plain = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-        header = json.dumps([name, plain.dtype.str, plain.shape])
-        total = zlib.crc32(plain.data, zlib.crc32(header.encode(), total))
-    return total
+UNSAVED = {"saved": False}
+"""Metadata of a field that no file holds: reading one gives its default."""
 
+_MISFITS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""What is raised where values do not fit their annotations, or the checks of a class."""
 
-def _check_sum(
-    path: Path, pages: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any], wanted: object
-) -> None:
-    """Refuse arrays and metadata that are not those that were written."""
-    if checksum(pages, metadata) != wanted:
-        raise FileError(
-            f"{path}: is damaged: its arrays or metadata differ from its checksum: use a copy, or "
-            "make it anew"
-        )
+_NOT_FINITE = ("nan", "inf", "-inf")
+"""Numbers that JSON lacks, as texts."""
+
+_PLAIN: dict[Any, Any] = {bool: bool, int: int, float: (float, int), str: str}
+"""Types of the JSON values of an annotation."""
 
 
-def check_format(path: str | PathLike[str], content: object, kind: str, newest: int) -> None:
-    """Refuse the metadata of another kind of file than `kind`, or of a format above `newest`.
+class Record(ReadOnly):
+    """Base of results that are saved: frozen dataclasses with read-only arrays."""
 
-    Raises
-    ------
-    FileError
-        If the metadata are not of such a file.
-    """
-    if not isinstance(content, dict) or content.get("kind") != kind:
-        held = content.get("kind") if isinstance(content, dict) else None
-        raise FileError(
-            f"{path}: holds {held or 'something else'}, expected {kind} that equipix has saved"
-        )
-    number = content.get("format")
-    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
-        raise FileError(f"{path}: is damaged: its format is {number!r}, expected a whole number")
-    if number > newest:
-        raise FileError(
-            f"{path}: has format {number}, this version of equipix reads up to {newest}: install"
-            " a newer one"
-        )
+    KIND: ClassVar[str]
+    VERSION: ClassVar[int]
+
+    def __init_subclass__(cls, *, kind: str, version: int) -> None:
+        """Name the kind in the metadata of a file, and the version of its content."""
+        cls.KIND, cls.VERSION = kind, version
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Write to a file that `equipix.load` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
+        force : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            If the file exists and `force` is not set, or it cannot be written.
+        InputError
+            If the suffix is unknown, or a value has not the type or shape that files hold.
+        """
+        held = _Arrays({})
+        try:
+            fields = _encoded(self, type(self), "", held)
+            json.dumps(fields)
+        except _MISFITS as error:
+            raise InputError(f"this {self.KIND} cannot be saved: {error}") from error
+        content = {"kind": self.KIND, "version": self.VERSION, "equipix": __version__}
+        save_pages(path, held.by_name, content | {"fields": fields}, force=force)
 
 
-def check_pages(
-    path: str | PathLike[str],
-    pages: Mapping[str, NDArray[Any]],
-    wanted: Mapping[str, type],
-    stacks: Mapping[str, type] | None = None,
-) -> None:
-    """Refuse pages without those required, or that are not all maps of one sensor.
+Kind = TypeVar("Kind", bound=Record)
+
+
+def read_record(path: str | PathLike[str], *kinds: type[Kind]) -> Kind:
+    """Read a record of one of some classes from the file that its `save` wrote.
 
     Parameters
     ----------
     path : path
-        The file they are from.
-    pages : mapping of str to ndarray
-        Arrays by name.
-    wanted : mapping of str to type
-        Dtype, or kind of dtype, of each page of shape (rows, cols) that must be there.
-    stacks : mapping of str to type, optional
-        The same of pages of shape (n, rows, cols).
+        The file.
+    *kinds : type
+        The classes that are wanted.
+
+    Returns
+    -------
+    Record
+        As it was saved, bit by bit.
 
     Raises
     ------
     FileError
-        If a page is missing, or has another dtype, rank or shape.
+        If the file cannot be read, is damaged, or holds another kind or version.
+    InputError
+        If the suffix is unknown.
     """
-    first = next(iter(wanted))
-    for name, dtype in {**wanted, **(stacks or {})}.items():
-        if name not in pages:
-            raise FileError(f"{path}: is damaged: lacks the page '{name}'")
-        page, (ndim, word) = pages[name], (2, "two") if name in wanted else (3, "three")
-        fits = page.ndim == ndim and page.shape[-2:] == pages[first].shape
-        if not (fits and np.issubdtype(page.dtype, dtype)):
-            raise FileError(
-                f"{path}: is damaged: page '{name}' is {page.dtype} of shape {page.shape},"
-                f" expected {dtype.__name__} in {word} dimensions, as large as '{first}'"
+    arrays, content = load_pages(path)
+    wanted = {each.KIND: each for each in kinds}
+    kind = str(content.get("kind"))
+    if kind not in wanted:
+        raise FileError(
+            f"{path}: holds {kind}, expected {' or '.join(wanted)} that equipix has saved: name "
+            "such a file"
+        )
+    version, known = content.get("version"), wanted[kind].VERSION
+    if version != known:
+        raise FileError(
+            f"{path}: holds {kind} of version {version}, this version of equipix reads version "
+            f"{known}: make the file again, or install the equipix that wrote it"
+        )
+    held = _Arrays(arrays)
+    try:
+        found: Kind = _decoded(content["fields"], wanted[kind], "", held)
+        held.refuse_rest()
+    except _MISFITS as error:
+        raise FileError(
+            f"{path}: is damaged: {error} (in {kind}): use a copy, or make it again"
+        ) from error
+    return found
+
+
+class _Arrays:
+    """Arrays of a record by name; types, sizes and checksums are checked on the way in and out."""
+
+    def __init__(self, by_name: dict[str, Array]) -> None:
+        self.by_name = by_name
+        self._sizes: dict[str, int] = {}
+
+    def put(self, name: str, array: Array, dtypes: str, axes: str) -> dict[str, Any]:
+        """Take an array of a record, as an image or a stack; return what stands in its place."""
+        self._check(name, array, dtypes, axes)
+        stored = array.view(np.uint8) if array.dtype == np.bool_ else array
+        self.by_name[name] = np.atleast_2d(stored)
+        shape = [*array.shape]
+        return {"dtype": array.dtype.name, "shape": shape, "crc32": _checksum(array)}
+
+    def take(self, name: str, told: dict[str, Any], dtypes: str, axes: str) -> Array:
+        """Give back the array in whose place `told` stands."""
+        if name not in self.by_name:
+            raise ValueError(f"array '{name}' is missing")
+        array = self.by_name.pop(name).reshape(told["shape"])
+        if told["dtype"] == "bool" and array.dtype == np.uint8:
+            array = array.astype(np.bool_)
+        self._check(name, array, dtypes, axes)
+        if (array.dtype.name, _checksum(array)) != (told["dtype"], told["crc32"]):
+            raise ValueError(f"array '{name}' differs from its checksum")
+        return array
+
+    def refuse_rest(self) -> None:
+        """Refuse arrays that have no place in the record."""
+        if self.by_name:
+            raise ValueError(f"arrays {', '.join(self.by_name)} have no place in it")
+
+    def _check(self, name: str, array: Array, dtypes: str, axes: str) -> None:
+        """Refuse another type or number of axes, and axes of one name and several sizes."""
+        wanted = axes.split()
+        fits = array.dtype.name in dtypes.split("|") and array.ndim == len(wanted)
+        for axis, size in zip(wanted, array.shape, strict=False):
+            known = int(axis) if axis.isdecimal() else self._sizes.get(axis, size)
+            fits = fits and size > 0 and size == known
+            if axis != "*":
+                self._sizes.setdefault(axis, size)
+        if not fits:
+            sizes = " ".join(str(self._sizes.get(axis, axis)) for axis in wanted)
+            raise ValueError(
+                f"array '{name}' is {array.dtype} of shape {array.shape}, expected {dtypes} with "
+                f"the axes ({axes}), here ({sizes})"
             )
+
+
+def _checksum(array: Array) -> int:
+    """CRC-32 of the bytes in little-endian order, the same on every machine."""
+    return zlib.crc32(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).data)
+
+
+def _encoded(value: Any, hint: Any, name: str, held: _Arrays) -> Any:
+    """Return the JSON value of a field; its arrays go to `held`."""
+    inner = _without_none(hint)
+    if value is None and inner is not hint:
+        return None
+    if typing.get_origin(inner) is Annotated:
+        return held.put(name, value, *inner.__metadata__)
+    if fields := _fields(inner):
+        return {
+            key: _encoded(getattr(value, key), each, _joined(name, key), held)
+            for key, each in fields.items()
+        }
+    if typing.get_origin(inner) is dict:
+        each = typing.get_args(inner)[1]
+        return {key: _encoded(it, each, _joined(name, key), held) for key, it in value.items()}
+    if typing.get_origin(inner) is tuple:
+        return [_encoded(it, each, key, held) for it, each, key in _items(value, inner, name)]
+    plain = value.item() if isinstance(value, np.generic) else value
+    _check_plain(plain, inner, name)
+    return str(plain) if inner is float and not math.isfinite(plain) else plain
+
+
+def _decoded(told: Any, hint: Any, name: str, held: _Arrays) -> Any:
+    """Return the value of a field from its JSON value and the arrays that `held` has."""
+    inner = _without_none(hint)
+    if told is None and inner is not hint:
+        return None
+    if typing.get_origin(inner) is Annotated:
+        return held.take(name, told, *inner.__metadata__)
+    if fields := _fields(inner):
+        if told.keys() != fields.keys():
+            raise ValueError(f"'{name}' holds {', '.join(told)}, expected {', '.join(fields)}")
+        return inner(
+            **{
+                key: _decoded(told[key], each, _joined(name, key), held)
+                for key, each in fields.items()
+            }
+        )
+    if typing.get_origin(inner) is dict:
+        each = typing.get_args(inner)[1]
+        return {key: _decoded(it, each, _joined(name, key), held) for key, it in told.items()}
+    if typing.get_origin(inner) is tuple:
+        return tuple(_decoded(it, each, key, held) for it, each, key in _items(told, inner, name))
+    if inner is float and told in _NOT_FINITE:
+        return float(told)
+    _check_plain(told, inner, name)
+    return told
+
+
+@cache
+def _fields(hint: Any) -> dict[str, Any]:
+    """Annotations of the fields of a dataclass or a named tuple that are stored; else none."""
+    if dataclasses.is_dataclass(hint):
+        names = [each.name for each in dataclasses.fields(hint) if each.metadata != UNSAVED]
+    else:
+        names = [*getattr(hint, "_fields", ())]
+    hints = typing.get_type_hints(hint, include_extras=True) if names else {}
+    return {name: hints[name] for name in names}
+
+
+def _without_none(hint: Any) -> Any:
+    """Return what an annotation allows beside None; itself where None is not allowed."""
+    if typing.get_origin(hint) not in (typing.Union, UnionType):
+        return hint
+    (inner,) = (each for each in typing.get_args(hint) if each is not NoneType)
+    return inner
+
+
+def _items(values: Any, hint: Any, name: str) -> list[tuple[Any, Any, str]]:
+    """Entries of a tuple with the annotation and the name of each."""
+    hints = typing.get_args(hint)
+    if hints[-1] is Ellipsis:
+        hints = hints[:1] * len(values)
+    names = (f"{name}.{number}" for number in range(len(values)))
+    return [*zip(values, hints, names, strict=True)]
+
+
+def _joined(name: str, key: str) -> str:
+    return f"{name}.{key}" if name else key
+
+
+def _check_plain(value: Any, hint: Any, name: str) -> None:
+    """Refuse a JSON value of another type than its annotation."""
+    if hint is Any:
+        return
+    if typing.get_origin(hint) is typing.Literal:
+        fits, wanted = value in typing.get_args(hint), f"one of {typing.get_args(hint)}"
+    else:
+        fits, wanted = isinstance(value, _PLAIN[hint]), hint.__name__
+        fits = fits and (hint is bool) == isinstance(value, bool)
+    if not fits:
+        raise ValueError(f"'{name}' is {value!r}, expected {wanted}")

@@ -112,10 +112,14 @@ def write_pages(path: Path, pages: Mapping[str, NDArray[Any]], description: str)
     """Write named arrays as pages, with a description of the first.
 
     The images of a stack have the stack's name and are numbered; a single image has no number.
+    Arrays of other sizes than the first one's are the last pages: tifffile takes all pages for
+    equal where a few at the beginning and the last are.
     """
+    sizes = [array.shape[-2:] for array in pages.values()]
+    ordered = sorted(pages.items(), key=lambda each: each[1].shape[-2:] != sizes[0])
     big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
     with tifffile.TiffWriter(path, bigtiff=big) as file:
-        for name, array in pages.items():
+        for name, array in ordered:
             named = (_PAGE_NAME, "s", 0, name, True)
             images = [array] if array.ndim == 2 else array
             for number, image in enumerate(images):

@@ -27,13 +27,13 @@ from equipix._check import (
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
+from equipix.io.record import read_record
 from equipix.measured.saturation import level_of
 from equipix.measured.statistics import (
     FrameStatistics,
     _masked,
     _step,
     _subtract,
-    load_statistics,
     saved_shape,
 )
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
@@ -199,7 +199,7 @@ def _saved(paths: list[Path], how: _How) -> FrameStatistics:
         )
     if how.rejection is not None:
         raise InputError(f"{path}: holds averaged frames, from which 'reject' cannot leave out any")
-    statistics = load_statistics(path)
+    statistics = read_record(path, FrameStatistics)
     level = how.level
     if level is not None and statistics.saturation not in (None, level):
         raise FileError(

@@ -1,4 +1,4 @@
-r"""Averaged frames, their dark, their light between frames, and files of them.
+r"""Averaged frames, their dark, and their light between frames.
 
 Frames of light 1 + δ make a pixel of signal μ scatter by μ² var(δ) besides its noise. The means of
 the frames show it. Where a share f of a pixel's samples is missing, frames are means over different
@@ -14,49 +14,36 @@ with the signals of the pixels that follow the light.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from equipix._check import Array, Floats, ReadOnly, check_maps
-from equipix.errors import FileError, InputError
+from equipix._check import Array, Floats, check_maps
+from equipix.errors import InputError
 from equipix.findings import Rule
-from equipix.io.formats import load_pages, refuse_saved, save_pages, saved_kind
-from equipix.io.record import check_format, check_pages
+from equipix.io.formats import refuse_saved, saved_kind
+from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.measured.noise import scatter_limit, step_of
 
-_FORMAT = 1  # of saved statistics; files with a larger number are refused
-
-_KIND = "frame statistics"
-
-_PAGES = {
-    "mean": np.float64,
-    "variance": np.float64,
-    "variance_of_mean": np.float64,
-    "count": np.uint32,
-    "saturated": np.uint32,
-}
+_MAPS = ("mean", "variance", "variance_of_mean", "count", "saturated")
 
 _COUNTS = ("count", "saturated")
 
-_NUMBERS = ("saturation", "reject", "step", "light_variance")
-
 _SAMPLED = 4096  # pixels that show the step between values
-
-_DARK = "dark_"  # before the names of the dark's pages
 
 DARKER = 0.25
 """Share of the dark by which frames are not darker than it: a dark drifts by less."""
 
 
 @dataclass(frozen=True, eq=False)
-class FrameStatistics(ReadOnly):
+class FrameStatistics(Record, kind="frame statistics", version=2):
     """Mean and scatter of repeated frames of one scene, as read-only arrays.
+
+    `equipix.average`, experiment.toml and the command line take the file that `save` writes in the
+    place of the frames.
 
     Attributes
     ----------
@@ -82,9 +69,7 @@ class FrameStatistics(ReadOnly):
         count.
     step : float
         Step between the values of the frames, in DN: 1 of whole numbers, 16 of 12 bits that were
-        shifted to 16; 0 of values that are not whole. Of files that hold no
-        step it is found from the sums over frames; it is 0 where they are not whole, since the dark
-        that was subtracted is not kept.
+        shifted to 16; 0 of values that are not whole.
     light_variance : float or None
         Unbiased variance of the means of the frames over the pixels that are not masked, in DN²:
         that of the light, and of the noise over the number of pixels. Where samples are missing it
@@ -92,11 +77,11 @@ class FrameStatistics(ReadOnly):
         where it is not known: a saved average does not show it without the pixels of another mask.
     """
 
-    mean: NDArray[Any]
-    variance: NDArray[Any]
-    variance_of_mean: NDArray[Any]
-    count: NDArray[Any]
-    saturated: NDArray[Any]
+    mean: Doubles
+    variance: Doubles
+    variance_of_mean: Doubles
+    count: Counts
+    saturated: Counts
     dark: FrameStatistics | None = None
     saturation: float | None = None
     raw: bool = False
@@ -106,122 +91,23 @@ class FrameStatistics(ReadOnly):
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
-        ReadOnly.__post_init__(self)
+        super().__post_init__()
         dark = {} if self.dark is None else {"dark": self.dark.mean}
         check_maps("FrameStatistics", self.maps | dark)
 
     @property
     def maps(self) -> dict[str, NDArray[Any]]:
         """The five maps by their names."""
-        return {name: getattr(self, name) for name in _PAGES}
-
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `FrameStatistics.load` reads.
-
-        `equipix.average`, experiment.toml and the command line take the file in the place of the
-        frames.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        """
-        save_statistics(path, self, force=force)
-
-    @staticmethod
-    def load(path: str | PathLike[str]) -> FrameStatistics:
-        """Read what `save` wrote.
-
-        Parameters
-        ----------
-        path : str or path
-            A .tif or .npz file.
-
-        Returns
-        -------
-        FrameStatistics
-            The averaged frames.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be read, holds something else, or was written in a newer format.
-        """
-        return load_statistics(path)
-
-
-def save_statistics(
-    path: str | PathLike[str], statistics: FrameStatistics, *, force: bool = False
-) -> None:
-    """Write averaged frames; the parameters and errors are those of `FrameStatistics.save`."""
-    pages, dark = dict(statistics.maps), statistics.dark
-    content: dict[str, Any] = {"format": _FORMAT, "kind": _KIND}
-    content |= {name: getattr(statistics, name) for name in ("raw", *_NUMBERS)}
-    if dark is not None:
-        pages |= {_DARK + name: values for name, values in dark.maps.items()}
-        content |= {_DARK + name: getattr(dark, name) for name in _NUMBERS}
-    save_pages(path, pages, content, force=force)
-
-
-def load_statistics(path: str | PathLike[str]) -> FrameStatistics:
-    """Read averaged frames; the parameter and errors are those of `FrameStatistics.load`."""
-    return read_statistics(path, *load_pages(path))
-
-
-def read_statistics(
-    path: str | PathLike[str], pages: Mapping[str, NDArray[Any]], content: dict[str, Any]
-) -> FrameStatistics:
-    """Make averages of the arrays and metadata of the file that `save_statistics` wrote."""
-    check_format(path, content, _KIND, _FORMAT)
-    check_pages(path, pages, _PAGES)
-    dark = None
-    if _DARK + "mean" in pages:
-        check_pages(path, pages, {_DARK + name: dtype for name, dtype in _PAGES.items()})
-        dark = _of_pages(path, pages, content, _DARK)
-    raw = content.get("raw", False)
-    statistics = dataclasses.replace(_of_pages(path, pages, content), dark=dark, raw=raw)
-    return statistics if "step" in content else _with_steps(statistics)
-
-
-def _with_steps(statistics: FrameStatistics) -> FrameStatistics:
-    """Find the steps of averages that were saved without: sums over frames still show them."""
-    dark, mean = statistics.dark, statistics.mean
-    if dark is not None:
-        dark, mean = _with_steps(dark), mean + dark.mean
-    step = _step(mean, statistics.variance, statistics.count)
-    return dataclasses.replace(statistics, dark=dark, step=step)
-
-
-def _of_pages(
-    path: str | PathLike[str],
-    pages: Mapping[str, NDArray[Any]],
-    content: dict[str, Any],
-    before: str = "",
-) -> FrameStatistics:
-    mean, variance, of_mean, count, saturated = (pages[before + name] for name in _PAGES)
-    numbers = {name: content[before + name] for name in _NUMBERS if before + name in content}
-    for name, value in numbers.items():
-        if type(value) not in (int, float) and (name == "step" or value is not None):
-            raise FileError(
-                f"{path}: is damaged: its '{before}{name}' is {value!r}, expected a number"
-            )
-    return FrameStatistics(mean, variance, of_mean, count, saturated, **numbers)
+        return {name: getattr(self, name) for name in _MAPS}
 
 
 def saved_shape(path: Path) -> tuple[int, int] | None:
     """Rows and columns of the averages in a file; None of frames. A calibration is an error."""
     if (kind := saved_kind(path)) is None:
         return None
-    if kind != _KIND:
+    if kind != FrameStatistics.KIND:
         refuse_saved(path)
-    rows, cols = load_statistics(path).mean.shape
+    rows, cols = read_record(path, FrameStatistics).mean.shape
     return rows, cols
 
 

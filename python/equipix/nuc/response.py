@@ -1,11 +1,9 @@
-"""Response curves as a correction, and files of them."""
+"""Response curves as a correction."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from os import PathLike
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,8 +13,7 @@ from equipix.correction.apply import CorrectionBase, apply, checked_frames
 from equipix.correction.protocol import Dark, named_cfa, with_dark
 from equipix.errors import InputError
 from equipix.findings import Finding, usable
-from equipix.io.formats import save_pages
-from equipix.io.record import check_format, check_pages
+from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
 from equipix.nuc.curves import counted_from, exact_inverse, response_at
@@ -26,7 +23,7 @@ _LARGEST = int(np.iinfo(np.uint32).max)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Response(CorrectionBase):
+class Response(CorrectionBase, Record, kind="response", version=2):
     """Response curves of all pixels, the result of `equipix.nuc.fit`; its arrays are read-only.
 
     Attributes
@@ -80,16 +77,16 @@ class Response(CorrectionBase):
     small for a good pixel. A pixel with K = −1 does not respond, and 1/(1 + K) is without bound.
     """
 
-    deviation: Floats
-    variances: Floats
-    inverse: Floats
-    inverse_error: Floats
-    limits: Floats
-    reduced_chi2: Floats
-    used: Array
-    flags: Array
-    levels: Floats
-    dark: Array | None = None
+    deviation: Annotated[Floats, "float64", "terms rows cols"]
+    variances: Annotated[Floats, "float64", "terms rows cols"]
+    inverse: Annotated[Floats, "float64", "terms_of_inverse rows cols"]
+    inverse_error: Doubles
+    limits: Annotated[Floats, "float64", "2 rows cols"]
+    reduced_chi2: Doubles
+    used: Counts
+    flags: Counts
+    levels: Annotated[Floats, "float64", "levels"]
+    dark: Map | None = None
     raw: bool = False
     saturation: float | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -98,6 +95,17 @@ class Response(CorrectionBase):
     findings: tuple[Finding, ...] = ()
     takes_dark: ClassVar[bool] = True
     needs_dark: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse numbers of coefficients that do not fit together, and filters that are none."""
+        super().__post_init__()
+        terms, inverse = len(self.deviation), len(self.inverse)
+        if terms not in range(1, 5) or inverse != (2 if terms < 3 else 4):
+            raise InputError(
+                f"'deviation' has {terms} coefficients and 'inverse' {inverse}, expected 1 or 2 "
+                "and 2, or 3 or 4 and 4"
+            )
+        Colours.of(self.cfa)
 
     @property
     def leaves_offset(self) -> bool:
@@ -272,25 +280,6 @@ class Response(CorrectionBase):
             metadata = {**metadata, "sensor": {**metadata.get("sensor", {}), "cfa": colours.rows}}
         return replace(self, flags=self.flags | more.astype(np.uint32), metadata=metadata)
 
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write to a file that `equipix.load` reads.
-
-        Parameters
-        ----------
-        path : str or path
-            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
-        force : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        FileError
-            If the file exists and `force` is not set, or it cannot be written.
-        InputError
-            If the suffix is unknown.
-        """
-        save_fields(path, vars(self), force=force)
-
     @property
     def _rising(self) -> Floats:
         """Coefficients of the curves that have an inverse, NaN elsewhere."""
@@ -311,83 +300,3 @@ def common_misfit(response: Response) -> float:
     noise = median_of_noise(response.freedom[judged])
     chi2 = response.reduced_chi2[judged]
     return float(min(np.median(chi2 / noise), chi2.mean()))
-
-
-KIND = "response"
-"""The kind in the metadata of the file."""
-
-FORMAT = 1
-"""Number of the file format; a file with a higher one is refused."""
-
-_MAPS: dict[str, type] = {
-    "flags": np.uint32,
-    "inverse_error": np.float64,
-    "reduced_chi2": np.float64,
-    "used": np.uint32,
-}
-
-_STACKS: dict[str, type] = dict.fromkeys(
-    ("deviation", "variances", "inverse", "limits"), np.float64
-)
-
-
-def save_fields(path: str | PathLike[str], fields: Mapping[str, Any], *, force: bool) -> None:
-    """Write the attributes of a `Response` to a file; see `Response.save`."""
-    pages = {name: fields[name] for name in (*_STACKS, *_MAPS)}
-    if fields["dark"] is not None:
-        pages["dark"] = fields["dark"]
-    content = {
-        "format": FORMAT,
-        "kind": KIND,
-        "levels": fields["levels"].tolist(),
-        "raw": fields["raw"],
-        "saturation": fields["saturation"],
-        "metadata": fields["metadata"],
-        "findings": [vars(each) for each in fields["findings"]],
-    }
-    if fields["cfa"] is not None:
-        content["cfa"] = fields["cfa"].rows
-        content["colour_response"] = fields["colour_response"]
-    save_pages(path, pages, content, force=force)
-
-
-def read_fields(
-    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
-) -> dict[str, Any]:
-    """Make the attributes of a `Response` of the arrays and metadata that `save_fields` wrote.
-
-    Raises
-    ------
-    FileError
-        If the format is newer than `FORMAT`, or a page is missing or does not fit.
-    KeyError, TypeError, ValueError
-        If a number is missing or is something else.
-    """
-    check_format(path, content, KIND, FORMAT)
-    maps = _MAPS | dict.fromkeys({"dark"} & pages.keys(), np.floating)
-    check_pages(path, pages, maps, _STACKS)
-    sizes = {name: len(pages[name]) for name in _STACKS}
-    orders = range(1, 5)
-    if sizes["deviation"] not in orders or sizes["variances"] != sizes["deviation"]:
-        raise ValueError(f"stacks of {sizes} images, expected a deviation of 1 to 4")
-    if sizes["inverse"] != (2 if sizes["deviation"] < 3 else 4) or sizes["limits"] != 2:
-        raise ValueError(f"stacks of {sizes} images, expected an inverse of 2 or 4 and 2 limits")
-    level = content["saturation"]
-    return {
-        **{name: pages[name] for name in (*_MAPS, *_STACKS)},
-        "dark": pages.get("dark"),
-        "levels": np.array(content["levels"], dtype=np.float64),
-        "raw": bool(content["raw"]),
-        "saturation": None if level is None else float(level),
-        "metadata": content["metadata"],
-        "cfa": Colours.of(content.get("cfa")),
-        "colour_response": content.get("colour_response"),
-        "findings": tuple(Finding(**each) for each in content["findings"]),
-    }
-
-
-def read_response(
-    path: str | PathLike[str], pages: Mapping[str, Array], content: dict[str, Any]
-) -> Response:
-    """Make a response of the arrays and metadata of the file that `Response.save` wrote."""
-    return Response(**read_fields(path, pages, content))

@@ -147,7 +147,7 @@ def draw_demo(demo: Demo) -> Figure:
     _densities(rows[2, 0], "Errors of pixels", "error, %", pixels, predicted)
     _densities(rows[2, 1], "Errors of 16×16 means", "error, %", blocks, predicted_blocks)
     history = demo.calibration.history
-    rows[2, 2].semilogy(history.sweep, 100 * history.error_estimate, marker="o")
+    rows[2, 2].semilogy(history["sweep"], 100 * history["error_estimate"], marker="o")
     rows[2, 2].set(title="Estimated distance from the optimum, %", xlabel="sweep", ylabel="%")
     rows[2, 2].grid(alpha=0.3)
     return figure

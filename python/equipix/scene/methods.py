@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from equipix._check import Array, as_array, number
+from equipix._check import Array, as_array, number, positive_workers
 from equipix._native import SceneCorrection as Native
 from equipix.errors import EquipixError, FileError
-from equipix.scene.scene_correction import DataRange, SceneCorrection, read_state, whole_number
+from equipix.scene.scene_correction import DataRange, SceneCorrection, SceneState, whole_number
 
 FOUR = ((0, 1, 0), (1, 0, 1), (0, 1, 0))
 """Weights of the mean of four neighbours."""
@@ -435,36 +435,29 @@ METHODS: dict[str, type[SceneCorrection]] = {
 """The class of each method by its name."""
 
 
-def load(
-    path: str | PathLike[str],
-    *,
-    shape: tuple[int, int] | None = None,
-    workers: int | None = None,
+def resumed(
+    path: str | PathLike[str], state: SceneState, *, workers: int | None = None
 ) -> SceneCorrection:
-    """Read a state of any method from the file that `save` wrote.
-
-    Parameters
-    ----------
-    path : str or path
-        The file; its suffix, .tif or .npz, names the format.
-    shape : tuple of int, optional
-        Sizes of the sensor; a state of another size is refused.
-    workers : int, optional
-        Number of threads; by default one for each processor.
-
-    Returns
-    -------
-    SceneCorrection
-        In the state in which it was saved.
+    """Make the correction of a state that was read from a file.
 
     Raises
     ------
     FileError
-        If the file cannot be read, is damaged, or holds something else or a newer format.
+        If no correction can have that state.
     """
-    maps, content = read_state(path, None, shape)
-    if content["method"] not in METHODS:
-        raise FileError(
-            f"{path}: holds a state of '{content['method']}', expected {' or '.join(METHODS)}"
+    positive_workers(workers)
+    try:
+        made = METHODS[state.method](
+            state.shape,
+            state.data_range,
+            saturation=state.saturation,
+            workers=workers,
+            mask=state.mask,
+            **state.options,
         )
-    return METHODS[content["method"]].resumed(path, maps, content, workers)
+        made.restore(state)
+    except (ArithmeticError, KeyError, TypeError, ValueError) as error:
+        raise FileError(
+            f"{path}: is damaged: {error} (in {state.KIND}): use a copy, or learn again"
+        ) from error
+    return made

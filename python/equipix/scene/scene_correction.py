@@ -1,18 +1,17 @@
-"""What all corrections from the scene share: update, state, files."""
+"""What all corrections from the scene share: update and state."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
+from dataclasses import dataclass
 from os import PathLike
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from equipix._check import (
     Array,
+    Bools,
     as_array,
     as_level,
     check_shape,
@@ -22,10 +21,9 @@ from equipix._check import (
 )
 from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
-from equipix.errors import FileError, InputError
+from equipix.errors import InputError
 from equipix.findings import Rule, ask, say, set_bits
-from equipix.io.formats import load_pages, save_pages
-from equipix.io.record import check_format
+from equipix.io.record import Record
 from equipix.measured.defects import unresponsive
 
 DataRange = tuple[float, float]
@@ -277,7 +275,7 @@ class SceneCorrection:
         return Polynomial(coefficients, flags, metadata, self._saturation, True, said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Write the state to a file, from which `load` goes on with the same bytes.
+        """Write the state to a file, from which `equipix.load` goes on with the same bytes.
 
         Parameters
         ----------
@@ -292,82 +290,22 @@ class SceneCorrection:
             If the file exists and `force` is not set, or it cannot be written.
         """
         maps, counts = self._native.state()
-        content: dict[str, Any] = {
-            "method": self.method,
-            "shape": list(self._shape),
-            "data_range": list(self._range),
-            "saturation": self._saturation,
-            "options": self._options,
-            "counts": dict(counts),
-            "peak": self._peak,
-        }
-        mask = {"mask": self._mask.astype(np.float32)}
-        write_state(path, dict(maps) | mask, content, force=force)
+        SceneState(
+            dict(maps),
+            self._mask,
+            self.method,
+            self._shape,
+            self._range,
+            self._saturation,
+            self.options,
+            dict(counts),
+            self._peak,
+        ).save(path, force=force)
 
-    @classmethod
-    def load(
-        cls,
-        path: str | PathLike[str],
-        *,
-        shape: tuple[int, int] | None = None,
-        workers: int | None = None,
-    ) -> Self:
-        """Read a state that `save` wrote.
-
-        Parameters
-        ----------
-        path : str or path
-            The file.
-        shape : tuple of int, optional
-            Sizes of the sensor; a state of another size is refused.
-        workers : int, optional
-            Number of threads; by default one for each processor.
-
-        Returns
-        -------
-        SceneCorrection
-            In the state in which it was saved.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be read, is damaged, or holds the state of another method, size or of
-            a newer format.
-        """
-        maps, content = read_state(path, cls.method, shape)
-        return cls.resumed(path, maps, content, workers)
-
-    @classmethod
-    def resumed(
-        cls,
-        path: str | PathLike[str],
-        maps: Mapping[str, Array],
-        content: Mapping[str, Any],
-        workers: int | None,
-    ) -> Self:
-        """Make a correction of the parts of its file; the errors are those of `load`."""
-        positive_workers(workers)
-        try:
-            low, high = content["data_range"]
-            made = cls(
-                tuple(content["shape"]),
-                (float(low), float(high)),
-                saturation=content["saturation"],
-                workers=workers,
-                mask=maps.get("mask"),
-                **content["options"],
-            )
-            counts = [
-                (str(name), whole_number(name, count)) for name, count in content["counts"].items()
-            ]
-            made._native.restore(list(maps.items()), counts)
-            made._masked_at = made.frames_taken
-            peak = content["peak"]
-            made._peak = None if peak is None else number("peak", peak)
-            check_digest(maps, content)
-        except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
-            raise FileError(f"{path}: is damaged: {error}") from error
-        return made
+    def restore(self, state: SceneState) -> None:
+        """Go on from the maps and counts of a state; the errors are those of `resumed`."""
+        self._native.restore([*state.maps.items()], [*state.counts.items()])
+        self._masked_at, self._peak = self.frames_taken, state.peak
 
 
 def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
@@ -472,102 +410,16 @@ def _range_of(data_range: DTypeLike | DataRange) -> DataRange:
     return float(limits.min), float(limits.max)
 
 
-KIND = "state of a correction from the scene"
-"""The kind in the metadata of the file."""
+@dataclass(frozen=True, eq=False)
+class SceneState(Record, kind="state of a correction from the scene", version=5):
+    """All that a correction from the scene remembers: its options, maps and counts."""
 
-FORMAT = 4
-"""Number of the file format; a file with another one is refused."""
-
-_CONTENT = frozenset({"method", "shape", "data_range", "saturation", "options", "counts", "peak"})
-"""What is remembered beside the maps."""
-
-
-def write_state(
-    path: str | PathLike[str], maps: Mapping[str, Array], content: Mapping[str, Any], *, force: bool
-) -> None:
-    """Write a state; see `SceneCorrection.save`."""
-    digest = {"digest": _digest(maps, content)}
-    save_pages(path, maps, {"format": FORMAT, "kind": KIND, **content, **digest}, force=force)
-
-
-def check_digest(maps: Mapping[str, Array], content: Mapping[str, Any]) -> None:
-    """Refuse a state of which any byte is not the one that was saved.
-
-    Raises
-    ------
-    InputError
-        If the digest is that of another state.
-    """
-    held = {key: content[key] for key in sorted(_CONTENT)}
-    if content.get("digest") != _digest(maps, held):
-        raise InputError("'digest' is that of another state: maps or numbers were changed")
-
-
-def _digest(maps: Mapping[str, Array], content: Mapping[str, Any]) -> str:
-    """SHA-256 of all maps and of the content."""
-    found = hashlib.sha256(json.dumps(dict(content), sort_keys=True).encode())
-    for name, values in sorted(maps.items()):
-        found.update(name.encode() + np.ascontiguousarray(values).tobytes())
-    return found.hexdigest()
-
-
-def read_state(
-    path: str | PathLike[str], method: str | None, shape: tuple[int, int] | None
-) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Read the maps and the rest of a state.
-
-    Parameters
-    ----------
-    path : str or path
-        The file.
-    method : str, optional
-        The method that it must be of.
-    shape : tuple of int, optional
-        The sizes of the sensor that it must be of.
-
-    Returns
-    -------
-    maps : dict of str to ndarray
-        Maps by name, float32.
-    content : dict
-        Method, shape, range, options, counts and the largest raw value.
-
-    Raises
-    ------
-    FileError
-        If it is not such a state, or is damaged.
-    """
-    maps, content = load_pages(path)
-    check_format(path, content, KIND, FORMAT)
-    if content["format"] < FORMAT:
-        raise FileError(
-            f"{path}: has format {content['format']}, of an earlier version whose states lack the "
-            f"noise, the largest value or the pattern (format {FORMAT}): learn again"
-        )
-    if missing := _CONTENT - content.keys():
-        raise FileError(f"{path}: is damaged: lacks {', '.join(sorted(missing))}")
-    if method is not None and content["method"] != method:
-        raise FileError(f"{path}: holds a state of '{content['method']}', expected '{method}'")
-    held = _sizes(path, content["shape"])
-    if not isinstance(content["method"], str):
-        raise FileError(f"{path}: is damaged: 'method' is {content['method']!r}")
-    if shape is not None and held != tuple(shape):
-        raise FileError(f"{path}: holds a state of a sensor {held}, expected {tuple(shape)}")
-    for name, values in maps.items():
-        if values.dtype != np.float32 or values.ndim != 2:
-            raise FileError(
-                f"{path}: is damaged: page '{name}' is {values.dtype} of shape {values.shape}, "
-                "expected float32 in two dimensions"
-            )
-    return maps, content
-
-
-def _sizes(path: str | PathLike[str], shape: Any) -> tuple[int, int]:
-    """Rows and columns of the sensor, from the file."""
-    if (
-        isinstance(shape, list)
-        and len(shape) == 2
-        and all(isinstance(size, int) and not isinstance(size, bool) for size in shape)
-    ):
-        return shape[0], shape[1]
-    raise FileError(f"{path}: is damaged: 'shape' is {shape!r}, expected two whole numbers")
+    maps: dict[str, Annotated[Array, "float32", "* *"]]
+    mask: Annotated[Bools, "bool", "rows cols"]
+    method: str
+    shape: tuple[int, int]
+    data_range: DataRange
+    saturation: float | None
+    options: dict[str, Any]
+    counts: dict[str, int]
+    peak: float | None

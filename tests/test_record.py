@@ -1,0 +1,306 @@
+"""Every kind of result as a file: each bit comes back, and every change of one is noticed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zlib
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import pytest
+import tifffile
+
+import equipix
+from equipix import bolometer, hardware, nuc, simulate
+from equipix._check import Array
+from equipix.errors import FileError, InputError
+from equipix.exposures.positions import Orientation
+from equipix.findings import Finding
+from equipix.io.formats import load_pages, refuse_saved, save_pages
+from equipix.io.record import UNSAVED, Map, Record, read_record
+from equipix.loading import RECORDS
+from equipix.scene.methods import METHODS
+from equipix.scene.scene_correction import SceneState
+from records import rewrite
+
+SHAPE = (24, 32)
+SUFFIXES = (".tif", ".npz")
+
+
+def measured(level, count=6, seed=0):
+    rng = np.random.default_rng([seed, int(level)])
+    return np.rint(50 + level + np.sqrt(level + 4) * rng.standard_normal((count, *SHAPE))).astype(
+        np.uint16
+    )
+
+
+def calibration(**options):
+    shifts = equipix.cross_pattern(3, 5) + 0.25 * np.eye(5, 2)
+    truth = simulate.paper_sensitivity(SHAPE, rng=1)
+    frames = simulate.exposures(truth, simulate.gaussian_beam(SHAPE, width=60), shifts)
+    frames += 1e-3 * np.random.default_rng(2).standard_normal(frames.shape)
+    return equipix.calibrate(frames, shifts, tolerance=1e-3, **options)
+
+
+def learned(name):
+    method = METHODS[name](SHAPE, (0, 1))
+    for frame in simulate.MovingScene(seed=1, shape=SHAPE).frames(40):
+        method.update(frame.values)
+    return method
+
+
+def made():
+    """Results of all kinds."""
+    dark = equipix.average(measured(0), saturation=4095)
+    levels = [equipix.average(measured(level), dark=dark) for level in (500, 1500, 3000)]
+    response = nuc.fit(levels, order=2)
+    states = np.arange(4.0) * 10
+    shutter = [500 + 3 * state + measured(100, seed=4)[0] / 50 for state in states]
+    odd = dataclasses.replace(
+        calibration(cfa="RGGB"),
+        colour_response={"R": float("nan"), "G": 1.0, "B": float("inf")},
+        tilt_std=np.array([np.inf, 0.1]),
+        findings=(
+            Finding("sign", "what, value, limit, remedy", "misfit"),
+            Finding("drift", "é", "input", "note"),
+        ),
+    )
+    first = calibration(shift_std=0.01, robust=True, uncertainty=True)
+    turned = dataclasses.replace(first.orientation, hidden=Orientation(rows=True), ratio=None)
+    return {
+        "calibration": dataclasses.replace(first, orientation=turned),
+        "calibration in colours": odd,
+        "response": response,
+        "averages": levels[0],
+        "averages without a dark": equipix.average(measured(9).astype(np.float64), reject=None),
+        "polynomial": equipix.combine(response, nuc.fit([each.mean for each in levels], order=1)),
+        "dynamic": bolometer.fit(shutter, states, 2.0, order=1),
+    }
+
+
+KINDS = made()
+
+
+def differences(one, other, name=""):
+    """The parts in which two results differ, to the last bit."""
+    if type(one) is not type(other):
+        return [name]
+    if isinstance(one, np.ndarray):
+        same = (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
+        return [] if same else [name]
+    if dataclasses.is_dataclass(one):
+        one, other = ({at: getattr(each, at) for at in stored(each)} for each in (one, other))
+    if isinstance(one, dict) and one.keys() == other.keys():
+        return [at for key in one for at in differences(one[key], other[key], f"{name}.{key}")]
+    if isinstance(one, tuple) and len(one) == len(other):
+        return [at for pair in zip(one, other, strict=True) for at in differences(*pair, name)]
+    return [] if one == other or (one != one and other != other) else [name]
+
+
+def stored(instance):
+    return [each.name for each in dataclasses.fields(instance) if each.metadata != UNSAVED]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_comes_back_bit_by_bit(tmp_path, name, suffix):
+    path = tmp_path / f"a{suffix}"
+    KINDS[name].save(path)
+    assert differences(KINDS[name], equipix.load(path)) == []
+    # No time of writing: the same result gives the same file.
+    whole = path.read_bytes()
+    equipix.load(path).save(path, force=True)
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_other_software_reads_the_pages(tmp_path, name):
+    KINDS[name].save(tmp_path / "a.tif")
+    first = next(iter(load_pages(tmp_path / "a.tif")[0].values()))
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        assert file.series[0].shape[-2:] == first.shape[-2:]
+        assert sum(len(each.pages) for each in file.series) == len(file.pages)
+    with pytest.raises(FileError, match=f"holds .*{KINDS[name].KIND}, expected raw frames"):
+        refuse_saved(tmp_path / "a.tif")
+    image = first.reshape(-1, *first.shape[-2:])[0]
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif", key=0), image)
+
+
+def test_all_records_are_tested():
+    assert {type(each) for each in KINDS.values()} == {*RECORDS} - {SceneState}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("name", METHODS)
+def test_a_state_comes_back_bit_by_bit(tmp_path, name, suffix):
+    path, method = tmp_path / f"a{suffix}", learned(name)
+    method.save(path)
+    loaded = equipix.load(path)
+    assert type(loaded) is type(method)
+    loaded.save(tmp_path / f"b{suffix}")
+    states = [read_record(tmp_path / f"{each}{suffix}", SceneState) for each in "ab"]
+    assert differences(*states) == []
+
+
+def test_a_table_is_read_by_its_suffix(tmp_path):
+    table = hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000))
+    for suffix in (".bin", ".hex", ".h"):
+        table.save(tmp_path / f"a{suffix}")
+        assert differences(table, equipix.load(tmp_path / f"a{suffix}")) == []
+    with pytest.raises(FileError, match=r"none\.bin: cannot be read"):
+        equipix.load(tmp_path / "none.bin")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("name", [*KINDS, "state"])
+def test_a_changed_byte_of_any_array_is_noticed(tmp_path, name, suffix):
+    path = tmp_path / f"a{suffix}"
+    (learned("gated") if name == "state" else KINDS[name]).save(path)
+    pages, content = load_pages(path)
+    for key, page in pages.items():
+        changed = bytearray(page.tobytes())
+        changed[len(changed) // 2] ^= 1
+        other = np.frombuffer(bytes(changed), page.dtype).reshape(page.shape)
+        save_pages(path, pages | {key: other}, content, force=True)
+        with pytest.raises(FileError, match=rf"a\{suffix}: is damaged: array '{key}' differs"):
+            equipix.load(path)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_flipped_bit_of_a_file_is_refused_or_changes_nothing(tmp_path, suffix):
+    path, wanted = tmp_path / f"kept{suffix}", KINDS["averages"]
+    wanted.save(path)
+    whole, rng = path.read_bytes(), np.random.default_rng(4)
+    for place in rng.integers(0, len(whole), 150):
+        changed = bytearray(whole)
+        changed[place] ^= 1 << rng.integers(8)
+        path.write_bytes(changed)
+        try:
+            found = equipix.load(path)
+        except FileError as error:
+            assert str(path) in str(error)
+        else:
+            assert differences(wanted, found) == [], int(place)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_other_versions_kinds_and_parts_are_refused_by_name(tmp_path, name):
+    path, kind = tmp_path / "a.npz", KINDS[name].KIND
+    for changed, message in (
+        ({"version": KINDS[name].VERSION + 1}, f"holds {kind} of version .* reads version"),
+        ({"version": 1}, f"holds {kind} of version 1, .* make the file again"),
+        ({"kind": "another"}, "holds another, expected calibration or .* name"),
+        ({"fields": {"unknown": 1}}, rf"is damaged: .* \(in {kind}\): use a copy"),
+        ({"fields": {"metadata": None}}, rf"is damaged: .* \(in {kind}\): use a copy"),
+        ({"arrays": {"unknown": np.ones((2, 3))}}, rf"is damaged: .* \(in {kind}\)"),
+    ):
+        KINDS[name].save(path, force=True)
+        rewrite(path, **changed)
+        with pytest.raises(FileError, match=rf"a\.npz: {message}"):
+            equipix.load(path)
+    KINDS[name].save(path, force=True)
+    pages, content = load_pages(path)
+    save_pages(path, pages | {"more": np.ones((2, 3))}, content, force=True)
+    with pytest.raises(FileError, match="is damaged: arrays more have no place in it"):
+        equipix.load(path)
+
+
+class Look(NamedTuple):
+    at: int
+    size: float
+
+
+@dataclass(frozen=True)
+class Part:
+    word: Literal["one", "two"]
+    looks: tuple[Look, ...]
+    map: Map | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Whole(Record, kind="whole", version=7):
+    map: Map
+    parts: tuple[Part, ...]
+    series: dict[str, Annotated[Array, "bool|>i8|int64", "n"]]
+    pair: tuple[str, bool] = ("", False)
+    any: dict[str, Any] = field(default_factory=dict)
+    cached: object = field(default=None, metadata=UNSAVED)
+
+
+def whole(**changed):
+    values = {
+        "map": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "parts": (Part("one", (Look(1, np.inf), Look(2, 3))), Part("two", (), np.ones((2, 3)))),
+        "series": {"a": np.array([True, False]), "b": np.arange(2)},
+        "pair": ("é", np.bool_(True)),
+        "any": {"x": [1, {"y": None}]},
+        "cached": object(),
+    }
+    return Whole(**values | changed)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_annotations_say_what_is_stored(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    whole().save(path)
+    found = read_record(path, Whole)
+    assert differences(whole(pair=("é", True)), found) == []
+    assert found.cached is None
+    assert isinstance(found.parts[0].looks[0], Look)
+    assert list(load_pages(path)[0]) == ["map", "parts.1.map", "series.a", "series.b"]
+    text = json.dumps(load_pages(path)[1], allow_nan=False)  # JSON of other languages, too
+    place = json.loads(text)["fields"]["map"]
+    assert place == {
+        "dtype": "float32",
+        "shape": [2, 3],
+        "crc32": zlib.crc32(whole().map.astype("<f4").tobytes()),
+    }
+
+
+def test_the_order_of_bytes_changes_no_checksum(tmp_path):
+    whole(map=whole().map.astype(">f4")).save(tmp_path / "a.npz")
+    np.testing.assert_array_equal(read_record(tmp_path / "a.npz", Whole).map, whole().map)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"map": np.ones(3)},
+        {"map": np.ones((2, 3), np.int32)},
+        {"map": np.ones((0, 3))},
+        {"map": np.ones((2, 4))},
+        {"map": None},
+        {"map": [[1.0, 2.0]]},
+        {"parts": (Part("three", ()),)},
+        {"parts": (Part("one", (Look("1", 2.0),)),)},
+        {"parts": (None,)},
+        {"series": {"a": np.arange(2), "b": np.arange(3)}},
+        {"pair": ("x",)},
+        {"pair": ("x", 1)},
+        {"any": {"x": object()}},
+    ],
+)
+def test_what_does_not_fit_is_not_saved(tmp_path, changed):
+    with pytest.raises(InputError, match="this whole cannot be saved: "):
+        whole(**changed).save(tmp_path / "a.npz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
+    KINDS["averages"].save(tmp_path / "a.tif")
+    with pytest.raises(FileError, match=r"a\.tif: holds frame statistics, expected calibration th"):
+        read_record(tmp_path / "a.tif", equipix.Calibration)
+    with pytest.raises(InputError, match=r"expected a \.tif or \.npz file"):
+        equipix.load(tmp_path / "a.txt")
+
+
+def test_inspect_shows_every_kind(tmp_path, run):
+    table = hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000))
+    for name, each in (KINDS | {"state": learned("kalman")}).items():
+        each.save(tmp_path / f"{name}.npz")
+        status, out, _ = run("inspect", tmp_path / f"{name}.npz", "--json")
+        assert (status, json.loads(out)["shape"]) == (0, [*SHAPE]), name
+    table.save(tmp_path / "a.hex")
+    assert run("inspect", tmp_path / "a.hex", "--json")[0] == 0
