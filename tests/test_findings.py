@@ -13,12 +13,12 @@ from equipix import simulate
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.rules import AFTER
 from equipix.errors import ConvergenceWarning, InputWarning, MisfitWarning
-from equipix.exposures.exposures import exposures_of
 from equipix.exposures.fit import FitOptions
 from equipix.findings import Finding, Rule, ask, say
 from equipix.fitting import windows
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.fitting.windows import WindowFit
+from given import exposures_of
 
 CROSS = equipix.cross_pattern(3, 5)
 
