@@ -35,7 +35,7 @@ from equipix.errors import InputError
 
 
 def gain(path: str) -> float:
-    correction = load(path)
+    correction: Correction = load(path)
     reveal_type(correction)
     return float(np.nanmean(correction.coefficients[1]))
 
