@@ -88,7 +88,7 @@ class TestArraysThatNoMachineHolds:
             raise MemoryError("no 8 bytes")
 
         response = equipix.nuc.fit(np.arange(2.0 * 8 * 9).reshape(2, 8, 9))
-        monkeypatch.setattr("equipix.nuc.response.dark_frame", refuse)
+        monkeypatch.setattr("equipix.correction.protocol._dark_frame", refuse)
         for work, named in ((response.correct, "correcting"), (response.extrapolated, "finding")):
             with pytest.raises(InsufficientMemoryError, match=f"{named}.*: no 8 bytes"):
                 work(np.ones((8, 9)), dark=np.ones((8, 9)))

@@ -1,7 +1,5 @@
 """Types of arguments, and their checks: arrays, masks, counts, shapes, words for messages."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

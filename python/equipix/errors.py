@@ -1,7 +1,5 @@
 """Errors and warnings: everything that equipix raises is one of these."""
 
-from __future__ import annotations
-
 __all__ = [
     "ConvergenceWarning",
     "EquipixError",

@@ -1,7 +1,5 @@
 """What limits a result, as findings; what limits a pixel, as flags."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable, Iterable

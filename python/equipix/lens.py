@@ -1,7 +1,5 @@
 """Fall-off of a lens's illumination: its law fitted to a flat frame, and removed as a gain."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args

@@ -1,7 +1,5 @@
 """Results of all kinds, read from the files that they were saved to."""
 
-from __future__ import annotations
-
 from os import PathLike
 from typing import Any
 

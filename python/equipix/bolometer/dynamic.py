@@ -1,7 +1,5 @@
 """Corrections that follow temperature and bias."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 

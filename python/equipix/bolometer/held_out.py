@@ -1,7 +1,5 @@
 """The order of a dynamic correction by predictions of temperatures that are held out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Offset and gain against the state, from a shutter and black bodies."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

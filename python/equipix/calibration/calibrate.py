@@ -1,7 +1,5 @@
 """Shift calibration: sensitivity and beam from exposures of one beam at several positions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -23,8 +21,8 @@ from equipix.exposures.positions import Positions
 from equipix.findings import Finding, ask, say
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.pixels import without_faint_pixels, without_false_pixels
-from equipix.fitting.stated_errors import steady_fit, widened
-from equipix.fitting.weighted import Options, Weighted, is_to_be_fitted
+from equipix.fitting.stated_errors import steadied, widened
+from equipix.fitting.weighted import Options, Weighted, is_to_be_fitted, weighted_fit
 from equipix.measured.colour import Colours
 from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
@@ -261,7 +259,7 @@ def calibrated(
     """
     started = datetime.now(UTC)
     said += say(*ask(BEFORE, exposures))
-    weighted = steady_fit(exposures, options, start)
+    weighted = steadied(weighted_fit(exposures, options, start), exposures, options)
     for step in STEPS:
         weighted = step(weighted, options)
     evidence = Evidence.of(weighted, options, exposures.flux)

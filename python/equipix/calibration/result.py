@@ -1,7 +1,5 @@
 """The result of a calibration."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The one way to apply a correction to frames: coefficients prepared once."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any, get_args

@@ -1,7 +1,5 @@
 """Frames in files corrected, and pictures of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

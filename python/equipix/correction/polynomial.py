@@ -1,7 +1,5 @@
 """A correction that is its coefficients, and the combination of two corrections."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 

@@ -1,7 +1,5 @@
 """What a correction is, and checks of its sensor and bit depth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ Pure functions of residuals in standard deviations, shape (n, rows, cols), NaN w
 Each gives the part of their squares that one cause explains, less what white noise would give.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import NamedTuple
 

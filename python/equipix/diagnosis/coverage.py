@@ -1,7 +1,5 @@
 """How much of the sensor a fit determines, and why it is not more."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from equipix import _native

@@ -1,7 +1,5 @@
 """Evidence on a fit: what residuals, fluxes and other models show of it."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Self

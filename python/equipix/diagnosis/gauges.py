@@ -1,7 +1,5 @@
 """Colours of a calibrated sensor: the gauge of each, and whether one beam is that of all."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, overload
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rules on what was given, before any fit."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

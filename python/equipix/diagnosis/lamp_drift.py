@@ -1,7 +1,5 @@
 """What the data say of given fluxes: the drift of the lamp, and the tilt that it hides."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

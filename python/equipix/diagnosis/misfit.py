@@ -1,7 +1,5 @@
 """Whether residuals are those of a right model, and what the likely cause is if not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ In a smooth beam the shifts in another orientation fit with other fluxes and ano
 that were given may exclude it, or the orientation as given.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

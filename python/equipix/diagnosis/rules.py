@@ -1,7 +1,5 @@
 """Rules on a fit and on its error bars: the tables of what is asked of a calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

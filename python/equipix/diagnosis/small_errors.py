@@ -1,7 +1,5 @@
 """Small errors that all exposures have in common: a curved response, an offset, crosstalk."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Exposures of one beam: fitted, predicted, and parts of them."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Self

@@ -1,7 +1,5 @@
 """Options of a fit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self, get_args
 

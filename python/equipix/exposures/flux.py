@@ -1,7 +1,5 @@
 """Relative flux of each exposure, and what is known of it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

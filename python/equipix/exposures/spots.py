@@ -1,7 +1,5 @@
 """Moves measured from images of a hole, whose hot pixels are mended."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

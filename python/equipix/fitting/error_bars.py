@@ -1,7 +1,5 @@
 """Standard deviations of what a fit found."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, cast
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measurements that disagree, and dust that falls and stays."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
 """Pixels that contradict or are faint, and flags of all pixels."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

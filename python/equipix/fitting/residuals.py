@@ -4,8 +4,6 @@ Residuals of a right model are white. Tests take residuals (..., rows, cols), Na
 none: images of neighbouring pixels in their last two axes. None needs a variance.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

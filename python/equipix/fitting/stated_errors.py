@@ -4,15 +4,12 @@ An error δ of a shift changes a measurement by δ·∇L, and so the flux of its
 mean slope of ln L.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from equipix._check import Array, Floats
-from equipix._native import Fit
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import WIDEST
 from equipix.fitting.residuals import Residuals, axes_of, left_by, sampled
@@ -194,12 +191,11 @@ def sampled_frames(variance: Array | None) -> float | None:
     return frames if abs(fourth - 1) < _LIKE else None
 
 
-def steady_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:
-    """Fit exposures, with a noise model of each if their variances scatter like sample variances.
+def steadied(weighted: Weighted, exposures: Exposures, options: Options) -> Weighted:
+    """Fit with a noise model of each exposure if the variances given scatter like sample variances.
 
-    The fit begins from `start`.
+    `exposures` are those of the fit as they were given, without variances where a model has them.
     """
-    weighted = weighted_fit(exposures, options, start)
     is_given = exposures.knows_noise and not exposures.offset
     frames = sampled_frames(exposures.variance) if is_given else None
     variance = exposures.variance

@@ -4,8 +4,6 @@ Exposures hold views of the caller's arrays, and the compiled fit reads them aga
 questions. A copy would double the memory of a calibration, and a checksum would read all of it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Files of named arrays with metadata: the formats by suffix."""
 
-from __future__ import annotations
-
 import json
 import os
 import zlib

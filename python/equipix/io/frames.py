@@ -1,7 +1,5 @@
 """Frames and masks from image files, by whichever reader decodes them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from os import PathLike

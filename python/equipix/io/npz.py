@@ -1,7 +1,5 @@
 """NPZ files of NumPy: named arrays with a text."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path

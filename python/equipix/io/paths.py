@@ -1,7 +1,5 @@
 """Names and globs to files, outputs whole or not at all, a reader's failure as an error."""
 
-from __future__ import annotations
-
 import glob
 import logging
 import os

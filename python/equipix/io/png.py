@@ -1,7 +1,5 @@
 """Grey PNG pictures of 8 or 16 bits, written with the standard library, and their descriptions."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path

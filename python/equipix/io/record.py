@@ -17,8 +17,6 @@ tuples of these or of arrays, each of them or None. There the place of an array 
 shape and CRC-32.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Averaging of repeated frames."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Which pixels must not be used: dead, hot, noisy, blind, unlike their neighbours."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

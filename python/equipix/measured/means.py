@@ -1,7 +1,5 @@
 """Averages of exposures or levels, reduced one by one."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Mean frames and what is known of them: checks of arrays and averages."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field

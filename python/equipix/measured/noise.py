@@ -21,8 +21,6 @@ References
    4 and 5.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import warnings

@@ -1,7 +1,5 @@
 """The level of saturation: given, of the dtype, or found by clipped values."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Frames a few at a time, and samples that deviate left out."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator
 from statistics import NormalDist

@@ -1,7 +1,5 @@
 """How good a correction is: spatial over temporal noise, and for how long."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from statistics import NormalDist
 

@@ -1,7 +1,5 @@
 """EMVA 1288: spatial figures, photon transfer, linearity."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Noise of a stack of frames: moments, and its seven components."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Figures of maps and frames: rms, block means, tilt, roughness, NETD, non-uniformity."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bad pixels of response curves and of frames, by limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

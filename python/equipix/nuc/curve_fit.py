@@ -1,7 +1,5 @@
 """Fit of response curves to levels of a uniform source."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Response curves and their inverses."""
 
-from __future__ import annotations
-
 from math import comb
 
 import numpy as np

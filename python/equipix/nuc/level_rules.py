@@ -1,7 +1,5 @@
 """Rules on levels and on the curves fitted to them: saturation, inverse, misfit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Levels of a uniform source: references, noise, usable pixels."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

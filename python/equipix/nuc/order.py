@@ -1,7 +1,5 @@
 """Order of response curves: what the levels allow, and which order predicts a held-out level."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Response curves as a correction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 

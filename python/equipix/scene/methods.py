@@ -1,7 +1,5 @@
 """The methods of corrections from the scene, and their states read from files."""
 
-from __future__ import annotations
-
 from os import PathLike
 from typing import ClassVar
 

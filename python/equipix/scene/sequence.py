@@ -1,7 +1,5 @@
 """A recorded sequence in files, through a correction from the scene."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
