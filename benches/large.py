@@ -110,7 +110,7 @@ def true_error(sensitivity: np.ndarray) -> float:
 def peak_bytes() -> int:
     """The most memory that this process ever held."""
     status = Path("/proc/self/status").read_text()
-    return 1024 * int(re.search(r"VmHWM:\s+(\d+)", status)[1])
+    return 1024 * int(re.findall(r"VmHWM:\s+(\d+)", status)[0])
 
 
 def wait_after_interrupt(frames: np.ndarray, seconds: float) -> float:

@@ -28,7 +28,7 @@ def rows(
     threads = len(os.sched_getaffinity(0))
     found = []
     for name, method in METHODS.items():
-        made = method(shape, data_range=(2**14, 2**14 + 2**13))
+        made = method(shape, data_range=(2**14, 2**14 + 2**13))  # type: ignore[call-arg]
         seconds = [_seconds(made, frame) for _ in range(passes) for frame in values]
         median = float(np.median(seconds))
         found.append(

@@ -44,7 +44,7 @@ EVERY = 20
 
 def methods(shape: tuple[int, int]) -> dict[str, SceneCorrection]:
     """Each method with its defaults, and one with the gate off."""
-    made = {name: each(shape, data_range=(0, 1)) for name, each in METHODS.items()}
+    made = {name: each(shape, data_range=(0, 1)) for name, each in METHODS.items()}  # type: ignore[call-arg]
     made["gate off"] = scene.Gated(shape, data_range=(0, 1), threshold=0)
     return made
 
@@ -134,7 +134,7 @@ def noise() -> None:
     """Print the falls of pattern and gain error in noisy video after 20 000 frames."""
     for spread in (0.01, 0.02, 0.05, 0.1):
         moving = MovingScene(seed=1, shape=(128, 128), noise=spread)
-        learning = {name: each(moving.shape, (0, 1)) for name, each in METHODS.items()}
+        learning = {name: each(moving.shape, (0, 1)) for name, each in METHODS.items()}  # type: ignore[call-arg]
         for frame in moving.frames(LONG):
             for method in learning.values():
                 method.update(frame.values)

@@ -405,10 +405,10 @@ def first_cause(found):
 
 def right_models(count):
     """Print the findings on right models of each kind."""
-    total = Counter()
+    total: Counter[str] = Counter()
     for k, model in enumerate(RIGHT):
         seeds = range(FRESH + k, FRESH + count, len(RIGHT))
-        told = Counter()
+        told: Counter[str] = Counter()
         for seed in seeds:
             found = findings(*model(np.random.default_rng([1, seed])))
             told.update({each.kind for each in found} if found is not None else ["refused"])
@@ -422,7 +422,8 @@ def wrong_models(count):
     import re
 
     for name, (model, pattern) in WRONG.items():
-        noticed, right, told = 0, 0, Counter()
+        noticed, right = 0, 0
+        told: Counter[str] = Counter()
         for seed in range(FRESH, FRESH + count):
             found = findings(*model(np.random.default_rng([2, seed])))
             first = "refused" if found is None else first_cause(found)

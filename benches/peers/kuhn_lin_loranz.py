@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 class Pairs(NamedTuple):
-    """Pairs of exposures: their moves q − p, their number at each pixel, and K."""
+    """Pairs of exposures: their moves q − p, how many there are at each pixel, and K."""
 
     moves: np.ndarray
-    count: np.ndarray
+    number: np.ndarray
     constant: np.ndarray
 
     @property

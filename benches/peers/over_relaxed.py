@@ -47,7 +47,7 @@ def _passes(frames: np.ndarray, shifts: np.ndarray, factor: float) -> Iterator[n
     level = pairs.moves[:, 0] == 0
     beside, apart = pairs.moves[level, 1], pairs.moves[~level]
     while True:
-        _update(g, beside, apart, pairs.count, pairs.constant, factor)
+        _update(g, beside, apart, pairs.number, pairs.constant, factor)
         yield inner(g, pairs)
 
 

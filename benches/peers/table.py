@@ -11,8 +11,11 @@ import numpy as np
 
 import equipix
 from equipix import metrics, simulate
-from equipix.exposures.exposures import exposures_of
+from equipix.exposures.exposures import Exposures
 from equipix.exposures.fit import FitOptions
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
+from equipix.measured.measured import measured_of
 from peers import alternating, kuhn_lin_loranz, log_lsmr, over_relaxed
 from peers.race import Outcome
 
@@ -89,7 +92,11 @@ def _ours(frames: np.ndarray, error_of: ErrorOf, tolerance: float, repetitions: 
     seconds = []
     for _ in range(repetitions):
         start = time.perf_counter()
-        fit = exposures_of(frames, SHIFTS).fit(FitOptions(tolerance=tolerance))
+        positions = Positions.of(SHIFTS, shape=frames.shape)
+        exposures = Exposures.of(
+            measured_of(frames), positions, Flux.of(None, None, None, len(frames))
+        )
+        fit = exposures.fit(FitOptions(tolerance=tolerance))
         seconds.append(time.perf_counter() - start)
     return Outcome(error_of(fit.sensitivity), int(fit.sweeps[-1]), statistics.median(seconds))
 
