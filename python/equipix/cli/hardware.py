@@ -21,10 +21,6 @@ _SOUGHT = ("offset_bits", "gain_bits")
 commands = typer.Typer()
 
 
-@commands.callback()
-def _group() -> None: ...
-
-
 @commands.command(
     epilog="Example: equipix hardware response.tif -o table.hex --offset-bits 12 --gain-bits 14"
 )

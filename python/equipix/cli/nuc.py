@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from equipix import metrics
-from equipix._check import Array, By, Flagged, naming_memory
+from equipix._check import Array, By, Flagged, Order, naming_memory
 from equipix.cli import terminal
 from equipix.cli.summary import flagged as flag_counts
 from equipix.cli.summary import summary, told
@@ -32,15 +32,7 @@ nuc = typer.Typer(
 
 commands.add_typer(nuc, name="nuc")
 
-_ORDERS = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
-
-
-@commands.callback()
-def _group() -> None: ...
-
-
-@nuc.callback()
-def _nuc() -> None: ...
+_ORDERS: dict[str, Order] = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
 
 
 @nuc.command(epilog="Example: equipix nuc fit levels.toml -o response.tif --order auto")

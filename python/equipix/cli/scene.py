@@ -27,10 +27,6 @@ _SHOWN = 10
 _TIFF = (".tif", ".tiff")
 
 
-@commands.callback()
-def _group() -> None: ...
-
-
 @commands.command(epilog="Example: equipix scene frames/*.tif -o nuc.tif --method registered")
 @terminal.options_of(
     *METHODS.values(),
