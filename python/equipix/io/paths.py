@@ -109,6 +109,8 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except EquipixError:
         raise
+    except FileNotFoundError as error:
+        raise FileError(f"{path}: does not exist") from error
     except Exception as error:
         hint = "; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
         raise FileError(f"{path}: cannot be read: {error}{hint}") from error
