@@ -10,14 +10,14 @@ import typer
 from equipix.cli import terminal
 from equipix.cli.summary import of_scene, told
 from equipix.errors import FileError, InputError
-from equipix.io.formats import SUFFIXES
+from equipix.io.formats import SUFFIXES, raw_header
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_sequence
 from equipix.scene.methods import METHODS, resumed
 from equipix.scene.scene_correction import SceneCorrection, SceneState
-from equipix.scene.sequence import SequenceResult, check_range, run_sequence, sequence_format
+from equipix.scene.sequence import SequenceResult, check_range, run_sequence
 
 commands = typer.Typer()
 
@@ -109,7 +109,8 @@ def _method(
     workers: int | None,
 ) -> SceneCorrection:
     """Make the correction, or read its state."""
-    shape, dtype = sequence_format(frames)
+    (_, rows, cols), dtype, _ = raw_header(find_files(frames)[0])
+    shape = (rows, cols)
     if resume is not None:
         if options or data_range:
             raise InputError(

@@ -122,9 +122,9 @@ def check_output(
 def raw_frames(frames: Iterable[str], correction: Path | None = None) -> Array:
     """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
     files = find_files(frames)
-    marks = {file: raw_header(file).description for file in files}
+    headers = {file: raw_header(file) for file in files}
     if correction is not None:
-        warn_of_corrected(marks, image_files.origin_of(correction))
+        warn_of_corrected(headers, image_files.origin_of(correction))
     return read_frames(files)
 
 

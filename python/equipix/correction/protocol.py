@@ -168,6 +168,15 @@ def is_stored(dark: Dark) -> bool:
         raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
     return isinstance(dark, str)
 
+def refuse_dark(correction: Correction, dark: Dark) -> None:
+    """Refuse another dark than "stored" where a correction takes none."""
+    if not correction.takes_dark:
+        raise InputError(
+            f"'dark' is {described(dark)}, but the offsets of this correction are part of it and "
+            "no dark frame can replace them: expected 'stored'"
+        )
+
+
 
 def with_dark(correction: _C, dark: Dark) -> _C:
     """Return a correction with this dark frame in place of that stored."""
@@ -178,11 +187,7 @@ def with_dark(correction: _C, dark: Dark) -> _C:
                 "it is already subtracted"
             )
         return correction
-    if not correction.takes_dark:
-        raise InputError(
-            "'dark' is given, but the offsets of this correction are part of it and no dark frame "
-            "can replace them: expected 'stored'"
-        )
+    refuse_dark(correction, dark)
     if dark is not None and correction.leaves_offset:
         raise InputError(
             "'dark' is given, but the offsets of this response are part of its curves: it was "

@@ -176,6 +176,15 @@ def _refuse_kind(path: Path, kind: str | None) -> None:
         raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
 
 
+def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Header]:
+    """What files say of their frames, which must be raw and of the sensor's shape."""
+    headers = {file: raw_header(file) for file in files}
+    for file, found in headers.items():
+        if found.shape[1:] != shape:
+            raise InputError(f"{file}: holds frames of shape {found.shape[1:]}, expected {shape}")
+    return headers
+
+
 def raw_header(path: Path) -> Header:
     """Shape, dtype and text of raw frames; what `save_pages` wrote is refused like there."""
     if path.suffix.lower() == ".npz":
