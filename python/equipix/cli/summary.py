@@ -128,7 +128,7 @@ def of_scene(method: SceneCorrection) -> dict[str, Any]:
     return {
         "shape": list(method.shape),
         "scene_method": method.method,
-        "scene_data_range": list(method.data_range),
+        "scene_data_range": np.asarray(method.data_range).tolist(),
         "usable_frames": method.frames_taken,
         "frames_that_counted": method.frames,
         "frames_foreign": method.frames_foreign,
