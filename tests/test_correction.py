@@ -282,7 +282,7 @@ class TestProducers:
                 gives = inspect.isclass(kind) and {"correct", "correction"} & set(dir(kind))
                 if gives and kind.__module__ == module.name:
                     found.add(name)
-        bases = {"Correction", "CorrectionBase", "SceneCorrection"}
+        bases = {"Correction", "CorrectionBase", "RawCorrection", "SceneCorrection"}
         assert found - bases == {name.split(" ")[0] for name in PRODUCERS}
 
 

@@ -1,6 +1,5 @@
 """What a correction is, and checks of its sensor and bit depth."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from os import PathLike
@@ -168,6 +167,7 @@ def is_stored(dark: Dark) -> bool:
         raise InputError(f"'dark' is {dark!r}, expected 'stored', an array or None")
     return isinstance(dark, str)
 
+
 def refuse_dark(correction: Correction, dark: Dark) -> None:
     """Refuse another dark than "stored" where a correction takes none."""
     if not correction.takes_dark:
@@ -175,7 +175,6 @@ def refuse_dark(correction: Correction, dark: Dark) -> None:
             f"'dark' is {described(dark)}, but the offsets of this correction are part of it and "
             "no dark frame can replace them: expected 'stored'"
         )
-
 
 
 def with_dark(correction: _C, dark: Dark) -> _C:
@@ -258,17 +257,6 @@ class Depth(NamedTuple):
 
 _DARK = 10.0
 """Level without light, in DN, from which frames of at most 1 DN are in another unit."""
-
-
-def bits_of(metadata: Mapping[str, Any], saturation: float | None) -> int:
-    """Return the bits of the sensor in metadata, else those that hold the saturation level.
-
-    Pixels may give more than that level, which may be set below the largest value. 0 without both.
-    """
-    bits = sensor_table(metadata).get("bit_depth")
-    if isinstance(bits, int):
-        return bits
-    return 0 if saturation in (None, math.inf) else math.ceil(saturation).bit_length()
 
 
 def depth_of(correction: Correction) -> Depth:

@@ -8,7 +8,7 @@ from numpy.polynomial.polynomial import polyval
 
 from equipix._check import Array, Bools, Floats
 from equipix._native import __version__
-from equipix.correction.protocol import Correction
+from equipix.correction.protocol import Correction, sensor_table
 from equipix.errors import InputError
 from equipix.findings import set_bits, usable
 from equipix.hardware.table_files import Content
@@ -231,12 +231,12 @@ def origin(correction: Correction) -> dict[str, Any]:
     for array in (np.asarray(correction.coefficients, "<f8"), np.asarray(correction.flags, "<u4")):
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
-    sensor = correction.metadata.get("sensor")
+    sensor = sensor_table(correction.metadata)
     return {
         "equipix": __version__,
         "correction": type(correction).__name__,
         "sha256": digest.hexdigest(),
-        **({"sensor": sensor} if isinstance(sensor, dict) else {}),
+        **({"sensor": sensor} if sensor else {}),
     }
 
 
