@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,8 +10,10 @@ import numpy as np
 from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
+from equipix.cli import terminal
 from equipix.correction.protocol import Correction, sensor_of
 from equipix.findings import Finding, Flag, usable
+from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
 from equipix.scene.methods import METHODS
@@ -22,12 +25,19 @@ _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
 
 
-def summary(
-    content: Correction | DynamicCorrection | FrameStatistics | SceneCorrection,
-) -> dict[str, Any]:
+def summary(content: Record | Correction | SceneCorrection) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     figures: _Figures = _FIGURES.get(type(content), _of_correction)
     return figures(content)
+
+
+def show_saved(
+    output: Path, result: Record, findings: Iterable[Finding], *, force: bool, as_json: bool
+) -> None:
+    """Save a result, and print its main figures and its findings."""
+    result.save(output, force=force)
+    figures = {"output": str(output), **summary(result), **told(findings, as_json=as_json)}
+    terminal.show_result(figures, as_json=as_json)
 
 
 def known(**figures: Any) -> dict[str, Any]:
