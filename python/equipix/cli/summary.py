@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +19,13 @@ from equipix.nuc.response import Response, common_misfit
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneCorrection
 
-_Figures: TypeAlias = Callable[[Any], dict[str, Any]]
-
 _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
 
 
 def summary(content: Record | Correction | SceneCorrection) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
-    figures: _Figures = _FIGURES.get(type(content), _of_correction)
+    figures: Callable[[Any], dict[str, Any]] = _FIGURES.get(type(content), _of_correction)
     return figures(content)
 
 
@@ -233,7 +231,7 @@ def _tilt_in_words(std: Array) -> str:
     return f"undetermined along {' and '.join(names)}, and set to 0" if names else "determined"
 
 
-_FIGURES: dict[type, _Figures] = {
+_FIGURES: dict[type, Callable[[Any], dict[str, Any]]] = {
     FrameStatistics: of_statistics,
     Calibration: of_calibration,
     Response: of_response,

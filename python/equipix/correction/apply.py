@@ -85,7 +85,7 @@ class Prepared:
         self.depth.refuse_type(raw.dtype)
         plain = result.flags.carray and not np.may_share_memory(result, raw)
         if formula is None and plain and {raw.dtype, result.dtype} <= {*self._types}:
-            highest = self.run(raw, result, largest_of(result.dtype))[-1]
+            highest = self.run(raw, result, largest_value(result.dtype))[-1]
             self.depth.refuse_highest(highest, raw.dtype)
             return
         kind = result.dtype if result.dtype in self._types else _DOUBLE
@@ -95,7 +95,7 @@ class Prepared:
             if taken.dtype not in self._types:
                 taken = taken.astype(_DOUBLE)
             made = np.empty(source.shape, kind)
-            self.run(taken, made, largest_of(kind))
+            self.run(taken, made, largest_value(kind))
             target[...] = made
 
 
@@ -275,11 +275,6 @@ def usual_treatment(dtype: np.dtype[Any]) -> Flagged:
     return "replace" if dtype.kind == "u" else "nan"
 
 
-def largest_of(dtype: np.dtype[Any]) -> float:
-    """Return the largest value of a dtype of whole numbers; 0, which is not used, of others."""
-    return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
-
-
 def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     """Return a type that corrected frames may have, and refuse others."""
     try:
@@ -291,10 +286,10 @@ def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     return found
 
 
-def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
-    """Return the largest value of whole numbers of so many bits."""
+def largest_value(dtype: np.dtype[Any], bit_depth: int | None = None) -> float:
+    """Return the largest value of whole numbers of so many bits; 0, which is not used, of others."""
     if bit_depth is None:
-        return largest_of(dtype)
+        return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
     bits = 8 * dtype.itemsize
     if dtype.kind != "u" or not is_whole(bit_depth, 8, bits):
         wanted = f"8 to {bits}"
