@@ -287,7 +287,7 @@ def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
 
 
 def largest_value(dtype: np.dtype[Any], bit_depth: int | None = None) -> float:
-    """Return the largest value of whole numbers of so many bits; 0, which is not used, of others."""
+    """Return the largest value of whole numbers of so many bits; 0, not used, of others."""
     if bit_depth is None:
         return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
     bits = 8 * dtype.itemsize
