@@ -20,7 +20,7 @@ from equipix.exposures.positions import Orientation
 from equipix.findings import Finding
 from equipix.io.formats import load_pages, refuse_saved, save_pages
 from equipix.io.record import UNSAVED, Map, Record, read_record
-from equipix.loading import RECORDS
+from equipix.saved_results import RECORDS
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneState
 from records import rewrite

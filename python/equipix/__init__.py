@@ -28,7 +28,7 @@ _HOMES = {
     "errors": "",
     "hardware": "",
     "lens": "",
-    "load": "loading",
+    "load": "saved_results",
     "measure_shift": "exposures.spots",
     "metrics": "",
     "nuc": "",

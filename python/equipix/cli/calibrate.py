@@ -17,9 +17,9 @@ from equipix.experiment.experiment import Experiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
-from equipix.loading import load
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
+from equipix.saved_results import load
 
 commands = typer.Typer()
 

@@ -13,9 +13,9 @@ from equipix.experiment.image_files import origin_of, refuse_repeated_files
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.loading import load_correction
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
+from equipix.saved_results import load_correction
 
 commands = typer.Typer()
 

@@ -17,11 +17,11 @@ from equipix.experiment.level_experiment import LevelExperiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
-from equipix.loading import load_correction
 from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
 from equipix.nuc.bad_pixels import find_defects
 from equipix.nuc.response import Response
+from equipix.saved_results import load_correction
 
 commands = typer.Typer()
 

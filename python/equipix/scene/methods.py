@@ -20,7 +20,7 @@ FOUR = ((0, 1, 0), (1, 0, 1), (0, 1, 0))
 class LocalMean(SceneCorrection):
     """Gain and offset towards the mean of the neighbours, in every frame.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
@@ -82,7 +82,7 @@ class LocalMean(SceneCorrection):
 class Gated(SceneCorrection):
     """Gain and offset towards a local mean, only where that mean has changed.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
@@ -137,7 +137,7 @@ class Gated(SceneCorrection):
 class Registered(SceneCorrection):
     """Gain and offset towards the other frame of a pair, moved by the shift between them.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 20 or more.
@@ -198,7 +198,7 @@ class Registered(SceneCorrection):
 class ConstantStatistics(SceneCorrection):
     """Mean and deviation of each pixel over time made equal to those of its neighbourhood.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
@@ -253,7 +253,7 @@ class ConstantStatistics(SceneCorrection):
 class Kalman(SceneCorrection):
     """Recursive estimate of drifting gains and offsets from blocks of frames, with variances.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
