@@ -13,7 +13,7 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, errors, metrics, simulate
-from equipix.loading import load_correction
+from equipix.saved_results import load_correction
 from equipix.simulate import BolometerArray
 from records import rewrite
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, bolometer, hardware, lens, loading, nuc, scene, simulate
+from equipix import Flag, bolometer, hardware, lens, nuc, saved_results, scene, simulate
 from equipix.correction.apply import apply
 from equipix.correction.correct_files import correct_files
 from equipix.correction.protocol import MEMBERS, check_correction
@@ -25,8 +25,8 @@ from equipix.io.formats import load_pages, save_pages
 from equipix.io.frames import read_frames
 from equipix.io.record import Counts, Record
 from equipix.io.tiff import write_frames
-from equipix.loading import load_correction
 from equipix.measured.colour import Colours
+from equipix.saved_results import load_correction
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -59,7 +59,7 @@ class Bent(Record, kind="bent response", version=2):
 
 @pytest.fixture
 def bent(monkeypatch):
-    monkeypatch.setattr(loading, "RECORDS", (*loading.RECORDS, Bent))
+    monkeypatch.setattr(saved_results, "RECORDS", (*saved_results.RECORDS, Bent))
     coefficients = np.stack(
         [RNG.normal(-60, 1, SHAPE), RNG.normal(1, 0.05, SHAPE), RNG.normal(1e-5, 1e-6, SHAPE)]
     ).astype(np.float32)
@@ -282,7 +282,7 @@ class TestProducers:
                 gives = inspect.isclass(kind) and {"correct", "correction"} & set(dir(kind))
                 if gives and kind.__module__ == module.name:
                     found.add(name)
-        bases = {"Correction", "CorrectionBase", "SceneCorrection"}
+        bases = {"Correction", "CorrectionBase", "RawCorrection", "SceneCorrection"}
         assert found - bases == {name.split(" ")[0] for name in PRODUCERS}
 
 

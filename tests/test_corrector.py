@@ -331,7 +331,7 @@ class TestBuffers:
             Corrector(Given(coefficients(2))).apply(raw, raw)
         locked = np.empty(SHAPE, np.uint16)
         locked.flags.writeable = False
-        with pytest.raises(errors.InputError, match="read-only"):
+        with pytest.raises(errors.InputError, match="expected a writeable uint16 array"):
             Corrector(Given(coefficients(2))).apply(raw, locked)
 
 

@@ -448,6 +448,8 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list(load_pages(path)[0]) == ["mean"]
     with pytest.raises(FileError, match=r"there is no folder .*none.: make it first"):
         save_pages(tmp_path / "none" / "out.tif", PAGES, {})
+    with pytest.raises(FileError, match="cannot be written"):
+        save_pages(path / "out.tif", PAGES, {})
     with pytest.raises(InputError, match=r"expected the suffix \.tif or \.npz"):
         save_pages(tmp_path / "out.jpg", PAGES, {})
     assert list(tmp_path.iterdir()) == [path]

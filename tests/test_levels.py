@@ -13,7 +13,7 @@ from equipix import Flag, LevelExperiment, errors, metrics, nuc
 from equipix.correction.correct_files import correct_files, picture
 from equipix.io import frames as images
 from equipix.io import tiff
-from equipix.io.frames import description, read_frames
+from equipix.io.frames import header, read_frames
 from equipix.io.png import write_png
 from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
@@ -429,7 +429,7 @@ class TestCorrectedFiles:
         _, call = corrected
         path, _ = call("out.tif", "--dtype", "uint16")
         digest = hashlib.sha256((tmp_path / "response.tif").read_bytes()).hexdigest()
-        assert description(path) == f"corrected by equipix, correction sha256 {digest}"
+        assert header(path).description == f"corrected by equipix, correction sha256 {digest}"
         arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.tif")
         assert "corrected already" in run(*arguments)[2]
 
@@ -600,7 +600,7 @@ class TestCorrectedFiles:
         _, call = corrected
         write_frames(folder / "single.tif", read_frames(folder / "level1.tif")[:1], nbytes=1)
         path, _ = call("out.png", source="single.tif")
-        assert description(path).startswith("corrected by equipix, correction sha256")
+        assert header(path).description.startswith("corrected by equipix, correction sha256")
         arguments = ("correct", tmp_path / "response.tif", path, "-o", tmp_path / "again.png")
         status, _, err = run(*arguments)
         assert status == 0
@@ -610,7 +610,7 @@ class TestCorrectedFiles:
     def test_pngs_of_others_have_no_mark(self, run, folder, tmp_path):
         frame = read_frames(folder / "level1.tif")[0]
         write_png(tmp_path / "raw.png", frame, description="of a camera")
-        assert description(tmp_path / "raw.png") == "of a camera"
+        assert header(tmp_path / "raw.png").description == "of a camera"
         arguments = ("correct", tmp_path / "response.tif", tmp_path / "raw.png")
         status, _, err = run(*arguments, "-o", tmp_path / "out.png")
         assert (status, "corrected already" in err) == (0, False)

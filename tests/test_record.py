@@ -20,7 +20,7 @@ from equipix.exposures.positions import Orientation
 from equipix.findings import Finding
 from equipix.io.formats import load_pages, refuse_saved, save_pages
 from equipix.io.record import UNSAVED, Map, Record, read_record
-from equipix.loading import RECORDS
+from equipix.saved_results import RECORDS
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneState
 from records import rewrite
@@ -292,7 +292,7 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
     KINDS["averages"].save(tmp_path / "a.tif")
     with pytest.raises(FileError, match=r"a\.tif: holds frame statistics, expected calibration th"):
         read_record(tmp_path / "a.tif", equipix.Calibration)
-    with pytest.raises(InputError, match=r"expected a \.tif or \.npz file"):
+    with pytest.raises(InputError, match=r"expected the suffix \.tif or \.npz"):
         equipix.load(tmp_path / "a.txt")
 
 

@@ -9,7 +9,7 @@ import equipix
 from equipix import Flag, errors
 from equipix.io.formats import load_pages
 from equipix.io.record import read_record
-from equipix.loading import load_correction
+from equipix.saved_results import load_correction
 from equipix.scene.methods import METHODS, resumed
 from equipix.scene.scene_correction import SceneState
 from equipix.simulate import MovingScene

@@ -248,7 +248,7 @@ def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_
 def test_gains_that_spread_are_named():
     gains = np.array([-0.04, 1.0, 50.0])
     with pytest.warns(errors.InputWarning, match=r"the gains spread by 23 \(limit 0.3\)"):
-        say(*ask(_RULES, _Learned(100, 100, None, (0, 1), None, gains)))
+        say(*ask(_RULES, _Learned(made("gated"), None, None, gains)))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -28,7 +28,7 @@ _HOMES = {
     "errors": "",
     "hardware": "",
     "lens": "",
-    "load": "loading",
+    "load": "saved_results",
     "measure_shift": "exposures.spots",
     "metrics": "",
     "nuc": "",
@@ -46,10 +46,7 @@ def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'equipix' has no attribute '{name}'")
     home = _HOMES[name]
-    value = (
-        getattr(import_module(f"equipix.{home}"), name)
-        if home
-        else import_module(f"equipix.{name}")
-    )
+    module = import_module(f"equipix.{home or name}")
+    value = getattr(module, name) if home else module
     globals()[name] = value
     return value

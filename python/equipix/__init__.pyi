@@ -22,7 +22,7 @@ from equipix.exposures.spots import cross_pattern as cross_pattern
 from equipix.exposures.spots import measure_shift as measure_shift
 from equipix.findings import Finding as Finding
 from equipix.findings import Flag as Flag
-from equipix.loading import load as load
 from equipix.measured.average import average as average
 from equipix.measured.noise import NoiseModel as NoiseModel
 from equipix.measured.statistics import FrameStatistics as FrameStatistics
+from equipix.saved_results import load as load

@@ -9,14 +9,8 @@ from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
+from equipix import errors
 from equipix._check import Array, Bools, Floats
-from equipix.errors import (
-    ConvergenceWarning,
-    EquipixWarning,
-    IdentifiabilityWarning,
-    InputWarning,
-    MisfitWarning,
-)
 
 Concern = Literal["input", "identifiability", "misfit", "convergence"]
 """What a finding concerns: the values given, what they determine, the model, or the solver."""
@@ -24,11 +18,11 @@ Concern = Literal["input", "identifiability", "misfit", "convergence"]
 Severity = Literal["note", "warning", "failure"]
 """The result is right, may be wrong, or is none."""
 
-WARNINGS: dict[Concern, type[EquipixWarning]] = {
-    "input": InputWarning,
-    "identifiability": IdentifiabilityWarning,
-    "misfit": MisfitWarning,
-    "convergence": ConvergenceWarning,
+WARNINGS: dict[Concern, type[errors.EquipixWarning]] = {
+    "input": errors.InputWarning,
+    "identifiability": errors.IdentifiabilityWarning,
+    "misfit": errors.MisfitWarning,
+    "convergence": errors.ConvergenceWarning,
 }
 """The class of the warning of each concern."""
 

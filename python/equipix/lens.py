@@ -209,10 +209,10 @@ def fit(
                 "is not darker at the edge. Give the flat, not the dark, and less noise"
             )
         focal = float(half / np.sqrt(found[3]))
-        errors["focal_length"] = focal * std[3] / found[3] / 2
-        return LensFalloff(law, centre, focal, np.empty(0), _plain(errors), shape, reach)
+        errors["focal_length"] = focal * std[3] / float(found[3]) / 2
+        return LensFalloff(law, centre, focal, np.empty(0), errors, shape, reach)
     errors |= {"k1": std[3], "k2": std[4]}
-    return LensFalloff(law, centre, float("nan"), found[3:], _plain(errors), shape, reach)
+    return LensFalloff(law, centre, float("nan"), found[3:], errors, shape, reach)
 
 
 def _image(frame: ArrayLike, sensitivity: ArrayLike | None, mask: ArrayLike | None) -> Floats:
@@ -253,7 +253,7 @@ def _blocks(image: Floats) -> tuple[Floats, Floats, Floats]:
 
 def _fitted(
     model: Callable[[Floats], Floats], values: Floats, start: Floats
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, list[float]]:
     """Parameters of least squares without outliers, and their standard errors."""
     used = np.ones(len(values), bool)
     found = start
@@ -271,7 +271,7 @@ def _fitted(
     variance = float(np.sum((values - model(found))[used] ** 2)) / freedom
     _check_settled(jacobian, (values - model(found))[used], variance, abs(float(found[0])))
     scaled = np.linalg.inv((jacobian / sizes).T @ (jacobian / sizes))
-    return found, np.sqrt(variance * np.diag(scaled)) / sizes
+    return found, (np.sqrt(variance * np.diag(scaled)) / sizes).tolist()
 
 
 def _check_settled(jacobian: Floats, residual: Floats, variance: float, scale: float) -> None:
@@ -322,7 +322,3 @@ def _radial(squared: Any, first: float, second: float) -> Floats:
 
 def _half_diagonal(shape: tuple[int, int]) -> float:
     return float(np.hypot(*shape)) / 2
-
-
-def _plain(errors: dict[str, Any]) -> dict[str, float]:
-    return {name: float(value) for name, value in errors.items()}

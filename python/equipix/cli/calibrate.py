@@ -10,16 +10,16 @@ import typer
 
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
-from equipix.cli.summary import of_calibration, summary, told
+from equipix.cli.summary import show_saved, summary
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
-from equipix.loading import load
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_comparison
+from equipix.saved_results import load
 
 commands = typer.Typer()
 
@@ -60,10 +60,7 @@ def calibrate(
         calibration = loaded.run(mask=excluded, workers=workers, progress=progress, **options)
     if not partial:
         _refuse_partial(calibration, output)
-    calibration.save(output, force=force)
-    result = {"output": str(output), **of_calibration(calibration)}
-    result |= told(calibration.findings, as_json=as_json)
-    terminal.show_result(result, as_json=as_json)
+    show_saved(output, calibration, calibration.findings, force=force, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
@@ -107,7 +104,7 @@ def compare(
         names = [file.stem for file in calibrations]
         save_figure(draw_comparison(result, names), output, force=force)
     predicted = None if result.predicted_rms is None else result.predicted_rms.tolist()
-    pairs = [
+    pairs: list[dict[str, Any]] = [
         {
             "files": [str(calibrations[i]) for i in pair],
             "rms": float(result.rms[k]),
@@ -122,7 +119,11 @@ def compare(
     if as_json:
         terminal.show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
         return
-    _show_pairs(pairs)
+    figures = ("rms", "block_rms", "largest")
+    terminal.show_table(
+        ("relative difference", "pixels, rms", "16×16 means, rms", "largest"),
+        [(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures)) for pair in pairs],
+    )
     words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
     if result.open_tilt.any():
         left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}
@@ -140,12 +141,3 @@ def _refuse_equal(files: list[Path], calibrations: list[Calibration]) -> None:
                 f"'{one}' and '{other}' hold one calibration, so that their agreement says "
                 "nothing: name calibrations of independent experiments"
             )
-
-
-def _show_pairs(pairs: list[dict[str, Any]]) -> None:
-    """Print how far the calibrations of each pair differ."""
-    figures = ("rms", "block_rms", "largest")
-    terminal.show_table(
-        ("relative difference", "pixels, rms", "16×16 means, rms", "largest"),
-        [(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures)) for pair in pairs],
-    )

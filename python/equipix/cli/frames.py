@@ -6,16 +6,16 @@ from typing import Annotated, Any
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import known, of_statistics, told
-from equipix.correction.correct_files import Corrected, correct_files, is_folder
+from equipix.cli.summary import known, show_saved
+from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
 from equipix.experiment.image_files import origin_of, refuse_repeated_files
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.loading import load_correction
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
+from equipix.saved_results import load_correction
 
 commands = typer.Typer()
 
@@ -56,9 +56,7 @@ def average(
             statistics.refuse_subtracted(offset, " ".join(dark))
         found = average_frames(frames, dark=offset, mask=excluded, **common, **options)
     said = say(*ask(statistics.AVERAGED, found))
-    found.save(output, force=force)
-    result = {"output": str(output), **of_statistics(found), **told(said, as_json=as_json)}
-    terminal.show_result(result, as_json=as_json)
+    show_saved(output, found, said, force=force, as_json=as_json)
 
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
@@ -103,19 +101,15 @@ def correct(
             progress=progress,
             **options,
         )
-    counts = _counts(done, whole=done.dtype != "float32" and options["display"] is None)
-    result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
-    terminal.show_result(result, as_json=as_json)
-
-
-def _counts(done: Corrected, *, whole: bool) -> dict[str, Any]:
-    """Collect what was counted, as far as it can differ from 0."""
-    return known(
+    whole = done.dtype != "float32" and options["display"] is None
+    counts = known(
         limited_values=done.limited if whole else None,
         extrapolated_values=done.extrapolated,
         replaced_pixels=done.replaced or None,
         unusable_pixels=done.flagged or None,
     )
+    result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
+    terminal.show_result(result, as_json=as_json)
 
 
 def _refuse_image(output: Path) -> None:

@@ -13,16 +13,12 @@ from equipix.findings import usable
 from equipix.hardware.quality import quality, smallest_widths
 from equipix.hardware.table import SUFFIXES, Table
 from equipix.hardware.words import STEPS
-from equipix.loading import load_correction
+from equipix.saved_results import load_correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""
 
 commands = typer.Typer()
-
-
-@commands.callback()
-def _group() -> None: ...
 
 
 @commands.command(

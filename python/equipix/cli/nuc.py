@@ -1,6 +1,6 @@
 """Commands about corrections with a uniform source: nuc fit, nuc defects, nuc quality."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -8,20 +8,20 @@ from typing import Annotated, Any, Literal
 import typer
 
 from equipix import metrics
-from equipix._check import Array, By, Flagged, naming_memory
+from equipix._check import Array, By, Flagged, Order, naming_memory
 from equipix.cli import terminal
 from equipix.cli.summary import flagged as flag_counts
-from equipix.cli.summary import summary, told
+from equipix.cli.summary import show_saved, told
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
-from equipix.loading import load_correction
 from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
 from equipix.nuc.bad_pixels import find_defects
 from equipix.nuc.response import Response
+from equipix.saved_results import load_correction
 
 commands = typer.Typer()
 
@@ -32,15 +32,7 @@ nuc = typer.Typer(
 
 commands.add_typer(nuc, name="nuc")
 
-_ORDERS = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
-
-
-@commands.callback()
-def _group() -> None: ...
-
-
-@nuc.callback()
-def _nuc() -> None: ...
+_ORDERS: dict[str, Order] = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
 
 
 @nuc.command(epilog="Example: equipix nuc fit levels.toml -o response.tif --order auto")
@@ -63,16 +55,9 @@ def fit(
     refuse_inputs([output], [levels, *loaded.files(), *terminal.given(mask)])
     with terminal.working(mask) as (progress, excluded):
         response = loaded.run(
-            order=_ORDERS[order],  # type: ignore[arg-type]
-            by=by,
-            mask=excluded,
-            workers=workers,
-            progress=progress,
+            order=_ORDERS[order], by=by, mask=excluded, workers=workers, progress=progress
         )
-    response.save(output, force=force)
-    figures = summary(response) | told(response.findings, as_json=as_json)
-    result = {"output": str(output), **figures}
-    terminal.show_result(result, as_json=as_json)
+    show_saved(output, response, response.findings, force=force, as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc defects response.tif level/*.tif -o flagged.tif")
@@ -147,21 +132,20 @@ def _quality(
 ) -> dict[str, Any]:
     """Measure spatial over temporal noise of corrected frames, and its parts; of each plane."""
 
-    def measured(flagged: Flagged, figure: Callable[[Array], Any]) -> dict[str, Any]:
-        # The corrected frames end here: of long series one stack at a time is held.
+    def planes(flagged: Flagged) -> Iterable[tuple[str, Array]]:
         corrected = correction.correct(raw, flagged=flagged)
-        cut = {"": corrected} if colours is None else metrics.planes(corrected, colours)
-        return {name: figure(each) for name, each in cut.items()}
+        return ({"": corrected} if colours is None else metrics.planes(corrected, colours)).items()
 
-    usable = measured("nan", lambda each: metrics.correctability(each, confidence=confidence))
-    kept = measured("keep", lambda each: metrics.correctability(each, confidence=confidence).ratio)
-    parts = measured(
-        "replace",
-        lambda each: {
-            "noise_variances": asdict(metrics.three_d_noise(each)),
-            "roughness": metrics.roughness(each.mean(axis=0)),
-        },
-    )
+    # Of long series one stack of corrected frames at a time is held.
+    usable = {k: metrics.correctability(v, confidence=confidence) for k, v in planes("nan")}
+    kept = {k: metrics.correctability(v).ratio for k, v in planes("keep")}
+    parts = {
+        k: {
+            "noise_variances": asdict(metrics.three_d_noise(v)),
+            "roughness": metrics.roughness(v.mean(axis=0)),
+        }
+        for k, v in planes("replace")
+    }
     result = {
         name: {
             "frames": good.frames,

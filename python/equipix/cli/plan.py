@@ -138,14 +138,10 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
         [(name, *map(words, plans)) for name, words in rows.items()],
     )
     for pattern, found in zip(patterns, plans, strict=True):
-        shifts = " ".join(f"{row:g},{col:g}" for row, col in _ordered(found))
+        shifts = " ".join("{:g},{:g}".format(*found["shifts"][k]) for k in found["order"])
         print(f"{pattern}, in the order advised: {shifts}")  # noqa: T201
 
 
 def _by_colour(found: dict[str, int]) -> str:
     """Write the components of each colour, and their sum."""
     return f"{sum(found.values())} ({', '.join(f'{k} {n}' for k, n in found.items())})"
-
-
-def _ordered(found: dict[str, Any]) -> list[list[float]]:
-    return [found["shifts"][k] for k in found["order"]]

@@ -4,20 +4,19 @@ from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import typer
 
 from equipix.cli import terminal
 from equipix.cli.summary import of_scene, told
 from equipix.errors import FileError, InputError
-from equipix.io.formats import SUFFIXES
+from equipix.io.formats import SUFFIXES, raw_header
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures.canvas import check_picture, save_figure
 from equipix.pictures.comparison import draw_sequence
 from equipix.scene.methods import METHODS, resumed
 from equipix.scene.scene_correction import SceneCorrection, SceneState
-from equipix.scene.sequence import SequenceResult, check_range, run_sequence, sequence_format
+from equipix.scene.sequence import SequenceResult, check_range, run_sequence
 
 commands = typer.Typer()
 
@@ -25,10 +24,6 @@ _SHOWN = 10
 """Most points of the quality that are printed."""
 
 _TIFF = (".tif", ".tiff")
-
-
-@commands.callback()
-def _group() -> None: ...
 
 
 @commands.command(epilog="Example: equipix scene frames/*.tif -o nuc.tif --method registered")
@@ -90,9 +85,9 @@ def scene(
             raise InputError("--bit-depth and --data-range exclude each other: leave out one")
         data_range = (0, 2**bit_depth - 1)
     with terminal.working(mask) as (progress, excluded):
-        options["mask"] = excluded
+        options |= {"data_range": data_range, "mask": excluded}
         chosen = {name: value for name, value in options.items() if value is not None}
-        learning = _method(method, frames, data_range, chosen, resume, workers)
+        learning = _method(method, frames, chosen, resume, workers)
         done = run_sequence(learning, frames, output=corrected, force=force, progress=progress)
     result = learning.correction()
     result.save(output, force=force)
@@ -105,17 +100,13 @@ def scene(
 
 
 def _method(
-    name: str,
-    frames: list[str],
-    data_range: tuple[float, float] | None,
-    options: dict[str, Any],
-    resume: Path | None,
-    workers: int | None,
+    name: str, frames: list[str], options: dict[str, Any], resume: Path | None, workers: int | None
 ) -> SceneCorrection:
     """Make the correction, or read its state."""
-    shape, dtype = sequence_format(frames)
+    (_, rows, cols), dtype, _ = raw_header(find_files(frames)[0])
+    shape = (rows, cols)
     if resume is not None:
-        if options or data_range:
+        if options:
             raise InputError(
                 "'resume' (--resume) brings its options with it: leave out --data-range, "
                 "--bit-depth, --mask, --saturation, --step, --width, --threshold, --motion, "
@@ -131,7 +122,7 @@ def _method(
             raise InputError(f"{resume}: is of --method {state.method}, not of {name}: name that")
         check_range(state.data_range, dtype, resume)
         return resumed(resume, state, workers=workers)
-    if data_range is None and dtype.kind != "u":
+    if "data_range" not in options and dtype.kind != "u":
         raise InputError(
             f"the frames are {dtype}, whose range is unknown: give 'data_range' (--data-range "
             "LOW HIGH), or --bit-depth"
@@ -139,7 +130,7 @@ def _method(
     known = signature(METHODS[name]).parameters
     if unknown := [f"--{option.replace('_', '-')}" for option in options if option not in known]:
         raise InputError(f"--method {name} does not take {' and '.join(unknown)}: leave it out")
-    return METHODS[name](shape, data_range or np.dtype(dtype), workers=workers, **options)
+    return METHODS[name](shape, **{"data_range": dtype, **options}, workers=workers)
 
 
 def _summary(output: Path, method: SceneCorrection, done: SequenceResult) -> dict[str, Any]:

@@ -61,13 +61,8 @@ def demo(
         terminal.working(announce=True) as (progress, _),
     ):
         folder = keep or Path(scratch) / "experiment"
-        options: dict[str, Any] = {
-            "rng": rng,
-            "force": force,
-            "workers": workers,
-            "progress": progress,
-        }
-        result = run_demo(folder, shape=shape, frames=frames, **options)
+        common: dict[str, Any] = {"force": force, "workers": workers, "progress": progress}
+        result = run_demo(folder, shape=shape, frames=frames, rng=rng, **common)
     save_figure(draw_demo(result), output, force=force)
     figures = {"picture": str(output), **result.figures()}
     if as_json:

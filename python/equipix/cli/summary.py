@@ -2,32 +2,40 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
+from equipix.cli import terminal
 from equipix.correction.protocol import Correction, sensor_of
 from equipix.findings import Finding, Flag, usable
+from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneCorrection
 
-_Figures: TypeAlias = Callable[[Any], dict[str, Any]]
-
 _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
 
 
-def summary(
-    content: Correction | DynamicCorrection | FrameStatistics | SceneCorrection,
-) -> dict[str, Any]:
+def summary(content: Record | Correction | SceneCorrection) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
-    figures: _Figures = _FIGURES.get(type(content), _of_correction)
+    figures: Callable[[Any], dict[str, Any]] = _FIGURES.get(type(content), _of_correction)
     return figures(content)
+
+
+def show_saved(
+    output: Path, result: Record, findings: Iterable[Finding], *, force: bool, as_json: bool
+) -> None:
+    """Save a result, and print its main figures and its findings."""
+    result.save(output, force=force)
+    figures = {"output": str(output), **summary(result), **told(findings, as_json=as_json)}
+    terminal.show_result(figures, as_json=as_json)
 
 
 def known(**figures: Any) -> dict[str, Any]:
@@ -128,7 +136,7 @@ def of_scene(method: SceneCorrection) -> dict[str, Any]:
     return {
         "shape": list(method.shape),
         "scene_method": method.method,
-        "scene_data_range": list(method.data_range),
+        "scene_data_range": np.asarray(method.data_range).tolist(),
         "usable_frames": method.frames_taken,
         "frames_that_counted": method.frames,
         "frames_foreign": method.frames_foreign,
@@ -223,7 +231,7 @@ def _tilt_in_words(std: Array) -> str:
     return f"undetermined along {' and '.join(names)}, and set to 0" if names else "determined"
 
 
-_FIGURES: dict[type, _Figures] = {
+_FIGURES: dict[type, Callable[[Any], dict[str, Any]]] = {
     FrameStatistics: of_statistics,
     Calibration: of_calibration,
     Response: of_response,

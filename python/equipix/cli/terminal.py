@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.models import OptionInfo
 
-from equipix._check import Array, Bools
+from equipix._check import Array, Bools, Progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
@@ -21,14 +21,12 @@ from equipix.io.formats import raw_header
 from equipix.io.frames import read_frames, read_mask
 from equipix.io.paths import find_files, refuse_inputs
 
-Report = Callable[[int, int, str], None]
-
 _WHOLE = 1e9
 """Whole numbers below this are printed with all digits, as saturation levels are."""
 
 
 @contextmanager
-def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
+def progress_bars(*, announce: bool = False) -> Iterator[Progress | None]:
     """Show bars on a terminal's stderr, one for each stage of the work, and none in a pipe.
 
     With `announce`, a pipe gets the name of each stage instead, on a line of its own.
@@ -52,7 +50,7 @@ def progress_bars(*, announce: bool = False) -> Iterator[Report | None]:
         yield report
 
 
-def _announcer() -> Report:
+def _announcer() -> Progress:
     """Return what writes the name of each stage once."""
     stages: set[str] = set()
 
@@ -122,9 +120,9 @@ def check_output(
 def raw_frames(frames: Iterable[str], correction: Path | None = None) -> Array:
     """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
     files = find_files(frames)
-    marks = {file: raw_header(file).description for file in files}
+    headers = {file: raw_header(file) for file in files}
     if correction is not None:
-        warn_of_corrected(marks, image_files.origin_of(correction))
+        warn_of_corrected(headers, image_files.origin_of(correction))
     return read_frames(files)
 
 
@@ -136,7 +134,7 @@ def given(*paths: Path | None) -> list[Path]:
 @contextmanager
 def working(
     mask: Path | None = None, *, announce: bool = False
-) -> Iterator[tuple[Report | None, Bools | None]]:
+) -> Iterator[tuple[Progress | None, Bools | None]]:
     """Give bars of progress, and the mask in a file, which messages on the mask name."""
     excluded = None if mask is None else read_mask(mask)
     try:

@@ -1,8 +1,9 @@
 """The one way to apply a correction to frames: coefficients prepared once."""
 
+import math
 import threading
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -14,13 +15,13 @@ from equipix._check import (
     ReadOnly,
     as_array,
     check_word,
+    is_whole,
     naming_memory,
     positive_workers,
 )
 from equipix.correction.protocol import (
     Correction,
     Dark,
-    bits_of,
     check_correction,
     check_sensor,
     depth_of,
@@ -84,17 +85,17 @@ class Prepared:
         self.depth.refuse_type(raw.dtype)
         plain = result.flags.carray and not np.may_share_memory(result, raw)
         if formula is None and plain and {raw.dtype, result.dtype} <= {*self._types}:
-            highest = self.run(raw, result, largest_of(result.dtype))[-1]
+            highest = self.run(raw, result, largest_value(result.dtype))[-1]
             self.depth.refuse_highest(highest, raw.dtype)
             return
         kind = result.dtype if result.dtype in self._types else _DOUBLE
-        for source, target in zip(_each(raw), _each(result), strict=True):
+        for source, target in zip(each_frame(raw), each_frame(result), strict=True):
             self.depth.refuse_highest(float(np.fmax.reduce(source, axis=None)), raw.dtype)
             taken = source if formula is None else formula(source)
             if taken.dtype not in self._types:
                 taken = taken.astype(_DOUBLE)
             made = np.empty(source.shape, kind)
-            self.run(taken, made, largest_of(kind))
+            self.run(taken, made, largest_value(kind))
             target[...] = made
 
 
@@ -114,8 +115,15 @@ class CorrectionBase(ReadOnly):
 
     @property
     def bits(self: Correction) -> int:
-        """Bits of the raw values, 0 where they are unknown."""
-        return bits_of(self.metadata, self.saturation)
+        """Bits of the raw values, by the saturation level unless named; 0 where both are unknown.
+
+        Pixels may give more than that level, which may be set below the largest value.
+        """
+        bits = sensor_table(self.metadata).get("bit_depth")
+        if isinstance(bits, int):
+            return bits
+        level = self.saturation
+        return 0 if level in (None, math.inf) else math.ceil(level).bit_length()
 
     @property
     def colours(self: Correction) -> Colours | None:
@@ -173,6 +181,15 @@ class CorrectionBase(ReadOnly):
         return self.coefficients
 
 
+class RawCorrection(CorrectionBase):
+    """Base of corrections of raw frames: no dark frame is subtracted, and no levels limit them."""
+
+    dark: ClassVar[None] = None
+    takes_dark: ClassVar[bool] = False
+    needs_dark: ClassVar[bool] = False
+    limits: ClassVar[None] = None
+
+
 def apply(
     correction: Any,
     frames: ArrayLike,
@@ -211,11 +228,12 @@ def _prepared(correction: Any, dark: Dark, flagged: Flagged, *, double: bool) ->
     return made
 
 
-def _each(stack: Array) -> Array:
+def each_frame(stack: Array) -> Array:
+    """One frame, or the frames of a stack, as a stack."""
     return stack[None] if stack.ndim == 2 else stack
 
 
-def checked_frames(frames: ArrayLike, shape: tuple[int, int]) -> Array:
+def checked_frames(frames: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Refuse frames of another shape than the sensor."""
     raw = as_array("frames", frames, ndim=(2, 3))
     if raw.shape[-2:] != shape:
@@ -228,14 +246,18 @@ def _result(raw: Array, out: Array | None, flagged: Flagged, *, whole: bool) -> 
     check_flagged(flagged)
     if out is None:
         return np.empty(raw.shape, _DOUBLE if raw.dtype == _DOUBLE else np.float32)
-    fits = isinstance(out, np.ndarray) and out.shape == raw.shape and out.flags.writeable
-    if not fits or out.dtype not in ((*FAST, _DOUBLE) if whole else (FAST[-1], _DOUBLE)):
-        got = f"{getattr(out, 'dtype', type(out).__name__)} {np.shape(out)}"
-        raise InputError(
-            f"'out' is {got}, expected a writeable float32 or float64 array of shape {raw.shape}"
-        )
+    _refuse_output(out, raw, (*FAST, _DOUBLE) if whole else (FAST[-1], _DOUBLE))
     check_flagged(flagged, out.dtype)
     return out
+
+
+def _refuse_output(out: Array, raw: Array, dtypes: tuple[np.dtype[Any], ...]) -> None:
+    """Refuse an array that frames of no such type, or of another shape, are written to."""
+    fits = isinstance(out, np.ndarray) and out.shape == raw.shape and out.flags.writeable
+    if not fits or out.dtype not in dtypes:
+        got = f"{getattr(out, 'dtype', type(out).__name__)} of shape {np.shape(out)}"
+        wanted = " or ".join(map(str, dtypes))
+        raise InputError(f"'out' is {got}, expected a writeable {wanted} array of {raw.shape}")
 
 
 def check_flagged(flagged: object, dtype: np.dtype[Any] | None = None) -> None:
@@ -253,11 +275,6 @@ def usual_treatment(dtype: np.dtype[Any]) -> Flagged:
     return "replace" if dtype.kind == "u" else "nan"
 
 
-def largest_of(dtype: np.dtype[Any]) -> float:
-    """Return the largest value of a dtype of whole numbers; 0, which is not used, of others."""
-    return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
-
-
 def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     """Return a type that corrected frames may have, and refuse others."""
     try:
@@ -269,13 +286,12 @@ def output_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     return found
 
 
-def largest_value(dtype: np.dtype[Any], bit_depth: int | None) -> float:
-    """Return the largest value of whole numbers of so many bits."""
+def largest_value(dtype: np.dtype[Any], bit_depth: int | None = None) -> float:
+    """Return the largest value of whole numbers of so many bits; 0, not used, of others."""
     if bit_depth is None:
-        return largest_of(dtype)
+        return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
     bits = 8 * dtype.itemsize
-    number = isinstance(bit_depth, int | np.integer) and not isinstance(bit_depth, bool)
-    if dtype.kind != "u" or not number or bit_depth not in range(8, bits + 1):
+    if dtype.kind != "u" or not is_whole(bit_depth, 8, bits):
         wanted = f"8 to {bits}"
         if dtype.kind != "u":
             wanted = "None for float32: whole numbers need 'dtype' (--dtype) uint16 or uint8"
@@ -435,10 +451,7 @@ class Corrector:
 
     def _checked(self, out: Array, raw: Array) -> Array:
         """Refuse an array that the result cannot be written to."""
-        array = isinstance(out, np.ndarray)
-        if not array or out.dtype != self.dtype or out.shape != raw.shape:
-            got = f"{getattr(out, 'dtype', type(out).__name__)} of shape {np.shape(out)}"
-            raise InputError(f"'out' is {got}, expected {self.dtype} of shape {raw.shape}")
+        _refuse_output(out, raw, (self.dtype,))
         if not out.flags.carray:
             raise InputError(
                 "'out' is not contiguous, not aligned or read-only: give a writeable C-order array"

@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 
 from equipix._check import Array, Display, Flagged, OutputType, Progress
 from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
-from equipix.correction.protocol import Correction, Dark
-from equipix.errors import (
-    FileError,
-    InputError,
-)
+from equipix.correction.protocol import Correction, Dark, refuse_dark
+from equipix.errors import FileError, InputError
 from equipix.findings import Finding, say, usable
-from equipix.io.formats import raw_header
+from equipix.io.formats import raw_headers
 from equipix.io.frames import Header, stream_frames
 from equipix.io.paths import find_files, folder_beside, refuse_inputs, write_whole
 from equipix.io.png import write_png
@@ -133,10 +130,10 @@ def correct_files(
     files = find_files(source)
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
-    headers = {file: _header(file, correction) for file in files}
+    headers = raw_headers(files, correction.shape)
     total, done = sum(header.shape[0] for header in headers.values()), 0
     _refuse_pictures(output, total, wanted)
-    warn_of_corrected({file: header.description for file, header in headers.items()}, origin)
+    warn_of_corrected(headers, origin)
     flagged = usual_treatment(wanted) if flagged is None else flagged
     of_dark = _dark(correction, dark)
     corrector = Corrector(
@@ -246,13 +243,13 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def warn_of_corrected(marks: Mapping[Path, str], origin: str) -> None:
+def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> None:
     """Warn of files whose text this module has written; `origin` as for `correct_files`."""
-    corrected = [file for file, mark in marks.items() if mark.startswith(_MARK)]
+    corrected = [file for file, each in headers.items() if each.description.startswith(_MARK)]
     if not corrected:
         return
     others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
-    same = bool(origin) and marks[corrected[0]].endswith(origin)
+    same = bool(origin) and headers[corrected[0]].description.endswith(origin)
     by = "by this correction" if same else "by another correction"
     words = (
         f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
@@ -290,24 +287,11 @@ def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
     say(Finding("limited", words, "input"))
 
 
-def _header(file: Path, correction: Correction) -> Header:
-    """Read what a file says of its frames; they must be raw, and of the sensor's shape."""
-    found = raw_header(file)
-    shape = found.shape[1:]
-    if shape != correction.shape:
-        raise InputError(f"{file}: holds frames of shape {shape}, expected {correction.shape}")
-    return found
-
-
 def _dark(correction: Correction, dark: str) -> Dark:
     """Give the dark frame that an option names, for the argument of `Corrector`."""
     if dark == "stored":
         return "stored"
-    if not correction.takes_dark:
-        raise InputError(
-            f"'dark' is '{dark}', but the offsets of this correction are part of it and no dark "
-            "frame can replace them: expected 'stored'"
-        )
+    refuse_dark(correction, dark)
     if dark == "none":
         return None
     statistics = average(dark)

@@ -1,12 +1,12 @@
 """A correction that is its coefficients, and the combination of two corrections."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 
 from equipix._check import Array, check_type
-from equipix.correction.apply import CorrectionBase
+from equipix.correction.apply import RawCorrection
 from equipix.correction.protocol import Correction, check_correction, sensor_table
 from equipix.errors import InputError
 from equipix.findings import Finding
@@ -17,7 +17,7 @@ _MOST = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Polynomial(CorrectionBase, Record, kind="polynomial", version=2):
+class Polynomial(RawCorrection, Record, kind="polynomial", version=2):
     """A correction Σ c_j y^j of raw values y, such as two corrections combined.
 
     Attributes
@@ -48,10 +48,6 @@ class Polynomial(CorrectionBase, Record, kind="polynomial", version=2):
     saturation: float | None = None
     leaves_offset: bool = False
     findings: tuple[Finding, ...] = ()
-    dark: ClassVar[None] = None
-    takes_dark: ClassVar[bool] = False
-    needs_dark: ClassVar[bool] = False
-    limits: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together."""

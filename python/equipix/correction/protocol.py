@@ -1,6 +1,5 @@
 """What a correction is, and checks of its sensor and bit depth."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from os import PathLike
@@ -169,6 +168,15 @@ def is_stored(dark: Dark) -> bool:
     return isinstance(dark, str)
 
 
+def refuse_dark(correction: Correction, dark: Dark) -> None:
+    """Refuse another dark than "stored" where a correction takes none."""
+    if not correction.takes_dark:
+        raise InputError(
+            f"'dark' is {described(dark)}, but the offsets of this correction are part of it and "
+            "no dark frame can replace them: expected 'stored'"
+        )
+
+
 def with_dark(correction: _C, dark: Dark) -> _C:
     """Return a correction with this dark frame in place of that stored."""
     if is_stored(dark):
@@ -178,11 +186,7 @@ def with_dark(correction: _C, dark: Dark) -> _C:
                 "it is already subtracted"
             )
         return correction
-    if not correction.takes_dark:
-        raise InputError(
-            "'dark' is given, but the offsets of this correction are part of it and no dark frame "
-            "can replace them: expected 'stored'"
-        )
+    refuse_dark(correction, dark)
     if dark is not None and correction.leaves_offset:
         raise InputError(
             "'dark' is given, but the offsets of this response are part of its curves: it was "
@@ -253,17 +257,6 @@ class Depth(NamedTuple):
 
 _DARK = 10.0
 """Level without light, in DN, from which frames of at most 1 DN are in another unit."""
-
-
-def bits_of(metadata: Mapping[str, Any], saturation: float | None) -> int:
-    """Return the bits of the sensor in metadata, else those that hold the saturation level.
-
-    Pixels may give more than that level, which may be set below the largest value. 0 without both.
-    """
-    bits = sensor_table(metadata).get("bit_depth")
-    if isinstance(bits, int):
-        return bits
-    return 0 if saturation in (None, math.inf) else math.ceil(saturation).bit_length()
 
 
 def depth_of(correction: Correction) -> Depth:

@@ -69,7 +69,8 @@ def _macros(content: Content, upper: str) -> list[str]:
 def _arrays(content: Content, lower: str) -> list[str]:
     """Words of all pixels, row by row."""
     lines = []
-    for name, values in content.arrays().items():
+    for name in DTYPES:
+        values = getattr(content, name)
         texts = [str(value) for value in values.ravel().tolist()]
         lines.append(f"static const {values.dtype.name}_t {lower}_{name}[{values.size}] = {{")
         lines += [",".join(texts[i : i + _A_LINE]) + "," for i in range(0, len(texts), _A_LINE)]
@@ -106,15 +107,10 @@ def from_c_header(path: Path, data: bytes) -> Content:
     if guard is None or not last.startswith(f"#endif /* {guard[1]}_H"):
         raise FileError(f"{path}: has no last line '#endif' with its guard: incomplete")
     content = made(path, fields, {name: _words(path, text, name) for name in DTYPES})
-    if _DIGEST not in last:
-        raise FileError(
-            f"{path}: its last line has no SHA-256 of the lines above: an older version wrote it, "
-            "or the digest was removed: write the table again"
-        )
     if last != _last(guard[1], above + newline):
         raise FileError(
-            f"{path}: was edited: the SHA-256 in its last line is not that of the lines above: "
-            "write the table again"
+            f"{path}: was edited, or its digest removed: the last line does not hold the SHA-256 "
+            "of the lines above: write the table again"
         )
     return content
 

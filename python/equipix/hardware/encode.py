@@ -5,13 +5,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
+from numpy.typing import DTypeLike
 
 from equipix._check import Array, Bools, Floats
 from equipix._native import __version__
-from equipix.correction.protocol import Correction
+from equipix.correction.protocol import Correction, sensor_table
 from equipix.errors import InputError
 from equipix.findings import set_bits, usable
-from equipix.hardware.table_files import Content
+from equipix.hardware.table_files import DTYPES, Content
 from equipix.hardware.words import Format, Words
 
 _FINEST_GAIN = -40
@@ -96,14 +97,11 @@ def encode(
     lost = fine - np.ldexp(float(base), steps.out) - np.ldexp(offset_words, exponent)
     exponents = {"adc": steps.adc, "coarse": coarse, "offset": exponent, "out": steps.out}
     found = Format(**widths, **exponents, gain=gain_exponent, base=base, zero=zero)
-    return Content(
-        found,
-        _spread(coarse_words, used, np.uint16),
-        _spread(offset_words, used, np.int16),
-        _spread(gain_words, used, np.uint16),
-        flags,
-        {"lowest": lowest, "largest_error_dn": float((np.abs(lost) + np.abs(rounding)).max())},
-    )
+    largest = float((np.abs(lost) + np.abs(rounding)).max())
+    stored = {"coarse": coarse_words, "offset": offset_words, "gain": gain_words}
+    arrays = {name: _spread(each, used, DTYPES[name]) for name, each in stored.items()}
+    metadata = {"lowest": lowest, "largest_error_dn": largest}
+    return Content(found, **arrays, flags=flags, metadata=metadata)
 
 
 def _zero(lowest: float, steps: Steps) -> int:
@@ -218,7 +216,7 @@ def _chosen(words: Words, values: Floats, exponent: int | None, finest: int) -> 
     return words.encoded(values, chosen), chosen
 
 
-def _spread(words: Floats, used: Bools, dtype: type[np.generic]) -> Array:
+def _spread(words: Floats, used: Bools, dtype: DTypeLike) -> Array:
     """Words of usable pixels in their places, 0 elsewhere."""
     out = np.zeros(used.shape, dtype)
     out[used] = words
@@ -231,12 +229,12 @@ def origin(correction: Correction) -> dict[str, Any]:
     for array in (np.asarray(correction.coefficients, "<f8"), np.asarray(correction.flags, "<u4")):
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
-    sensor = correction.metadata.get("sensor")
+    sensor = sensor_table(correction.metadata)
     return {
         "equipix": __version__,
         "correction": type(correction).__name__,
         "sha256": digest.hexdigest(),
-        **({"sensor": sensor} if isinstance(sensor, dict) else {}),
+        **({"sensor": sensor} if sensor else {}),
     }
 
 

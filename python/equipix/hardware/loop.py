@@ -3,10 +3,10 @@
 import numpy as np
 
 from equipix import _native
-from equipix._check import Array, ArrayLike, as_array, check_shape, positive_workers, read_only
+from equipix._check import Array, ArrayLike, check_shape, positive_workers, read_only
 from equipix._native import __version__
 from equipix.errors import InputError
-from equipix.hardware.table import Table
+from equipix.hardware.table import Table, adc_words
 from equipix.hardware.words import STEPS, WIDTHS, Format, check_width, exponent_of
 
 _FINEST = 12
@@ -108,13 +108,7 @@ class AdaptiveLoop:
             If the shape or the dtype does not fit, or a word exceeds the largest of the ADC; then
             nothing is changed.
         """
-        raw = as_array("frames", frames, ndim=(2, 3))
-        if raw.shape[-2:] != self._gain.shape or raw.dtype not in (np.uint8, np.uint16):
-            raise InputError(
-                f"'frames' is {raw.dtype} of shape {raw.shape}, expected uint8 or uint16 words of "
-                f"{self._gain.shape}"
-            )
-        words = np.ascontiguousarray(raw, np.uint16)
+        words = adc_words(frames, self._gain.shape)
         largest = 2 ** self._widths[0] - 1
         if words.size and words.max() > largest:
             raise InputError(

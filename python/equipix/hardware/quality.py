@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -183,18 +183,13 @@ def smallest_widths(
     return Widths(offset, gain, both, found)
 
 
-class _Level(NamedTuple):
+def _level(
+    name: str, correction: Correction, frames: ArrayLike
+) -> tuple[Array, Array, Correctability]:
     """Frames of one level, the same corrected in floating point, and their C."""
-
-    raw: Array
-    exact: Array
-    before: Correctability
-
-
-def _level(name: str, correction: Correction, frames: ArrayLike) -> _Level:
     raw = as_array(name, frames, ndim=3)
     exact = correction.correct(raw, flagged="nan")
-    return _Level(raw, exact, correctability(exact))
+    return raw, exact, correctability(exact)
 
 
 def _first(found: dict[int, float], limit: float) -> int | None:

@@ -1,11 +1,9 @@
 """A table of words: made, applied, written, read."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -15,25 +13,32 @@ from equipix._check import (
     ArrayLike,
     Flagged,
     Floats,
-    ReadOnly,
     naming_memory,
     number,
     positive_workers,
 )
-from equipix.correction.apply import CorrectionBase, apply, checked_frames
+from equipix.correction.apply import RawCorrection, apply, checked_frames, each_frame
 from equipix.correction.protocol import Correction, Dark, check_correction, with_dark
 from equipix.errors import FileError, InputError
 from equipix.findings import Finding, usable
 from equipix.hardware import c_header, table_files
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
-from equipix.hardware.table_files import Content, check_words
-from equipix.hardware.words import WIDTHS, Format, check_width, chosen_exponent, exponent_of
+from equipix.hardware.table_files import Content
+from equipix.hardware.words import WIDTHS, check_width, chosen_exponent, exponent_of
 from equipix.io.paths import as_path, write_whole
 from equipix.measured.colour import Colours
 
 
+class Applied(NamedTuple):
+    """Corrected words, and how many outputs were limited to 0 and to the largest word."""
+
+    words: Array
+    below: int
+    above: int
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Table(CorrectionBase):
+class Table(RawCorrection, Content):
     r"""Words of a correction: a coarse offset ahead of the ADC, fine offset and gain behind it.
 
     Attributes
@@ -81,22 +86,7 @@ class Table(CorrectionBase):
     True
     """
 
-    format: Format
-    coarse: Array
-    offset: Array
-    gain: Array
-    flags: Array
-    metadata: dict[str, Any] = field(default_factory=dict)
-    dark: ClassVar[None] = None
-    takes_dark: ClassVar[bool] = False
-    needs_dark: ClassVar[bool] = False
-    limits: ClassVar[None] = None
     saturation: ClassVar[None] = None
-
-    def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together."""
-        ReadOnly.__post_init__(self)
-        check_words(self._content)
 
     def __repr__(self) -> str:
         """Short form: sizes and widths."""
@@ -191,7 +181,7 @@ class Table(CorrectionBase):
         }
         if linearise is not None:
             metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
-        return cls(*found._replace(metadata=metadata))
+        return cls(**vars(found) | {"metadata": metadata})
 
     @property
     def leaves_offset(self) -> bool:
@@ -240,7 +230,7 @@ class Table(CorrectionBase):
         raw, f, used = checked_frames(frames, self.shape), self.format, usable(self.flags)
         pedestal = np.ldexp(self.coarse.astype(np.float64), f.coarse)
         words = np.empty(raw.shape, np.uint16)
-        for source, target in zip(_each(raw), _each(words), strict=True):
+        for source, target in zip(each_frame(raw), each_frame(words), strict=True):
             lost = int(np.count_nonzero(~np.isfinite(source) & used))
             if lost:
                 raise InputError(f"'frames' holds {lost} usable pixels that are not finite")
@@ -272,20 +262,14 @@ class Table(CorrectionBase):
 
     def applied(self, frames: ArrayLike, *, workers: int | None = None) -> Applied:
         """Like `apply`, with the numbers of outputs that were limited."""
-        raw = checked_frames(frames, self.shape)
-        if raw.dtype not in (np.uint8, np.uint16):
-            raise InputError(
-                f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
-                "table.digitise(frames) makes them of raw values"
-            )
-        words = np.ascontiguousarray(raw, np.uint16)
-        out, stack = np.empty(words.shape, np.uint16), (-1, *self.shape)
+        words = adc_words(frames, self.shape)
+        out, stack, f = np.empty(words.shape, np.uint16), (-1, *self.shape), self.format
         below, above = _native.apply_words(
             words.reshape(stack),
             np.ascontiguousarray(self.gain),
             np.ascontiguousarray(self.offset),
             out.reshape(stack),
-            self.format.arithmetic,
+            (f.adc_bits, f.out_bits, f.adc, f.offset, f.gain, f.out, f.base),
             workers=positive_workers(workers),
         )
         return Applied(out, below, above)
@@ -350,14 +334,9 @@ class Table(CorrectionBase):
         """
         file = as_path("path", path)
         encode_file, _ = _FORMATS[_suffix(file)]
-        data = encode_file(self._content, file.stem)
+        data = encode_file(self, file.stem)
         with write_whole(path, force=force) as temporary:
             temporary.write_bytes(data)
-
-    @property
-    def _content(self) -> Content:
-        arrays = (self.coarse, self.offset, self.gain, self.flags)
-        return Content(self.format, *arrays, self.metadata)
 
 
 _FORMATS = {
@@ -382,7 +361,7 @@ def read_table(path: str | PathLike[str]) -> Table:
     file = as_path("path", path)
     _, decode_file = _FORMATS[_suffix(file)]
     try:
-        return Table(*decode_file(file, file.read_bytes()))
+        return Table(**vars(decode_file(file, file.read_bytes())))
     except FileError:
         raise
     except OSError as error:
@@ -398,13 +377,12 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-class Applied(NamedTuple):
-    """Corrected words, and how many outputs were limited to 0 and to the largest word."""
-
-    words: Array
-    below: int
-    above: int
-
-
-def _each(stack: Array) -> Array:
-    return stack[None] if stack.ndim == 2 else stack
+def adc_words(frames: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Words of the ADC of one frame or a stack, uint16."""
+    raw = checked_frames(frames, shape)
+    if raw.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"'frames' is {raw.dtype}, expected uint8 or uint16 words of the ADC: "
+            "table.digitise(frames) makes them of raw values"
+        )
+    return np.ascontiguousarray(raw, np.uint16)

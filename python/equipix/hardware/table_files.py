@@ -15,13 +15,13 @@ Flags of a pixel follow its word as a comment.
 import json
 import struct
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from equipix._check import Array
+from equipix._check import Array, ReadOnly
 from equipix.errors import FileError, InputError
 from equipix.findings import usable
 from equipix.hardware.words import Format
@@ -35,50 +35,47 @@ DTYPES = {"coarse": np.uint16, "offset": np.int16, "gain": np.uint16, "flags": n
 """Type of each array, in the order of the files."""
 
 
-class Content(NamedTuple):
-    """The parts of a table."""
-
-    format: Format
-    coarse: Array
-    offset: Array
-    gain: Array
-    flags: Array
-    metadata: dict[str, Any]
-
-    def arrays(self) -> dict[str, Array]:
-        """Arrays by name."""
-        return {name: getattr(self, name) for name in DTYPES}
-
-
-def check_words(content: Content) -> None:
-    """Refuse arrays that do not fit together.
+@dataclass(frozen=True, eq=False)
+class Content(ReadOnly):
+    """The parts of a table, as of `equipix.hardware.Table`.
 
     Raises
     ------
     InputError
         If a type or a size is another, or words do not fit their widths.
     """
-    for name, array in content.arrays().items():
-        dtype = DTYPES[name]
-        if array.dtype != dtype or array.ndim != 2 or array.shape != content.gain.shape:
-            raise InputError(
-                f"'{name}' is {array.dtype} of shape {array.shape}, expected "
-                f"{np.dtype(dtype)} of {content.gain.shape}"
-            )
-    for name, bits in content.format.stored.items():
-        words = content.arrays()[name].astype(np.int32)
-        end = 2 ** (bits - (name == "offset"))
-        if np.any((words >= end) | (words < -end)):
-            raise InputError(f"'{name}' holds words of more than its width")
-    if np.any((content.gain == 0) != ~usable(content.flags)):
-        raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
+
+    format: Format
+    coarse: Array
+    offset: Array
+    gain: Array
+    flags: Array
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
+        super().__post_init__()
+        for name, dtype in DTYPES.items():
+            array = getattr(self, name)
+            if array.dtype != dtype or array.ndim != 2 or array.shape != self.gain.shape:
+                raise InputError(
+                    f"'{name}' is {array.dtype} of shape {array.shape}, expected "
+                    f"{np.dtype(dtype)} of {self.gain.shape}"
+                )
+        for name, bits in self.format.stored.items():
+            words = getattr(self, name).astype(np.int32)
+            end = 2 ** (bits - (name == "offset"))
+            if np.any((words >= end) | (words < -end)):
+                raise InputError(f"'{name}' holds words of more than its width")
+        if np.any((self.gain == 0) != ~usable(self.flags)):
+            raise InputError("'gain' must be 0 where 'flags' has DO_NOT_USE, and only there")
 
 
 def checksum(content: Content) -> int:
     """CRC-32 of format and metadata, then of the arrays as little-endian numbers of their types."""
     crc = zlib.crc32(json.dumps([asdict(content.format), content.metadata]).encode())
     for name, dtype in DTYPES.items():
-        stored = content.arrays()[name].astype(np.dtype(dtype).newbyteorder("<"))
+        stored = getattr(content, name).astype(np.dtype(dtype).newbyteorder("<"))
         crc = zlib.crc32(stored.tobytes(), crc)
     return crc
 
@@ -165,7 +162,7 @@ def to_binary(content: Content, _name: str) -> bytes:
     text = text.ljust(_aligned(_FIXED + len(text)) - _FIXED)
     parts = [_MAGIC, _LENGTH.pack(len(text)), text]
     for name, dtype in _stored(content.format).items():
-        memory = content.arrays()[name].astype(dtype).tobytes()
+        memory = getattr(content, name).astype(dtype).tobytes()
         parts.append(memory.ljust(_aligned(len(memory)), b"\0"))
     return b"".join(parts)
 

@@ -83,11 +83,6 @@ class Format:
             )
 
     @property
-    def arithmetic(self) -> tuple[int, int, int, int, int, int, int]:
-        """Numbers that the compiled part needs."""
-        return self.adc_bits, self.out_bits, self.adc, self.offset, self.gain, self.out, self.base
-
-    @property
     def stored(self) -> dict[str, int]:
         """Bits of the words of a pixel, by the names of a table's arrays."""
         widths = (self.dac_bits, self.offset_bits, self.gain_bits)

@@ -1,24 +1,22 @@
-"""Files of named arrays with metadata: the formats by suffix."""
+"""Files of named arrays with metadata: their formats by suffix, and NPZ, which is one of them."""
 
 import json
-import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
+import numpy as np
 
+from equipix._check import Array
 from equipix.errors import FileError, InputError
-from equipix.io import npz, tiff
+from equipix.io import tiff
 from equipix.io.frames import Header, frame_format, header
 from equipix.io.paths import as_path, reading, write_whole
 
-_FORMATS = {".tif": tiff, ".tiff": tiff, ".npz": npz}
-"""The module of each format: ``write_pages``, ``read_pages`` and ``description``."""
-
-SUFFIXES = tuple(_FORMATS)
+_TEXT = "metadata"
+"""Name of the array of an NPZ file that is the text."""
 
 _SEPARATORS = (", ", " : ")
 """Of the JSON text: tifffile takes one that holds ``"shape":`` for its own."""
@@ -27,9 +25,33 @@ _CRC = "crc32"
 """Key of the checksum of the metadata."""
 
 
+_Content = tuple[dict[str, Array], str]
+"""Arrays by name, and the text."""
+
+
+def _write_npz(path: Path, pages: Mapping[str, Array], text: str) -> None:
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **{_TEXT: np.array(text)}, **pages)
+
+
+def _read_npz(path: Path) -> _Content:
+    with path.open("rb") as stream, np.lib.npyio.NpzFile(stream) as file:
+        pages = dict(file)
+    return pages, str(pages.pop(_TEXT, ""))
+
+
+_FORMATS = {
+    **dict.fromkeys((".tif", ".tiff"), (tiff.write_pages, tiff.read_pages)),
+    ".npz": (_write_npz, _read_npz),
+}
+"""What writes and reads arrays and a text in each format; of other files there is no text."""
+
+SUFFIXES = tuple(_FORMATS)
+
+
 def save_pages(
     path: str | PathLike[str],
-    pages: Mapping[str, NDArray[Any]],
+    pages: Mapping[str, Array],
     metadata: Mapping[str, Any],
     *,
     force: bool = False,
@@ -55,15 +77,13 @@ def save_pages(
     InputError
         If the suffix is unknown.
     """
-    kind = _FORMATS.get(as_path("path", path).suffix.lower())
-    if kind is None:
-        raise InputError(f"'path' is {os.fspath(path)!r}, expected the suffix .tif or .npz")
+    write_pages, _ = _format(as_path("path", path))
     text = json.dumps({**metadata, _CRC: _checksum(metadata)}, separators=_SEPARATORS)
     with write_whole(path, force=force) as temporary:
-        kind.write_pages(temporary, pages, text)
+        write_pages(temporary, pages, text)
 
 
-def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, Any]]:
     """Read what `save_pages` wrote.
 
     Parameters
@@ -87,13 +107,9 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
         If the suffix is unknown.
     """
     path = as_path("path", path)
-    kind = _FORMATS.get(path.suffix.lower())
-    if kind is None:
-        raise InputError(
-            f"{path}: ends in '{path.suffix}', expected a .tif or .npz file that equipix has saved"
-        )
+    _, read_pages = _format(path)
     with reading(path):
-        pages, text = kind.read_pages(path)
+        pages, text = read_pages(path)
     metadata = _parsed(text)
     if _CRC not in metadata:
         raise FileError(
@@ -105,6 +121,12 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, NDArray[Any]], dict
             "again"
         )
     return pages, metadata
+
+
+def _format(path: Path) -> tuple[Callable[..., None], Callable[[Path], _Content]]:
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(f"{path}: ends in '{path.suffix}', expected the suffix .tif or .npz")
+    return _FORMATS[path.suffix.lower()]
 
 
 def _checksum(metadata: Mapping[str, Any]) -> int:
@@ -125,11 +147,11 @@ def saved_kind(path: Path) -> str | None:
 
     Files of whole numbers, which cameras write, are not searched.
     """
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES or (suffix != ".npz" and frame_format(path)[1].kind != "f"):
-        return None
-    with reading(path):
-        return _kind(_FORMATS[suffix].description(path))
+    if path.suffix.lower() == ".npz":
+        with reading(path):
+            return _kind(_read_npz(path)[1])
+    is_searched = path.suffix.lower() in SUFFIXES and frame_format(path)[1].kind == "f"
+    return _kind(header(path).description) if is_searched else None
 
 
 def _kind(text: str) -> str | None:
@@ -152,6 +174,15 @@ def _refuse_kind(path: Path, kind: str | None) -> None:
     if kind is not None:
         article = "" if kind.endswith("s") else "a "
         raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
+
+
+def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Header]:
+    """What files say of their frames, which must be raw and of the sensor's shape."""
+    headers = {file: raw_header(file) for file in files}
+    for file, found in headers.items():
+        if found.shape[1:] != shape:
+            raise InputError(f"{file}: holds frames of shape {found.shape[1:]}, expected {shape}")
+    return headers
 
 
 def raw_header(path: Path) -> Header:

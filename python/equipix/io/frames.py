@@ -18,24 +18,13 @@ _AT_ONCE = 2**27
 """Most bytes of a file of several frames that are read at once."""
 
 
-def description(path: Path) -> str:
-    """Text stored with a TIFF or PNG; empty where there is none."""
-    if path.suffix.lower() == ".png":
-        return png.description(path)
-    return tiff.description(path)
-
-
-def read_frames(
-    source: str | PathLike[str] | Iterable[str | PathLike[str]], *, workers: int | None = None
-) -> NDArray[Any]:
+def read_frames(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> NDArray[Any]:
     """All frames of some files at once; `equipix.average` does not hold them all.
 
     Parameters
     ----------
     source : path, glob, or list of these
         Files as in `find_files`.
-    workers : int, optional
-        Number of threads; by default one for each processor.
 
     Returns
     -------
@@ -47,7 +36,7 @@ def read_frames(
     FileError
         If a file cannot be read or differs from the first in shape or dtype.
     """
-    return np.concatenate([frames for _, frames in stream_frames(source, workers=workers)])
+    return np.concatenate([frames for _, frames in stream_frames(source)])
 
 
 def stream_frames(
@@ -129,10 +118,6 @@ def _format(frames: NDArray[Any]) -> str:
     return f"{frames.shape[-2]} x {frames.shape[-1]} (rows x columns), {frames.dtype}"
 
 
-_MAGIC = b"\x93NUMPY"
-"""First bytes of an .npy file."""
-
-
 def read_mask(path: str | PathLike[str]) -> NDArray[np.bool_]:
     """Read which pixels must not be used: those that are not 0 in the file.
 
@@ -166,7 +151,7 @@ def read_mask(path: str | PathLike[str]) -> NDArray[np.bool_]:
 
 def _array(file: Path) -> NDArray[Any]:
     with reading(file), file.open("rb") as stream:
-        if stream.read(len(_MAGIC)) != _MAGIC:
+        if stream.read(6) != np.lib.format.MAGIC_PREFIX:
             raise FileError(f"{file}: is no .npy file, whatever its name says")
         stream.seek(0)
         return np.asarray(np.load(stream, allow_pickle=False))

@@ -8,7 +8,7 @@ import shutil
 import threading
 import uuid
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
@@ -109,6 +109,8 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except EquipixError:
         raise
+    except FileNotFoundError as error:
+        raise FileError(f"{path}: does not exist") from error
     except Exception as error:
         hint = "; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
         raise FileError(f"{path}: cannot be read: {error}{hint}") from error
@@ -156,8 +158,7 @@ def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[P
         If `path` is not the name of a file.
     """
     target = as_path("path", path)
-    temporary = _beside(target)
-    try:
+    with _temporary(target) as temporary:
         if target.is_dir():
             raise FileError(f"{target}: is a folder, expected the name of a file")
         if not target.parent.exists():
@@ -168,12 +169,6 @@ def write_whole(path: str | PathLike[str], *, force: bool = False) -> Iterator[P
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(target)
-    except EquipixError:
-        raise
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -195,9 +190,16 @@ def folder_beside(target: Path) -> Iterator[Path]:
     FileError
         If something cannot be written.
     """
-    temporary = _beside(target.resolve())
-    try:
+    with _temporary(target.resolve()) as temporary:
         temporary.mkdir(parents=True)
+        yield temporary
+
+
+@contextmanager
+def _temporary(target: Path) -> Iterator[Path]:
+    """Name what becomes the target: a file or a folder beside it, removed if it is left there."""
+    temporary = _beside(target)
+    try:
         yield temporary
     except EquipixError:
         raise
@@ -205,6 +207,8 @@ def folder_beside(target: Path) -> Iterator[Path]:
         raise FileError(f"{target}: cannot be written: {error}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def replace_folder(target: Path, new: Path) -> None:

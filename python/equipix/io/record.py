@@ -22,6 +22,7 @@ import json
 import math
 import typing
 import zlib
+from collections.abc import Callable
 from functools import cache
 from os import PathLike
 from types import NoneType, UnionType
@@ -203,13 +204,10 @@ def _encoded(value: Any, hint: Any, name: str, held: _Arrays) -> Any:
     if typing.get_origin(inner) is Annotated:
         return held.put(name, value, *inner.__metadata__)
     if fields := _fields(inner):
-        return {
-            key: _encoded(getattr(value, key), each, _joined(name, key), held)
-            for key, each in fields.items()
-        }
+        return _each(_encoded, {key: getattr(value, key) for key in fields}, fields, name, held)
     if typing.get_origin(inner) is dict:
-        each = typing.get_args(inner)[1]
-        return {key: _encoded(it, each, _joined(name, key), held) for key, it in value.items()}
+        hints = dict.fromkeys(value, typing.get_args(inner)[1])
+        return _each(_encoded, value, hints, name, held)
     if typing.get_origin(inner) is tuple:
         return [_encoded(it, each, key, held) for it, each, key in _items(value, inner, name)]
     plain = value.item() if isinstance(value, np.generic) else value
@@ -227,21 +225,24 @@ def _decoded(told: Any, hint: Any, name: str, held: _Arrays) -> Any:
     if fields := _fields(inner):
         if told.keys() != fields.keys():
             raise ValueError(f"'{name}' holds {', '.join(told)}, expected {', '.join(fields)}")
-        return inner(
-            **{
-                key: _decoded(told[key], each, _joined(name, key), held)
-                for key, each in fields.items()
-            }
-        )
+        return inner(**_each(_decoded, told, fields, name, held))
     if typing.get_origin(inner) is dict:
-        each = typing.get_args(inner)[1]
-        return {key: _decoded(it, each, _joined(name, key), held) for key, it in told.items()}
+        hints = dict.fromkeys(told, typing.get_args(inner)[1])
+        return _each(_decoded, told, hints, name, held)
     if typing.get_origin(inner) is tuple:
         return tuple(_decoded(it, each, key, held) for it, each, key in _items(told, inner, name))
     if inner is float and told in _NOT_FINITE:
         return float(told)
     _check_plain(told, inner, name)
     return told
+
+
+def _each(
+    code: Callable[..., Any], told: dict[str, Any], hints: dict[str, Any], name: str, held: _Arrays
+) -> dict[str, Any]:
+    """Encode or decode the named values of a field by their annotations."""
+    names = {key: f"{name}.{key}" if name else key for key in hints}
+    return {key: code(told[key], hint, names[key], held) for key, hint in hints.items()}
 
 
 @cache
@@ -270,10 +271,6 @@ def _items(values: Any, hint: Any, name: str) -> list[tuple[Any, Any, str]]:
         hints = hints[:1] * len(values)
     names = (f"{name}.{number}" for number in range(len(values)))
     return [*zip(values, hints, names, strict=True)]
-
-
-def _joined(name: str, key: str) -> str:
-    return f"{name}.{key}" if name else key
 
 
 def _check_plain(value: Any, hint: Any, name: str) -> None:

@@ -156,10 +156,3 @@ def _image_or_stack(path: Path, name: str, images: Sequence[Any]) -> NDArray[Any
             f" number from 0 with their count {len(images)}"
         )
     return np.stack([image.asarray() for image in images])
-
-
-def description(path: Path) -> str:
-    """Text stored with the first page of a TIFF; empty where there is none."""
-    with reading(path), tifffile.TiffFile(path) as file:
-        page: Any = file.pages[0]
-        return str(page.description)

@@ -1,33 +1,31 @@
 """The methods of corrections from the scene, and their states read from files."""
 
+from dataclasses import dataclass
 from os import PathLike
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
+from numpy.typing import ArrayLike
 
-from equipix._check import Array, as_array, number, positive_workers
+from equipix._check import Array, positive_workers
 from equipix._native import SceneCorrection as Native
 from equipix.errors import EquipixError, FileError
-from equipix.scene.scene_correction import DataRange, SceneCorrection, SceneState, whole_number
+from equipix.scene.scene_correction import SceneCorrection, SceneState
 
 FOUR = ((0, 1, 0), (1, 0, 1), (0, 1, 0))
 """Weights of the mean of four neighbours."""
 
 
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class LocalMean(SceneCorrection):
     """Gain and offset towards the mean of the neighbours, in every frame.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
     data_range : dtype or tuple of float
         Lowest and highest raw value in DN, or the dtype of whole numbers.
-    step : float
-        Step η, below the stability bound 1/λ (Notes).
-    kernel : array_like, shape (odd, odd)
-        Weights of the neighbours; they are divided by their sum.
     saturation : float, optional
         Raw value in DN from which a pixel is saturated and does not learn; by default the largest
         whole number of the frames' dtype, and none for floats.
@@ -35,6 +33,10 @@ class LocalMean(SceneCorrection):
         Number of threads; by default one for each processor.
     mask : array_like, shape (rows, cols), optional
         Pixels that are not 0 in it do not learn, and others do not learn from them.
+    step : float
+        Step η, below the stability bound 1/λ (Notes).
+    kernel : array_like, shape (odd, odd)
+        Weights of the neighbours; they are divided by their sum.
 
     Raises
     ------
@@ -69,37 +71,30 @@ class LocalMean(SceneCorrection):
     """
 
     method: ClassVar[str] = "local-mean"
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        data_range: DTypeLike | DataRange,
-        *,
-        step: float = 0.025,
-        kernel: ArrayLike = FOUR,
-        saturation: float | None = None,
-        workers: int | None = None,
-        mask: ArrayLike | None = None,
-    ) -> None:
-        """Begin with gain 1 and offset 0."""
-        weights = as_array("kernel", kernel, ndim=2).astype(np.float64)
-        options = {"step": number("step", step), "kernel": weights.tolist()}
-        super().__init__(shape, data_range, saturation, workers, options, mask)
+    step: float = 0.025
+    kernel: ArrayLike = FOUR
 
     def _made(self) -> Native:
-        kernel = np.array(self._options["kernel"], np.float64)
-        return Native.local_mean(self._shape, self._range, self._options["step"], kernel)
+        return Native.local_mean(self.shape, self._range, self.step, np.array(self.kernel))
 
 
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Gated(SceneCorrection):
     """Gain and offset towards a local mean, only where that mean has changed.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
     data_range : dtype or tuple of float
         Lowest and highest raw value in DN, or the dtype of whole numbers.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
     step : float
         Step η, below the stability bound 1/λ; it is 0.82 for a width of 11.
     width : int
@@ -110,13 +105,6 @@ class Gated(SceneCorrection):
     texture : float
         Factor k of the step η / (1 + k σ²) with the variance σ² of the corrected values in the
         square, on the scale [0, 1]. With 1000 the pattern itself makes the first steps too short.
-    saturation : float, optional
-        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
-        whole number of the frames' dtype, and none for floats.
-    workers : int, optional
-        Number of threads; by default one for each processor.
-    mask : array_like, shape (rows, cols), optional
-        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -139,42 +127,29 @@ class Gated(SceneCorrection):
     _UNLEARNED: ClassVar[str] = (
         "the local mean never changed by more than 'threshold'; take a moving scene"
     )
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        data_range: DTypeLike | DataRange,
-        *,
-        step: float = 0.06,
-        width: int = 11,
-        threshold: float = 0.02,
-        texture: float = 100.0,
-        saturation: float | None = None,
-        workers: int | None = None,
-        mask: ArrayLike | None = None,
-    ) -> None:
-        """Begin with gain 1 and offset 0."""
-        options = {
-            "step": number("step", step),
-            "width": whole_number("width", width),
-            "threshold": number("threshold", threshold),
-            "texture": number("texture", texture),
-        }
-        super().__init__(shape, data_range, saturation, workers, options, mask)
-
-    def _made(self) -> Native:
-        return Native.gated(self._shape, self._range, **self._options)
+    step: float = 0.06
+    width: int = 11
+    threshold: float = 0.02
+    texture: float = 100.0
 
 
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Registered(SceneCorrection):
     """Gain and offset towards the other frame of a pair, moved by the shift between them.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 20 or more.
     data_range : dtype or tuple of float
         Lowest and highest raw value in DN, or the dtype of whole numbers.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
     step : float
         Step η, below the stability bound 0.25.
     least_motion : float
@@ -188,13 +163,6 @@ class Registered(SceneCorrection):
         Least mean cosine of the phases that the shift leaves, 0 to 1; pairs below, as after a
         change of scene, are not used. On small arrays, of few phases, at least what the best shift
         between unrelated frames exceeds in 1 % of them is asked for: 0.36 at 96×96, 0.62 at 48×64.
-    saturation : float, optional
-        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
-        whole number of the frames' dtype, and none for floats.
-    workers : int, optional
-        Number of threads; by default one for each processor.
-    mask : array_like, shape (rows, cols), optional
-        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -219,44 +187,30 @@ class Registered(SceneCorrection):
     _UNLEARNED: ClassVar[str] = (
         "the scene never moved by 'least_motion', or no pair of frames agreed; take a moving scene"
     )
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        data_range: DTypeLike | DataRange,
-        *,
-        step: float = 0.1,
-        least_motion: float = 0.5,
-        most_motion: int = 8,
-        cutoff: float = 0.1,
-        agreement: float = 0.3,
-        saturation: float | None = None,
-        workers: int | None = None,
-        mask: ArrayLike | None = None,
-    ) -> None:
-        """Begin with gain 1 and offset 0."""
-        options = {
-            "step": number("step", step),
-            "least_motion": number("least_motion", least_motion),
-            "most_motion": whole_number("most_motion", most_motion),
-            "cutoff": number("cutoff", cutoff),
-            "agreement": number("agreement", agreement),
-        }
-        super().__init__(shape, data_range, saturation, workers, options, mask)
-
-    def _made(self) -> Native:
-        return Native.registered(self._shape, self._range, **self._options)
+    step: float = 0.1
+    least_motion: float = 0.5
+    most_motion: int = 8
+    cutoff: float = 0.1
+    agreement: float = 0.3
 
 
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ConstantStatistics(SceneCorrection):
     """Mean and deviation of each pixel over time made equal to those of its neighbourhood.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
     data_range : dtype or tuple of float
         Lowest and highest raw value in DN, or the dtype of whole numbers.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
     width : int
         Rows and columns of the neighbourhood, odd.
     window : int
@@ -267,13 +221,6 @@ class ConstantStatistics(SceneCorrection):
         on the scale [0, 1]. Only frames that moved count.
     prior : int
         Number of moving frames at which half of a gain's deviation from 1 is believed.
-    saturation : float, optional
-        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
-        whole number of the frames' dtype, and none for floats.
-    workers : int, optional
-        Number of threads; by default one for each processor.
-    mask : array_like, shape (rows, cols), optional
-        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -296,42 +243,29 @@ class ConstantStatistics(SceneCorrection):
 
     method: ClassVar[str] = "constant-statistics"
     _UNLEARNED: ClassVar[str] = "the scene never moved by more than 'motion'; take a moving scene"
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        data_range: DTypeLike | DataRange,
-        *,
-        width: int = 21,
-        window: int = 4000,
-        motion: float = 0.004,
-        prior: int = 100,
-        saturation: float | None = None,
-        workers: int | None = None,
-        mask: ArrayLike | None = None,
-    ) -> None:
-        """Begin with gain 1 and offset 0."""
-        options = {
-            "width": whole_number("width", width),
-            "window": whole_number("window", window),
-            "motion": number("motion", motion),
-            "prior": whole_number("prior", prior),
-        }
-        super().__init__(shape, data_range, saturation, workers, options, mask)
-
-    def _made(self) -> Native:
-        return Native.constant_statistics(self._shape, self._range, **self._options)
+    width: int = 21
+    window: int = 4000
+    motion: float = 0.004
+    prior: int = 100
 
 
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Kalman(SceneCorrection):
     """Recursive estimate of drifting gains and offsets from blocks of frames, with variances.
 
-    Parameters
+    Attributes
     ----------
     shape : tuple of int
         Sizes of the sensor (rows, cols), 16 or more.
     data_range : dtype or tuple of float
         Lowest and highest raw value in DN, or the dtype of whole numbers.
+    saturation : float, optional
+        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
+        whole number of the frames' dtype, and none for floats.
+    workers : int, optional
+        Number of threads; by default one for each processor.
+    mask : array_like, shape (rows, cols), optional
+        Pixels that are not 0 in it do not learn, and others do not learn from them.
     width : int
         Rows and columns of the neighbourhood, odd.
     block : int
@@ -344,13 +278,6 @@ class Kalman(SceneCorrection):
     memory : float
         Moving frames over which gains and offsets drift: their correlation after n frames is
         exp(−n/memory).
-    saturation : float, optional
-        Raw value in DN from which a pixel is saturated and does not learn; by default the largest
-        whole number of the frames' dtype, and none for floats.
-    workers : int, optional
-        Number of threads; by default one for each processor.
-    mask : array_like, shape (rows, cols), optional
-        Pixels that are not 0 in it do not learn, and others do not learn from them.
 
     Raises
     ------
@@ -376,38 +303,15 @@ class Kalman(SceneCorrection):
     _UNLEARNED: ClassVar[str] = (
         "no block of moving frames is complete; take a moving scene, or a shorter 'block'"
     )
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        data_range: DTypeLike | DataRange,
-        *,
-        width: int = 21,
-        block: int = 50,
-        motion: float = 0.004,
-        gain_spread: float = 0.05,
-        offset_spread: float = 0.1,
-        memory: float = 1e6,
-        saturation: float | None = None,
-        workers: int | None = None,
-        mask: ArrayLike | None = None,
-    ) -> None:
-        """Begin with gain 1 and offset 0."""
-        options = {
-            "width": whole_number("width", width),
-            "block": whole_number("block", block),
-            "motion": number("motion", motion),
-            "gain_spread": number("gain_spread", gain_spread),
-            "offset_spread": number("offset_spread", offset_spread),
-            "memory": number("memory", memory),
-        }
-        super().__init__(shape, data_range, saturation, workers, options, mask)
-
-    def _made(self) -> Native:
-        return Native.kalman(self._shape, self._range, **self._options)
+    width: int = 21
+    block: int = 50
+    motion: float = 0.004
+    gain_spread: float = 0.05
+    offset_spread: float = 0.1
+    memory: float = 1e6
 
     def _learned(self) -> bool:
-        return self.frames >= int(self._options["block"])
+        return self.frames >= self.block
 
     @property
     def gain_std(self) -> Array:

@@ -1,8 +1,6 @@
 """What all corrections from the scene share: update and state."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, Field, dataclass, field, fields
 from os import PathLike
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -48,6 +46,34 @@ _TAKEN = (np.uint8, np.uint16, np.float32, np.float64)
 """Types that the compiled part takes as they are."""
 
 
+@dataclass(frozen=True, eq=False)
+class SceneState(Record, kind="state of a correction from the scene", version=5):
+    """All that a correction from the scene remembers: its options, maps and counts."""
+
+    maps: dict[str, Annotated[Array, "float32", "* *"]]
+    mask: Annotated[Bools, "bool", "rows cols"]
+    method: str
+    shape: tuple[int, int]
+    data_range: DataRange
+    saturation: float | None
+    options: dict[str, Any]
+    counts: dict[str, int]
+    peak: float | None
+
+
+@dataclass
+class _Seen:
+    """What changes with the frames, beside the compiled part.
+
+    `masked_at` is the number of frames after which pixels that do not respond were masked, `peak`
+    the largest value.
+    """
+
+    masked_at: int = 0
+    peak: float | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class SceneCorrection:
     """Base of the corrections from the scene: gain and offset that each frame changes.
 
@@ -66,7 +92,36 @@ class SceneCorrection:
     vary by less than half of what the pixels around them do are masked too. A frame that differs
     from the one before and from the last usable one by more than three times the usual change, as
     one of a shutter, is corrected and changes nothing (`Registered` compares pairs instead).
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Sizes of the sensor (rows, cols).
+    data_range : tuple of float
+        Lowest and highest raw value in DN, which become 0 and 1; also of a dtype.
+    saturation : float or None
+        Saturation level in DN that was given.
+    workers : int or None
+        Number of threads that was given.
+    mask : array_like or None
+        Pixels that are not used, as they were given.
+
+    Notes
+    -----
+    A method is a dataclass, whose own fields are its options. They are checked by their defaults:
+    whole numbers, numbers, or weights.
     """
+
+    shape: tuple[int, int]
+    data_range: DTypeLike | DataRange
+    _: KW_ONLY
+    saturation: float | None = None
+    workers: int | None = None
+    mask: ArrayLike | None = None
+    _range: DataRange = field(init=False)
+    _native: Native = field(init=False)
+    _mask: Bools = field(init=False)
+    _seen: _Seen = field(init=False, default_factory=_Seen)
 
     method: ClassVar[str] = ""
     """Name of the method, as the command line takes it."""
@@ -74,50 +129,33 @@ class SceneCorrection:
     _UNLEARNED: ClassVar[str] = "take frames first"
     """What to do where no frame counted."""
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        data_range: DTypeLike | DataRange,
-        saturation: float | None,
-        workers: int | None,
-        options: dict[str, Any],
-        mask: ArrayLike | None,
-    ) -> None:
-        """Check what all methods take; `options` holds the keywords of the method."""
-        self._shape = check_shape(shape)
-        self._range = _range_of(data_range)
-        self._saturation = as_level(saturation)
-        self._workers = positive_workers(workers)
-        self._options = options
-        self._native = self._made()
-        self._mask, self._masked_at = _mask_of(mask, self._shape), 0
-        self._peak: float | None = None
+    def __post_init__(self) -> None:
+        """Check what all methods take, and the options of the method."""
+        kept = vars(self)
+        kept["shape"] = check_shape(self.shape)
+        kept["data_range"] = kept["_range"] = _range_of(self.data_range)
+        kept["saturation"] = as_level(self.saturation)
+        kept["workers"] = positive_workers(self.workers)
+        kept |= {each.name: _option(each, kept[each.name]) for each in _options_of(self)}
+        kept |= {"_mask": _mask_of(self.mask, self.shape), "_native": self._made()}
         if self._mask.any():
             self._native.mask(self._mask)
 
     def _made(self) -> Native:
-        """Make the compiled correction of the options."""
-        raise NotImplementedError
+        """Make the compiled correction, which has the name of the method."""
+        make = getattr(Native, self.method.replace("-", "_"))
+        made: Native = make(self.shape, self._range, **self.options)
+        return made
 
     def __repr__(self) -> str:
         """Short form: method, sizes and frames."""
-        rows, cols = self._shape
+        rows, cols = self.shape
         return f"<{type(self).__name__} of {rows} x {cols} pixels, {self.frames} frames>"
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Sizes of the sensor (rows, cols)."""
-        return self._shape
-
-    @property
-    def data_range(self) -> DataRange:
-        """Lowest and highest raw value in DN, which become 0 and 1."""
-        return self._range
 
     @property
     def options(self) -> dict[str, Any]:
         """Keywords of the method, as JSON values."""
-        return dict(self._options)
+        return {each.name: getattr(self, each.name) for each in _options_of(self)}
 
     @property
     def frames(self) -> int:
@@ -143,13 +181,8 @@ class SceneCorrection:
         and includes nothing that stands still in all frames. While a pattern is still being
         learned, it is larger.
         """
-        found = self._native.floor(self._workers)
+        found = self._native.floor(self.workers)
         return None if found is None else found * (self._range[1] - self._range[0])
-
-    @property
-    def saturation(self) -> float | None:
-        """Saturation level in DN that was given."""
-        return self._saturation
 
     @property
     def gain(self) -> Array:
@@ -185,28 +218,29 @@ class SceneCorrection:
             range; then nothing has changed.
         """
         raw = as_array("frame", frame, ndim=2)
-        if raw.shape != self._shape or raw.dtype == np.bool_:
+        if raw.shape != self.shape or raw.dtype == np.bool_:
             raise InputError(
-                f"'frame' is {raw.dtype} of shape {raw.shape}, expected numbers of {self._shape}"
+                f"'frame' is {raw.dtype} of shape {raw.shape}, expected numbers of {self.shape}"
             )
         taken = raw if raw.dtype in _TAKEN else raw.astype(np.float64)
-        corrected = np.empty(self._shape, np.float32)
-        level = self._saturation
+        corrected = np.empty(self.shape, np.float32)
+        level = self.saturation
         if level is None and raw.dtype.kind in "iu":
             level = float(np.iinfo(raw.dtype).max)
-        self._native.update(taken, corrected, saturation=level, workers=self._workers)
+        self._native.update(taken, corrected, saturation=level, workers=self.workers)
         if np.isfinite(top := float(raw.max())):
-            self._peak = top if self._peak is None else max(self._peak, top)
+            peak = self._seen.peak
+            self._seen.peak = top if peak is None else max(peak, top)
         self._mask_unresponsive()
         return corrected
 
     def _mask_unresponsive(self) -> None:
         """Mask pixels that do not respond, after 64 frames and each time that they doubled."""
         taken = self.frames_taken
-        if taken < _FIRST_MASK or taken & (taken - 1) or taken == self._masked_at:
+        if taken < _FIRST_MASK or taken & (taken - 1) or taken == self._seen.masked_at:
             return
-        self._masked_at = taken
-        weak = unresponsive(np.ones(self._shape), self._native.deviation(), taken)
+        self._seen.masked_at = taken
+        weak = unresponsive(np.ones(self.shape), self._native.deviation(), taken)
         if not (self._mask | weak).all():
             self._native.mask(self._mask | weak)
 
@@ -252,7 +286,7 @@ class SceneCorrection:
         self.check_learned()
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
         low, high = self._range
-        flags = np.zeros(self._shape, np.uint32)
+        flags = np.zeros(self.shape, np.uint32)
         set_bits(flags, "out_of_range", self._mask)
         set_bits(flags, "dead", unresponsive(gain, self._native.deviation(), self.frames_taken))
         metadata = {
@@ -260,19 +294,18 @@ class SceneCorrection:
                 "method": self.method,
                 "options": self.options,
                 "data_range": list(self._range),
-                "saturation": self._saturation,
+                "saturation": self.saturation,
                 "frames": self.frames,
                 "frames_taken": self.frames_taken,
                 "frames_foreign": self.frames_foreign,
                 "floor_dn": self.floor,
             }
         }
-        counts, still = (self.frames, self.frames_taken), self._native.still()
-        learned = _Learned(*counts, still, self._range, self._peak, gain[flags == 0])
+        learned = _Learned(self, self._native.still(), self._seen.peak, gain[flags == 0])
         said = say(*ask(_RULES, learned))
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
         # The mean of the offsets is 0, so that of raw frames stays.
-        return Polynomial(coefficients, flags, metadata, self._saturation, True, said)
+        return Polynomial(coefficients, flags, metadata, self.saturation, True, said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `equipix.load` goes on with the same bytes.
@@ -290,22 +323,14 @@ class SceneCorrection:
             If the file exists and `force` is not set, or it cannot be written.
         """
         maps, counts = self._native.state()
-        SceneState(
-            dict(maps),
-            self._mask,
-            self.method,
-            self._shape,
-            self._range,
-            self._saturation,
-            self.options,
-            dict(counts),
-            self._peak,
-        ).save(path, force=force)
+        made_of = (self.method, self.shape, self._range, self.saturation, self.options)
+        state = SceneState(dict(maps), self._mask, *made_of, dict(counts), self._seen.peak)
+        state.save(path, force=force)
 
     def restore(self, state: SceneState) -> None:
         """Go on from the maps and counts of a state; the errors are those of `resumed`."""
         self._native.restore([*state.maps.items()], [*state.counts.items()])
-        self._masked_at, self._peak = self.frames_taken, state.peak
+        self._seen.masked_at, self._seen.peak = self.frames_taken, state.peak
 
 
 def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
@@ -319,22 +344,21 @@ def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
 
 
 class _Learned(NamedTuple):
-    """What was learned: from how many frames, of which motion and values; the gains."""
+    """What was learned: in which share of the field, up to which value; the gains."""
 
-    frames: int
-    taken: int
+    method: SceneCorrection
     still: float | None
-    data_range: DataRange
     peak: float | None
     gain: Array
 
 
 def _on_few(e: _Learned) -> str | None:
     """Say that few frames counted: the scene moved hardly, or was not seen to."""
-    if e.frames >= _FEW * e.taken:
+    frames, taken = e.method.frames, e.method.frames_taken
+    if frames >= _FEW * taken:
         return None
     return (
-        f"{e.frames} of {e.taken} frames counted: the scene moved hardly, or "
+        f"{frames} of {taken} frames counted: the scene moved hardly, or "
         "its contrast is too low for its motion to be seen beside the pattern"
     )
 
@@ -352,7 +376,7 @@ def _on_still(e: _Learned) -> str | None:
 
 def _on_range(e: _Learned) -> str | None:
     """Say that the range is far wider than the frames: thresholds are shares of it."""
-    (low, high), peak = e.data_range, e.peak
+    (low, high), peak = e.method._range, e.peak
     if peak is None or peak >= low + _USED * (high - low):
         return None
     bits = max(int(np.ceil(np.log2(max(peak, 1) + 1))), 1)
@@ -384,10 +408,19 @@ _RULES: tuple[Rule[_Learned], ...] = (
 """What is asked of a correction from the scene."""
 
 
-def whole_number(name: str, value: int) -> int:
-    """A whole number from 0, checked."""
+def _options_of(method: SceneCorrection) -> tuple[Field[Any], ...]:
+    """Fields of a method that others do not have."""
+    return fields(method)[len(fields(SceneCorrection)) :]
+
+
+def _option(field: Field[Any], value: Any) -> Any:
+    """Check an option by its default: a whole number, a number, or weights."""
+    if isinstance(field.default, float):
+        return number(field.name, value)
+    if not isinstance(field.default, int):
+        return as_array(field.name, value, ndim=2).astype(np.float64).tolist()
     if not is_whole(value, 0):
-        raise InputError(f"'{name}' is {value!r}, expected a whole number")
+        raise InputError(f"'{field.name}' is {value!r}, expected a whole number")
     return int(value)
 
 
@@ -408,18 +441,3 @@ def _range_of(data_range: DTypeLike | DataRange) -> DataRange:
             "'uint16'"
         ) from error
     return float(limits.min), float(limits.max)
-
-
-@dataclass(frozen=True, eq=False)
-class SceneState(Record, kind="state of a correction from the scene", version=5):
-    """All that a correction from the scene remembers: its options, maps and counts."""
-
-    maps: dict[str, Annotated[Array, "float32", "* *"]]
-    mask: Annotated[Bools, "bool", "rows cols"]
-    method: str
-    shape: tuple[int, int]
-    data_range: DataRange
-    saturation: float | None
-    options: dict[str, Any]
-    counts: dict[str, int]
-    peak: float | None

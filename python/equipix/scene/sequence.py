@@ -10,8 +10,8 @@ import numpy as np
 from equipix._check import Array, Progress, check_progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
-from equipix.io.formats import raw_header
-from equipix.io.frames import Header, stream_frames
+from equipix.io.formats import raw_headers
+from equipix.io.frames import stream_frames
 from equipix.io.paths import find_files, refuse_inputs, write_whole
 from equipix.io.tiff import write_frames
 from equipix.metrics.maps import roughness
@@ -45,18 +45,6 @@ class SequenceResult:
     raw: tuple[float, ...]
     corrected: tuple[float, ...]
     last: Array
-
-
-def sequence_format(source: list[str]) -> tuple[tuple[int, int], np.dtype[Any]]:
-    """Shape (rows, cols) and dtype of the first file's frames.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read, or is no file of raw frames.
-    """
-    (_, rows, cols), dtype, _ = raw_header(find_files(source)[0])
-    return (rows, cols), dtype
 
 
 def check_range(data_range: tuple[float, float], dtype: np.dtype[Any], state: Path) -> None:
@@ -106,14 +94,14 @@ def run_sequence(
     Raises
     ------
     FileError
-        If a file cannot be read, holds frames of another shape, or the output cannot be written.
+        If a file cannot be read, or the output cannot be written.
     InputError
-        If a frame is refused, or no frame counted; then no output is left.
+        If frames have another shape, one is refused, or none counted; then no output is left.
     """
     check_progress(progress)
     files = find_files(source)
-    headers = {file: _header(file, method.shape) for file in files}
-    warn_of_corrected({file: header.description for file, header in headers.items()}, "")
+    headers = raw_headers(files, method.shape)
+    warn_of_corrected(headers, "")
     record = _Record(sum(header.shape[0] for header in headers.values()))
     frames = _corrected(method, files, record, progress)
     if output is None:
@@ -127,14 +115,6 @@ def run_sequence(
             write_frames(temporary, frames, nbytes=nbytes, description=_MARK)
             method.check_learned()
     return record.sequence()
-
-
-def _header(file: Path, shape: tuple[int, int]) -> Header:
-    """Read what a file says of its frames, which must be raw and of the sensor's shape."""
-    found = raw_header(file)
-    if found.shape[1:] != shape:
-        raise FileError(f"{file}: holds frames of shape {found.shape[1:]}, expected {shape}")
-    return found
 
 
 class _Record:
