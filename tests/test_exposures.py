@@ -13,8 +13,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.errors import InputError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions, in_beam, variance_in_beam
 from equipix.fitting import outliers as robust

@@ -299,6 +299,19 @@ def per_exposure(
     return array
 
 
+def one_or_each(
+    name: str, values: ArrayLike, shape: tuple[int, ...], *, ndim: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Finite numbers not below 0, one for all or one for each, as an array of that shape."""
+    array = as_array(name, values, ndim=ndim).astype(np.float64)
+    if array.shape not in ((1,), shape):  # as_array makes one number an array of one
+        raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
+    wrong = array[~(np.isfinite(array) & (array >= 0))]
+    if wrong.size:
+        raise InputError(f"'{name}' holds {wrong[0]:g}, expected finite numbers not below 0")
+    return np.broadcast_to(array, shape)
+
+
 def check_count(name: str, got: int, count: int, one: str = "exposure") -> None:
     """Refuse an argument that has not one entry for each exposure, or level."""
     if got != count:

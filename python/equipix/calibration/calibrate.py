@@ -14,8 +14,7 @@ from equipix.calibration.result import Calibration
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.inputs import BEFORE
 from equipix.diagnosis.rules import AFTER, LAST
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.findings import Finding, ask, say

@@ -7,8 +7,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats
 from equipix._native import Fit
 from equipix.diagnosis import causes
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.findings import usable
 from equipix.fitting.residuals import (
     EXACT,

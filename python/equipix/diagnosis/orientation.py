@@ -14,8 +14,7 @@ import numpy as np
 from equipix._check import Array, Floats, ShiftSign
 from equipix._native import Fit
 from equipix.errors import InputError, InsufficientMemoryError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions
 from equipix.fitting.residuals import left_by

@@ -10,8 +10,7 @@ import numpy as np
 from equipix._check import Array, Floats
 from equipix._native import Fit
 from equipix.diagnosis.evidence import Evidence
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.findings import usable
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.residuals import EXACT, FEWEST, tested

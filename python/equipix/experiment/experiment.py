@@ -11,8 +11,7 @@ from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import Manifest
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.findings import Finding, say

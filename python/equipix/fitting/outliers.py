@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from equipix._check import Array, Bools, Floats
 from equipix._native import Fit
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.measured.noise import ROBUST, nanmedian_abs
 
 _BEYOND = 5.0

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, union
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.findings import set_bits
 from equipix.fitting.outliers import weights_of
 from equipix.fitting.residuals import FEWEST, in_search

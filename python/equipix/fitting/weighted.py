@@ -15,8 +15,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats, union
 from equipix._native import Fit
 from equipix.errors import InputError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.outliers import rejected, without_fallen_dust
 from equipix.measured.noise import modelled_variances
 

@@ -14,8 +14,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats, Progress
 from equipix._native import Fit
 from equipix.errors import InputError, InsufficientMemoryError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.residuals import (
     EXACT,

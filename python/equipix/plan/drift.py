@@ -8,7 +8,16 @@ from itertools import permutations
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, Floats, Ints, as_array, as_shifts, per_exposure
+from equipix._check import (
+    Array,
+    ArrayLike,
+    Floats,
+    Ints,
+    as_array,
+    as_shifts,
+    one_or_each,
+    per_exposure,
+)
 from equipix.errors import InputError
 
 _ON_A_LINE = 1e-12
@@ -200,24 +209,14 @@ def tilt_std(
     count = len(positions)
     variance = np.zeros(count)
     if flux_std is not None:
-        variance += np.square(_each("flux_std", flux_std, (count,)))
+        variance += np.square(one_or_each("flux_std", flux_std, (count,), ndim=(0, 1)))
     if shift_std is not None:
         slope = per_exposure("beam_slope", beam_slope, 2, default=0)
-        variance += np.square(_each("shift_std", shift_std, (count, 2)) * slope).sum(axis=1)
+        errors = one_or_each("shift_std", shift_std, (count, 2), ndim=(0, 1, 2))
+        variance += np.square(errors * slope).sum(axis=1)
     if np.linalg.matrix_rank(positions - positions.mean(axis=0)) < 2:
         return np.full(2, np.inf)
     return tilt_of_fluxes(shape, positions, np.sqrt(variance))
-
-
-def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Standard deviations, one for all or one for each."""
-    array = as_array(name, values, ndim=(0, 1, len(shape))).astype(np.float64)
-    if array.shape not in ((1,), shape):
-        raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
-    wrong = array[~(np.isfinite(array) & (array >= 0))]
-    if wrong.size:
-        raise InputError(f"'{name}' holds {wrong[0]:g}, expected finite numbers not below 0")
-    return np.broadcast_to(array, shape)
 
 
 _ALL = 8

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from equipix._check import Array, Floats, Ints
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.measured.measured import measured_of
