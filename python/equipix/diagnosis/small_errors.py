@@ -179,8 +179,8 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     return [each for each in found if each.sigmas**2 >= least]
 
 
-@if_there_is_light
-def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
+@if_there_is_light()
+def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError] | None:
     """Each error that is larger than noise."""
     window, start = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)

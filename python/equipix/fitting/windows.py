@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +26,6 @@ from equipix.fitting.residuals import (
     tested,
 )
 from equipix.fitting.weighted import Options, Weighted
-
-_Asked = ParamSpec("_Asked")
-
-_Answer = TypeVar("_Answer")
 
 _COARSE, _MOST_COARSE = 1e-2, 300
 """Tolerance and most products of the first fits, sufficient in a beam with structure."""
@@ -210,20 +206,14 @@ def window_of(exposures: Exposures, fit: Fit) -> tuple[Exposures, Fit | None]:
     return exposures.window(side), None
 
 
-def if_there_is_light(question: Callable[_Asked, _Answer]) -> Callable[_Asked, _Answer | None]:
-    """Return a question of fits of a window that answers None in too little light or memory.
+@contextmanager
+def if_there_is_light() -> Iterator[None]:
+    """Let a question of fits of a window answer None in too little light or memory.
 
     All arguments are valid for the whole sensor.
     """
-
-    @functools.wraps(question)
-    def asked(*args: _Asked.args, **kwargs: _Asked.kwargs) -> _Answer | None:
-        try:
-            return question(*args, **kwargs)
-        except (InputError, InsufficientMemoryError):
-            return None
-
-    return asked
+    with suppress(InputError, InsufficientMemoryError):
+        yield
 
 
 def _named(progress: Progress) -> Progress:
@@ -238,7 +228,7 @@ class Chi2(NamedTuple):
     std: float
 
 
-@if_there_is_light
+@if_there_is_light()
 def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     """Reduced χ² by the degrees of freedom that simulated measurements have; None without such.
 
@@ -312,7 +302,7 @@ _LEFT = 0.1
 _FLIPS = {"upside down": (0,), "mirrored left to right": (1,), "turned by 180 degrees": (0, 1)}
 
 
-@if_there_is_light
+@if_there_is_light()
 def misplaced(
     exposures: Exposures, pairs: Sequence[tuple[int, int]], worst: int | None, options: FitOptions
 ) -> str | None:
@@ -329,7 +319,7 @@ def misplaced(
     worst = standing_out(given.residuals) if worst is None else worst
     tried = {
         f"{exposures.name_of(i)} and {exposures.name_of(j)} fit better each at the shift of the "
-        "other: check the order of the frames and of 'shifts'": _at_the_other(window, (i, j))
+        "other: check the order of the frames and of 'shifts'": _exchanged(window, i, j)
         for i, j in pairs
     }
     if worst is not None:
@@ -355,15 +345,11 @@ def _explains(best: WindowFit, given: WindowFit, *, knows_noise: bool) -> bool:
     return not is_noise and best.left - noise < _LEFT * (given.left - noise)
 
 
-def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
+def _exchanged(window: Exposures, i: int, j: int) -> Exposures:
     """Return the exposures, each of two at the place of the other."""
     order = np.arange(len(window))
-    order[list(pair)] = pair[::-1]
-    positions = window.positions
-    moved = dataclasses.replace(
-        positions, shifts=positions.shifts[order], rotation=positions.rotation[order]
-    )
-    return dataclasses.replace(window, positions=moved)
+    order[[i, j]] = j, i
+    return dataclasses.replace(window, positions=window.positions.chosen(order))
 
 
 def _flipped(
