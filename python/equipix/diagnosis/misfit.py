@@ -397,7 +397,7 @@ def _is_fine(weighted: Weighted, residuals: Residuals) -> bool:
 def _seen_by_all(weighted: Weighted, residuals: Residuals) -> Bools:
     """Measurements in cells that all exposures see: elsewhere the beam takes more of a residual."""
     positions, shape = weighted.exposures.positions, weighted.exposures.shape
-    if len(set(positions.rotation.tolist())) > 1:
+    if positions.are_turned:
         return np.isfinite(residuals.values)
     return np.asarray(testable(residuals.rows, on_sensor(positions), shape) > 1 - 1e-9)
 

@@ -20,7 +20,7 @@ from equipix.exposures.positions import Orientation, Positions
 from equipix.fitting.residuals import left_by
 from equipix.fitting.windows import WindowFit
 from equipix.measured.noise import chi2_tail
-from equipix.plan.drift import affine_columns
+from equipix.plan.drift import undetermined_fluxes
 
 _MOST_EXPOSURES = 12
 """Most exposures of the test: each has a flux to be fitted."""
@@ -393,7 +393,7 @@ def _fluxes(fit: WindowFit, window: Exposures, flux: Flux) -> _Fluxes:
     """Compare fitted fluxes with those given, without what the shifts leave undetermined."""
     if flux.kind == "fit":
         return _Fluxes(0.0, agree=True)
-    columns = _undetermined(window.positions, flux)
+    columns = undetermined_fluxes(window.positions, flux.time)
     deviations = np.log(np.array(fit.fit.flux) / flux.values)
     rest, rank = left_by(columns, deviations)
     freedom = len(rest) - rank
@@ -405,13 +405,6 @@ def _fluxes(fit: WindowFit, window: Exposures, flux: Flux) -> _Fluxes:
     std = np.hypot(error, 0.0 if flux.std is None else flux.std)
     agree = chi2_tail(float(np.sum((rest / std) ** 2)), freedom) >= _RARE
     return _Fluxes(float(np.sqrt(rest @ rest / freedom)), agree)
-
-
-def _undetermined(positions: Positions, flux: Flux) -> Floats:
-    """Combinations of ln c (n, columns) that leave no residual or belong to a trend."""
-    if len(set(positions.rotation.tolist())) > 1:
-        return np.ones((len(positions), 1))
-    return affine_columns(positions.shifts, flux.time)
 
 
 def _difference(one: WindowFit, other: WindowFit, shape: tuple[int, int]) -> tuple[float, float]:

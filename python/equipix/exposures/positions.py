@@ -77,6 +77,11 @@ class Positions(ReadOnly):
         """Return the number of exposures."""
         return len(self.shifts)
 
+    @property
+    def are_turned(self) -> bool:
+        """Whether exposures are turned against each other."""
+        return len(set(self.rotation.tolist())) > 1
+
     def oriented(self, orientation: Orientation) -> Self:
         """Return the positions with shifts and rotations in another orientation."""
         std = self.std

@@ -16,7 +16,7 @@ from equipix.fitting.residuals import Residuals, axes_of, left_by, sampled
 from equipix.fitting.weighted import Options, Weighted, weighted_fit
 from equipix.fitting.windows import misplaced
 from equipix.measured.noise import NoiseModel, chi2_tail, photon_transfer
-from equipix.plan.drift import affine_columns
+from equipix.plan.drift import undetermined_fluxes
 
 _RARE = 1e-3
 """Probability of such deviations from a prior below which it is contradicted."""
@@ -95,10 +95,7 @@ def _of_fluxes(weighted: Weighted) -> Contradiction | None:
     flux, positions = weighted.exposures.flux, weighted.exposures.positions
     if flux.kind != "prior" or flux.std is None:
         return None
-    turned = len(set(positions.rotation.tolist())) > 1
-    columns = np.ones((len(positions), 1))
-    if not turned:
-        columns = affine_columns(positions.shifts, None)
+    columns = undetermined_fluxes(positions, None)
     deviations = np.log(np.array(weighted.fit.flux) / flux.values)
     std = flux.std
     if positions.std is not None:

@@ -19,6 +19,7 @@ from equipix._check import (
     per_exposure,
 )
 from equipix.errors import InputError
+from equipix.exposures.positions import Positions
 
 _ON_A_LINE = 1e-12
 """Share of the variance of shifts along an axis, 1 − ρ², below which only rounding is left."""
@@ -91,6 +92,13 @@ def affine_columns(shifts: Array, times: ArrayLike | None) -> Floats:
     if times is not None:
         columns.append(unit_times(np.asarray(times, np.float64)))
     return np.stack(columns, axis=1)
+
+
+def undetermined_fluxes(positions: Positions, times: ArrayLike | None) -> Floats:
+    """Columns of ln c that leave no residual; a factor alone where exposures are turned apart."""
+    if positions.are_turned:
+        return np.ones((len(positions), 1))
+    return affine_columns(positions.shifts, times)
 
 
 def tilt_of_fluxes(shape: tuple[int, int], shifts: Array, flux_std: ArrayLike) -> Floats:
