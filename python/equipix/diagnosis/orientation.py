@@ -13,12 +13,11 @@ import numpy as np
 
 from equipix._check import Array, Floats, ShiftSign
 from equipix._native import Fit
-from equipix.errors import InputError, InsufficientMemoryError
 from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions
 from equipix.fitting.residuals import left_by
-from equipix.fitting.windows import WindowFit
+from equipix.fitting.windows import WindowFit, if_there_is_light
 from equipix.measured.noise import chi2_tail
 from equipix.plan.drift import undetermined_fluxes
 
@@ -161,18 +160,15 @@ def orientation_test(
         return OrientationTest(reason="there are too few measurements; " + _REMEDY)
     # The window first: the exposures chosen are copied.
     windows = {way: exposures.oriented(way).window(side).chosen(asked) for way in ways}
-    try:
+    with if_there_is_light():
         fits = _fits(windows, options)
         left = _left(fits)
         test = _outcome(fits, left)
         if test.sign != "undetermined" or AS_GIVEN not in left:
             return test
         equal = {way: fits[way] for way in ways if way in left}
-        also = hidden(equal, windows, known.chosen(asked), exposures.shape)
-        return test if also is None else dataclasses.replace(test, **also._asdict())
-    except (InputError, InsufficientMemoryError):
-        # All arguments are valid for the whole sensor: the window has too little light or memory.
-        return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
+        return with_hidden(test, equal, windows, known.chosen(asked), exposures.shape)
+    return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
 
 
 def chosen_exposures(positions: Positions, most: int) -> Array:
@@ -278,16 +274,9 @@ def _outcome(fits: Mapping[Orientation, WindowFit], left: set[Orientation]) -> O
         sign = "contradicted"
     elif left == {AS_GIVEN}:
         sign = "confirmed"
-    return OrientationTest(
-        rows=rows,
-        cols=cols,
-        exchanged=exchanged,
-        turned=turned,
-        sign=sign,
-        best=best,
-        ratio=fits[AS_GIVEN].left / fits[best].left if fits[best].left > 0 else None,
-        reason=_reason(fits[best], left, best) if sign == "undetermined" else "",
-    )
+    ratio = fits[AS_GIVEN].left / fits[best].left if fits[best].left > 0 else None
+    reason = _reason(fits[best], left, best) if sign == "undetermined" else ""
+    return OrientationTest(rows, cols, exchanged, turned, sign, best, ratio, reason)
 
 
 def _answer(left: set[Orientation], name: str) -> ShiftSign:
@@ -322,18 +311,6 @@ _PLACES = 33
 """Places along each side of the sensor where the difference of M is evaluated."""
 
 
-class Hidden(NamedTuple):
-    """Another orientation that fits equally well.
-
-    `difference` is the rms difference of its ln M over the sensor, and `is_likely` says whether its
-    fluxes agree with those given while those of the orientation as given do not.
-    """
-
-    hidden: Orientation
-    difference: float
-    is_likely: bool
-
-
 class _Fluxes(NamedTuple):
     """How far fluxes are from those given, rms, and whether they agree with them."""
 
@@ -341,16 +318,19 @@ class _Fluxes(NamedTuple):
     agree: bool
 
 
-def hidden(
+def with_hidden(
+    test: OrientationTest,
     fits: Mapping[Orientation, WindowFit],
     windows: Mapping[Orientation, Exposures],
     flux: Flux,
     shape: tuple[int, int],
-) -> Hidden | None:
-    """Find the orientation that no measurement excludes and whose M is farthest from that as given.
+) -> OrientationTest:
+    """Add the orientation that no measurement excludes and whose M is farthest from that as given.
 
     Parameters
     ----------
+    test : OrientationTest
+        The test whose sign is undetermined.
     fits, windows : mapping
         Fits with free fluxes in the orientations that their residuals do not exclude, the one as
         given among them, and what was fitted.
@@ -361,27 +341,28 @@ def hidden(
 
     Returns
     -------
-    Hidden or None
-        The likely one if there is one. Else, where fluxes are free or have a prior, one that agrees
-        with it; None where M is the same in all of them within its noise.
+    OrientationTest
+        With the likely orientation if there is one. Else, where fluxes are free or have a prior,
+        with one that agrees with it; as it was where M is the same in all of them within its noise.
     """
-    given = Orientation()
     fluxes = {way: _fluxes(fit, windows[way], flux) for way, fit in fits.items()}
-    others = [way for way in fits if way != given]
-    likely = [way for way in others if _is_likely(fluxes[way], fluxes[given])]
+    others = [way for way in fits if way != AS_GIVEN]
+    likely = [way for way in others if _is_likely(fluxes[way], fluxes[AS_GIVEN])]
     if likely:
         best = min(likely, key=lambda way: fluxes[way].distance)
-        return Hidden(best, _difference(fits[best], fits[given], shape)[0], is_likely=True)
+        size, _ = _difference(fits[best], fits[AS_GIVEN], shape)
+        return dataclasses.replace(test, hidden=best, difference=size, is_likely=True)
     if flux.kind not in ("fit", "prior"):
-        return None
-    found = [
-        Hidden(way, size, is_likely=False)
-        for way in others
-        if fluxes[way].agree
-        for size, noise in [_difference(fits[way], fits[given], shape)]
-        if size > _ABOVE * noise
-    ]
-    return max(found, key=lambda each: each.difference, default=None)
+        return test
+    found = {}
+    for way in others:
+        size, noise = _difference(fits[way], fits[AS_GIVEN], shape)
+        if fluxes[way].agree and size > _ABOVE * noise:
+            found[way] = size
+    if not found:
+        return test
+    best = max(found, key=lambda way: found[way])
+    return dataclasses.replace(test, hidden=best, difference=found[best])
 
 
 def _is_likely(other: _Fluxes, given: _Fluxes) -> bool:
