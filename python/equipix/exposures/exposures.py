@@ -211,6 +211,10 @@ class Exposures(Measured):
         positions, flux = self.positions.chosen(exposures), self.flux.chosen(exposures)
         return dataclasses.replace(super().chosen(exposures), positions=positions, flux=flux)
 
+    def marked(self, **found: Bools | None) -> Self:
+        """Return the exposures with bad pixels of some kinds in place of those found before."""
+        return dataclasses.replace(self, bad_pixels=dataclasses.replace(self.bad_pixels, **found))
+
     def middle(self, side: int) -> tuple[slice, slice]:
         """Return the rows and columns of the central part, at most `side` pixels along an axis."""
         sizes = [min(size, side) for size in self.shape]

@@ -1,6 +1,5 @@
 """Measurements that disagree, and dust that falls and stays."""
 
-import dataclasses
 import functools
 from typing import Any
 
@@ -241,8 +240,7 @@ def without_fallen_dust(
             break
         moment = np.where(found, first, moment)
         before = np.arange(len(exposures))[:, None, None] < moment
-        bad_pixels = dataclasses.replace(exposures.bad_pixels, contradictory=moment > 0)
-        exposures = dataclasses.replace(exposures.without(before), bad_pixels=bad_pixels)
+        exposures = exposures.without(before).marked(contradictory=moment > 0)
         fit = exposures.fit(options, fit)
         if edges:
             break

@@ -1,7 +1,5 @@
 """Pixels that contradict or are faint, and flags of all pixels."""
 
-import dataclasses
-
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, union
@@ -61,13 +59,9 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
 
 def _without(weighted: Weighted, dead: Bools, hot: Bools, options: Options) -> Weighted:
     """Fit again without dead and hot pixels, which are bad_pixels then."""
-    exposures = weighted.exposures
-    bad_pixels = dataclasses.replace(
-        exposures.bad_pixels,
-        dead=union(exposures.bad_pixels.dead, dead),
-        hot=union(exposures.bad_pixels.hot, hot),
-    )
-    exposures = dataclasses.replace(exposures.without(dead | hot), bad_pixels=bad_pixels)
+    before = weighted.exposures.bad_pixels
+    exposures = weighted.exposures.without(dead | hot)
+    exposures = exposures.marked(dead=union(before.dead, dead), hot=union(before.hot, hot))
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
@@ -146,8 +140,7 @@ def without_faint_pixels(weighted: Weighted, options: Options) -> Weighted:
     faint = _faint(with_dark) & ~_faint(without) & (weighted.fit.flags == 0)
     if not faint.any():
         return weighted
-    bad_pixels = dataclasses.replace(exposures.bad_pixels, faint=faint)
-    exposures = dataclasses.replace(exposures, bad_pixels=bad_pixels)
+    exposures = exposures.marked(faint=faint)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 

@@ -196,9 +196,7 @@ def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
     """
     before, after = given.sum(axis=0), kept.usable().sum(axis=0)
     contradictory = (before > 2 * after) | ((before > after) & (after < _FEWEST))
-    found = union(kept.bad_pixels.contradictory, contradictory)
-    bad_pixels = dataclasses.replace(kept.bad_pixels, contradictory=found)
-    return dataclasses.replace(kept, bad_pixels=bad_pixels)
+    return kept.marked(contradictory=union(kept.bad_pixels.contradictory, contradictory))
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:
