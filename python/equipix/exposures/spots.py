@@ -258,17 +258,11 @@ def mended(frames: Array, places: Places) -> Array:
     for image in result:
         values = image.astype(np.float64)
         base = float(np.median(values))
-        floor = _FAINT * float(np.ptp(_without(values, at))) + float(np.finfo(np.float32).tiny)
+        others = np.delete(values, np.ravel_multi_index(at, values.shape))
+        floor = _FAINT * float(np.ptp(others)) + float(np.finfo(np.float32).tiny)
         light = base + _light(values - base, places, floor)
         image[at] = np.rint(light) if image.dtype.kind in "iu" else light
     return result
-
-
-def _without(values: Array, at: tuple[Any, ...]) -> Array:
-    """Return the values but those at some places."""
-    others = np.ones(values.shape, bool)
-    others[at] = False
-    return values[others]
 
 
 def _alone(pixels: Bools) -> Bools:
