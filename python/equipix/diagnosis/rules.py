@@ -166,10 +166,6 @@ def _on_uncertainty(e: Evidence) -> str | None:
     return why_none(e.weighted) if e.options.uncertainty else None
 
 
-def _on_uncertainty(e: Evidence) -> str | None:
-    return why_none(e.weighted) if e.options.uncertainty else None
-
-
 def _on_dark(e: Evidence) -> str | None:
     if e.dark is None:
         return None
