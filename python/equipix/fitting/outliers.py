@@ -117,11 +117,10 @@ def deviations(
     new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
     for k in range(len(exposures)):
         light, weight = _seen(exposures, fit, k, response, options.workers)
-        spread = _spread(
-            _share(weight * light**2, on_pixels),
-            _share(weight * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
-            left_out[k],
-        )
+        sign, seen = np.where(left_out[k], 1, -1), exposures.cells(on_cells, fit, k)
+        # Variances of residuals in σ², without what M and L take of their noise, or with it.
+        spread = 1 + sign * _share(weight * light**2, on_pixels)
+        spread *= 1 + sign * _share(weight * (flux[k] * response) ** 2, seen)
         known = (weight > 0) & (spread > _TESTABLE)  # NaN is not
         light *= response
         root = np.sqrt(weight, out=weight)
@@ -143,12 +142,6 @@ def _seen(
     light = np.nan_to_num(exposures.light(fit, exposure, workers), copy=False)
     used = exposures.used(fit, exposure) & (light * response != 0)
     return light, weights_of(exposures.variance, exposure, used)
-
-
-def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
-    """Variances of residuals in σ², from the shares of their noise that M and L take."""
-    sign = np.where(left_out, 1, -1)
-    return np.asarray((1 + sign * of_pixel) * (1 + sign * of_cell))
 
 
 def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
@@ -235,7 +228,8 @@ def without_fallen_dust(
         found = _together((step > _STEP_BEYOND) & (step > _LEADING_STEP * step.max()), first)
         edges = not found.any() and moment.any()
         if edges:
-            found, first = _beside(moment, step > _STEP_NEAR), _moment_around(moment)
+            first = _moment_around(moment)
+            found = (moment == 0) & (step > _STEP_NEAR) & (first > 0)
         if not found.any():
             break
         moment = np.where(found, first, moment)
@@ -295,11 +289,6 @@ def _together(found: Bools, first: NDArray[np.int64]) -> Bools:
         same = found & (first == moment)
         together |= same & (box_sums(same) >= _TOGETHER)
     return together
-
-
-def _beside(moment: NDArray[np.int64], near: Bools) -> Bools:
-    """Pixels that deviate, beside those that were found."""
-    return np.asarray((moment == 0) & near & (_moment_around(moment) > 0))
 
 
 def _moment_around(moment: NDArray[np.int64]) -> NDArray[np.int64]:
