@@ -113,11 +113,8 @@ def draw_comparison(comparison: Comparison, names: Sequence[str]) -> Figure:
     along = zip(labels, [each[middle] for each in differences], strict=True)
     _curves(rows[0, 1], f"Differences along row {middle}, %", None, along)
     scatter = 100 * comparison.agreement
-    title, high = (
-        f"Scatter of a pixel, %\n(rms {rms(scatter):.2g})",
-        np.nanpercentile(scatter, 99.9),
-    )
-    draw_map(rows[1, 0], title, scatter, (0, float(high)), "gray")
+    title = f"Scatter of a pixel, %\n(rms {rms(scatter):.2g})"
+    draw_map(rows[1, 0], title, scatter, (0, float(np.nanpercentile(scatter, 99.9))), "gray")
     worst = int(np.argmax(comparison.block_rms))
     _block_map(rows[1, 1], labels[worst], blocks[worst], blocks[worst])
     for axes, title, errors, predicted in (

@@ -85,13 +85,8 @@ class FitOptions:
         if method not in get_args(Method):
             raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
         check_progress(progress)
-        return cls(
-            method=method,
-            tolerance=as_tolerance(tolerance),
-            max_sweeps=None if max_sweeps is None else positive_count("max_sweeps", max_sweeps),
-            workers=positive_workers(workers),
-            progress=progress,
-        )
+        most = None if max_sweeps is None else positive_count("max_sweeps", max_sweeps)
+        return cls(method, as_tolerance(tolerance), most, positive_workers(workers), progress)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -110,15 +110,10 @@ class WindowFit:
         squares = window.weighted_squares(np.square(window.values, dtype=np.float64))
         residuals = window.residuals(fit, options.workers)
         scaled = np.copysign(np.sqrt(window.weighted_squares(np.square(residuals))), residuals)
-        share = fit.degrees_of_freedom / max(int(np.count_nonzero(np.isfinite(scaled))), 1)
-        return cls(
-            fit=fit,
-            left=fit.misfit / max(fit.degrees_of_freedom, 1),
-            freedom=fit.degrees_of_freedom,
-            share=share,
-            power=float(np.nanmean(squares)),
-            residuals=scaled,
-        )
+        freedom = fit.degrees_of_freedom
+        left = fit.misfit / max(freedom, 1)
+        share = freedom / max(int(np.count_nonzero(np.isfinite(scaled))), 1)
+        return cls(fit, left, freedom, share, float(np.nanmean(squares)), scaled)
 
     @cached_property
     def neighbours(self) -> tuple[Correlation, Correlation]:
