@@ -288,6 +288,11 @@ def check_progress(progress: object) -> None:
         )
 
 
+def staged(progress: Progress | None, stage: str) -> Progress | None:
+    """Progress that names one stage, whatever the work calls its own."""
+    return None if progress is None else lambda done, total, _: progress(done, total, stage)
+
+
 def per_exposure(
     name: str, values: ArrayLike | None, count: int, *, default: float
 ) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from equipix._check import Array, Bools, Floats, Progress
+from equipix._check import Array, Bools, Floats, staged
 from equipix._native import Fit
 from equipix.errors import InputError, InsufficientMemoryError
 from equipix.exposures.exposures import Exposures, FitOptions
@@ -103,7 +103,7 @@ class WindowFit:
                 tolerance=tolerance,
                 max_sweeps=_MOST_COARSE if noise is None else _MOST_FINE,
                 workers=options.workers,
-                progress=None if options.progress is None else _named(options.progress),
+                progress=staged(options.progress, "sign of shifts"),
             ),
             None if before is None else before.fit,
         )
@@ -211,11 +211,6 @@ def if_there_is_light() -> Iterator[None]:
         yield
 
 
-def _named(progress: Progress) -> Progress:
-    """Progress with the name of this stage."""
-    return lambda done, total, _: progress(done, total, "sign of shifts")
-
-
 class Chi2(NamedTuple):
     """Reduced χ², and its standard error where model and variances are right."""
 
@@ -306,9 +301,7 @@ def misplaced(
     Fits of a central window are compared, in all orders, with that as given. Shifts are held: those
     that are found follow the mistake. Unless given, the worst exposure is that which stands out.
     """
-    exposures = dataclasses.replace(
-        exposures, positions=dataclasses.replace(exposures.positions, std=None)
-    )
+    exposures = exposures.at(dataclasses.replace(exposures.positions, std=None))
     window = exposures.window(_SIDE)
     given = WindowFit.of(window, options)
     worst = standing_out(given.residuals) if worst is None else worst
@@ -344,7 +337,7 @@ def _exchanged(window: Exposures, i: int, j: int) -> Exposures:
     """Return the exposures, each of two at the place of the other."""
     order = np.arange(len(window))
     order[[i, j]] = j, i
-    return dataclasses.replace(window, positions=window.positions.chosen(order))
+    return window.at(window.positions.chosen(order))
 
 
 def _flipped(
