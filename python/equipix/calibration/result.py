@@ -26,7 +26,7 @@ from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
-from equipix.exposures.positions import ROUNDING, Positions
+from equipix.exposures.positions import ROUNDING, Positions, as_rotation
 from equipix.findings import Finding, determined
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged, sampled_arrays
@@ -191,8 +191,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         """Refuse places that cannot be those of a calibration, and filters that are none."""
         super().__post_init__()
         grid, origin = self.beam.shape, np.array(self.beam_origin)
-        if not set(self.rotation.tolist()) <= {0, 90, 180, 270}:
-            raise InputError(f"'rotation' is {self.rotation}, expected 0, 90, 180 or 270 degrees")
+        as_rotation(self.rotation, len(self.shifts))
         # A cell reaches half of its side around its place.
         if not np.all((origin >= -0.5) & (origin <= np.subtract(grid, 0.5))):
             raise InputError(f"'beam_origin' is {self.beam_origin}, expected a place on {grid}")
@@ -214,10 +213,11 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         filters, gauge = exposures.filters, gauge_of(weighted, flags)
         std, offset = None if bars is None else bars.sensitivity, fit.offset
         coefficients = fit.beam.coefficients
+        row, col = (int(each) if each.is_integer() else each for each in fit.beam.origin)
         return cls(
             sensitivity=scaled(fit.sensitivity, gauge.of_sensitivity, dtype),
             beam=scaled(fit.beam.values, gauge.of_beam),
-            beam_origin=_whole_if_possible(fit.beam.origin),
+            beam_origin=(row, col),
             beam_coefficients=None if coefficients is None else scaled(coefficients, gauge.of_beam),
             beam_tilt=np.array(fit.beam.tilt),
             flags=flags,
@@ -524,12 +524,6 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     def _beam(self) -> Beam:
         tilt = self.beam_tilt.tolist()
         return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
-
-
-def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:
-    """Return a place on the grid with whole numbers as int, as indices are."""
-    row, col = (int(each) if each.is_integer() else each for each in place)
-    return row, col
 
 
 def _are_whole(places: NDArray[Any]) -> bool:

@@ -161,7 +161,6 @@ def suggest(
         raise InputError("'exposures' is 1, expected two or more: one compares no pixels")
     else:
         counts = range(exposures, exposures + 1)
-    found: list[Points] = []
     for count in counts:
         starts = _starts(count, travel // period, random)
         if colours is not None:
@@ -175,7 +174,7 @@ def suggest(
         found = _distinct([end for end in ends if end is not None], score)
         if found:
             break
-    if not found:
+    else:
         raise InputError(
             f"'max_shift' is {travel.tolist()}: no pattern of {exposures or 'two to five'} "
             "exposures within it was found that compares every pixel"
