@@ -239,7 +239,7 @@ def calibrate(
             dark_variance=dark_variance,
         )
     if fit_options.whole_shifts:
-        exposures = exposures.whole()
+        exposures = exposures.at(exposures.positions.whole())
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 

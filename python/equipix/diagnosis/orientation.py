@@ -159,7 +159,8 @@ def orientation_test(
     if len(ways) < 2 or len(asked) < 3 or (len(asked) - 2) * pixels < _FEWEST:
         return OrientationTest(reason="there are too few measurements; " + _REMEDY)
     # The window first: the exposures chosen are copied.
-    windows = {way: exposures.oriented(way).window(side).chosen(asked) for way in ways}
+    turned = {way: exposures.at(exposures.positions.oriented(way)) for way in ways}
+    windows = {way: each.window(side).chosen(asked) for way, each in turned.items()}
     with if_there_is_light():
         fits = _fits(windows, options)
         left = _left(fits)

@@ -200,13 +200,13 @@ class Experiment(Described[Manifest]):
             exposures = Exposures.of(measured, positions, fluxes, mask=excluded)
         start = None
         if whole:
-            exposures = exposures.whole(std)
+            exposures = exposures.at(positions.whole(std))
         elif self._is_moved():
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
             shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
-            exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
+            exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
             start = first.fit
         origin = self._provenance(
             hashes,

@@ -26,7 +26,7 @@ from equipix._check import (
 from equipix._native import Fit
 from equipix.errors import InputError
 from equipix.exposures.flux import Flux
-from equipix.exposures.positions import Orientation, Positions, nearest_whole
+from equipix.exposures.positions import Positions, nearest_whole
 from equipix.measured.defects import BadPixels
 from equipix.measured.filters import Filters, mean_signal
 from equipix.measured.measured import Measured
@@ -197,9 +197,9 @@ class Exposures(Measured):
             relative=not known and not self.noise,
         )
 
-    def whole(self, std: Floats | None = None) -> Self:
-        """Return the exposures at shifts that differ by whole pixels; see `Positions.whole`."""
-        return dataclasses.replace(self, positions=self.positions.whole(std))
+    def at(self, positions: Positions) -> Self:
+        """Return the exposures at other positions."""
+        return dataclasses.replace(self, positions=positions)
 
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the exposures."""
@@ -238,10 +238,6 @@ class Exposures(Measured):
             filters=None,
         )
 
-    def oriented(self, orientation: Orientation) -> Self:
-        """Return the exposures with shifts and rotations in another orientation."""
-        return dataclasses.replace(self, positions=self.positions.oriented(orientation))
-
     def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
         """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
 
@@ -254,7 +250,21 @@ class Exposures(Measured):
             If there is not enough memory.
         """
         with naming_memory("calibrating"):
-            return self._compiled(options).fit(start=start, **vars(options))
+            compiled = _native.Exposures(
+                self.values,
+                self.positions.shifts,
+                shift_std=self.positions.std,
+                rotation=self.positions.rotation.tolist(),
+                flux=self.flux.values.tolist(),
+                flux_model=self.flux.model,
+                offset=self.offset,
+                variance=self.variance,
+                mask=self.mask,
+                unreliable=self.bad_pixels.unreliable,
+                workers=options.workers,
+                progress=options.progress,
+            )
+            return compiled.fit(start=start, **vars(options))
 
     def light(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
         """Return c · L(u) on each pixel in an exposure; NaN where the beam was not observed."""
@@ -308,22 +318,6 @@ class Exposures(Measured):
         corner = np.add(fit.beam.origin, fit.shifts[exposure])
         row, col = nearest_whole(corner).astype(int)
         return np.rot90(grid[row : row + rows, col : col + cols], turn // 90)
-
-    def _compiled(self, options: FitOptions) -> _native.Exposures:
-        return _native.Exposures(
-            self.values,
-            self.positions.shifts,
-            shift_std=self.positions.std,
-            rotation=self.positions.rotation.tolist(),
-            flux=self.flux.values.tolist(),
-            flux_model=self.flux.model,
-            offset=self.offset,
-            variance=self.variance,
-            mask=self.mask,
-            unreliable=self.bad_pixels.unreliable,
-            workers=options.workers,
-            progress=options.progress,
-        )
 
     def medians(self) -> Floats:
         """Return the median of value/flux in each pixel; NaN where nothing is measured."""

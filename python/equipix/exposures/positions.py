@@ -102,10 +102,6 @@ class Positions(ReadOnly):
         moves, rounding = round_shifts(self.shifts, std)
         return dataclasses.replace(self, shifts=self.shifts[0] + moves, rounding=rounding)
 
-    def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
-        """Return the same exposures at other shifts, measured with standard deviations `std`."""
-        return type(self).of(shifts, rotation=self.rotation, std=std)
-
     def chosen(self, exposures: Sequence[int] | NDArray[Any]) -> Self:
         """Return the positions of some exposures."""
         std = None if self.std is None else self.std[exposures]
