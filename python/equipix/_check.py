@@ -331,22 +331,26 @@ def union(*masks: Bools | None) -> Bools | None:
 
 
 def as_mask(
-    mask: ArrayLike | None, shape: tuple[int, ...], *, may_be_whole: bool = False
+    mask: ArrayLike | None,
+    shape: tuple[int, ...],
+    *,
+    name: str = "mask",
+    may_be_whole: bool = False,
 ) -> Bools | None:
     """Mask of frames of that shape (rows, cols), or (n, rows, cols): of each or of all of them."""
     if mask is None:
         return None
     shapes = list(dict.fromkeys([shape[-2:], shape]))
-    array = as_array("mask", mask, ndim=tuple(map(len, shapes)))
+    array = as_array(name, mask, ndim=tuple(map(len, shapes)))
     if array.dtype != np.bool_:
         raise InputError(
-            f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+            f"'{name}' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
         )
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
-        raise InputError(f"'mask' has shape {array.shape}, expected {wanted}")
+        raise InputError(f"'{name}' has shape {array.shape}, expected {wanted}")
     if array.all() and not may_be_whole:
-        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
+        raise InputError(f"'{name}' excludes all pixels: give one with pixels that may be used")
     return array
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, as_array, is_whole
+from equipix._check import Array, Bools, as_array, as_mask, is_whole
 from equipix.errors import InputError
 from equipix.exposures.positions import _BEYOND
 from equipix.measured.saturation import saturation_level
@@ -128,7 +128,7 @@ def measure_shift(
             f"{frames['before'].shape[1:]}"
         )
     levels = (saturation_level(before, saturation), saturation_level(after, saturation))
-    known = None if hot is None else _hot(hot, frames["before"].shape[1:])
+    known = as_mask(hot, frames["before"].shape[1:], name="hot", may_be_whole=True)
     for (name, images), level in zip(frames.items(), levels, strict=True):
         frames[name] = mended(images, hot_places(images, level, known))
     first, second = (
@@ -180,15 +180,6 @@ def _frames(name: str, values: ArrayLike) -> NDArray[Any]:
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         array = array.astype(np.float64)
     return array if array.ndim == 3 else array[np.newaxis]
-
-
-def _hot(hot: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    array = as_array("hot", hot, ndim=2)
-    if array.dtype != np.bool_ or array.shape != shape:
-        raise InputError(
-            f"'hot' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}"
-        )
-    return array
 
 
 Places = NDArray[np.int64]
