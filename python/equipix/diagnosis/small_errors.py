@@ -132,12 +132,7 @@ def small_errors_found(evidence: Evidence) -> str | None:
     errors = small_errors(weighted._replace(exposures=exposures), evidence.options.fit)
     if not errors or (evidence.misfit is not None and not errors[0].share > _MOST):
         return None
-    return _words(errors)
-
-
-def _words(errors: list[SmallError]) -> str:
-    first = errors[0]
-    likely = ", or ".join(each.words for each in errors)
+    first, likely = errors[0], ", or ".join(each.words for each in errors)
     return (
         f"the residuals show {likely}: {abs(first.sigmas):.0f} standard errors (limit "
         f"{_SIGMAS:g}), and an error of the sensitivity of {first.effect:.1e} rms: "

@@ -92,7 +92,7 @@ class Positions(ReadOnly):
             std=std if std is None or not orientation.exchanged else std[:, ::-1],
         )
 
-    def whole(self, std: ArrayLike | None = None) -> Self:
+    def whole(self, std: Floats | float = 0.0) -> Self:
         """Return the positions whole pixels from the first one that are nearest to these.
 
         `std` are errors of the shifts. A part of a pixel that all have in common is kept.
@@ -307,7 +307,7 @@ def nearest_whole(distance: Floats) -> Floats:
 
 
 def round_shifts(
-    shifts: Floats, std: ArrayLike | None = None
+    shifts: Floats, std: Floats | float = 0.0
 ) -> tuple[NDArray[np.int64], Rounding | None]:
     """Shifts from the first one in whole pixels, and the largest rounding that is noticeable.
 
@@ -315,8 +315,8 @@ def round_shifts(
     ----------
     shifts : ndarray, shape (n, 2)
         Shifts (row, col) in pixels.
-    std : array_like, shape (n, 2), optional
-        Their standard errors, in pixels; 0 unless given.
+    std : ndarray, shape (n, 2), or float
+        Their standard errors, in pixels.
 
     Returns
     -------
@@ -334,9 +334,8 @@ def round_shifts(
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
     exact = np.clip(as_shifts(shifts - shifts[0]), -_BEYOND, _BEYOND)
     whole = nearest_whole(exact)
-    known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
     change = np.abs(exact - whole)
-    change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
+    change[~(change > np.maximum(_UNNOTICED, 3 * std))] = 0
     worst = int(change.max(axis=1).argmax())
     rounding = Rounding(worst, shifts[worst].tolist()) if change[worst].any() else None
     return whole.astype(np.int64), rounding

@@ -237,7 +237,9 @@ class _Score:
         kept = np.broadcast_to(others, (len(places), *others.shape))
         patterns = np.concatenate([kept, places[:, None]], axis=1)
         spans = np.ptp(patterns, axis=1)
-        rest = count / (count - self._cells(spans, count))
+        # Beam cells over pixels: the trace of K of `local_variance`, times n.
+        cells = np.prod((np.array(self.shape) + spans) / self.shape, axis=1)
+        rest = count / (count - np.minimum(cells, count * (1 - 1e-3)))
         visible = self._visible(others, places)
         inverse = np.mean(1 / visible[:_WAVES], axis=0, dtype=np.float64)
         if len(visible) > _WAVES:
@@ -245,11 +247,6 @@ class _Score:
         noise = self._noise**2 * inverse * (1 - 1 / count) * rest
         drift = tilt_rms(tilt_of_fluxes(self.shape, patterns, self._drift))
         return np.asarray(np.sqrt(noise + drift**2))
-
-    def _cells(self, spans: Points, count: int) -> Floats:
-        """Beam cells over pixels: the trace of K of `local_variance`, times n."""
-        cells = np.prod((np.array(self.shape) + spans) / self.shape, axis=1)
-        return np.asarray(np.minimum(cells, count * (1 - 1e-3)))
 
     def _visible(self, others: Points, places: Points) -> Floats:
         """Return λ of the waves, of each pattern."""
