@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
@@ -258,11 +259,7 @@ def mended(frames: Array, places: Places) -> Array:
 
 def _alone(pixels: Bools) -> Bools:
     """Pixels, away from the border, with no other of these pixels beside them."""
-    rows, cols = pixels.shape
-    padded = np.pad(pixels, 1).astype(np.uint8)
-    near = np.zeros(pixels.shape, np.uint8)
-    for i, j in np.ndindex(3, 3):
-        near += padded[i : i + rows, j : j + cols]
+    near = sliding_window_view(np.pad(pixels, 1), (3, 3)).sum(axis=(2, 3))
     alone: Bools = np.logical_and(pixels, near == 1)
     alone[:2] = alone[-2:] = alone[:, :2] = alone[:, -2:] = False
     return alone

@@ -1,9 +1,9 @@
 """Measurements that disagree, and dust that falls and stays."""
 
-import functools
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from equipix._check import Array, Bools, Floats
@@ -228,7 +228,7 @@ def without_fallen_dust(
         found = _together((step > _STEP_BEYOND) & (step > _LEADING_STEP * step.max()), first)
         edges = not found.any() and moment.any()
         if edges:
-            first = _moment_around(moment)
+            first = sliding_window_view(np.pad(moment, 1), (3, 3)).max(axis=(2, 3))
             found = (moment == 0) & (step > _STEP_NEAR) & (first > 0)
         if not found.any():
             break
@@ -289,11 +289,3 @@ def _together(found: Bools, first: NDArray[np.int64]) -> Bools:
         same = found & (first == moment)
         together |= same & (box_sums(same) >= _TOGETHER)
     return together
-
-
-def _moment_around(moment: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Largest moment among the 3×3 pixels around each."""
-    padded = np.pad(moment, 1)
-    rows, cols = moment.shape
-    parts = (padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
-    return functools.reduce(np.maximum, parts)
