@@ -240,20 +240,15 @@ class _Score:
         # Beam cells over pixels: the trace of K of `local_variance`, times n.
         cells = np.prod((np.array(self.shape) + spans) / self.shape, axis=1)
         rest = count / (count - np.minimum(cells, count * (1 - 1e-3)))
-        visible = self._visible(others, places)
+        sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
+        visible = count - (sums.real**2 + sums.imag**2) / count  # λ of the waves of each pattern
+        visible = np.maximum(visible, 1e-3).astype(np.float64)
         inverse = np.mean(1 / visible[:_WAVES], axis=0, dtype=np.float64)
         if len(visible) > _WAVES:
             inverse *= 1 + _PERIODIC / visible[_WAVES:].min(axis=0)
         noise = self._noise**2 * inverse * (1 - 1 / count) * rest
         drift = tilt_rms(tilt_of_fluxes(self.shape, patterns, self._drift))
         return np.asarray(np.sqrt(noise + drift**2))
-
-    def _visible(self, others: Points, places: Points) -> Floats:
-        """Return λ of the waves, of each pattern."""
-        count = len(others) + 1
-        sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
-        visible = count - (sums.real**2 + sums.imag**2) / count
-        return np.asarray(np.maximum(visible, 1e-3), dtype=np.float64)
 
     def _waves(self, places: Points) -> NDArray[np.complex64]:
         down, right = self._phases
