@@ -287,10 +287,7 @@ def _metadata(evidence: Evidence, started: datetime) -> dict[str, Any]:
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     if dark is not None:
-        metadata["dark"] = {
-            "std_along_sensitivity": dark.along_sensitivity,
-            "std_of_a_pixel": dark.of_a_pixel,
-        }
+        metadata["dark"] = dark._asdict()
     if rejected is not None:
         metadata["rejected"] = rejected.sum(axis=(1, 2)).tolist()
     if bars is not None:

@@ -506,7 +506,8 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         positions = Positions.of(shifts, rotation=rotation)
         fluxes = per_exposure("flux", flux, len(positions), default=1)
         check_count("shifts", len(positions), count)
-        beam, response = self._beam, self._response
+        response, tilt = self._response, self.beam_tilt.tolist()
+        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
         places = positions.shifts.tolist(), positions.rotation.tolist(), fluxes.tolist()
         for (row, col), turn, c in zip(*places, strict=True):
             light = beam.light(self.shape, (row, col), turn, workers=None)
@@ -519,11 +520,6 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             return self.sensitivity
         response = self.cfa.map_of(self.colour_response, self.shape)
         return np.asarray(self.sensitivity * response, self.sensitivity.dtype)
-
-    @property
-    def _beam(self) -> Beam:
-        tilt = self.beam_tilt.tolist()
-        return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
 
 
 def _are_whole(places: NDArray[Any]) -> bool:

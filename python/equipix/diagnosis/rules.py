@@ -169,7 +169,7 @@ def _on_uncertainty(e: Evidence) -> str | None:
 def _on_dark(e: Evidence) -> str | None:
     if e.dark is None:
         return None
-    along, alone = e.dark.along_sensitivity, e.dark.of_a_pixel
+    along, alone = e.dark.std_along_sensitivity, e.dark.std_of_a_pixel
     limited = e.fit.ended == "sweeps used" and e.options.fit.max_sweeps is not None
     if along is not None and alone is not None and along > alone:
         known = f"its standard deviation is {along:.1e}, that of a pixel by noise {alone:.1e}"

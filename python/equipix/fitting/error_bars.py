@@ -34,17 +34,17 @@ class DarkStd(NamedTuple):
 
     Attributes
     ----------
-    along_sensitivity : float or None
+    std_along_sensitivity : float or None
         Standard deviation of b, the least-squares part b·M of all errors, in the units of the
         frames; None where the fit did not converge or no noise is known. With fitted ratios of the
         levels no measurement changes when O → O + b·M, L → L − b and the ratios are adapted,
         if L is the same at all positions of a pixel.
-    of_a_pixel : float or None
+    std_of_a_pixel : float or None
         Root mean square of the error of the dark by the noise of the same pixel.
     """
 
-    along_sensitivity: float | None
-    of_a_pixel: float | None
+    std_along_sensitivity: float | None
+    std_of_a_pixel: float | None
 
 
 def standard_deviations(

@@ -96,17 +96,13 @@ class WindowFit:
         cls, window: Exposures, options: FitOptions, before: WindowFit | None = None
     ) -> WindowFit:
         """Fit beam and sensitivity: coarsely, or finer than the noise that a fit before left."""
-        noise = None if before is None else before.noise
-        tolerance = _COARSE if noise is None else max(_FINER * noise, np.finfo(float).eps)
-        fit = window.fit(
-            FitOptions(
-                tolerance=tolerance,
-                max_sweeps=_MOST_COARSE if noise is None else _MOST_FINE,
-                workers=options.workers,
-                progress=staged(options.progress, "sign of shifts"),
-            ),
-            None if before is None else before.fit,
-        )
+        tolerance, most, start = _COARSE, _MOST_COARSE, None
+        if before is not None:
+            tolerance = max(_FINER * before.noise, np.finfo(float).eps)
+            most, start = _MOST_FINE, before.fit
+        progress = staged(options.progress, "sign of shifts")
+        stop = FitOptions("multiscale", tolerance, most, options.workers, progress)
+        fit = window.fit(stop, start)
         squares = window.weighted_squares(np.square(window.values, dtype=np.float64))
         residuals = window.residuals(fit, options.workers)
         scaled = np.copysign(np.sqrt(window.weighted_squares(np.square(residuals))), residuals)
