@@ -145,19 +145,11 @@ def _spots(
         level = manifest.sensor.saturation_level
         if equalisation is not None:
             before, after = (
-                _equalised(images, saturation_level(images, level), equalisation, hot)
-                for images in (before, after)
+                mended(equalisation.apply(raw), hot_places(raw, saturation_level(raw, level), hot))
+                for raw in (before, after)
             )
             # In other units; the first measurement has checked that nothing saturates.
             level, hot = None, None
         return measure_shift(before, after, saturation=level, hot=hot), before.shape[-2:]
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
-
-
-def _equalised(
-    images: Array, level: float | None, equalisation: Equalisation, hot: Bools | None
-) -> Array:
-    """Images as equal pixels would have given them; isolated hot ones as their neighbours show."""
-    places = hot_places(images, level, hot)
-    return mended(equalisation.apply(images), places)

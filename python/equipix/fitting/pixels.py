@@ -107,8 +107,7 @@ def _of_pixels(squares: Floats) -> Floats:
     """Mean of squares (n, rows, cols) over the exposures of each pixel; NaN without any."""
     count = np.isfinite(squares).sum(axis=0)
     total = np.nansum(squares, axis=0)
-    mean = np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan))
-    return np.asarray(mean)
+    return np.asarray(np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan)))
 
 
 _RELIABLE = 0.04
@@ -178,15 +177,6 @@ def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
     return dead | (sensitivity <= options.tolerance), hot
 
 
-def _weights(weighted: Weighted) -> Floats:
-    """Sum of the weights of each pixel, one exposure at a time: large sensors must fit."""
-    exposures = weighted.exposures
-    total = np.zeros(exposures.shape)
-    for k in range(len(exposures)):
-        total += weights_of(exposures.variance, k, exposures.used(weighted.fit, k))
-    return total
-
-
 def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array]:
     """Standard deviation of M without and with the noise of the dark, the beam's error left out.
 
@@ -200,5 +190,7 @@ def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array
         without = np.asarray(1 / np.sqrt(information / variance))
         if exposures.dark_variance is None:
             return without, without
-        total = variance + exposures.dark_variance * _weights(weighted)
+        used = (exposures.used(weighted.fit, k) for k in range(len(exposures)))
+        weights = sum(weights_of(exposures.variance, k, each) for k, each in enumerate(used))
+        total = variance + exposures.dark_variance * weights
         return without, np.asarray(1 / np.sqrt(information / total))
