@@ -182,8 +182,7 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> Array:
     if not good.any():
         raise InputError("'calibrations' have no pixel that is good in all of them")
     maps[:, ~good] = np.nan
-    gauged: Array = maps / np.nanmean(maps, axis=(1, 2), keepdims=True)
-    return gauged
+    return np.asarray(maps / np.nanmean(maps, axis=(1, 2), keepdims=True))
 
 
 def _expected(calibrations: Sequence[Calibration]) -> Array | None:

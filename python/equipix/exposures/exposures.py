@@ -338,8 +338,7 @@ def _medians(values: Array) -> Array:
     values.sort(axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
     middle = [np.maximum(index, 0)[None] for index in ((count - 1) // 2, count // 2)]
-    medians: Array = np.mean([np.take_along_axis(values, i, axis=0)[0] for i in middle], axis=0)
-    return medians
+    return np.asarray(np.mean([np.take_along_axis(values, i, axis=0)[0] for i in middle], axis=0))
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:

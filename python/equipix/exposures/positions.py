@@ -125,8 +125,7 @@ class Positions(ReadOnly):
 
 def in_beam(pixel: ArrayLike, rotation: int, shape: tuple[int, int]) -> Array:
     """Return A p + t: the place of a pixel in the beam at shift 0."""
-    place: Array = np.array(_TURNS[rotation]) @ np.asarray(pixel) + _offset(rotation, shape)
-    return place
+    return np.asarray(np.array(_TURNS[rotation]) @ np.asarray(pixel) + _offset(rotation, shape))
 
 
 def variance_in_beam(variance: Array, rotation: int) -> Array:
@@ -136,8 +135,7 @@ def variance_in_beam(variance: Array, rotation: int) -> Array:
 
 def _offset(rotation: int, shape: ArrayLike) -> Array:
     """Return t, which makes the smallest corner of the turned window 0."""
-    offset: Array = -np.minimum(_TURNS[rotation], 0) @ (np.asarray(shape) - 1)
-    return offset
+    return np.asarray(-np.minimum(_TURNS[rotation], 0) @ (np.asarray(shape) - 1))
 
 
 def as_rotation(rotation: ArrayLike | None, count: int) -> NDArray[np.int64]:

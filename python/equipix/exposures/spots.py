@@ -280,5 +280,4 @@ def _light(signal: Array, places: Places, floor: float) -> NDArray[np.float64]:
         values.append(np.where(bright, np.exp(_CUBIC @ logs), _CUBIC @ four))
         slopes.append(np.abs(logs[2] - logs[1]) + np.abs(logs[3] - logs[0]))
     best = np.argmin(slopes, axis=0)
-    light: NDArray[np.float64] = np.array(values)[best, np.arange(len(places))]
-    return light
+    return np.asarray(np.array(values)[best, np.arange(len(places))])

@@ -157,21 +157,18 @@ def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Arr
 def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     """Mean of the 3×3 residuals around each pixel, in standard deviations by their own scale."""
     mean = box_sums(np.where(where, residual, 0)) / np.sqrt(np.maximum(box_sums(where), 1))
-    scaled: NDArray[Any] = mean / max(1.0, ROBUST * _median(mean, where))
-    return scaled
+    return np.asarray(mean / max(1.0, ROBUST * _median(mean, where)))
 
 
 def weights_of(variance: Array | None, exposure: int, used: Bools) -> Array:
     """Weights 1/σ² of an exposure; 0 where nothing is used."""
     scale = 1.0 if variance is None else variance[exposure]
-    weights: Array = np.divide(1.0, scale, where=used, out=np.zeros(used.shape))
-    return weights
+    return np.asarray(np.divide(1.0, scale, where=used, out=np.zeros(used.shape)))
 
 
 def _share(own: NDArray[Any], total: NDArray[Any]) -> NDArray[Any]:
     """Share that a weight has in a sum; NaN where the sum is 0."""
-    share: NDArray[Any] = np.divide(own, total, where=total > 0, out=np.full(own.shape, np.nan))
-    return share
+    return np.asarray(np.divide(own, total, where=total > 0, out=np.full(own.shape, np.nan)))
 
 
 def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
@@ -183,8 +180,7 @@ def box_sums(image: NDArray[Any]) -> NDArray[Any]:
     """Sum of the 3×3 pixels around each, those beyond the border counting 0."""
     padded = np.pad(image.astype(np.float32), 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
-    total: NDArray[Any] = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
-    return total
+    return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
 
 
 _STEP_BEYOND = 6.0

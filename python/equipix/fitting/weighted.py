@@ -237,8 +237,7 @@ def _sample(array: Array) -> Array:
     if array.size <= _SAMPLE:
         return array.copy()
     places = np.random.default_rng(0).integers(array.size, size=_SAMPLE)
-    sample: Array = array[np.unravel_index(places, array.shape)]
-    return sample
+    return np.asarray(array[np.unravel_index(places, array.shape)])
 
 
 def check_unchanged(exposures: Exposures, before: Mapping[str, Array]) -> None:
