@@ -130,7 +130,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         The exposures with their weights and the fit, for `std_of`; None if read from a file or
         unpickled.
     findings : tuple of Finding
-        BadPixels that limit the result: `calibrate` has warned of each.
+        What limits the result: `calibrate` has warned of each.
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}

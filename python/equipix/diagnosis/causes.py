@@ -47,7 +47,7 @@ def by_patterns(residuals: Floats, patterns: list[Floats], noise: float) -> Part
     """
     explained, remaining = 0.0, residuals.copy()
     for k, (columns, values) in enumerate(_each_exposure(residuals, patterns)):
-        fitted = columns @ _coefficients(columns, values)
+        fitted = columns @ _least_squares(columns, values)
         explained += float(fitted @ fitted) - noise * len(patterns)
         remaining[k][np.isfinite(residuals[k])] -= fitted
     return Part(explained, remaining)
@@ -55,7 +55,7 @@ def by_patterns(residuals: Floats, patterns: list[Floats], noise: float) -> Part
 
 def coefficients(residuals: Floats, patterns: list[Floats]) -> Floats:
     """Factors of patterns (n, patterns) that explain residuals best: errors of ln c, of shifts."""
-    return np.array([_coefficients(*each) for each in _each_exposure(residuals, patterns)])
+    return np.array([_least_squares(*each) for each in _each_exposure(residuals, patterns)])
 
 
 def by_illumination(residuals: Floats, signal: Floats, slopes: Floats, noise: float) -> Part:
@@ -153,7 +153,7 @@ def _each_exposure(residuals: Floats, patterns: list[Floats]) -> list[tuple[Arra
     return result
 
 
-def _coefficients(columns: Array, values: Array) -> Floats:
+def _least_squares(columns: Array, values: Array) -> Floats:
     """Least-squares coefficients; 0 of a pattern that there is not."""
     normal = columns.T @ columns
     return np.asarray(np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ (columns.T @ values))

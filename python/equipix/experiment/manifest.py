@@ -327,7 +327,7 @@ def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]
 
 
 def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
-    """One of pydantic's bad_pixels in the terms of the file."""
+    """One of pydantic's errors in the terms of the file."""
     location = detail["loc"]
     match location:
         case ["exposure" | "level" as kind, int(index), *_]:

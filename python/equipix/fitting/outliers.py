@@ -210,7 +210,8 @@ def without_fallen_dust(
 ) -> tuple[Exposures, Fit]:
     """Leave out, where dust fell, the values before it did, and fit again.
 
-    Under the grain the sensitivity is then that of the later exposures. The pixels are bad_pixels.
+    Under the grain the sensitivity is then that of the later exposures. Its pixels are marked as
+    contradictory.
 
     Notes
     -----

@@ -58,7 +58,7 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
 
 
 def _without(weighted: Weighted, dead: Bools, hot: Bools, options: Options) -> Weighted:
-    """Fit again without dead and hot pixels, which are bad_pixels then."""
+    """Fit again without dead and hot pixels, which are marked so then."""
     before = weighted.exposures.bad_pixels
     exposures = weighted.exposures.without(dead | hot)
     exposures = exposures.marked(dead=union(before.dead, dead), hot=union(before.hot, hot))
