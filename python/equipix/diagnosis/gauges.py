@@ -32,8 +32,8 @@ class Gauge(NamedTuple):
     `response` is that of each colour, of mean 1 over the pixels in use; None without a `cfa`.
     """
 
-    of_sensitivity: Floats | float = 1.0
-    of_beam: float = 1.0
+    of_sensitivity: Floats | float
+    of_beam: float
     response: dict[str, float] | None = None
 
 

@@ -107,7 +107,7 @@ class OrientationTest:
 
 
 def orientation_test(
-    exposures: Exposures, fit: Fit, options: FitOptions, flux: Flux | None = None
+    exposures: Exposures, fit: Fit, options: FitOptions, flux: Flux
 ) -> OrientationTest:
     """Compare the fit with the shifts as given to those in all other orientations.
 
@@ -119,8 +119,8 @@ def orientation_test(
         Their fit: the free fluxes start from its fluxes.
     options : FitOptions
         Number of threads and progress.
-    flux : Flux, optional
-        The fluxes as they were given; those of `exposures` unless given.
+    flux : Flux
+        The fluxes as they were given, with their own prior.
 
     Returns
     -------
@@ -145,7 +145,6 @@ def orientation_test(
     """
     if exposures.offset:
         return OrientationTest(reason="it is not tested where the dark is fitted; " + _REMEDY)
-    known = exposures.flux if flux is None else flux
     exposures = dataclasses.replace(
         exposures,
         flux=exposures.flux.free(np.array(fit.flux)),
@@ -168,7 +167,7 @@ def orientation_test(
         if test.sign != "undetermined" or AS_GIVEN not in left:
             return test
         equal = {way: fits[way] for way in ways if way in left}
-        return with_hidden(test, equal, windows, known.chosen(asked), exposures.shape)
+        return with_hidden(test, equal, windows, flux.chosen(asked), exposures.shape)
     return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
 
 
