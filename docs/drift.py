@@ -20,8 +20,7 @@ import numpy as np
 import equipix
 from equipix import simulate
 from equipix.diagnosis.lamp_drift import lamp_drift
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.fitting.error_bars import functional_std

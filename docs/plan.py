@@ -17,7 +17,7 @@ from figures import FOLDER, SAVED
 import equipix
 from equipix import plan
 from equipix.errors import MisfitWarning
-from equipix.pictures.plans import draw_plans
+from equipix.pictures import draw_plans
 
 SENSOR, TRAVEL = (582, 782), 80
 CAUSES = {"noise": 5.8e-4, "drift": 3e-5, "shift_error": 0.01, "beam_width": 1000}

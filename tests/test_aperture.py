@@ -11,7 +11,7 @@ import equipix
 from equipix import simulate
 from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.exposures.spots import Spot
 from equipix.findings import Flag
 from equipix.fitting.weighted import Weighted

@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix._check import Method
 from equipix.errors import ConvergenceWarning, FileError, InputError, InputWarning
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.exposures.positions import Positions, Rounding
 from records import rewrite
 

@@ -9,7 +9,7 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
-from equipix.pictures.comparison import draw_comparison
+from equipix.pictures import draw_comparison
 
 SHAPE = (96, 128)
 ARMS = ((5, 7), (7, 11), (11, 19))

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from equipix import cli, demo, errors, measure_shift
-from equipix.pictures.canvas import new_figure
-from equipix.pictures.comparison import draw_demo
+from equipix.pictures import draw_demo, new_figure
 
 pytest.importorskip("matplotlib")
 

@@ -13,8 +13,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.errors import InputError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions, in_beam, variance_in_beam
 from equipix.fitting import outliers as robust
@@ -80,10 +79,10 @@ def test_a_window_of_exposures_has_the_sensitivity_of_its_part():
 def test_reversed_exposures_differ_in_the_sign_of_shifts_alone():
     exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2.5)])
     back = Orientation(rows=True, cols=True)
-    other = exposures.oriented(back)
+    other = exposures.at(exposures.positions.oriented(back))
     np.testing.assert_array_equal(other.positions.shifts, -exposures.positions.shifts)
     assert other.values is exposures.values
-    np.testing.assert_array_equal(other.oriented(back).positions.shifts, exposures.positions.shifts)
+    np.testing.assert_array_equal(other.positions.oriented(back).shifts, exposures.positions.shifts)
 
 
 def test_masks_add_up():

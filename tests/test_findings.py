@@ -13,7 +13,7 @@ from equipix import simulate
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.rules import AFTER
 from equipix.errors import ConvergenceWarning, InputWarning, MisfitWarning
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.findings import Finding, Rule, ask, say
 from equipix.fitting import windows
 from equipix.fitting.weighted import Options, weighted_fit

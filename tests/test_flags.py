@@ -9,7 +9,7 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.findings import BITS, Flag
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, Weighted, contradictory_found, weighted_fit

@@ -11,7 +11,7 @@ import equipix
 from equipix import simulate
 from equipix.diagnosis.lamp_drift import lamp_drift
 from equipix.errors import MisfitWarning
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.fitting.residuals import sampled
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.noise import chi2_tail

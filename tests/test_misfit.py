@@ -11,7 +11,7 @@ import equipix
 from equipix import simulate
 from equipix.diagnosis.misfit import misfit
 from equipix.errors import EquipixWarning, MisfitWarning
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.fitting.residuals import bands, lag_one, sampled
 
 SENSOR, CROSS = (64, 96), equipix.cross_pattern(11, 19)

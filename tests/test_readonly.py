@@ -121,8 +121,8 @@ def test_exposures_are_read_only_views_of_the_callers_arrays():
     for changed in (
         exposures.chosen(np.array([0, 2])),
         exposures.window(12),
-        exposures.oriented(Orientation(rows=True)),
-        exposures.whole(),
+        exposures.at(exposures.positions.oriented(Orientation(rows=True))),
+        exposures.at(exposures.positions.whole()),
         exposures.weighted(np.ones(5)),
         exposures.without(np.zeros((5, *SHAPE), bool)),
     ):

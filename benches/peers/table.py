@@ -11,8 +11,7 @@ import numpy as np
 
 import equipix
 from equipix import metrics, simulate
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.measured.measured import measured_of

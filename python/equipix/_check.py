@@ -288,6 +288,11 @@ def check_progress(progress: object) -> None:
         )
 
 
+def staged(progress: Progress | None, stage: str) -> Progress | None:
+    """Progress that names one stage, whatever the work calls its own."""
+    return None if progress is None else lambda done, total, _: progress(done, total, stage)
+
+
 def per_exposure(
     name: str, values: ArrayLike | None, count: int, *, default: float
 ) -> NDArray[np.float64]:
@@ -297,6 +302,19 @@ def per_exposure(
     array = as_array(name, values, ndim=1).astype(np.float64)
     check_count(name, len(array), count)
     return array
+
+
+def one_or_each(
+    name: str, values: ArrayLike, shape: tuple[int, ...], *, ndim: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Finite numbers not below 0, one for all or one for each, as an array of that shape."""
+    array = as_array(name, values, ndim=ndim).astype(np.float64)
+    if array.shape not in ((1,), shape):  # as_array makes one number an array of one
+        raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
+    wrong = array[~(np.isfinite(array) & (array >= 0))]
+    if wrong.size:
+        raise InputError(f"'{name}' holds {wrong[0]:g}, expected finite numbers not below 0")
+    return np.broadcast_to(array, shape)
 
 
 def check_count(name: str, got: int, count: int, one: str = "exposure") -> None:
@@ -313,22 +331,26 @@ def union(*masks: Bools | None) -> Bools | None:
 
 
 def as_mask(
-    mask: ArrayLike | None, shape: tuple[int, ...], *, may_be_whole: bool = False
+    mask: ArrayLike | None,
+    shape: tuple[int, ...],
+    *,
+    name: str = "mask",
+    may_be_whole: bool = False,
 ) -> Bools | None:
     """Mask of frames of that shape (rows, cols), or (n, rows, cols): of each or of all of them."""
     if mask is None:
         return None
     shapes = list(dict.fromkeys([shape[-2:], shape]))
-    array = as_array("mask", mask, ndim=tuple(map(len, shapes)))
+    array = as_array(name, mask, ndim=tuple(map(len, shapes)))
     if array.dtype != np.bool_:
         raise InputError(
-            f"'mask' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+            f"'{name}' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
         )
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
-        raise InputError(f"'mask' has shape {array.shape}, expected {wanted}")
+        raise InputError(f"'{name}' has shape {array.shape}, expected {wanted}")
     if array.all() and not may_be_whole:
-        raise InputError("'mask' excludes all pixels: give one with pixels that may be used")
+        raise InputError(f"'{name}' excludes all pixels: give one with pixels that may be used")
     return array
 
 

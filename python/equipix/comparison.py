@@ -9,7 +9,7 @@ import numpy as np
 from equipix._check import Array, ArrayLike, Bools, Ints, as_array, check_count
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError
-from equipix.findings import Flag, determined
+from equipix.findings import determined, usable
 from equipix.measured.filters import BLOCK
 from equipix.metrics.maps import block_means, relative_error, rms
 
@@ -178,12 +178,11 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> Array:
     maps = np.stack([each.sensitivity.astype(np.float64) for each in calibrations])
     good = np.isfinite(maps).all(axis=0)
     for each in calibrations:
-        good &= (each.flags & Flag.DO_NOT_USE) == 0
+        good &= usable(each.flags)
     if not good.any():
         raise InputError("'calibrations' have no pixel that is good in all of them")
     maps[:, ~good] = np.nan
-    gauged: Array = maps / np.nanmean(maps, axis=(1, 2), keepdims=True)
-    return gauged
+    return np.asarray(maps / np.nanmean(maps, axis=(1, 2), keepdims=True))
 
 
 def _expected(calibrations: Sequence[Calibration]) -> Array | None:
@@ -194,7 +193,7 @@ def _expected(calibrations: Sequence[Calibration]) -> Array | None:
             return None
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = each.sensitivity_std / each.sensitivity
-        pixels = rms(relative[np.isfinite(relative) & ((each.flags & Flag.DO_NOT_USE) == 0)])
+        pixels = rms(relative[np.isfinite(relative) & usable(each.flags)])
         blocks = (
             np.nan if each.weighted is None else rms(np.asarray(each.std_of(_some_blocks(each))))
         )

@@ -138,8 +138,7 @@ def _under_hole(virtual: VirtualExperiment, pixels: Array) -> Array:
     """Whether the image of the hole falls on these pixels in any exposure."""
     rows, cols = np.divmod(pixels, virtual.camera.shape[1])
     light = [virtual.hole(rows + row, cols + col) for row, col in virtual.positions]
-    under: Array = np.max(light, axis=0) > UNDER_HOLE * EXPOSURE_E
-    return under
+    return np.asarray(np.max(light, axis=0) > UNDER_HOLE * EXPOSURE_E)
 
 
 def run_demo(
@@ -203,5 +202,4 @@ def _flat_field(camera: Camera, dark: Array, frames: int, rng: int) -> Array:
     light = EXPOSURE_E * (1 + SOURCE_UNEVENNESS * slope)
     signal = average(camera.frames(light, frames, rng=rng)).mean - dark
     signal[~camera.good] = np.nan
-    normalised: Array = signal / np.nanmean(signal)
-    return normalised
+    return np.asarray(signal / np.nanmean(signal))

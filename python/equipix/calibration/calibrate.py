@@ -1,6 +1,6 @@
 """Shift calibration: sensitivity and beam from exposures of one beam at several positions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -14,27 +14,18 @@ from equipix.calibration.result import Calibration
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.inputs import BEFORE
 from equipix.diagnosis.rules import AFTER, LAST
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.findings import Finding, ask, say
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.pixels import without_faint_pixels, without_false_pixels
 from equipix.fitting.stated_errors import steadied, widened
-from equipix.fitting.weighted import Options, Weighted, is_to_be_fitted, weighted_fit
+from equipix.fitting.weighted import Options, is_to_be_fitted, weighted_fit
 from equipix.measured.colour import Colours
 from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics
-
-STEPS: tuple[Callable[[Weighted, Options], Weighted], ...] = (
-    without_false_pixels,
-    without_faint_pixels,
-    widened,
-    with_dark_misfit,
-)
-"""What follows the first fit, until weights and priors are final."""
 
 
 def calibrate(
@@ -240,7 +231,7 @@ def calibrate(
             dark_variance=dark_variance,
         )
     if fit_options.whole_shifts:
-        exposures = exposures.whole()
+        exposures = exposures.at(exposures.positions.whole())
     return calibrated(exposures, Options(fit_options, robust=robust, uncertainty=uncertainty))
 
 
@@ -260,7 +251,8 @@ def calibrated(
     started = datetime.now(UTC)
     said += say(*ask(BEFORE, exposures))
     weighted = steadied(weighted_fit(exposures, options, start), exposures, options)
-    for step in STEPS:
+    # Until weights and priors are final.
+    for step in (without_false_pixels, without_faint_pixels, widened, with_dark_misfit):
         weighted = step(weighted, options)
     evidence = Evidence.of(weighted, options, exposures.flux)
     # Before the error bars, which may be refused or interrupted.
@@ -295,10 +287,7 @@ def _metadata(evidence: Evidence, started: datetime) -> dict[str, Any]:
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     if dark is not None:
-        metadata["dark"] = {
-            "std_along_sensitivity": dark.along_sensitivity,
-            "std_of_a_pixel": dark.of_a_pixel,
-        }
+        metadata["dark"] = dark._asdict()
     if rejected is not None:
         metadata["rejected"] = rejected.sum(axis=(1, 2)).tolist()
     if bars is not None:

@@ -1,9 +1,9 @@
 """The result of a calibration."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,13 +26,13 @@ from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
-from equipix.exposures.positions import ROUNDING, Positions
+from equipix.exposures.positions import ROUNDING, Positions, as_rotation
 from equipix.findings import Finding, determined
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged, sampled_arrays
 from equipix.io.record import UNSAVED, Counts, Map, Record
 from equipix.measured.colour import Colours
-from equipix.measured.measured import Measured, measured_of
+from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.maps import slope_pixels, tilt
@@ -191,9 +191,9 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         """Refuse places that cannot be those of a calibration, and filters that are none."""
         super().__post_init__()
         grid, origin = self.beam.shape, np.array(self.beam_origin)
-        if not set(self.rotation.tolist()) <= {0, 90, 180, 270}:
-            raise InputError(f"'rotation' is {self.rotation}, expected 0, 90, 180 or 270 degrees")
-        if not _is_inside(origin, grid):
+        as_rotation(self.rotation, len(self.shifts))
+        # A cell reaches half of its side around its place.
+        if not np.all((origin >= -0.5) & (origin <= np.subtract(grid, 0.5))):
             raise InputError(f"'beam_origin' is {self.beam_origin}, expected a place on {grid}")
         if not (_are_whole(origin) or _are_whole(origin + self.shifts)):
             raise InputError(f"'beam_origin' is {self.beam_origin}, expected exposures in cells")
@@ -212,11 +212,13 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         weighted = evidence.weighted._replace(sampled=sampled_arrays(exposures))
         filters, gauge = exposures.filters, gauge_of(weighted, flags)
         std, offset = None if bars is None else bars.sensitivity, fit.offset
+        coefficients = fit.beam.coefficients
+        row, col = (int(each) if each.is_integer() else each for each in fit.beam.origin)
         return cls(
             sensitivity=scaled(fit.sensitivity, gauge.of_sensitivity, dtype),
             beam=scaled(fit.beam.values, gauge.of_beam),
-            beam_origin=_whole_if_possible(fit.beam.origin),
-            beam_coefficients=scaled(fit.beam.coefficients, gauge.of_beam),
+            beam_origin=(row, col),
+            beam_coefficients=None if coefficients is None else scaled(coefficients, gauge.of_beam),
             beam_tilt=np.array(fit.beam.tilt),
             flags=flags,
             shifts=np.array(fit.shifts, dtype=np.float64),
@@ -237,7 +239,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             dark=exposures.dark if offset is None else scaled(offset, exposures.response, dtype),
             dark_is_fitted=exposures.offset,
             metadata=metadata,
-            sensitivity_std=scaled(std, gauge.of_sensitivity, dtype),
+            sensitivity_std=None if std is None else scaled(std, gauge.of_sensitivity, dtype),
             tilt_std=None if bars is None else bars.tilt,
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
@@ -422,8 +424,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         """
         if np.shape(shift) != (2,):
             raise InputError(f"'shift' is {shift!r}, expected two numbers, (row, col) in pixels")
-        (place,) = places_of(np.reshape(shift, (1, 2)), [rotation], [flux])
-        signal = signal_at(place, self._beam, self._response)
+        (signal,) = self._signals(np.reshape(shift, (1, 2)), [rotation], [flux], 1)
         if not np.isfinite(signal).any():
             raise InputError(
                 f"'shift' is {np.asarray(shift).tolist()}: no exposure has observed the beam where "
@@ -481,16 +482,36 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             raise InputError(f"'frames' has shape {values.shape}, the sensor {self.shape}")
         if shifts is None:
             check_count("frames", len(values), len(self.shifts))
-        places = places_of(
+        signals = self._signals(
             self.shifts if shifts is None else shifts,
             self.rotation if shifts is None and rotation is None else rotation,
             self.flux if shifts is None and flux is None else flux,
+            len(values),
         )
-        check_count("shifts", len(places), len(values))
         residuals = np.full(values.shape, np.nan, np.result_type(values, self.sensitivity))
-        signals = (signal_at(place, self._beam, self._response) for place in places)
-        subtract_signals(measured, signals, self.dark if self.dark_is_fitted else None, residuals)
+        for k, signal in enumerate(signals):
+            np.subtract(values[k], signal, out=residuals[k], where=np.isfinite(values[k]))
+            if self.dark_is_fitted:
+                residuals[k] -= self.dark
+            variance = measured.variance_of(k, signal)
+            if variance is not None:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    residuals[k] /= np.sqrt(variance)
         return residuals
+
+    def _signals(
+        self, shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None, count: int
+    ) -> Iterator[Array]:
+        """Frames c · L(u) · M(p) of so many exposures, in the dtype of the sensitivity."""
+        positions = Positions.of(shifts, rotation=rotation)
+        fluxes = per_exposure("flux", flux, len(positions), default=1)
+        check_count("shifts", len(positions), count)
+        response, tilt = self._response, self.beam_tilt.tolist()
+        beam = Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
+        places = positions.shifts.tolist(), positions.rotation.tolist(), fluxes.tolist()
+        for (row, col), turn, c in zip(*places, strict=True):
+            light = beam.light(self.shape, (row, col), turn, workers=None)
+            yield np.asarray(c * light * response, response.dtype)
 
     @property
     def _response(self) -> NDArray[Any]:
@@ -499,64 +520,6 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             return self.sensitivity
         response = self.cfa.map_of(self.colour_response, self.shape)
         return np.asarray(self.sensitivity * response, self.sensitivity.dtype)
-
-    @property
-    def _beam(self) -> Beam:
-        tilt = self.beam_tilt.tolist()
-        return Beam(self.beam, self.beam_coefficients, self.beam_origin, tilt=tilt)
-
-
-def _whole_if_possible(place: tuple[float, float]) -> tuple[float, float]:
-    """Return a place on the grid with whole numbers as int, as indices are."""
-    row, col = (int(each) if each.is_integer() else each for each in place)
-    return row, col
-
-
-class Place(NamedTuple):
-    """Where the sensor is in the beam, and how bright the beam is."""
-
-    shift: tuple[float, float]
-    rotation: int
-    flux: float
-
-
-def places_of(shifts: ArrayLike, rotation: ArrayLike | None, flux: ArrayLike | None) -> list[Place]:
-    """Shift, rotation and flux of each exposure, checked."""
-    positions = Positions.of(shifts, rotation=rotation)
-    fluxes = per_exposure("flux", flux, len(positions), default=1)
-    rows = zip(positions.shifts, positions.rotation, fluxes, strict=True)
-    return [
-        Place((float(shift[0]), float(shift[1])), int(turn), float(c)) for shift, turn, c in rows
-    ]
-
-
-def signal_at(place: Place, beam: Beam, sensitivity: Array) -> Array:
-    """Frame c · L(u) · M(p) from a place, in the dtype of the sensitivity."""
-    rows, cols = sensitivity.shape
-    light = beam.light((rows, cols), place.shift, place.rotation, workers=None)
-    return np.asarray(place.flux * light * sensitivity, sensitivity.dtype)
-
-
-def subtract_signals(
-    measured: Measured, signals: Iterable[Array], dark: Array | None, out: Array
-) -> None:
-    """Write values less signals and dark, in standard deviations where variances are known.
-
-    Where nothing is measured `out` stays as it is.
-    """
-    for k, (values, signal) in enumerate(zip(measured.values, signals, strict=True)):
-        np.subtract(values, signal, out=out[k], where=np.isfinite(values))
-        if dark is not None:
-            out[k] -= dark
-        variance = measured.variance_of(k, signal)
-        if variance is not None:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                out[k] /= np.sqrt(variance)
-
-
-def _is_inside(place: NDArray[Any], grid: tuple[int, ...]) -> bool:
-    """Whether a place is in a cell of a grid, which reaches half of its side around it."""
-    return bool(np.all((place >= -0.5) & (place <= np.subtract(grid, 0.5))))
 
 
 def _are_whole(places: NDArray[Any]) -> bool:

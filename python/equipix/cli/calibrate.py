@@ -17,8 +17,7 @@ from equipix.experiment.experiment import Experiment
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
-from equipix.pictures.canvas import check_picture, save_figure
-from equipix.pictures.comparison import draw_comparison
+from equipix.pictures import check_picture, draw_comparison, save_figure
 from equipix.saved_results import load
 
 commands = typer.Typer()

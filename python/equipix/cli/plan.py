@@ -9,8 +9,7 @@ from equipix.cli.summary import told
 from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Finding, say
-from equipix.pictures.canvas import check_picture, save_figure
-from equipix.pictures.plans import draw_plans
+from equipix.pictures import check_picture, draw_plans, save_figure
 from equipix.plan.budget import ErrorBudget, error_budget
 from equipix.plan.components import identify
 from equipix.plan.drift import advise_order, distinct_trend

@@ -10,8 +10,7 @@ from equipix.cli import terminal
 from equipix.demo import run_demo, virtual_experiment
 from equipix.errors import EquipixError
 from equipix.io.paths import refuse_inputs
-from equipix.pictures.canvas import check_picture, save_figure
-from equipix.pictures.comparison import draw_demo
+from equipix.pictures import check_picture, draw_demo, save_figure
 
 commands = typer.Typer()
 

@@ -40,26 +40,29 @@ class Part(NamedTuple):
     remaining: Floats
 
 
-def by_flux(residuals: Floats, signal: Floats, noise: float) -> Part:
-    """Part proportional to the signal of each exposure, as of a wrong flux."""
-    return _explained(residuals, [signal], noise)
+def by_patterns(residuals: Floats, patterns: list[Floats], noise: float) -> Part:
+    """Part proportional to patterns (n, rows, cols), with a factor of its own in each exposure.
+
+    The signal is the pattern of a wrong flux; its slopes are those of a wrong shift.
+    """
+    explained, remaining = 0.0, residuals.copy()
+    for k, (columns, values) in enumerate(_each_exposure(residuals, patterns)):
+        fitted = columns @ _least_squares(columns, values)
+        explained += float(fitted @ fitted) - noise * len(patterns)
+        remaining[k][np.isfinite(residuals[k])] -= fitted
+    return Part(explained, remaining)
 
 
-def factors(residuals: Floats, signal: Floats) -> Floats:
-    """Errors of ln c of the exposures (n) that explain residuals best."""
-    return np.array([_coefficients(*each)[0] for each in _each_exposure(residuals, [signal])])
-
-
-def by_shifts(residuals: Floats, signal: Floats, slopes: Floats, noise: float) -> Part:
-    """Part proportional to the signal of each exposure and to its slopes (2, n, rows, cols)."""
-    return _explained(residuals, [signal, *slopes], noise)
+def coefficients(residuals: Floats, patterns: list[Floats]) -> Floats:
+    """Factors of patterns (n, patterns) that explain residuals best: errors of ln c, of shifts."""
+    return np.array([_least_squares(*each) for each in _each_exposure(residuals, patterns)])
 
 
 def by_illumination(residuals: Floats, signal: Floats, slopes: Floats, noise: float) -> Part:
     """Part that a beam explains which changes its shape smoothly: also quadratic in the place."""
     rows, cols = (np.linspace(-1, 1, size) for size in residuals.shape[1:])
     places = (rows[:, None], cols, rows[:, None] ** 2, rows[:, None] * cols, cols**2)
-    return _explained(residuals, [signal, *slopes, *(signal * place for place in places)], noise)
+    return by_patterns(residuals, [signal, *slopes, *(signal * place for place in places)], noise)
 
 
 def maybe_exchanged(residuals: Floats, light: Floats, response: Floats) -> list[tuple[int, int]]:
@@ -81,12 +84,6 @@ def maybe_exchanged(residuals: Floats, light: Floats, response: Floats) -> list[
     }
     likeliest = sorted(shares, key=lambda each: shares[each])
     return [pair for pair in likeliest[:_PAIRS] if shares[pair] < _EXCHANGED]
-
-
-def moves(residuals: Floats, signal: Floats, slopes: Floats) -> Floats:
-    """Errors of the shifts (n, 2) along rows and columns that explain residuals best, in pixels."""
-    found = [_coefficients(*each)[1:] for each in _each_exposure(residuals, [signal, *slopes])]
-    return np.array(found)
 
 
 def by_lines(residuals: Floats, axis: int, noise: float) -> Part:
@@ -146,16 +143,6 @@ def by_signal(residuals: Floats, signal: Floats) -> float:
     return 1 - left / float(np.sum((squares - squares.mean()) ** 2))
 
 
-def _explained(residuals: Floats, patterns: list[Floats], noise: float) -> Part:
-    """Part along patterns of each exposure."""
-    explained, remaining = 0.0, residuals.copy()
-    for k, (columns, values) in enumerate(_each_exposure(residuals, patterns)):
-        fitted = columns @ _coefficients(columns, values)
-        explained += float(fitted @ fitted) - noise * len(patterns)
-        remaining[k][np.isfinite(residuals[k])] -= fitted
-    return Part(explained, remaining)
-
-
 def _each_exposure(residuals: Floats, patterns: list[Floats]) -> list[tuple[Array, Array]]:
     """Patterns as columns, and residuals, of the measurements of each exposure."""
     known = np.isfinite(residuals)
@@ -166,7 +153,7 @@ def _each_exposure(residuals: Floats, patterns: list[Floats]) -> list[tuple[Arra
     return result
 
 
-def _coefficients(columns: Array, values: Array) -> Floats:
+def _least_squares(columns: Array, values: Array) -> Floats:
     """Least-squares coefficients; 0 of a pattern that there is not."""
     normal = columns.T @ columns
     return np.asarray(np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ (columns.T @ values))

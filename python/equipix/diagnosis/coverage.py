@@ -107,7 +107,7 @@ def _cause_in_shifts(exposures: Exposures, components: int) -> str:
     """Return why the shifts leave pixels unconnected."""
     shifts, count = exposures.positions.shifts, len(exposures)
     away = shifts - shifts[0]
-    turned = len(set(exposures.positions.rotation.tolist())) > 1
+    turned = exposures.positions.are_turned
     result = f"the shifts leave {components} parts of the sensor unconnected"
     if not away.any() and not turned:
         return f"{result}, since they are all alike: move the sensor between exposures"

@@ -1,6 +1,6 @@
 """Colours of a calibrated sensor: the gauge of each, and whether one beam is that of all."""
 
-from typing import NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -32,8 +32,8 @@ class Gauge(NamedTuple):
     `response` is that of each colour, of mean 1 over the pixels in use; None without a `cfa`.
     """
 
-    of_sensitivity: Floats | float = 1.0
-    of_beam: float = 1.0
+    of_sensitivity: Floats | float
+    of_beam: float
     response: dict[str, float] | None = None
 
 
@@ -61,20 +61,8 @@ def gauge_of(weighted: Weighted, flags: Array) -> Gauge:
     return Gauge(1 / filters.colours.map_of(means, shape), mean, found)
 
 
-@overload
-def scaled(values: None, factor: Floats | float, dtype: DTypeLike = ...) -> None: ...
-
-
-@overload
-def scaled(values: Array, factor: Floats | float, dtype: DTypeLike = ...) -> Array: ...
-
-
-def scaled(
-    values: Array | None, factor: Floats | float, dtype: DTypeLike = np.float64
-) -> Array | None:
+def scaled(values: Array, factor: Floats | float, dtype: DTypeLike = np.float64) -> Array:
     """Values times a factor in a dtype; the array itself where nothing changes."""
-    if values is None:
-        return None
     same = isinstance(factor, float) and factor == 1
     return (values if same else values * factor).astype(dtype, copy=False)
 
@@ -141,9 +129,8 @@ def _sums(weighted: Weighted, colours: Colours, good: Bools) -> tuple[Floats, Fl
         signal = exposures.light(fit, k, None) * fit.sensitivity
         residual = exposures.residual(fit, k, None)
         used = exposures.usable(k) & good & np.isfinite(residual)
-        scaled = (
-            signal[used] / exposures.deviation(k)[used if exposures.deviation(k).ndim else ...] ** 2
-        )
+        deviation = np.broadcast_to(exposures.deviation(k), signal.shape)[used]
+        scaled = signal[used] / deviation**2
         for target, factor in ((weights, signal), (sums, residual)):
             count = np.bincount(group[used], scaled * factor[used], minlength=target[k].size)
             target[k] = count.reshape(target[k].shape)

@@ -83,7 +83,7 @@ def _on_rounding(exposures: Exposures) -> str | None:
 def _on_order(exposures: Exposures) -> str | None:
     """Say that a drift in time is degenerate with a tilt in the order of the exposures."""
     times, positions = exposures.flux.time, exposures.positions
-    if times is None or len(set(positions.rotation.tolist())) > 1:
+    if times is None or positions.are_turned:
         return None
     share = distinct_trend(positions.shifts, times)
     if share >= _DEGENERATE:
@@ -118,7 +118,7 @@ def on_brightness(exposures: Exposures) -> str | None:
     Wrong shifts in a steep beam make several exposures look so.
     """
     # Values with an offset are not proportional to light.
-    if exposures.offset or exposures.raw or len(set(exposures.positions.rotation.tolist())) > 1:
+    if exposures.offset or exposures.raw or exposures.positions.are_turned:
         return None
     shifts = on_sensor(exposures.positions)
     away = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)

@@ -142,8 +142,9 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     median of its exposure is left out, so that dust looks like no drift.
     """
     exposures, fit = weighted.exposures, weighted.fit
-    turns = set(exposures.positions.rotation.tolist())
-    if exposures.offset or len(turns) > 1 or exposures.flux.kind not in ("known", "linear"):
+    if exposures.offset or exposures.positions.are_turned:
+        return None
+    if exposures.flux.kind not in ("known", "linear"):
         return None
     if fit.degrees_of_freedom < FEWEST or not residuals.inexactness <= EXACT:
         return None

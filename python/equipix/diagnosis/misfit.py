@@ -7,8 +7,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats
 from equipix._native import Fit
 from equipix.diagnosis import causes
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.findings import usable
 from equipix.fitting.residuals import (
     EXACT,
@@ -125,13 +124,11 @@ def misfit(
         words = misplaced(weighted.exposures, (), None, options) if failed else None
         nothing = Correlation(0.0, 0.0, 0.0)
         return None if words is None else Misfit(float("nan"), None, nothing, "order", words)
-    known = weighted.exposures.knows_noise
-    chi2 = weighted.reduced_chi2 if known else float("nan")
-    left, unexplained = without_shift_errors(weighted, residuals), 1.0
-    if left is not residuals:
-        unexplained = float(np.nansum(left.values**2) / np.nansum(residuals.values**2))
-        residuals = left
-    chi2, std = unexplained * chi2, weighted.chi2_std if known else float("nan")
+    left = without_shift_errors(weighted, residuals)
+    unexplained = float(np.nansum(left.values**2) / np.nansum(residuals.values**2))
+    residuals, chi2, std = left, float("nan"), float("nan")
+    if weighted.exposures.knows_noise:
+        chi2, std = unexplained * weighted.reduced_chi2, weighted.chi2_std
     high, low = _beyond(chi2, std, inexactness)
     if high or low:
         chi2 *= _share_of_good(weighted, flags, options)
@@ -145,6 +142,7 @@ def misfit(
             chi2, std = unexplained * simulated.value, simulated.std
             high, low = _beyond(chi2, std, inexactness)
             low = low and _is_low(chi2, std, weighted.exposures, residuals)
+    limit = _limit(std) if high or low else None
     largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
     correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
     correlated &= inexactness <= EXACT
@@ -153,13 +151,12 @@ def misfit(
         worst = standing_out(_flat(residuals.values))
         words = None if worst is None else misplaced(weighted.exposures, (), worst, options)
         if words is not None:
-            return Misfit(chi2, _limit(std) if high or low else None, largest, "order", words)
-    if not (high or low or correlated):
+            return Misfit(chi2, limit, largest, "order", words)
+    if limit is None and not correlated:
         return None
-    cause, remedy = _cause(
-        weighted, residuals, largest, options, correlated=bool(correlated), low=low
-    )
-    return Misfit(chi2, _limit(std) if high or low else None, largest, cause, remedy)
+    found = _common(weighted, residuals, largest, options) if correlated else None
+    cause = found or _cause(weighted, residuals, correlated=bool(correlated), low=low)
+    return Misfit(chi2, limit, largest, *cause)
 
 
 def _limit(std: float) -> float:
@@ -205,19 +202,9 @@ def _is_low(chi2: float, std: float, exposures: Exposures, residuals: Residuals)
 
 
 def _cause(
-    weighted: Weighted,
-    residuals: Residuals,
-    largest: Correlation,
-    options: FitOptions,
-    *,
-    correlated: bool,
-    low: bool,
+    weighted: Weighted, residuals: Residuals, *, correlated: bool, low: bool
 ) -> tuple[str, str]:
-    """The likely cause and its remedy."""
-    if correlated:
-        found = _common(weighted, residuals, largest, options)
-        if found is not None:
-            return found
+    """The likely cause and its remedy, where neighbours show none that they have in common."""
     values, signal = (_flat(each) for each in (residuals.values, residuals.signal))
     if low:
         return "noise", (
@@ -283,7 +270,7 @@ def _common(
         )
     if found is not None:
         return found
-    remaining = causes.by_shifts(values, signal, slopes, noise).remaining
+    remaining = causes.by_patterns(values, [signal, *slopes], noise).remaining
     for axis, name in ((2, "rows"), (1, "columns")):
         parts = [causes.by_lines(each, axis, noise).explained for each in (values, remaining)]
         if max(parts) > _MOST * excess:
@@ -313,8 +300,8 @@ def _of_exposures(
     illumination = causes.by_illumination(values, signal, slopes, noise).explained
     lines = [causes.by_lines(values, axis, noise).explained for axis in (1, 2)]
     limit = max(_MOST * excess, _ENOUGH * max(illumination, *lines))
-    if causes.by_flux(values, signal, noise).explained > limit:
-        factors = causes.factors(values, signal)
+    if causes.by_patterns(values, [signal], noise).explained > limit:
+        factors = causes.coefficients(values, [signal])[:, 0]
         worst = int(np.abs(factors).argmax())
         # The sensitivity takes 1/n of what an error of a flux leaves.
         error = factors[worst] / (1 - 1 / len(factors))
@@ -323,11 +310,12 @@ def _of_exposures(
             f"{weighted.exposures.name_of(worst)}, by some {error:+.0%}: use flux='fit' "
             "or 'flux_std'"
         )
-    if causes.by_shifts(values, signal, slopes, noise).explained > limit:
+    moves = [signal, *slopes]
+    if causes.by_patterns(values, moves, noise).explained > limit:
         stated = weighted.exposures.positions.std is not None
         return "shifts", (
             "they are proportional to the slope of the beam: check the shifts"
-            f"{_scale_words(weighted, causes.moves(values, signal, slopes))}"
+            f"{_scale_words(weighted, causes.coefficients(values, moves)[:, 1:])}"
             f"{', which are wrong by more than their' if stated else ', or give'} 'shift_std'"
         )
     if illumination > limit:
@@ -398,7 +386,7 @@ def _is_fine(weighted: Weighted, residuals: Residuals) -> bool:
 def _seen_by_all(weighted: Weighted, residuals: Residuals) -> Bools:
     """Measurements in cells that all exposures see: elsewhere the beam takes more of a residual."""
     positions, shape = weighted.exposures.positions, weighted.exposures.shape
-    if len(set(positions.rotation.tolist())) > 1:
+    if positions.are_turned:
         return np.isfinite(residuals.values)
     return np.asarray(testable(residuals.rows, on_sensor(positions), shape) > 1 - 1e-9)
 

@@ -13,15 +13,13 @@ import numpy as np
 
 from equipix._check import Array, Floats, ShiftSign
 from equipix._native import Fit
-from equipix.errors import InputError, InsufficientMemoryError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions
 from equipix.fitting.residuals import left_by
-from equipix.fitting.windows import WindowFit
+from equipix.fitting.windows import WindowFit, if_there_is_light
 from equipix.measured.noise import chi2_tail
-from equipix.plan.drift import affine_columns
+from equipix.plan.drift import undetermined_fluxes
 
 _MOST_EXPOSURES = 12
 """Most exposures of the test: each has a flux to be fitted."""
@@ -109,7 +107,7 @@ class OrientationTest:
 
 
 def orientation_test(
-    exposures: Exposures, fit: Fit, options: FitOptions, flux: Flux | None = None
+    exposures: Exposures, fit: Fit, options: FitOptions, flux: Flux
 ) -> OrientationTest:
     """Compare the fit with the shifts as given to those in all other orientations.
 
@@ -121,8 +119,8 @@ def orientation_test(
         Their fit: the free fluxes start from its fluxes.
     options : FitOptions
         Number of threads and progress.
-    flux : Flux, optional
-        The fluxes as they were given; those of `exposures` unless given.
+    flux : Flux
+        The fluxes as they were given, with their own prior.
 
     Returns
     -------
@@ -147,7 +145,6 @@ def orientation_test(
     """
     if exposures.offset:
         return OrientationTest(reason="it is not tested where the dark is fitted; " + _REMEDY)
-    known = exposures.flux if flux is None else flux
     exposures = dataclasses.replace(
         exposures,
         flux=exposures.flux.free(np.array(fit.flux)),
@@ -161,19 +158,17 @@ def orientation_test(
     if len(ways) < 2 or len(asked) < 3 or (len(asked) - 2) * pixels < _FEWEST:
         return OrientationTest(reason="there are too few measurements; " + _REMEDY)
     # The window first: the exposures chosen are copied.
-    windows = {way: exposures.oriented(way).window(side).chosen(asked) for way in ways}
-    try:
+    turned = {way: exposures.at(exposures.positions.oriented(way)) for way in ways}
+    windows = {way: each.window(side).chosen(asked) for way, each in turned.items()}
+    with if_there_is_light():
         fits = _fits(windows, options)
         left = _left(fits)
         test = _outcome(fits, left)
         if test.sign != "undetermined" or AS_GIVEN not in left:
             return test
         equal = {way: fits[way] for way in ways if way in left}
-        also = hidden(equal, windows, known.chosen(asked), exposures.shape)
-        return test if also is None else dataclasses.replace(test, **also._asdict())
-    except (InputError, InsufficientMemoryError):
-        # All arguments are valid for the whole sensor: the window has too little light or memory.
-        return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
+        return with_hidden(test, equal, windows, flux.chosen(asked), exposures.shape)
+    return OrientationTest(reason="the middle of the sensor has too little light; " + _REMEDY)
 
 
 def chosen_exposures(positions: Positions, most: int) -> Array:
@@ -279,16 +274,9 @@ def _outcome(fits: Mapping[Orientation, WindowFit], left: set[Orientation]) -> O
         sign = "contradicted"
     elif left == {AS_GIVEN}:
         sign = "confirmed"
-    return OrientationTest(
-        rows=rows,
-        cols=cols,
-        exchanged=exchanged,
-        turned=turned,
-        sign=sign,
-        best=best,
-        ratio=fits[AS_GIVEN].left / fits[best].left if fits[best].left > 0 else None,
-        reason=_reason(fits[best], left, best) if sign == "undetermined" else "",
-    )
+    ratio = fits[AS_GIVEN].left / fits[best].left if fits[best].left > 0 else None
+    reason = _reason(fits[best], left, best) if sign == "undetermined" else ""
+    return OrientationTest(rows, cols, exchanged, turned, sign, best, ratio, reason)
 
 
 def _answer(left: set[Orientation], name: str) -> ShiftSign:
@@ -323,18 +311,6 @@ _PLACES = 33
 """Places along each side of the sensor where the difference of M is evaluated."""
 
 
-class Hidden(NamedTuple):
-    """Another orientation that fits equally well.
-
-    `difference` is the rms difference of its ln M over the sensor, and `is_likely` says whether its
-    fluxes agree with those given while those of the orientation as given do not.
-    """
-
-    hidden: Orientation
-    difference: float
-    is_likely: bool
-
-
 class _Fluxes(NamedTuple):
     """How far fluxes are from those given, rms, and whether they agree with them."""
 
@@ -342,16 +318,19 @@ class _Fluxes(NamedTuple):
     agree: bool
 
 
-def hidden(
+def with_hidden(
+    test: OrientationTest,
     fits: Mapping[Orientation, WindowFit],
     windows: Mapping[Orientation, Exposures],
     flux: Flux,
     shape: tuple[int, int],
-) -> Hidden | None:
-    """Find the orientation that no measurement excludes and whose M is farthest from that as given.
+) -> OrientationTest:
+    """Add the orientation that no measurement excludes and whose M is farthest from that as given.
 
     Parameters
     ----------
+    test : OrientationTest
+        The test whose sign is undetermined.
     fits, windows : mapping
         Fits with free fluxes in the orientations that their residuals do not exclude, the one as
         given among them, and what was fitted.
@@ -362,27 +341,28 @@ def hidden(
 
     Returns
     -------
-    Hidden or None
-        The likely one if there is one. Else, where fluxes are free or have a prior, one that agrees
-        with it; None where M is the same in all of them within its noise.
+    OrientationTest
+        With the likely orientation if there is one. Else, where fluxes are free or have a prior,
+        with one that agrees with it; as it was where M is the same in all of them within its noise.
     """
-    given = Orientation()
     fluxes = {way: _fluxes(fit, windows[way], flux) for way, fit in fits.items()}
-    others = [way for way in fits if way != given]
-    likely = [way for way in others if _is_likely(fluxes[way], fluxes[given])]
+    others = [way for way in fits if way != AS_GIVEN]
+    likely = [way for way in others if _is_likely(fluxes[way], fluxes[AS_GIVEN])]
     if likely:
         best = min(likely, key=lambda way: fluxes[way].distance)
-        return Hidden(best, _difference(fits[best], fits[given], shape)[0], is_likely=True)
+        size, _ = _difference(fits[best], fits[AS_GIVEN], shape)
+        return dataclasses.replace(test, hidden=best, difference=size, is_likely=True)
     if flux.kind not in ("fit", "prior"):
-        return None
-    found = [
-        Hidden(way, size, is_likely=False)
-        for way in others
-        if fluxes[way].agree
-        for size, noise in [_difference(fits[way], fits[given], shape)]
-        if size > _ABOVE * noise
-    ]
-    return max(found, key=lambda each: each.difference, default=None)
+        return test
+    found = {}
+    for way in others:
+        size, noise = _difference(fits[way], fits[AS_GIVEN], shape)
+        if fluxes[way].agree and size > _ABOVE * noise:
+            found[way] = size
+    if not found:
+        return test
+    best = max(found, key=lambda way: found[way])
+    return dataclasses.replace(test, hidden=best, difference=found[best])
 
 
 def _is_likely(other: _Fluxes, given: _Fluxes) -> bool:
@@ -394,7 +374,7 @@ def _fluxes(fit: WindowFit, window: Exposures, flux: Flux) -> _Fluxes:
     """Compare fitted fluxes with those given, without what the shifts leave undetermined."""
     if flux.kind == "fit":
         return _Fluxes(0.0, agree=True)
-    columns = _undetermined(window.positions, flux)
+    columns = undetermined_fluxes(window.positions, flux.time)
     deviations = np.log(np.array(fit.fit.flux) / flux.values)
     rest, rank = left_by(columns, deviations)
     freedom = len(rest) - rank
@@ -406,13 +386,6 @@ def _fluxes(fit: WindowFit, window: Exposures, flux: Flux) -> _Fluxes:
     std = np.hypot(error, 0.0 if flux.std is None else flux.std)
     agree = chi2_tail(float(np.sum((rest / std) ** 2)), freedom) >= _RARE
     return _Fluxes(float(np.sqrt(rest @ rest / freedom)), agree)
-
-
-def _undetermined(positions: Positions, flux: Flux) -> Floats:
-    """Combinations of ln c (n, columns) that leave no residual or belong to a trend."""
-    if len(set(positions.rotation.tolist())) > 1:
-        return np.ones((len(positions), 1))
-    return affine_columns(positions.shifts, flux.time)
 
 
 def _difference(one: WindowFit, other: WindowFit, shape: tuple[int, int]) -> tuple[float, float]:

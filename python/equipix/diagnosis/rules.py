@@ -8,14 +8,7 @@ from equipix.diagnosis.coverage import TOO_WEAK, left_out, too_far, too_few
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
-from equipix.fitting.error_bars import (
-    NOT_FOUND,
-    fits_noise,
-    incomplete_searches,
-    is_too_far,
-    is_too_fine,
-    too_fine,
-)
+from equipix.fitting.error_bars import fits_noise, incomplete_searches, why_none
 
 _UNDETERMINED = 1e-4
 """A Ritz value this small belongs to a pattern that the measurements do not determine: its noise is
@@ -170,23 +163,13 @@ def _on_convergence(e: Evidence) -> str | None:
 
 
 def _on_uncertainty(e: Evidence) -> str | None:
-    """A fit that is too far from its minimum or its beam for standard deviations."""
-    if not e.options.uncertainty:
-        return None
-    if is_too_fine(e.weighted):
-        return too_fine(e.weighted)
-    if not is_too_far(e.fit):
-        return None
-    return (
-        "no standard deviations: the fit is too far from its minimum (estimated error "
-        f"{float(e.fit.error_estimate[-1]):.1e}, limit {NOT_FOUND:g})"
-    )
+    return why_none(e.weighted) if e.options.uncertainty else None
 
 
 def _on_dark(e: Evidence) -> str | None:
     if e.dark is None:
         return None
-    along, alone = e.dark.along_sensitivity, e.dark.of_a_pixel
+    along, alone = e.dark.std_along_sensitivity, e.dark.std_of_a_pixel
     limited = e.fit.ended == "sweeps used" and e.options.fit.max_sweeps is not None
     if along is not None and alone is not None and along > alone:
         known = f"its standard deviation is {along:.1e}, that of a pixel by noise {alone:.1e}"
@@ -249,13 +232,7 @@ AFTER: tuple[Rule[Evidence], ...] = (
     Rule("convergence", "convergence", _on_convergence),
     Rule("uncertainty", "convergence", _on_uncertainty),
     Rule("variance", "misfit", _replaced("variance"), severity="note"),
-    Rule(
-        "misfit",
-        "misfit",
-        small_errors_found,
-        unless=_STRONGER,
-        instead=frozenset({"misfit"}),
-    ),
+    Rule("misfit", "misfit", small_errors_found, unless=_STRONGER, instead=frozenset({"misfit"})),
 )
 """What is asked of a fit, the most important first."""
 

@@ -10,8 +10,7 @@ import numpy as np
 from equipix._check import Array, Floats
 from equipix._native import Fit
 from equipix.diagnosis.evidence import Evidence
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.findings import usable
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.residuals import EXACT, FEWEST, tested
@@ -133,12 +132,7 @@ def small_errors_found(evidence: Evidence) -> str | None:
     errors = small_errors(weighted._replace(exposures=exposures), evidence.options.fit)
     if not errors or (evidence.misfit is not None and not errors[0].share > _MOST):
         return None
-    return _words(errors)
-
-
-def _words(errors: list[SmallError]) -> str:
-    first = errors[0]
-    likely = ", or ".join(each.words for each in errors)
+    first, likely = errors[0], ", or ".join(each.words for each in errors)
     return (
         f"the residuals show {likely}: {abs(first.sigmas):.0f} standard errors (limit "
         f"{_SIGMAS:g}), and an error of the sensitivity of {first.effect:.1e} rms: "
@@ -180,8 +174,8 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     return [each for each in found if each.sigmas**2 >= least]
 
 
-@if_there_is_light
-def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError]:
+@if_there_is_light()
+def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError] | None:
     """Each error that is larger than noise."""
     window, start = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)

@@ -103,27 +103,29 @@ def measured_shifts(
 
     `hot` are the pixels that the dark frames show to be hot.
     """
-    shifts, variances = [np.zeros(2)], [np.zeros(2)]
     first, *others = manifest.exposure
-    if first.shift is not None:
-        shifts[0] = np.array(first.shift)
-        variances[0] = np.square(first.shift_std or [0.0, 0.0])
+    shifts, variances = ([each] for each in _given(first))
     for old, new in zip(manifest.exposure, others, strict=False):
-        if new.shift is not None:
-            shifts.append(np.array(new.shift))
-            variances.append(np.square(new.shift_std or [0.0, 0.0]))
-            continue
-        spots, shape = _spots(path, manifest, new, equalisation, hot)
-        ends = ((spots.before, old.rotation), (spots.after, new.rotation))
-        before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
-        shifts.append(shifts[-1] + before - after)
-        noise = sum(variance_in_beam(np.square(spot.std), turn) for spot, turn in ends)
-        unequal = sum(
-            _UNEQUAL_PIXELS**2 if equalisation is None else equalisation.unequal_pixels(spot)
-            for spot, _ in ends
-        )
-        variances.append(variances[-1] + noise + unequal)
+        shift, variance = _given(new)
+        if new.shift is None:
+            spots, shape = _spots(path, manifest, new, equalisation, hot)
+            ends = ((spots.before, old.rotation), (spots.after, new.rotation))
+            before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
+            shift = shifts[-1] + before - after
+            noise = sum(variance_in_beam(np.square(spot.std), turn) for spot, turn in ends)
+            unequal = sum(
+                _UNEQUAL_PIXELS**2 if equalisation is None else equalisation.unequal_pixels(spot)
+                for spot, _ in ends
+            )
+            variance = variances[-1] + noise + unequal
+        shifts.append(shift)
+        variances.append(variance)
     return np.array(shifts), np.sqrt(variances)
+
+
+def _given(exposure: Exposure) -> tuple[Floats, Floats]:
+    """Shift of an exposure in the manifest, and its variance; 0 unless given."""
+    return np.array(exposure.shift or [0.0, 0.0]), np.square(exposure.shift_std or [0.0, 0.0])
 
 
 def _spots(
@@ -143,19 +145,11 @@ def _spots(
         level = manifest.sensor.saturation_level
         if equalisation is not None:
             before, after = (
-                _equalised(images, saturation_level(images, level), equalisation, hot)
-                for images in (before, after)
+                mended(equalisation.apply(raw), hot_places(raw, saturation_level(raw, level), hot))
+                for raw in (before, after)
             )
             # In other units; the first measurement has checked that nothing saturates.
             level, hot = None, None
         return measure_shift(before, after, saturation=level, hot=hot), before.shape[-2:]
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
-
-
-def _equalised(
-    images: Array, level: float | None, equalisation: Equalisation, hot: Bools | None
-) -> Array:
-    """Images as equal pixels would have given them; isolated hot ones as their neighbours show."""
-    places = hot_places(images, level, hot)
-    return mended(equalisation.apply(images), places)

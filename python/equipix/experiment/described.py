@@ -10,17 +10,19 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import EXPOSURES, Bools, Progress, Words, as_mask, naming_memory, union
+from equipix._check import (
+    EXPOSURES,
+    Bools,
+    Progress,
+    Words,
+    as_mask,
+    naming_memory,
+    staged,
+    union,
+)
 from equipix.errors import FileError, InputError
 from equipix.experiment.image_files import check_formats, image_files, refuse_repeats, sha256_of
-from equipix.experiment.manifest import (
-    Dark,
-    LevelManifest,
-    Manifest,
-    Region,
-    entry_files,
-    read_manifest,
-)
+from equipix.experiment.manifest import Dark, LevelManifest, Manifest, entry_files, read_manifest
 from equipix.io.frames import read_mask
 from equipix.io.paths import as_path
 from equipix.measured.average import average
@@ -92,14 +94,10 @@ class Described(Generic[_Manifest]):
         progress: Progress | None,
     ) -> FrameStatistics:
         """Average the files of an entry; `name` is for the progress."""
-
-        def report(done: int, total: int, _: str) -> None:
-            if progress is not None:
-                progress(done, total, f"averaging {name}")
-
         sensor, files = self.manifest.sensor, entry_files(self.path, entry)
         level = sensor.saturation_level
-        found = average(files, dark=dark, saturation=level, workers=workers, progress=report)
+        stage = staged(progress, f"averaging {name}")
+        found = average(files, dark=dark, saturation=level, workers=workers, progress=stage)
         if sensor.largest is not None and found.mean.max() > sensor.largest:
             raise FileError(
                 f"{self.path}: '{files[0].name}' of {name} holds means up to "
@@ -166,7 +164,7 @@ class Described(Generic[_Manifest]):
         sensor = self.manifest.sensor
         masks = [] if sensor.mask is None else [_of_file(self.path, sensor.mask, shape)]
         for index, region in enumerate(sensor.region or [], start=1):
-            masks.append(_of_region(f"{self.path}: [[sensor.region]] {index}", region, shape))
+            masks.append(region.pixels(f"{self.path}: [[sensor.region]] {index}", shape))
         excluded = union(*masks)
         if excluded is not None and excluded.all():
             raise FileError(f"{self.path}: 'mask' and 'region' in [sensor] leave no pixel to use")
@@ -194,33 +192,3 @@ def _of_file(path: Path, entry: str, shape: tuple[int, int]) -> Bools:
             f"{file}: is a mask of shape {mask.shape}, expected {shape} like the frames"
         )
     return mask
-
-
-def _of_region(place: str, region: Region, shape: tuple[int, int]) -> Bools:
-    shaped = _rectangle if region.centre is None else _disc
-    inside = shaped(place, region, shape)
-    return ~inside if region.outside else inside
-
-
-def _rectangle(place: str, region: Region, shape: tuple[int, int]) -> Bools:
-    inside = np.zeros(shape, bool)
-    spans = []
-    for name, span, size in zip(("rows", "cols"), (region.rows, region.cols), shape, strict=True):
-        first, end = span or (0, size)
-        if end > size:
-            raise FileError(f"{place}: '{name}' ends at {end}, expected at most {size}")
-        spans.append(slice(first, end))
-    inside[tuple(spans)] = True
-    return inside
-
-
-def _disc(place: str, region: Region, shape: tuple[int, int]) -> Bools:
-    row, col = region.centre or (0.0, 0.0)
-    rows, cols = np.ogrid[: shape[0], : shape[1]]
-    inside: Bools = np.hypot(rows - row, cols - col) <= (region.radius or 0.0)
-    if not inside.any():
-        raise FileError(
-            f"{place}: 'centre' {[row, col]} and 'radius' {region.radius:g} name no pixel of the "
-            f"sensor, which has {shape[0]} rows and {shape[1]} columns"
-        )
-    return inside

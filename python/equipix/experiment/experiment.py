@@ -11,8 +11,7 @@ from equipix.errors import InputError
 from equipix.experiment.aperture import Equalisation, measured_shifts
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import Manifest
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.findings import Finding, say
@@ -201,13 +200,13 @@ class Experiment(Described[Manifest]):
             exposures = Exposures.of(measured, positions, fluxes, mask=excluded)
         start = None
         if whole:
-            exposures = exposures.whole(std)
+            exposures = exposures.at(positions.whole(std))
         elif self._is_moved():
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
             equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
             shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
-            exposures = replace(exposures, positions=exposures.positions.at(shifts, std))
+            exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
             start = first.fit
         origin = self._provenance(
             hashes,

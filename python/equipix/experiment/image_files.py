@@ -129,15 +129,12 @@ def _alike(
 ) -> Iterator[tuple[Path, Path]]:
     """Give the pairs of the same file, or of the same content; within a list if both are one."""
     marks = {file: file.resolve() if hashes is None else hashes[file] for file in [*first, *second]}
-    if second is not first:
-        seen = {marks[file]: file for file in reversed(first)}
-        yield from ((seen[marks[file]], file) for file in second if marks[file] in seen)
-        return
-    seen = {}
-    for file in first:
+    seen = {} if second is first else {marks[file]: file for file in reversed(first)}
+    for file in second:
         if marks[file] in seen:
             yield seen[marks[file]], file
-        seen.setdefault(marks[file], file)
+        if second is first:
+            seen.setdefault(marks[file], file)
 
 
 def _words(one: Path, other: Path) -> str:

@@ -4,9 +4,11 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from equipix._check import Bools
 from equipix.errors import EquipixError, FileError, InputError
 from equipix.io.paths import find_files
 from equipix.measured.colour import Colours
@@ -85,6 +87,33 @@ class Region(_Table):
             if first >= end:
                 raise _problem(f"{[first, end]} holds no pixel: the first must be below the end")
         return self
+
+    def pixels(self, place: str, shape: tuple[int, int]) -> Bools:
+        """Pixels of a sensor that must not be used; `place` names the region in messages."""
+        inside = self._rectangle(place, shape) if self.centre is None else self._disc(place, shape)
+        return ~inside if self.outside else inside
+
+    def _rectangle(self, place: str, shape: tuple[int, int]) -> Bools:
+        inside = np.zeros(shape, bool)
+        spans = []
+        for name, span, size in zip(("rows", "cols"), (self.rows, self.cols), shape, strict=True):
+            first, end = span or (0, size)
+            if end > size:
+                raise FileError(f"{place}: '{name}' ends at {end}, expected at most {size}")
+            spans.append(slice(first, end))
+        inside[tuple(spans)] = True
+        return inside
+
+    def _disc(self, place: str, shape: tuple[int, int]) -> Bools:
+        row, col = self.centre or (0.0, 0.0)
+        rows, cols = np.ogrid[: shape[0], : shape[1]]
+        inside: Bools = np.hypot(rows - row, cols - col) <= (self.radius or 0.0)
+        if not inside.any():
+            raise FileError(
+                f"{place}: 'centre' {[row, col]} and 'radius' {self.radius:g} name no pixel of the "
+                f"sensor, which has {shape[0]} rows and {shape[1]} columns"
+            )
+        return inside
 
 
 class Sensor(_Table):

@@ -1,8 +1,8 @@
-"""Exposures of one beam: fitted, predicted, and parts of them."""
+"""Exposures of one beam: how they are fitted, predicted, and parts of them."""
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,16 +12,21 @@ from equipix._check import (
     Array,
     Bools,
     Floats,
-    as_array,
+    Method,
+    Progress,
     as_mask,
+    as_tolerance,
+    check_progress,
     naming_memory,
+    one_or_each,
+    positive_count,
+    positive_workers,
     union,
 )
 from equipix._native import Fit
 from equipix.errors import InputError
-from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
-from equipix.exposures.positions import Orientation, Positions, nearest_whole
+from equipix.exposures.positions import Positions, nearest_whole
 from equipix.measured.defects import BadPixels
 from equipix.measured.filters import Filters, mean_signal
 from equipix.measured.measured import Measured
@@ -30,13 +35,58 @@ from equipix.measured.saturation import clipping_advice
 _BLOCK = 64
 """Rows of a block for medians."""
 
-
 _REASONS = {  # the first that most pixels share: dark frames scatter more than a wrong model too
     "noisy": "scatters between frames by more than its noise model explains: correct the gain "
     "('gain_dn_per_e' in [sensor], 'variance' of calibrate), or leave it out",
     "hot": "is hot in the dark frames: give dark frames of the same camera and exposure time",
     "dead": "does not respond to light: is the dark that of these frames?",
 }
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to minimise the objective, and how far.
+
+    Attributes
+    ----------
+    method : {"multiscale", "coordinate-descent"}
+        The solver at shifts that differ by whole pixels.
+    tolerance : float
+        Largest relative error of the sensitivity at which the solver stops.
+    max_sweeps : int or None
+        Upper limit on passes over the data or its weights.
+    workers : int or None
+        Number of threads; None: as many as processors may be used.
+    progress : callable or None
+        Called as ``progress(done, total, stage)`` repeatedly.
+    """
+
+    method: Method = "multiscale"
+    tolerance: float = 1e-6
+    max_sweeps: int | None = None
+    workers: int | None = None
+    progress: Progress | None = None
+
+    @property
+    def whole_shifts(self) -> bool:
+        """Whether the method takes shifts alone that differ by whole pixels: the core decides."""
+        return _native.needs_whole_shifts(self.method)
+
+    @classmethod
+    def of(
+        cls,
+        method: Method,
+        tolerance: float,
+        max_sweeps: int | None,
+        workers: int | None,
+        progress: Progress | None,
+    ) -> Self:
+        """Check what the caller gave."""
+        if method not in get_args(Method):
+            raise InputError(f"'method' is {method!r}, expected one of {get_args(Method)}")
+        check_progress(progress)
+        most = None if max_sweeps is None else positive_count("max_sweeps", max_sweeps)
+        return cls(method, as_tolerance(tolerance), most, positive_workers(workers), progress)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,14 +197,18 @@ class Exposures(Measured):
             relative=not known and not self.noise,
         )
 
-    def whole(self, std: Floats | None = None) -> Self:
-        """Return the exposures at shifts that differ by whole pixels; see `Positions.whole`."""
-        return dataclasses.replace(self, positions=self.positions.whole(std))
+    def at(self, positions: Positions) -> Self:
+        """Return the exposures at other positions."""
+        return dataclasses.replace(self, positions=positions)
 
     def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the exposures."""
         positions, flux = self.positions.chosen(exposures), self.flux.chosen(exposures)
         return dataclasses.replace(super().chosen(exposures), positions=positions, flux=flux)
+
+    def marked(self, **found: Bools | None) -> Self:
+        """Return the exposures with bad pixels of some kinds in place of those found before."""
+        return dataclasses.replace(self, bad_pixels=dataclasses.replace(self.bad_pixels, **found))
 
     def middle(self, side: int) -> tuple[slice, slice]:
         """Return the rows and columns of the central part, at most `side` pixels along an axis."""
@@ -184,10 +238,6 @@ class Exposures(Measured):
             filters=None,
         )
 
-    def oriented(self, orientation: Orientation) -> Self:
-        """Return the exposures with shifts and rotations in another orientation."""
-        return dataclasses.replace(self, positions=self.positions.oriented(orientation))
-
     def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
         """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
 
@@ -200,14 +250,21 @@ class Exposures(Measured):
             If there is not enough memory.
         """
         with naming_memory("calibrating"):
-            return self._compiled(options).fit(
-                method=options.method,
-                tolerance=options.tolerance,
-                max_sweeps=options.max_sweeps,
-                start=start,
+            compiled = _native.Exposures(
+                self.values,
+                self.positions.shifts,
+                shift_std=self.positions.std,
+                rotation=self.positions.rotation.tolist(),
+                flux=self.flux.values.tolist(),
+                flux_model=self.flux.model,
+                offset=self.offset,
+                variance=self.variance,
+                mask=self.mask,
+                unreliable=self.bad_pixels.unreliable,
                 workers=options.workers,
                 progress=options.progress,
             )
+            return compiled.fit(start=start, **vars(options))
 
     def light(self, fit: Fit, exposure: int, workers: int | None) -> Floats:
         """Return c · L(u) on each pixel in an exposure; NaN where the beam was not observed."""
@@ -262,22 +319,6 @@ class Exposures(Measured):
         row, col = nearest_whole(corner).astype(int)
         return np.rot90(grid[row : row + rows, col : col + cols], turn // 90)
 
-    def _compiled(self, options: FitOptions) -> _native.Exposures:
-        return _native.Exposures(
-            self.values,
-            self.positions.shifts,
-            shift_std=self.positions.std,
-            rotation=self.positions.rotation.tolist(),
-            flux=self.flux.values.tolist(),
-            flux_model=self.flux.model,
-            offset=self.offset,
-            variance=self.variance,
-            mask=self.mask,
-            unreliable=self.bad_pixels.unreliable,
-            workers=options.workers,
-            progress=options.progress,
-        )
-
     def medians(self) -> Floats:
         """Return the median of value/flux in each pixel; NaN where nothing is measured."""
         result = np.empty(self.shape)
@@ -297,8 +338,7 @@ def _medians(values: Array) -> Array:
     values.sort(axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
     middle = [np.maximum(index, 0)[None] for index in ((count - 1) // 2, count // 2)]
-    medians: Array = np.mean([np.take_along_axis(values, i, axis=0)[0] for i in middle], axis=0)
-    return medians
+    return np.asarray(np.mean([np.take_along_axis(values, i, axis=0)[0] for i in middle], axis=0))
 
 
 def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Floats | None:
@@ -312,13 +352,4 @@ def _of_dark(given: ArrayLike | None, measured: Measured, *, offset: bool) -> Fl
         return None
     if given is None:
         return measured.dark_variance
-    shape = measured.values.shape[1:]
-    variance = as_array("dark_variance", given, ndim=(0, 2)).astype(np.float64)
-    if variance.shape not in ((1,), shape):  # as_array makes one number an array of one
-        raise InputError(
-            f"'dark_variance' has shape {variance.shape}, expected {shape} or one number"
-        )
-    wrong = variance[~(np.isfinite(variance) & (variance >= 0))]
-    if wrong.size:
-        raise InputError(f"'dark_variance' holds {wrong[0]:g}, expected finite numbers not below 0")
-    return np.array(np.broadcast_to(variance, shape))
+    return np.array(one_or_each("dark_variance", given, measured.shape, ndim=(0, 2)))

@@ -77,6 +77,11 @@ class Positions(ReadOnly):
         """Return the number of exposures."""
         return len(self.shifts)
 
+    @property
+    def are_turned(self) -> bool:
+        """Whether exposures are turned against each other."""
+        return len(set(self.rotation.tolist())) > 1
+
     def oriented(self, orientation: Orientation) -> Self:
         """Return the positions with shifts and rotations in another orientation."""
         std = self.std
@@ -87,7 +92,7 @@ class Positions(ReadOnly):
             std=std if std is None or not orientation.exchanged else std[:, ::-1],
         )
 
-    def whole(self, std: ArrayLike | None = None) -> Self:
+    def whole(self, std: Floats | float = 0.0) -> Self:
         """Return the positions whole pixels from the first one that are nearest to these.
 
         `std` are errors of the shifts. A part of a pixel that all have in common is kept.
@@ -96,10 +101,6 @@ class Positions(ReadOnly):
             return self
         moves, rounding = round_shifts(self.shifts, std)
         return dataclasses.replace(self, shifts=self.shifts[0] + moves, rounding=rounding)
-
-    def at(self, shifts: ArrayLike, std: ArrayLike) -> Self:
-        """Return the same exposures at other shifts, measured with standard deviations `std`."""
-        return type(self).of(shifts, rotation=self.rotation, std=std)
 
     def chosen(self, exposures: Sequence[int] | NDArray[Any]) -> Self:
         """Return the positions of some exposures."""
@@ -124,8 +125,7 @@ class Positions(ReadOnly):
 
 def in_beam(pixel: ArrayLike, rotation: int, shape: tuple[int, int]) -> Array:
     """Return A p + t: the place of a pixel in the beam at shift 0."""
-    place: Array = np.array(_TURNS[rotation]) @ np.asarray(pixel) + _offset(rotation, shape)
-    return place
+    return np.asarray(np.array(_TURNS[rotation]) @ np.asarray(pixel) + _offset(rotation, shape))
 
 
 def variance_in_beam(variance: Array, rotation: int) -> Array:
@@ -135,8 +135,7 @@ def variance_in_beam(variance: Array, rotation: int) -> Array:
 
 def _offset(rotation: int, shape: ArrayLike) -> Array:
     """Return t, which makes the smallest corner of the turned window 0."""
-    offset: Array = -np.minimum(_TURNS[rotation], 0) @ (np.asarray(shape) - 1)
-    return offset
+    return np.asarray(-np.minimum(_TURNS[rotation], 0) @ (np.asarray(shape) - 1))
 
 
 def as_rotation(rotation: ArrayLike | None, count: int) -> NDArray[np.int64]:
@@ -306,7 +305,7 @@ def nearest_whole(distance: Floats) -> Floats:
 
 
 def round_shifts(
-    shifts: Floats, std: ArrayLike | None = None
+    shifts: Floats, std: Floats | float = 0.0
 ) -> tuple[NDArray[np.int64], Rounding | None]:
     """Shifts from the first one in whole pixels, and the largest rounding that is noticeable.
 
@@ -314,8 +313,8 @@ def round_shifts(
     ----------
     shifts : ndarray, shape (n, 2)
         Shifts (row, col) in pixels.
-    std : array_like, shape (n, 2), optional
-        Their standard errors, in pixels; 0 unless given.
+    std : ndarray, shape (n, 2), or float
+        Their standard errors, in pixels.
 
     Returns
     -------
@@ -333,9 +332,8 @@ def round_shifts(
     # A shift beyond any sensor, which the solver refuses, must still fit an integer.
     exact = np.clip(as_shifts(shifts - shifts[0]), -_BEYOND, _BEYOND)
     whole = nearest_whole(exact)
-    known = np.zeros_like(exact) if std is None else as_array("std", std, ndim=2)
     change = np.abs(exact - whole)
-    change[~(change > np.maximum(_UNNOTICED, 3 * known))] = 0
+    change[~(change > np.maximum(_UNNOTICED, 3 * std))] = 0
     worst = int(change.max(axis=1).argmax())
     rounding = Rounding(worst, shifts[worst].tolist()) if change[worst].any() else None
     return whole.astype(np.int64), rounding

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, as_array, is_whole
+from equipix._check import Array, Bools, as_array, as_mask, is_whole
 from equipix.errors import InputError
 from equipix.exposures.positions import _BEYOND
 from equipix.measured.saturation import saturation_level
@@ -128,7 +129,7 @@ def measure_shift(
             f"{frames['before'].shape[1:]}"
         )
     levels = (saturation_level(before, saturation), saturation_level(after, saturation))
-    known = None if hot is None else _hot(hot, frames["before"].shape[1:])
+    known = as_mask(hot, frames["before"].shape[1:], name="hot", may_be_whole=True)
     for (name, images), level in zip(frames.items(), levels, strict=True):
         frames[name] = mended(images, hot_places(images, level, known))
     first, second = (
@@ -180,15 +181,6 @@ def _frames(name: str, values: ArrayLike) -> NDArray[Any]:
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         array = array.astype(np.float64)
     return array if array.ndim == 3 else array[np.newaxis]
-
-
-def _hot(hot: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    array = as_array("hot", hot, ndim=2)
-    if array.dtype != np.bool_ or array.shape != shape:
-        raise InputError(
-            f"'hot' is {array.dtype} of shape {array.shape}, expected bool of shape {shape}"
-        )
-    return array
 
 
 Places = NDArray[np.int64]
@@ -258,26 +250,16 @@ def mended(frames: Array, places: Places) -> Array:
     for image in result:
         values = image.astype(np.float64)
         base = float(np.median(values))
-        floor = _FAINT * float(np.ptp(_without(values, at))) + float(np.finfo(np.float32).tiny)
+        others = np.delete(values, np.ravel_multi_index(at, values.shape))
+        floor = _FAINT * float(np.ptp(others)) + float(np.finfo(np.float32).tiny)
         light = base + _light(values - base, places, floor)
         image[at] = np.rint(light) if image.dtype.kind in "iu" else light
     return result
 
 
-def _without(values: Array, at: tuple[Any, ...]) -> Array:
-    """Return the values but those at some places."""
-    others = np.ones(values.shape, bool)
-    others[at] = False
-    return values[others]
-
-
 def _alone(pixels: Bools) -> Bools:
     """Pixels, away from the border, with no other of these pixels beside them."""
-    rows, cols = pixels.shape
-    padded = np.pad(pixels, 1).astype(np.uint8)
-    near = np.zeros(pixels.shape, np.uint8)
-    for i, j in np.ndindex(3, 3):
-        near += padded[i : i + rows, j : j + cols]
+    near = sliding_window_view(np.pad(pixels, 1), (3, 3)).sum(axis=(2, 3))
     alone: Bools = np.logical_and(pixels, near == 1)
     alone[:2] = alone[-2:] = alone[:, :2] = alone[:, -2:] = False
     return alone
@@ -298,5 +280,4 @@ def _light(signal: Array, places: Places, floor: float) -> NDArray[np.float64]:
         values.append(np.where(bright, np.exp(_CUBIC @ logs), _CUBIC @ four))
         slopes.append(np.abs(logs[2] - logs[1]) + np.abs(logs[3] - logs[0]))
     best = np.argmin(slopes, axis=0)
-    light: NDArray[np.float64] = np.array(values)[best, np.arange(len(places))]
-    return light
+    return np.asarray(np.array(values)[best, np.arange(len(places))])

@@ -12,9 +12,8 @@ from equipix.findings import Finding, say
 from equipix.fitting.weighted import Options, Weighted
 from equipix.metrics.maps import slope_pixels, tilt_weights
 
-NOT_FOUND = 0.1
+_FOUND = 0.1
 """Largest estimated error of M for which noise determines the residuals."""
-
 
 _FINEST = 2.0
 """Excess of variance by a beam finer than its spline up to which error bars are widened: the error
@@ -35,17 +34,17 @@ class DarkStd(NamedTuple):
 
     Attributes
     ----------
-    along_sensitivity : float or None
+    std_along_sensitivity : float or None
         Standard deviation of b, the least-squares part b·M of all errors, in the units of the
         frames; None where the fit did not converge or no noise is known. With fitted ratios of the
         levels no measurement changes when O → O + b·M, L → L − b and the ratios are adapted,
         if L is the same at all positions of a pixel.
-    of_a_pixel : float or None
+    std_of_a_pixel : float or None
         Root mean square of the error of the dark by the noise of the same pixel.
     """
 
-    along_sensitivity: float | None
-    of_a_pixel: float | None
+    std_along_sensitivity: float | None
+    std_of_a_pixel: float | None
 
 
 def standard_deviations(
@@ -58,9 +57,9 @@ def standard_deviations(
     or from its beam has none.
     """
     exposures, fit = weighted.exposures, weighted.fit
-    wanted = options.uncertainty and not (is_too_far(fit) or is_too_fine(weighted))
+    wanted = options.uncertainty and why_none(weighted) is None
     asks_dark = exposures.offset and exposures.flux.kind != "known"
-    unknown = is_too_fine(weighted) or not np.isfinite(weighted.noise_variance)
+    unknown = too_fine(weighted) is not None or not np.isfinite(weighted.noise_variance)
     if asks_dark and not wanted and unknown:
         return None, DarkStd(None, None)
     if not (wanted or asks_dark):
@@ -110,7 +109,7 @@ def _of_dark(weighted: Weighted, answer: Uncertainty, scale: float) -> DarkStd:
 def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:
     """Add what the noise of the dark adds to F, unless the fit is too far from its minimum."""
     exposures, fit = weighted.exposures, weighted.fit
-    found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= NOT_FOUND
+    found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= _FOUND
     if exposures.dark_variance is None or not found:
         return weighted
     with naming_memory("the misfit of the dark"):
@@ -127,28 +126,32 @@ def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:
     return weighted._replace(dark_misfit=cast("float", answer.dark_misfit))
 
 
-def is_too_far(fit: Fit) -> bool:
-    """Whether a fit is too far from its minimum for standard deviations."""
-    is_far = not float(fit.error_estimate[-1]) <= NOT_FOUND
-    return fits_noise(fit) or (fit.is_joint and is_far)
-
-
 def fits_noise(fit: Fit) -> bool:
     """Whether a fit went on without bringing M within its own size."""
     return fit.ended == "stalled" and not float(fit.error_estimate[-1]) < 1
 
 
-def is_too_fine(weighted: Weighted) -> bool:
-    """Whether the beam is so much finer than its spline that errors of M are unknown."""
-    return weighted.excess > _FINEST
-
-
-def too_fine(weighted: Weighted) -> str:
-    """Message on a beam that is much finer than its spline."""
+def too_fine(weighted: Weighted) -> str | None:
+    """Say that the beam is so much finer than its spline that errors of M are unknown."""
+    if not weighted.excess > _FINEST:
+        return None
     return (
         "no standard deviations: the beam is finer than a spline of one knot a pixel can follow, "
         f"and residuals have {weighted.excess:.3g} times the variance of the noise (limit "
         f"{_FINEST:g}): move by whole pixels, or defocus the beam"
+    )
+
+
+def why_none(weighted: Weighted) -> str | None:
+    """Say why a fit has no standard deviations: its beam is too fine, or its minimum too far."""
+    fit, error = weighted.fit, float(weighted.fit.error_estimate[-1])
+    if weighted.excess > _FINEST:
+        return too_fine(weighted)
+    if not fits_noise(fit) and (error <= _FOUND or not fit.is_joint):
+        return None
+    return (
+        "no standard deviations: the fit is too far from its minimum (estimated error "
+        f"{error:.1e}, limit {_FOUND:g})"
     )
 
 
@@ -161,8 +164,8 @@ def noise_scale(weighted: Weighted) -> float:
         If the beam is much finer than its spline, or no variance was given and the residuals cannot
         determine it.
     """
-    if is_too_fine(weighted):
-        raise InputError(too_fine(weighted))
+    if words := too_fine(weighted):
+        raise InputError(words)
     variance = weighted.noise_variance
     if not np.isfinite(variance):
         raise InputError(

@@ -1,16 +1,14 @@
 """Measurements that disagree, and dust that falls and stays."""
 
-import dataclasses
-import functools
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from equipix._check import Array, Bools, Floats
 from equipix._native import Fit
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.measured.noise import ROBUST, nanmedian_abs
 
 _BEYOND = 5.0
@@ -119,11 +117,10 @@ def deviations(
     new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
     for k in range(len(exposures)):
         light, weight = _seen(exposures, fit, k, response, options.workers)
-        spread = _spread(
-            _share(weight * light**2, on_pixels),
-            _share(weight * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
-            left_out[k],
-        )
+        sign, seen = np.where(left_out[k], 1, -1), exposures.cells(on_cells, fit, k)
+        # Variances of residuals in σ², without what M and L take of their noise, or with it.
+        spread = 1 + sign * _share(weight * light**2, on_pixels)
+        spread *= 1 + sign * _share(weight * (flux[k] * response) ** 2, seen)
         known = (weight > 0) & (spread > _TESTABLE)  # NaN is not
         light *= response
         root = np.sqrt(weight, out=weight)
@@ -147,12 +144,6 @@ def _seen(
     return light, weights_of(exposures.variance, exposure, used)
 
 
-def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
-    """Variances of residuals in σ², from the shares of their noise that M and L take."""
-    sign = np.where(left_out, 1, -1)
-    return np.asarray((1 + sign * of_pixel) * (1 + sign * of_cell))
-
-
 def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
     """Deviations alone or of the 3×3 means around, of what was used and of what was left out."""
     own = np.abs(residual)
@@ -166,21 +157,18 @@ def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Arr
 def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     """Mean of the 3×3 residuals around each pixel, in standard deviations by their own scale."""
     mean = box_sums(np.where(where, residual, 0)) / np.sqrt(np.maximum(box_sums(where), 1))
-    scaled: NDArray[Any] = mean / max(1.0, ROBUST * _median(mean, where))
-    return scaled
+    return np.asarray(mean / max(1.0, ROBUST * _median(mean, where)))
 
 
 def weights_of(variance: Array | None, exposure: int, used: Bools) -> Array:
     """Weights 1/σ² of an exposure; 0 where nothing is used."""
     scale = 1.0 if variance is None else variance[exposure]
-    weights: Array = np.divide(1.0, scale, where=used, out=np.zeros(used.shape))
-    return weights
+    return np.asarray(np.divide(1.0, scale, where=used, out=np.zeros(used.shape)))
 
 
 def _share(own: NDArray[Any], total: NDArray[Any]) -> NDArray[Any]:
     """Share that a weight has in a sum; NaN where the sum is 0."""
-    share: NDArray[Any] = np.divide(own, total, where=total > 0, out=np.full(own.shape, np.nan))
-    return share
+    return np.asarray(np.divide(own, total, where=total > 0, out=np.full(own.shape, np.nan)))
 
 
 def _median(values: NDArray[Any], where: NDArray[np.bool_]) -> float:
@@ -192,8 +180,7 @@ def box_sums(image: NDArray[Any]) -> NDArray[Any]:
     """Sum of the 3×3 pixels around each, those beyond the border counting 0."""
     padded = np.pad(image.astype(np.float32), 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
-    total: NDArray[Any] = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
-    return total
+    return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
 
 
 _STEP_BEYOND = 6.0
@@ -223,7 +210,8 @@ def without_fallen_dust(
 ) -> tuple[Exposures, Fit]:
     """Leave out, where dust fell, the values before it did, and fit again.
 
-    Under the grain the sensitivity is then that of the later exposures. The pixels are bad_pixels.
+    Under the grain the sensitivity is then that of the later exposures. Its pixels are marked as
+    contradictory.
 
     Notes
     -----
@@ -237,13 +225,13 @@ def without_fallen_dust(
         found = _together((step > _STEP_BEYOND) & (step > _LEADING_STEP * step.max()), first)
         edges = not found.any() and moment.any()
         if edges:
-            found, first = _beside(moment, step > _STEP_NEAR), _moment_around(moment)
+            first = sliding_window_view(np.pad(moment, 1), (3, 3)).max(axis=(2, 3))
+            found = (moment == 0) & (step > _STEP_NEAR) & (first > 0)
         if not found.any():
             break
         moment = np.where(found, first, moment)
         before = np.arange(len(exposures))[:, None, None] < moment
-        bad_pixels = dataclasses.replace(exposures.bad_pixels, contradictory=moment > 0)
-        exposures = dataclasses.replace(exposures.without(before), bad_pixels=bad_pixels)
+        exposures = exposures.without(before).marked(contradictory=moment > 0)
         fit = exposures.fit(options, fit)
         if edges:
             break
@@ -298,16 +286,3 @@ def _together(found: Bools, first: NDArray[np.int64]) -> Bools:
         same = found & (first == moment)
         together |= same & (box_sums(same) >= _TOGETHER)
     return together
-
-
-def _beside(moment: NDArray[np.int64], near: Bools) -> Bools:
-    """Pixels that deviate, beside those that were found."""
-    return np.asarray((moment == 0) & near & (_moment_around(moment) > 0))
-
-
-def _moment_around(moment: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Largest moment among the 3×3 pixels around each."""
-    padded = np.pad(moment, 1)
-    rows, cols = moment.shape
-    parts = (padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
-    return functools.reduce(np.maximum, parts)

@@ -1,11 +1,9 @@
 """Pixels that contradict or are faint, and flags of all pixels."""
 
-import dataclasses
-
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, union
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import FitOptions
 from equipix.findings import set_bits
 from equipix.fitting.outliers import weights_of
 from equipix.fitting.residuals import FEWEST, in_search
@@ -60,14 +58,10 @@ def without_false_pixels(weighted: Weighted, options: Options) -> Weighted:
 
 
 def _without(weighted: Weighted, dead: Bools, hot: Bools, options: Options) -> Weighted:
-    """Fit again without dead and hot pixels, which are bad_pixels then."""
-    exposures = weighted.exposures
-    bad_pixels = dataclasses.replace(
-        exposures.bad_pixels,
-        dead=union(exposures.bad_pixels.dead, dead),
-        hot=union(exposures.bad_pixels.hot, hot),
-    )
-    exposures = dataclasses.replace(exposures.without(dead | hot), bad_pixels=bad_pixels)
+    """Fit again without dead and hot pixels, which are marked so then."""
+    before = weighted.exposures.bad_pixels
+    exposures = weighted.exposures.without(dead | hot)
+    exposures = exposures.marked(dead=union(before.dead, dead), hot=union(before.hot, hot))
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
@@ -113,8 +107,7 @@ def _of_pixels(squares: Floats) -> Floats:
     """Mean of squares (n, rows, cols) over the exposures of each pixel; NaN without any."""
     count = np.isfinite(squares).sum(axis=0)
     total = np.nansum(squares, axis=0)
-    mean = np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan))
-    return np.asarray(mean)
+    return np.asarray(np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan)))
 
 
 _RELIABLE = 0.04
@@ -146,8 +139,7 @@ def without_faint_pixels(weighted: Weighted, options: Options) -> Weighted:
     faint = _faint(with_dark) & ~_faint(without) & (weighted.fit.flags == 0)
     if not faint.any():
         return weighted
-    bad_pixels = dataclasses.replace(exposures.bad_pixels, faint=faint)
-    exposures = dataclasses.replace(exposures, bad_pixels=bad_pixels)
+    exposures = exposures.marked(faint=faint)
     return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
 
 
@@ -185,15 +177,6 @@ def odd_pixels(weighted: Weighted, options: FitOptions) -> tuple[Bools, Bools]:
     return dead | (sensitivity <= options.tolerance), hot
 
 
-def _weights(weighted: Weighted) -> Floats:
-    """Sum of the weights of each pixel, one exposure at a time: large sensors must fit."""
-    exposures = weighted.exposures
-    total = np.zeros(exposures.shape)
-    for k in range(len(exposures)):
-        total += weights_of(exposures.variance, k, exposures.used(weighted.fit, k))
-    return total
-
-
 def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array]:
     """Standard deviation of M without and with the noise of the dark, the beam's error left out.
 
@@ -207,5 +190,7 @@ def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array
         without = np.asarray(1 / np.sqrt(information / variance))
         if exposures.dark_variance is None:
             return without, without
-        total = variance + exposures.dark_variance * _weights(weighted)
+        used = (exposures.used(weighted.fit, k) for k in range(len(exposures)))
+        weights = sum(weights_of(exposures.variance, k, each) for k, each in enumerate(used))
+        total = variance + exposures.dark_variance * weights
         return without, np.asarray(1 / np.sqrt(information / total))

@@ -16,7 +16,7 @@ from equipix.fitting.residuals import Residuals, axes_of, left_by, sampled
 from equipix.fitting.weighted import Options, Weighted, weighted_fit
 from equipix.fitting.windows import misplaced
 from equipix.measured.noise import NoiseModel, chi2_tail, photon_transfer
-from equipix.plan.drift import affine_columns
+from equipix.plan.drift import undetermined_fluxes
 
 _RARE = 1e-3
 """Probability of such deviations from a prior below which it is contradicted."""
@@ -29,14 +29,14 @@ class Contradiction(NamedTuple):
     """A prior that the data contradict.
 
     `name` is the keyword, `factor` the deviations in standard deviations, rms, `freedom` the
-    number of combinations of the values that the data determine, and `worst` the exposures with the
-    largest deviations, the largest first; `remedy` says what to check.
+    number of combinations of the values that the data determine, and `worst` the two exposures with
+    the largest deviations, the largest first; `remedy` says what to check.
     """
 
     name: str
     factor: float
     freedom: int
-    worst: tuple[int, ...]
+    worst: tuple[int, int]
     remedy: str = "check how they were measured, and that no exposure is flipped or exchanged"
 
     @property
@@ -63,7 +63,10 @@ def widened(weighted: Weighted, options: Options) -> Weighted:
     less where the data hold little beside it. The factor is √(Σ x²/f). A flipped exposure, or two
     that are exchanged, are fitted with shifts far from those given: those furthest are tried.
     """
-    found = [_explained(each, weighted, options) for each in contradictions(weighted)]
+    if weighted.fit.ended != "converged":
+        return weighted
+    asked = (_of_fluxes(weighted), _of_shifts(weighted, options))
+    found = [each for each in asked if each is not None]
     if not found:
         return weighted
     exposures = weighted.exposures
@@ -74,31 +77,11 @@ def widened(weighted: Weighted, options: Options) -> Weighted:
     return weighted._replace(exposures=exposures, fit=fit, replaced=replaced)
 
 
-def contradictions(weighted: Weighted) -> list[Contradiction]:
-    """The priors that the data contradict."""
-    if weighted.fit.ended != "converged":
-        return []
-    asked = [_of_fluxes(weighted), _of_shifts(weighted)]
-    return [each for each in asked if each is not None]
-
-
-def _explained(found: Contradiction, weighted: Weighted, options: Options) -> Contradiction:
-    """Say which exposure is flipped, or which two are exchanged, where that explains shifts."""
-    if found.name != "shift_std":
-        return found
-    first, second = found.worst
-    words = misplaced(weighted.exposures, [(first, second)], first, options.fit)
-    return found if words is None else found._replace(remedy=words)
-
-
 def _of_fluxes(weighted: Weighted) -> Contradiction | None:
     flux, positions = weighted.exposures.flux, weighted.exposures.positions
     if flux.kind != "prior" or flux.std is None:
         return None
-    turned = len(set(positions.rotation.tolist())) > 1
-    columns = np.ones((len(positions), 1))
-    if not turned:
-        columns = affine_columns(positions.shifts, None)
+    columns = undetermined_fluxes(positions, None)
     deviations = np.log(np.array(weighted.fit.flux) / flux.values)
     std = flux.std
     if positions.std is not None:
@@ -107,12 +90,17 @@ def _of_fluxes(weighted: Weighted) -> Contradiction | None:
     return _contradiction("flux_std", deviations[:, None], std[:, None], columns)
 
 
-def _of_shifts(weighted: Weighted) -> Contradiction | None:
+def _of_shifts(weighted: Weighted, options: Options) -> Contradiction | None:
+    """Test shifts; say which exposure is flipped, or which two are exchanged, if that is why."""
     positions = weighted.exposures.positions
     if positions.std is None or weighted.fit.refinement != "refined":
         return None
     deviations = np.array(weighted.fit.shifts) - positions.shifts
-    return _contradiction("shift_std", deviations, positions.std, np.ones((len(positions), 1)))
+    found = _contradiction("shift_std", deviations, positions.std, np.ones((len(positions), 1)))
+    if found is None:
+        return None
+    words = misplaced(weighted.exposures, [found.worst], found.worst[0], options.fit)
+    return found if words is None else found._replace(remedy=words)
 
 
 def _contradiction(
@@ -130,7 +118,8 @@ def _contradiction(
     factor = (float(total.sum()) / freedom) ** 0.5
     if chi2_tail(float(total.sum()), freedom) >= _RARE or factor < _FACTOR:
         return None
-    return Contradiction(name, factor, freedom, tuple(np.argsort(-total)[:2].tolist()))
+    first, second = np.argsort(-total)[:2].tolist()
+    return Contradiction(name, factor, freedom, (first, second))
 
 
 def _wider(exposures: Exposures, found: Contradiction) -> Exposures:
@@ -199,7 +188,8 @@ def steadied(weighted: Weighted, exposures: Exposures, options: Options) -> Weig
     is_given = exposures.knows_noise and not exposures.offset
     frames = sampled_frames(exposures.variance) if is_given else None
     variance = exposures.variance
-    if frames is None or variance is None or _explains_residuals(weighted, options.fit.workers):
+    workers = options.fit.workers
+    if frames is None or variance is None or _explains_residuals(weighted, variance, workers):
         return weighted
     usable, number, response = exposures.usable(), max(2, round(frames)), exposures.response
     period = (1, 1) if exposures.filters is None else exposures.filters.colours.period
@@ -215,16 +205,13 @@ def steadied(weighted: Weighted, exposures: Exposures, options: Options) -> Weig
     return steady._replace(replaced={"variance": words(frames)})
 
 
-def _explains_residuals(weighted: Weighted, workers: int | None) -> bool:
+def _explains_residuals(weighted: Weighted, variance: Array, workers: int | None) -> bool:
     """Whether squared residuals r² follow the scatter of the variances v, as they do true ones.
 
     The slope of r² against v, from differences of neighbours, is near 1 for true variances, and
     near 0 for sample variances, whose scatter is independent of that of the mean.
     """
     exposures, fit = weighted.exposures, weighted.fit
-    variance = exposures.variance
-    if variance is None or variance.ndim != 3:
-        return True
     along = square = 0.0
     for k in range(len(exposures)):
         residual = exposures.residual(fit, k, workers)

@@ -15,8 +15,7 @@ import numpy as np
 from equipix._check import Array, Bools, Floats, union
 from equipix._native import Fit
 from equipix.errors import InputError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.outliers import rejected, without_fallen_dust
 from equipix.measured.noise import modelled_variances
 
@@ -69,9 +68,7 @@ class Options:
 
 def is_to_be_fitted(dark: object) -> bool:
     """Whether the dark is an unknown of the fit; refuses other values."""
-    if dark is None or isinstance(dark, bool):
-        raise InputError(f"'dark' is {dark!r}, expected 'subtracted' or 'fit'")
-    if not isinstance(dark, str):
+    if not isinstance(dark, str | bool | None):
         raise InputError(
             "'dark' holds values: subtract it from the frames, or give it to equipix.average"
         )
@@ -197,9 +194,7 @@ def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
     """
     before, after = given.sum(axis=0), kept.usable().sum(axis=0)
     contradictory = (before > 2 * after) | ((before > after) & (after < _FEWEST))
-    found = union(kept.bad_pixels.contradictory, contradictory)
-    bad_pixels = dataclasses.replace(kept.bad_pixels, contradictory=found)
-    return dataclasses.replace(kept, bad_pixels=bad_pixels)
+    return kept.marked(contradictory=union(kept.bad_pixels.contradictory, contradictory))
 
 
 def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:
@@ -242,8 +237,7 @@ def _sample(array: Array) -> Array:
     if array.size <= _SAMPLE:
         return array.copy()
     places = np.random.default_rng(0).integers(array.size, size=_SAMPLE)
-    sample: Array = array[np.unravel_index(places, array.shape)]
-    return sample
+    return np.asarray(array[np.unravel_index(places, array.shape)])
 
 
 def check_unchanged(exposures: Exposures, before: Mapping[str, Array]) -> None:

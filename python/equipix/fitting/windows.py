@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from equipix._check import Array, Bools, Floats, Progress
+from equipix._check import Array, Bools, Floats, staged
 from equipix._native import Fit
 from equipix.errors import InputError, InsufficientMemoryError
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.residuals import (
     EXACT,
@@ -27,10 +26,6 @@ from equipix.fitting.residuals import (
     tested,
 )
 from equipix.fitting.weighted import Options, Weighted
-
-_Asked = ParamSpec("_Asked")
-
-_Answer = TypeVar("_Answer")
 
 _COARSE, _MOST_COARSE = 1e-2, 300
 """Tolerance and most products of the first fits, sufficient in a beam with structure."""
@@ -101,29 +96,20 @@ class WindowFit:
         cls, window: Exposures, options: FitOptions, before: WindowFit | None = None
     ) -> WindowFit:
         """Fit beam and sensitivity: coarsely, or finer than the noise that a fit before left."""
-        noise = None if before is None else before.noise
-        tolerance = _COARSE if noise is None else max(_FINER * noise, np.finfo(float).eps)
-        fit = window.fit(
-            FitOptions(
-                tolerance=tolerance,
-                max_sweeps=_MOST_COARSE if noise is None else _MOST_FINE,
-                workers=options.workers,
-                progress=None if options.progress is None else _named(options.progress),
-            ),
-            None if before is None else before.fit,
-        )
+        tolerance, most, start = _COARSE, _MOST_COARSE, None
+        if before is not None:
+            tolerance = max(_FINER * before.noise, np.finfo(float).eps)
+            most, start = _MOST_FINE, before.fit
+        progress = staged(options.progress, "sign of shifts")
+        stop = FitOptions("multiscale", tolerance, most, options.workers, progress)
+        fit = window.fit(stop, start)
         squares = window.weighted_squares(np.square(window.values, dtype=np.float64))
         residuals = window.residuals(fit, options.workers)
         scaled = np.copysign(np.sqrt(window.weighted_squares(np.square(residuals))), residuals)
-        share = fit.degrees_of_freedom / max(int(np.count_nonzero(np.isfinite(scaled))), 1)
-        return cls(
-            fit=fit,
-            left=fit.misfit / max(fit.degrees_of_freedom, 1),
-            freedom=fit.degrees_of_freedom,
-            share=share,
-            power=float(np.nanmean(squares)),
-            residuals=scaled,
-        )
+        freedom = fit.degrees_of_freedom
+        left = fit.misfit / max(freedom, 1)
+        share = freedom / max(int(np.count_nonzero(np.isfinite(scaled))), 1)
+        return cls(fit, left, freedom, share, float(np.nanmean(squares)), scaled)
 
     @cached_property
     def neighbours(self) -> tuple[Correlation, Correlation]:
@@ -211,25 +197,14 @@ def window_of(exposures: Exposures, fit: Fit) -> tuple[Exposures, Fit | None]:
     return exposures.window(side), None
 
 
-def if_there_is_light(question: Callable[_Asked, _Answer]) -> Callable[_Asked, _Answer | None]:
-    """Return a question of fits of a window that answers None in too little light or memory.
+@contextmanager
+def if_there_is_light() -> Iterator[None]:
+    """Let a question of fits of a window answer None in too little light or memory.
 
     All arguments are valid for the whole sensor.
     """
-
-    @functools.wraps(question)
-    def asked(*args: _Asked.args, **kwargs: _Asked.kwargs) -> _Answer | None:
-        try:
-            return question(*args, **kwargs)
-        except (InputError, InsufficientMemoryError):
-            return None
-
-    return asked
-
-
-def _named(progress: Progress) -> Progress:
-    """Progress with the name of this stage."""
-    return lambda done, total, _: progress(done, total, "sign of shifts")
+    with suppress(InputError, InsufficientMemoryError):
+        yield
 
 
 class Chi2(NamedTuple):
@@ -239,7 +214,7 @@ class Chi2(NamedTuple):
     std: float
 
 
-@if_there_is_light
+@if_there_is_light()
 def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     """Reduced χ² by the degrees of freedom that simulated measurements have; None without such.
 
@@ -313,7 +288,7 @@ _LEFT = 0.1
 _FLIPS = {"upside down": (0,), "mirrored left to right": (1,), "turned by 180 degrees": (0, 1)}
 
 
-@if_there_is_light
+@if_there_is_light()
 def misplaced(
     exposures: Exposures, pairs: Sequence[tuple[int, int]], worst: int | None, options: FitOptions
 ) -> str | None:
@@ -322,15 +297,13 @@ def misplaced(
     Fits of a central window are compared, in all orders, with that as given. Shifts are held: those
     that are found follow the mistake. Unless given, the worst exposure is that which stands out.
     """
-    exposures = dataclasses.replace(
-        exposures, positions=dataclasses.replace(exposures.positions, std=None)
-    )
+    exposures = exposures.at(dataclasses.replace(exposures.positions, std=None))
     window = exposures.window(_SIDE)
     given = WindowFit.of(window, options)
     worst = standing_out(given.residuals) if worst is None else worst
     tried = {
         f"{exposures.name_of(i)} and {exposures.name_of(j)} fit better each at the shift of the "
-        "other: check the order of the frames and of 'shifts'": _at_the_other(window, (i, j))
+        "other: check the order of the frames and of 'shifts'": _exchanged(window, i, j)
         for i, j in pairs
     }
     if worst is not None:
@@ -356,15 +329,11 @@ def _explains(best: WindowFit, given: WindowFit, *, knows_noise: bool) -> bool:
     return not is_noise and best.left - noise < _LEFT * (given.left - noise)
 
 
-def _at_the_other(window: Exposures, pair: tuple[int, int]) -> Exposures:
+def _exchanged(window: Exposures, i: int, j: int) -> Exposures:
     """Return the exposures, each of two at the place of the other."""
     order = np.arange(len(window))
-    order[list(pair)] = pair[::-1]
-    positions = window.positions
-    moved = dataclasses.replace(
-        positions, shifts=positions.shifts[order], rotation=positions.rotation[order]
-    )
-    return dataclasses.replace(window, positions=moved)
+    order[[i, j]] = j, i
+    return window.at(window.positions.chosen(order))
 
 
 def _flipped(

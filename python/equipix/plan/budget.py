@@ -173,11 +173,10 @@ def error_budget(
         pattern_errors.local_variance, sizes, positions, powers, beam_width, scale=scale
     )
     drift_tilt = tilt_of_fluxes(sizes, exact, drift)
-    moved, moved_tilt = 0.0, (0.0, 0.0)
-    if beam_width is not None and shift_error:
-        moved, moved_tilt = pattern_errors.shift_error_effect(
-            sizes, exact, powers, beam_width, shift_error
-        )
+    along_rows, along_cols = drift_tilt.tolist()
+    moved, moved_tilt = pattern_errors.shift_error_effect(
+        sizes, exact, powers, beam_width, shift_error
+    )
     causes = {
         "noise": _rms(variances()),
         "drift": float(tilt_rms(drift_tilt)),
@@ -188,10 +187,7 @@ def error_budget(
         shifts=exact,
         rms=float(np.linalg.norm(list(causes.values()))),
         rms_by_cause=causes,
-        tilt_by_cause={
-            "drift": (float(drift_tilt[0]), float(drift_tilt[1])),
-            "shift_error": moved_tilt,
-        },
+        tilt_by_cause={"drift": (along_rows, along_cols), "shift_error": moved_tilt},
         spectrum=waves,
         distinct_trend=distinct_trend(exact),
         components=components,

@@ -8,8 +8,18 @@ from itertools import permutations
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, Floats, Ints, as_array, as_shifts, per_exposure
+from equipix._check import (
+    Array,
+    ArrayLike,
+    Floats,
+    Ints,
+    as_array,
+    as_shifts,
+    one_or_each,
+    per_exposure,
+)
 from equipix.errors import InputError
+from equipix.exposures.positions import Positions
 
 _ON_A_LINE = 1e-12
 """Share of the variance of shifts along an axis, 1 − ρ², below which only rounding is left."""
@@ -82,6 +92,13 @@ def affine_columns(shifts: Array, times: ArrayLike | None) -> Floats:
     if times is not None:
         columns.append(unit_times(np.asarray(times, np.float64)))
     return np.stack(columns, axis=1)
+
+
+def undetermined_fluxes(positions: Positions, times: ArrayLike | None) -> Floats:
+    """Columns of ln c that leave no residual; a factor alone where exposures are turned apart."""
+    if positions.are_turned:
+        return np.ones((len(positions), 1))
+    return affine_columns(positions.shifts, times)
 
 
 def tilt_of_fluxes(shape: tuple[int, int], shifts: Array, flux_std: ArrayLike) -> Floats:
@@ -200,24 +217,14 @@ def tilt_std(
     count = len(positions)
     variance = np.zeros(count)
     if flux_std is not None:
-        variance += np.square(_each("flux_std", flux_std, (count,)))
+        variance += np.square(one_or_each("flux_std", flux_std, (count,), ndim=(0, 1)))
     if shift_std is not None:
         slope = per_exposure("beam_slope", beam_slope, 2, default=0)
-        variance += np.square(_each("shift_std", shift_std, (count, 2)) * slope).sum(axis=1)
+        errors = one_or_each("shift_std", shift_std, (count, 2), ndim=(0, 1, 2))
+        variance += np.square(errors * slope).sum(axis=1)
     if np.linalg.matrix_rank(positions - positions.mean(axis=0)) < 2:
         return np.full(2, np.inf)
     return tilt_of_fluxes(shape, positions, np.sqrt(variance))
-
-
-def _each(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Standard deviations, one for all or one for each."""
-    array = as_array(name, values, ndim=(0, 1, len(shape))).astype(np.float64)
-    if array.shape not in ((1,), shape):
-        raise InputError(f"'{name}' has shape {array.shape}, expected {shape} or one number")
-    wrong = array[~(np.isfinite(array) & (array >= 0))]
-    if wrong.size:
-        raise InputError(f"'{name}' holds {wrong[0]:g}, expected finite numbers not below 0")
-    return np.broadcast_to(array, shape)
 
 
 _ALL = 8

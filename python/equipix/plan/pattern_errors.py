@@ -7,8 +7,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from equipix._check import Array, Floats, Ints
-from equipix.exposures.exposures import Exposures
-from equipix.exposures.fit import FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.measured.measured import measured_of
@@ -117,14 +116,18 @@ _NODES = 10
 
 
 def shift_error_effect(
-    shape: tuple[int, int], shifts: Floats, powers: Floats, width: float, error: float
+    shape: tuple[int, int], shifts: Floats, powers: Floats, width: float | None, error: float
 ) -> tuple[float, tuple[float, float]]:
     """Root mean square of M's error, and its tilt, that independent errors of shifts leave.
+
+    An even beam, without a width, leaves none.
 
     An error δ of d_k changes ln y_k by δ·∇ln L(u_k), and ln L = −|u|²/D². What M and L then make
     of it is smooth: minimise Σ_k ∫ c_k² L² [h_k(p) − g(p) − f(p + d_k)]² over polynomials g on
     the sensor and f on the beam, for each h_k that one exposure's error along one axis makes.
     """
+    if width is None or not error:
+        return 0.0, (0.0, 0.0)
     places, weights = _nodes(shape)
     low = shifts.min(axis=0) - 0.5
     extent = np.ptp(shifts, axis=0) + shape

@@ -161,7 +161,6 @@ def suggest(
         raise InputError("'exposures' is 1, expected two or more: one compares no pixels")
     else:
         counts = range(exposures, exposures + 1)
-    found: list[Points] = []
     for count in counts:
         starts = _starts(count, travel // period, random)
         if colours is not None:
@@ -175,7 +174,7 @@ def suggest(
         found = _distinct([end for end in ends if end is not None], score)
         if found:
             break
-    if not found:
+    else:
         raise InputError(
             f"'max_shift' is {travel.tolist()}: no pattern of {exposures or 'two to five'} "
             "exposures within it was found that compares every pixel"
@@ -238,26 +237,18 @@ class _Score:
         kept = np.broadcast_to(others, (len(places), *others.shape))
         patterns = np.concatenate([kept, places[:, None]], axis=1)
         spans = np.ptp(patterns, axis=1)
-        rest = count / (count - self._cells(spans, count))
-        visible = self._visible(others, places)
+        # Beam cells over pixels: the trace of K of `local_variance`, times n.
+        cells = np.prod((np.array(self.shape) + spans) / self.shape, axis=1)
+        rest = count / (count - np.minimum(cells, count * (1 - 1e-3)))
+        sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
+        visible = count - (sums.real**2 + sums.imag**2) / count  # λ of the waves of each pattern
+        visible = np.maximum(visible, 1e-3).astype(np.float64)
         inverse = np.mean(1 / visible[:_WAVES], axis=0, dtype=np.float64)
         if len(visible) > _WAVES:
             inverse *= 1 + _PERIODIC / visible[_WAVES:].min(axis=0)
         noise = self._noise**2 * inverse * (1 - 1 / count) * rest
         drift = tilt_rms(tilt_of_fluxes(self.shape, patterns, self._drift))
         return np.asarray(np.sqrt(noise + drift**2))
-
-    def _cells(self, spans: Points, count: int) -> Floats:
-        """Beam cells over pixels: the trace of K of `local_variance`, times n."""
-        cells = np.prod((np.array(self.shape) + spans) / self.shape, axis=1)
-        return np.asarray(np.minimum(cells, count * (1 - 1e-3)))
-
-    def _visible(self, others: Points, places: Points) -> Floats:
-        """Return λ of the waves, of each pattern."""
-        count = len(others) + 1
-        sums = self._waves(others).sum(axis=1)[:, None] + self._waves(places)
-        visible = count - (sums.real**2 + sums.imag**2) / count
-        return np.asarray(np.maximum(visible, 1e-3), dtype=np.float64)
 
     def _waves(self, places: Points) -> NDArray[np.complex64]:
         down, right = self._phases

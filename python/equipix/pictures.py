@@ -1,8 +1,9 @@
-"""Pictures of results beside one another, the truth or raw frames."""
+"""Pictures of calibrations, corrections and plans; they need matplotlib, the extra ``plot``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,14 +12,75 @@ from equipix._check import Array
 from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction
 from equipix.demo import Demo
+from equipix.errors import EquipixError, InputError
+from equipix.io.paths import write_whole
 from equipix.measured.filters import BLOCK
 from equipix.metrics.maps import block_means, rms
-from equipix.pictures.canvas import PREDICTION, draw_map, new_figure
+from equipix.plan.budget import ErrorBudget
 from equipix.scene.sequence import SequenceResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure of this size in inches, drawn without a display.
+
+    Raises
+    ------
+    EquipixError
+        If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise EquipixError(
+            "pictures need matplotlib, which is not installed: pip install 'equipix[plot]'"
+        ) from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def check_picture(path: Path | None) -> None:
+    """Refuse a picture that cannot be drawn, before the work starts.
+
+    Raises
+    ------
+    EquipixError
+        If matplotlib is not installed.
+    InputError
+        If the suffix is unknown.
+    """
+    if path is None:
+        return
+    formats = new_figure(1, 1).canvas.get_supported_filetypes()
+    if path.suffix.lower().removeprefix(".") not in formats:
+        raise InputError(
+            f"'{path}' is not the name of a picture, expected the suffix {' or '.join(formats)}"
+        )
+
+
+def save_figure(figure: Figure, path: Path, *, force: bool = False) -> None:
+    """Write a figure to a file whose suffix names the format; it appears whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If the file exists and `force` is not set, or cannot be written.
+    """
+    with write_whole(path, force=force) as temporary:
+        figure.savefig(temporary)
+
+
+def draw_map(
+    axes: Axes, title: str, image: Array, limits: tuple[float, float], cmap: str, step: int = 1
+) -> None:
+    """Draw an image with its scale; a pixel of it is `step` pixels wide and high."""
+    rows, cols = (step * size for size in image.shape)
+    extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
+    shown = axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=cmap, extent=extent)
+    axes.set(title=title, xlabel="column", ylabel="row")
+    axes.figure.colorbar(shown, ax=axes, shrink=0.8)
 
 
 def draw_comparison(comparison: Comparison, names: Sequence[str]) -> Figure:
@@ -51,11 +113,8 @@ def draw_comparison(comparison: Comparison, names: Sequence[str]) -> Figure:
     along = zip(labels, [each[middle] for each in differences], strict=True)
     _curves(rows[0, 1], f"Differences along row {middle}, %", None, along)
     scatter = 100 * comparison.agreement
-    title, high = (
-        f"Scatter of a pixel, %\n(rms {rms(scatter):.2g})",
-        np.nanpercentile(scatter, 99.9),
-    )
-    draw_map(rows[1, 0], title, scatter, (0, float(high)), "gray")
+    title = f"Scatter of a pixel, %\n(rms {rms(scatter):.2g})"
+    draw_map(rows[1, 0], title, scatter, (0, float(np.nanpercentile(scatter, 99.9))), "gray")
     worst = int(np.argmax(comparison.block_rms))
     _block_map(rows[1, 1], labels[worst], blocks[worst], blocks[worst])
     for axes, title, errors, predicted in (
@@ -102,7 +161,7 @@ def _densities(
         sigmas = np.linspace(-6, 6, 121)
         normal = np.exp(-0.5 * sigmas**2) / (predicted * np.sqrt(2 * np.pi))
         label = f"predicted {predicted:.2g}"
-        axes.plot(predicted * sigmas, normal, color=PREDICTION, linestyle=":", label=label)
+        axes.plot(predicted * sigmas, normal, color="black", linestyle=":", label=label)
         lowest, highest = max(lowest, normal.max() / 1e4), max(highest, float(normal.max()))
     limits = (lowest, 30 * highest)
     axes.set(title=title, xlabel=what, ylabel="density", yscale="log", ylim=limits)
@@ -189,3 +248,77 @@ def draw_sequence(sequence: SequenceResult, correction: Correction) -> Figure:
     axes.set(xlabel="frame", ylabel="roughness", ylim=(0, None))
     axes.legend()
     return figure
+
+
+def draw_plans(budgets: list[ErrorBudget]) -> Figure:
+    """Show patterns of shifts, a row each, and what errors they leave.
+
+    Parameters
+    ----------
+    budgets : list of ErrorBudget
+        What `equipix.plan.error_budget` gave.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        In each row the positions of the sensor, numbered by exposure; the spectrum λ(q)/n with
+        its worst wave; the standard deviation of M that noise leaves, on a scale common to all
+        rows; and the errors by cause.
+    """
+    figure = new_figure(15, 3.6 * len(budgets))
+    rows = figure.subplots(len(budgets), 4, squeeze=False, width_ratios=(1, 1.5, 1.3, 0.9))
+    shown = [_thinned(budget.noise_map) for budget in budgets]
+    finite = np.concatenate([values[np.isfinite(values)] for values, _ in shown])
+    limits = (float(finite.min()), float(finite.max()))
+    largest = max(max(b.rms_by_cause.values()) for b in budgets if np.isfinite(b.rms))
+    for row, budget, (values, step) in zip(rows, budgets, shown, strict=True):
+        _positions(row[0], budget)
+        _spectrum(row[1], budget)
+        rms = budget.rms_by_cause["noise"]
+        draw_map(row[2], f"Error from noise (rms {rms:.2g})", values, limits, "viridis", step)
+        _causes(row[3], budget, 1.15 * largest)
+    return figure
+
+
+def _thinned(image: Array) -> tuple[Array, int]:
+    """Leave out rows and columns of a map that no picture could show."""
+    step = max(1, max(image.shape) // 1000)
+    return image[::step, ::step], step
+
+
+def _positions(axes: Axes, budget: ErrorBudget) -> None:
+    """Draw the positions of the sensor."""
+    rows, cols = budget.shifts.T
+    axes.plot(cols, rows, color="gray", linewidth=0.6, linestyle=":")
+    axes.plot(cols, rows, "o", color="C0")
+    for k, (row, col) in enumerate(budget.shifts):
+        axes.annotate(str(k), (col, row), xytext=(5, 3), textcoords="offset points")
+    axes.set(title=f"{len(rows)} positions, pixels", xlabel="column", ylabel="row")
+    axes.margins(0.15)
+    axes.invert_yaxis()
+    axes.set_aspect("equal", "datalim")
+
+
+def _spectrum(axes: Axes, budget: ErrorBudget) -> None:
+    """Draw λ(q)/n on a logarithmic scale."""
+    found = budget.spectrum
+    share = np.log10(np.maximum(found.values / len(budget.shifts), 1e-4))
+    extent = (found.cols[0], found.cols[-1], found.rows[0], found.rows[-1])
+    shown = axes.imshow(
+        share, origin="lower", extent=extent, aspect="auto", cmap="magma", vmin=-3, vmax=0
+    )
+    axes.plot(*found.worst[::-1], "o", mfc="none", mec="white", ms=9)
+    axes.set(
+        title=f"log₁₀ λ/n of waves; least away from 0: {found.smallest / len(budget.shifts):.1g}",
+        xlabel="cycles per column",
+        ylabel="cycles per row",
+    )
+    axes.figure.colorbar(shown, ax=axes, shrink=0.8)
+
+
+def _causes(axes: Axes, budget: ErrorBudget, limit: float) -> None:
+    """Draw a bar for each cause of error."""
+    names = [name.replace("_", "\n") for name in budget.rms_by_cause]
+    bars = axes.bar(names, list(budget.rms_by_cause.values()), color=("C0", "C1", "C2"))
+    axes.bar_label(bars, fmt="%.1e", fontsize="small")
+    axes.set(title="rms error of M by cause", ylim=(0, limit))

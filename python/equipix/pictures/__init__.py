@@ -1,1 +1,0 @@
-"""Pictures of calibrations and plans; they need matplotlib, the extra ``plot``."""
