@@ -160,7 +160,7 @@ def fitted(
             check_count(part, chosen)
             if chosen == 0 and by == "gain":
                 check_gain(part)
-        options["weights"] = "equal" if given.noise is None else "variances"
+        options["weights"] = "equal" if given.level_noise is None else "variances"
         metadata = {
             "versions": {"equipix": _native.__version__, "numpy": np.__version__},
             "options": options,
@@ -177,11 +177,11 @@ def fitted(
 
 def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:
     """The levels of each colour, with a map of its pixels; all of them without colours."""
-    everywhere = np.ones(levels.usable.shape, bool)
+    everywhere = np.ones(levels.good.shape, bool)
     if levels.cfa is None:
         return [(everywhere, levels)]
     planes = [plane for _, plane in levels.cfa.planes(everywhere.shape)]
-    return [(plane, levels.of_pixels(plane)) for plane in planes if levels.usable[plane].any()]
+    return [(plane, levels.of_pixels(plane)) for plane in planes if levels.good[plane].any()]
 
 
 def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
@@ -214,8 +214,8 @@ def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str
     deviation, variances, misfit, used = found
     freedom = used.astype(np.int64) - (order + 1)
     chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
-    if levels.noise is None:
-        variances = variances * _pooled(misfit, freedom, levels.usable)
+    if levels.level_noise is None:
+        variances = variances * _pooled(misfit, freedom, levels.good)
     variances = _with_dark(variances, levels, by if order == 0 else "offset")
     limits = levels.limits()
     rising = least_slope(deviation, limits) > 0
@@ -259,13 +259,13 @@ def _of_alike_pixels(levels: Levels, misfit: Floats, freedom: int) -> Levels | N
     noise of a value, which add 1 % to χ², pass.
     """
     rounding = (_ROUNDING * np.abs(levels.references).max()) ** 2 / levels.variances.min()
-    squares = np.maximum(misfit[levels.usable], len(levels) * rounding)[None]
+    squares = np.maximum(misfit[levels.good], len(levels) * rounding)[None]
     alike = alike_pixels(squares)
     if alike.all():
         return None
-    cleaned = levels.without(~alike)
+    cleaned = levels.judged_without(~alike)
     typical = np.median(squares) / (freedom * median_of_noise(np.array(freedom)))
-    noise = levels.variances if levels.noise else typical
+    noise = levels.variances if levels.level_noise else typical
     moved = (cleaned.references - levels.references) ** 2
     return cleaned if np.any(moved > _MOST_MOVED * noise) else None
 
@@ -292,7 +292,7 @@ def _with_dark(variances: Floats, levels: Levels, by: By) -> Floats:
 
 def _flags(deviation: Floats, levels: Levels, rising: Array) -> Array:
     """Bits of `equipix.Flag` of each pixel."""
-    flags = np.zeros(levels.usable.shape, np.uint32)
+    flags = np.zeros(levels.good.shape, np.uint32)
     bad_pixels, undetermined = levels.bad_pixels, np.isnan(deviation[0])
     for finding, pixels in vars(bad_pixels).items():
         set_bits(flags, finding, pixels)

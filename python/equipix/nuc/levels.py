@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, ReadOnly, Words, as_mask, union
+from equipix._check import Array, Bools, Floats, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours
@@ -45,28 +45,18 @@ class LevelNoise(NamedTuple):
         return np.asarray(self.constant + self.slope * np.maximum(value - self.dark, 0))
 
 
-@dataclass(frozen=True, eq=False)
-class Levels(ReadOnly):
-    """Mean frames of a uniform source at several levels, checked.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Levels(Measured):
+    """Mean frames of a uniform source at several levels, checked; NaN where not to be used.
 
     Attributes
     ----------
-    values : ndarray, shape (n, rows, cols)
-        Mean frames in DN; NaN where a value is not to be used.
     references : ndarray, shape (n,), float64
         Mean V̄ of each level over the pixels that are good and have a value at every level.
-    usable : ndarray of bool, shape (rows, cols)
+    good : ndarray of bool, shape (rows, cols)
         These pixels.
-    noise : tuple of LevelNoise, or None
+    level_noise : tuple of LevelNoise, or None
         Noise of the mean frames, without that of the dark; None if it is unknown.
-    bad_pixels : BadPixels
-        Bad pixels.
-    dark, dark_variance : ndarray, shape (rows, cols), or None
-        The dark frame that was subtracted, and the variance of its mean.
-    raw : bool
-        Whether they are averages of whole numbers from which no dark was subtracted.
-    saturation : float or None
-        Level of saturation in DN, where it is known.
     frame_noise : float or None
         Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
         given; None if it is unknown.
@@ -76,15 +66,9 @@ class Levels(ReadOnly):
         What limits them.
     """
 
-    values: Array
     references: Floats
-    usable: Bools
-    noise: tuple[LevelNoise, ...] | None
-    bad_pixels: BadPixels
-    dark: Array | None = None
-    dark_variance: Floats | None = None
-    raw: bool = False
-    saturation: float | None = None
+    good: Bools
+    level_noise: tuple[LevelNoise, ...] | None
     frame_noise: float | None = None
     filters: Filters | None = None
     findings: tuple[Finding, ...] = ()
@@ -101,48 +85,44 @@ class Levels(ReadOnly):
             return None if image is None else image[pixels][None]
 
         values = np.ascontiguousarray(self.values[:, pixels][:, None])
-        usable = self.usable[pixels][None]
+        good = self.good[pixels][None]
         return dataclasses.replace(
             self,
             values=values,
-            usable=usable,
-            references=_references(values, usable),
+            good=good,
+            references=_references(values, good),
             bad_pixels=BadPixels(dead=chosen(self.bad_pixels.dead)),
             dark=chosen(self.dark),
             dark_variance=chosen(self.dark_variance),
             filters=None,
         )
 
-    def __len__(self) -> int:
-        """Return the number of levels."""
-        return len(self.values)
-
     @property
     def variances(self) -> Floats:
         """Variance of a pixel's value at each level; 1 where no noise is known."""
-        if self.noise is None:
+        if self.level_noise is None:
             return np.ones(len(self))
-        pairs = zip(self.noise, self.references, strict=True)
+        pairs = zip(self.level_noise, self.references, strict=True)
         return np.array([float(noise.variance(reference)) for noise, reference in pairs])
 
-    def chosen(self, which: Sequence[int]) -> Self:
+    def chosen(self, exposures: NDArray[np.int64]) -> Self:
         """Return some of the levels, with their references."""
+        noise = self.level_noise
         return dataclasses.replace(
-            self,
-            values=self.values[which],
-            references=self.references[which],
-            noise=None if self.noise is None else tuple(self.noise[level] for level in which),
+            super().chosen(exposures),
+            references=self.references[exposures],
+            level_noise=None if noise is None else tuple(noise[level] for level in exposures),
         )
 
-    def without(self, odd: Bools) -> Self:
-        """Return the levels with references from which some of the usable pixels are left out."""
-        usable = self.usable.copy()
-        usable[self.usable] = ~odd
-        return dataclasses.replace(self, usable=usable, references=_references(self.values, usable))
+    def judged_without(self, odd: Bools) -> Self:
+        """Return the levels with references from which some of the good pixels are left out."""
+        good = self.good.copy()
+        good[self.good] = ~odd
+        return dataclasses.replace(self, good=good, references=_references(self.values, good))
 
     def limits(self) -> Floats:
         """Lowest and highest V̄ at which each pixel has a value, shape (2, rows, cols)."""
-        low, high = np.full((2, *self.usable.shape), np.nan)
+        low, high = np.full((2, *self.good.shape), np.nan)
         for value, reference in zip(self.values, self.references, strict=True):
             known = np.isfinite(value)
             np.fmin(low, reference, out=low, where=known)
@@ -156,12 +136,12 @@ class Levels(ReadOnly):
         is of noise between levels of one light, and of gains between others.
         """
         order = np.argsort(self.references)
-        sigma = np.sqrt(self.variances) if self.noise else np.zeros(len(self))
+        sigma = np.sqrt(self.variances) if self.level_noise else np.zeros(len(self))
         count, last = 1, order[0]
         for level in order[1:]:
             smallest = SIGMAS * np.hypot(sigma[level], sigma[last])
             smallest = max(smallest, _ROUNDING * abs(self.references[level]))
-            if not self.noise:
+            if not self.level_noise:
                 smallest = max(smallest, _scatter(self.values, int(last), int(level)))
             if self.references[level] - self.references[last] > smallest:
                 count, last = count + 1, level
@@ -173,7 +153,7 @@ class Levels(ReadOnly):
             self.values,
             self.references.tolist(),
             form=form,
-            noise=self.noise,
+            noise=self.level_noise,
             workers=workers,
         )
 
@@ -203,19 +183,22 @@ def levels_of(
     values = measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
     filters = _filters(values, measured.colours)
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
-    usable = _usable(values, bad_pixels, given)
-    references = _references(values, usable)
+    good = _good(values, bad_pixels, given)
+    references = _references(values, good)
+    frame_noise = _frame_noise(averaged if variance is None else None, noise, references)
+    found = {
+        "values": values,
+        "bad_pixels": bad_pixels,
+        "mask": None,
+        "variance": None,
+        "noise": (),
+    }
     checked = Levels(
-        values=values,
+        **vars(measured) | found | {"raw": measured.raw and averaged is not None},
         references=references,
-        usable=usable,
-        noise=noise,
-        bad_pixels=bad_pixels,
-        dark=measured.dark,
-        dark_variance=measured.dark_variance,
-        raw=measured.raw and averaged is not None,
-        saturation=measured.saturation,
-        frame_noise=_frame_noise(averaged if variance is None else None, noise, references),
+        good=good,
+        level_noise=noise,
+        frame_noise=frame_noise,
         filters=filters,
     )
     return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
@@ -320,7 +303,7 @@ def _spread(count: int) -> Array:
     return np.linspace(0, count - 1, min(count, _SAMPLED)).astype(np.intp)
 
 
-def _usable(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
+def _good(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     """Good pixels with a value at every level; refused where they are few."""
     known = np.isfinite(values)
     bad = union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy)
@@ -349,17 +332,17 @@ def _on_bright_dark(levels: Levels) -> str | None:
     """
     if levels.dark is None:
         return None
-    sample = np.flatnonzero(levels.usable)
+    sample = np.flatnonzero(levels.good)
     sample = sample[_spread(len(sample))]
     of_dark = 0.0 if levels.dark_variance is None else float(np.median(levels.dark_variance))
     below = []
     for level, every in enumerate(levels.values):
         each = every.reshape(-1)[sample]
         median = float(np.median(each))
-        if levels.noise is None:
+        if levels.level_noise is None:
             sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)
         else:
-            sigma = np.sqrt(float(levels.noise[level].variance(median)) + of_dark)
+            sigma = np.sqrt(float(levels.level_noise[level].variance(median)) + of_dark)
         if median < -SIGMAS * sigma:
             below.append(f"{median:.6g} DN at level {level}")
     if not below:

@@ -44,7 +44,7 @@ def check_count(levels: Levels, order: int) -> None:
     if distinct > order:
         return
     means = ", ".join(f"{reference:.6g}" for reference in levels.references)
-    sigma = f", {np.sqrt(np.median(levels.variances)):.2g} DN" if levels.noise else ""
+    sigma = f", {np.sqrt(np.median(levels.variances)):.2g} DN" if levels.level_noise else ""
     raise InputError(
         f"'levels': {distinct} of {len(levels)} differ by more than the noise of a pixel's mean"
         f"{sigma}, but order {order} needs {order + 1}; their means are {means} DN: take more "
@@ -59,7 +59,7 @@ def check_gain(levels: Levels) -> None:
             "'levels' are averages of raw frames, whose dark level would enter the ratio of "
             "by='gain': average them with dark=, or take order=1, which finds the offsets"
         )
-    sigma = np.sqrt(levels.variances) if levels.noise else np.zeros(len(levels))
+    sigma = np.sqrt(levels.variances) if levels.level_noise else np.zeros(len(levels))
     if not np.any(levels.references > 6 * sigma):
         raise InputError(
             f"'levels': the largest mean is {levels.references.max():.6g} DN, which is no signal "
@@ -94,7 +94,7 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
     alike = alike_pixels(squares)
     if not alike.all():
-        levels = levels.without(~alike)
+        levels = levels.judged_without(~alike)
         squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
         alike = alike_pixels(squares)
     errors = squares[:, alike].mean(axis=1).tolist()
@@ -104,10 +104,10 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
 
 def _squares(levels: Levels, held: Array, order: int, by: By, workers: int | None) -> Floats:
     """Mean square error of each usable pixel, over predictions of each held level by the others."""
-    total = np.zeros(int(levels.usable.sum()))
+    total = np.zeros(int(levels.good.sum()))
     for each in held:
-        others = levels.chosen([level for level in range(len(levels)) if level != each])
+        others = levels.chosen(np.delete(np.arange(len(levels)), each))
         deviation, *_ = others.fit(form_of(order, by), workers=workers)
         error = levels.values[each] - response_at(deviation, levels.references[each])
-        total += error[levels.usable] ** 2 / levels.variances[each]
+        total += error[levels.good] ** 2 / levels.variances[each]
     return total / len(held)
