@@ -108,7 +108,7 @@ def test_two_hot_pixels_side_by_side_are_refused_on_the_rim():
 
 @pytest.mark.parametrize("hot", [np.zeros((3, 4), bool), np.zeros(SHAPE)])
 def test_hot_pixels_that_are_no_map_are_refused(hot):
-    with pytest.raises(errors.InputError, match="'hot' is"):
+    with pytest.raises(errors.InputError, match="'hot' has"):
         equipix.measure_shift(disc(), disc(), hot=hot)
 
 

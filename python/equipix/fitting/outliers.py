@@ -117,10 +117,11 @@ def deviations(
     new, old = (np.empty(exposures.values.shape, np.float32) for _ in range(2))
     for k in range(len(exposures)):
         light, weight = _seen(exposures, fit, k, response, options.workers)
-        sign, seen = np.where(left_out[k], 1, -1), exposures.cells(on_cells, fit, k)
-        # Variances of residuals in σ², without what M and L take of their noise, or with it.
-        spread = 1 + sign * _share(weight * light**2, on_pixels)
-        spread *= 1 + sign * _share(weight * (flux[k] * response) ** 2, seen)
+        spread = _spread(
+            _share(weight * light**2, on_pixels),
+            _share(weight * (flux[k] * response) ** 2, exposures.cells(on_cells, fit, k)),
+            left_out[k],
+        )
         known = (weight > 0) & (spread > _TESTABLE)  # NaN is not
         light *= response
         root = np.sqrt(weight, out=weight)
@@ -142,6 +143,12 @@ def _seen(
     light = np.nan_to_num(exposures.light(fit, exposure, workers), copy=False)
     used = exposures.used(fit, exposure) & (light * response != 0)
     return light, weights_of(exposures.variance, exposure, used)
+
+
+def _spread(of_pixel: Array, of_cell: Array, left_out: Bools) -> Array:
+    """Variances of residuals in σ², from the shares of their noise that M and L take."""
+    sign = np.where(left_out, 1, -1)
+    return np.asarray((1 + sign * of_pixel) * (1 + sign * of_cell))
 
 
 def _conspicuous(residual: Array, used: Bools, known: Bools) -> tuple[Array, Array]:
