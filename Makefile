@@ -54,7 +54,7 @@ lint: $(BIN)/.built-ci docs
 	$(BIN)/mypy
 	$(BIN)/python -m mypy.stubtest equipix._native
 	for each in benches docs tools; do \
-		MYPYPATH=python:$$each $(BIN)/mypy $(LOOSELY) $$each/*.py || exit 1; done
+		MYPYPATH=python:$$each $(BIN)/mypy $(LOOSELY) $$each || exit 1; done
 	find python/equipix -name '*.py' | xargs $(BIN)/numpydoc lint
 
 audit:

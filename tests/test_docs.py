@@ -263,7 +263,6 @@ def test_the_example_between_pixels(capsys):
 
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
-@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 def test_the_example_of_a_monitor(capsys):
     steady, monitor = figures("drift_monitor", capsys)
     # 1 % against 0.02 % of error in the fluxes makes as much of a difference in the tilt.

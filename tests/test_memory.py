@@ -93,6 +93,14 @@ class TestArraysThatNoMachineHolds:
             with pytest.raises(InsufficientMemoryError, match=f"{named}.*: no 8 bytes"):
                 work(np.ones((8, 9)), dark=np.ones((8, 9)))
 
+    def test_a_plan(self, monkeypatch):
+        def refuse(*_, **__):
+            raise MemoryError("no 8 bytes")
+
+        monkeypatch.setattr("equipix.measured.measured.as_floats", refuse)
+        with pytest.raises(InsufficientMemoryError, match=r"planning.*: no 8 bytes"):
+            equipix.plan.error_budget((64, 64), equipix.cross_pattern(3, 4), noise=1e-3)
+
     @pytest.mark.parametrize("shape", [(2, 2**25, 2**25), (2, 2**31, 2**29)])
     def test_average(self, shape):
         words = r"averaging frames of .* needs .* \(\d{17,} bytes\) .* are available: "

@@ -253,7 +253,7 @@ class TestOrientationsThatLeaveNoResidual:
 def test_after_a_wrong_sign_no_other_cause_is_named():
     """Reversed shifts in a beam with structure also contradict fluxes and leave a misfit."""
     frames = photograph(4, simulate.wavy_beam(SENSOR, rng=5))
-    with pytest.warns(MisfitWarning) as told:
+    with pytest.warns(MisfitWarning, match="A shift grows when the sensor moves") as told:
         cal = equipix.calibrate(frames, -CROSS, variance=np.full(5, 1e-6), tolerance=1e-3)
     assert [finding.kind for finding in cal.findings] == ["sign"]
     assert len(told) == 1

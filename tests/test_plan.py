@@ -404,7 +404,7 @@ class TestSuggest:
             assert steps[-1][0] == steps[-1][1]
 
     def test_says_that_drift_will_tilt(self):
-        with pytest.warns(MisfitWarning):
+        with pytest.warns(MisfitWarning, match="drift"):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)
         plan.suggest((64, 80), 4, 5, patterns=1)  # warnings are errors here
         with pytest.warns(MisfitWarning, match="pattern 1: "):

@@ -136,3 +136,14 @@ def test_each_error_is_the_first_cause(kind, draws, figure):
     )
     figure(f"{kind}: named", f"{right} of {len(seeds)}", "nine of ten")
     assert right >= 0.9 * len(seeds) - 3 * (0.09 * len(seeds)) ** 0.5
+
+
+def test_a_curved_response_is_found_beside_a_level_that_clips():
+    """Pixels that the caller masks show a saturation level; it explains no curve of the others."""
+    frames = experiment("curved", 1)
+    mask = np.zeros(SHAPE, bool)
+    mask.flat[np.random.default_rng(5).choice(mask.size, 20, replace=False)] = True
+    frames[:, mask] = np.ceil(1.2 * frames.max())
+    with pytest.warns(errors.EquipixWarning):
+        cal = equipix.calibrate(frames, CROSS, variance=np.full(5, NOISE**2), mask=mask)
+    assert [each.kind for each in cal.findings] == ["saturation", "misfit"]

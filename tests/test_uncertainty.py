@@ -368,6 +368,17 @@ class TestArraysThatChange:
         changed[:] = kept
         assert cal.std_of(weights) == before
 
+    def test_also_while_error_bars_are_found(self):
+        frames, options = case(7)
+
+        def change(_done, _total, stage):
+            if stage == "uncertainty":
+                frames[:, 3:5] = 0
+
+        cal = equipix.calibrate(frames, CROSS, uncertainty=True, progress=change, **options)
+        with pytest.raises(InputError, match="'frames' of this calibration changed after"):
+            cal.std_of(np.full(cal.shape, 1 / cal.flags.size))
+
     def test_copies_may_change(self):
         frames, options = case(7)
         options["variance"] = np.asfortranarray(options["variance"])

@@ -162,7 +162,7 @@ def _densities(
         normal = np.exp(-0.5 * sigmas**2) / (predicted * np.sqrt(2 * np.pi))
         label = f"predicted {predicted:.2g}"
         axes.plot(predicted * sigmas, normal, color="black", linestyle=":", label=label)
-        lowest, highest = max(lowest, normal.max() / 1e4), max(highest, float(normal.max()))
+        highest = max(highest, float(normal.max()))
     limits = (lowest, 30 * highest)
     axes.set(title=title, xlabel=what, ylabel="density", yscale="log", ylim=limits)
     axes.legend(loc="upper right", fontsize="small")

@@ -152,26 +152,26 @@ def calibrate(
     Warns
     -----
     InputWarning
-        If coordinate descent rounds a shift by more than 0.02 pixel.
+        If coordinate descent rounds a shift by more than 0.02 pixel; if many values are exactly at
+        the highest one, and no saturation level is given or a higher one; if no dark was
+        subtracted from frames of whole numbers; if the rounding of means is large beside their
+        noise.
     IdentifiabilityWarning
         If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
         than half of the pixels that are not masked are determined (`Calibration.is_partial`); if
         free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly
-        degenerate with the sensitivity; if shifts look like millimetres or micrometres.
+        degenerate with the sensitivity; if shifts look like millimetres or micrometres; if the
+        order of the exposures lets a drift of the lamp look like a tilt.
     ConvergenceWarning
-        If the tolerance was not reached.
+        If the tolerance was not reached, or a fit is too far from its minimum for error bars.
     MisfitWarning
-        If the data contradict the fluxes given: the lamp has drifted, which hides a tilt, or one
-        flux is far off.
-    MisfitWarning
-        If reduced χ² deviates from 1 by more than five standard errors and 3 %, or if residuals of
-        neighbouring pixels are correlated, or if residuals show a curved response, an offset of all
-        values, crosstalk or the pattern of the dark. The message names the likely cause.
-    InputWarning
-        If many values are exactly at the highest one, and no saturation level is given or a higher
-        one.
-    MisfitWarning
-        If the data contradict the orientation of the shifts: a sign, or the order of the axes.
+        If the data contradict what was given: the light varied between the frames of an exposure;
+        the lamp has drifted, which hides a tilt, or one flux is far off; one exposure is given
+        twice; the orientation of the shifts, a sign or the order of the axes, is wrong; colour
+        filters are others; reduced χ² deviates from 1 by more than five standard errors and 3 %;
+        residuals of neighbouring pixels are correlated, or show a curved response, an offset of all
+        values, crosstalk or the pattern of the dark. The message names the likely cause, and
+        ``kind`` of the warning is that of the finding.
 
     Notes
     -----

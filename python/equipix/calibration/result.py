@@ -29,7 +29,7 @@ from equipix.errors import InputError
 from equipix.exposures.positions import ROUNDING, Positions, as_rotation
 from equipix.findings import Finding, determined
 from equipix.fitting.error_bars import functional_std
-from equipix.fitting.weighted import Weighted, check_unchanged, sampled_arrays
+from equipix.fitting.weighted import Weighted, check_unchanged
 from equipix.io.record import UNSAVED, Counts, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.measured import measured_of
@@ -209,7 +209,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         """Make the result from a fit and what was derived from it."""
         exposures, fit, bars = evidence.exposures, evidence.fit, evidence.bars
         dtype, flags, orientation = exposures.values.dtype, evidence.flags, evidence.orientation
-        weighted = evidence.weighted._replace(sampled=sampled_arrays(exposures))
+        weighted = evidence.weighted
         filters, gauge = exposures.filters, gauge_of(weighted, flags)
         std, offset = None if bars is None else bars.sensitivity, fit.offset
         coefficients = fit.beam.coefficients

@@ -96,7 +96,7 @@ class HgCdTe:
 
     Notes
     -----
-    A pixel of composition x has the band gap E_g(x) of `blackbody.hgcdte_cutoff` [1]_. Its response
+    A pixel of composition x has the band gap E_g(x) of `hgcdte_cutoff` [1]_. Its response
     to photons of energy E is
 
     .. math:: S = 1 - 2^{-\exp((E - E_g)/W)} ,
@@ -168,7 +168,7 @@ class HgCdTe:
         Returns
         -------
         ndarray, of the shape of `composition`
-            Per second and area, in the unit of `blackbody.band_photons`.
+            Per second and area, in the unit of `band_photons`.
 
         Raises
         ------

@@ -15,7 +15,7 @@ from equipix.exposures.flux import Flux
 from equipix.fitting.error_bars import DarkStd, ErrorBars, standard_deviations
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.residuals import Residuals, sampled
-from equipix.fitting.weighted import Options, Weighted
+from equipix.fitting.weighted import Options, Weighted, sampled_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +60,8 @@ class Evidence:
     @classmethod
     def of(cls, weighted: Weighted, options: Options, flux: Flux) -> Self:
         """Collect it; `flux` is that which was given, with its own prior."""
+        # Before anything that calls the caller back, who may change the arrays.
+        weighted = weighted._replace(sampled=sampled_arrays(weighted.exposures))
         orientation = orientation_test(weighted.exposures, weighted.fit, options.fit, flux)
         flags = pixel_flags(weighted, options.fit)
         residuals = sampled(weighted, workers=options.fit.workers)

@@ -195,15 +195,7 @@ _SHIFTS = frozenset({"sign", "unit"})
 _SOURCES = _SHIFTS | {"flux"}
 """Kinds beside which a cause of residuals is no news."""
 
-_STRONGER = _SOURCES | {
-    "orientation",
-    "repeated",
-    "saturation",
-    "variance",
-    "prior",
-    "drift",
-    "colour",
-}
+_STRONGER = _SOURCES | {"orientation", "variance", "prior", "drift", "colour"}
 """Kinds whose causes leave what looks like a small error."""
 
 AFTER: tuple[Rule[Evidence], ...] = (

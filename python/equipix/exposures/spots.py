@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
@@ -250,8 +249,9 @@ def mended(frames: Array, places: Places) -> Array:
     for image in result:
         values = image.astype(np.float64)
         base = float(np.median(values))
-        others = np.delete(values, np.ravel_multi_index(at, values.shape))
-        floor = _FAINT * float(np.ptp(others)) + float(np.finfo(np.float32).tiny)
+        hot, values[at] = values[at], base
+        floor = _FAINT * float(np.ptp(values)) + float(np.finfo(np.float32).tiny)
+        values[at] = hot
         light = base + _light(values - base, places, floor)
         image[at] = np.rint(light) if image.dtype.kind in "iu" else light
     return result
@@ -259,7 +259,9 @@ def mended(frames: Array, places: Places) -> Array:
 
 def _alone(pixels: Bools) -> Bools:
     """Pixels, away from the border, with no other of these pixels beside them."""
-    near = sliding_window_view(np.pad(pixels, 1), (3, 3)).sum(axis=(2, 3))
+    rows, cols = pixels.shape
+    padded = np.pad(pixels, 1).view(np.uint8)
+    near = sum(padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
     alone: Bools = np.logical_and(pixels, near == 1)
     alone[:2] = alone[-2:] = alone[:, :2] = alone[:, -2:] = False
     return alone

@@ -188,7 +188,7 @@ def _robust_fit(
 
 
 def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
-    """Exposures with a finding for each pixel whose measurements contradict each other.
+    """Mark pixels whose measurements contradict each other.
 
     Most of those given are left out, or so many that no two agree.
     """

@@ -193,7 +193,7 @@ def tilt_std(
     -------
     ndarray, shape (2,), float64
         Standard deviation of the slope of ln M, edge to edge, (row, col); infinite along an axis
-        that the shifts do not determine.
+        that the shifts do not determine, 0 along one of a single pixel.
 
     Notes
     -----

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
-from equipix._check import Array, Floats, Ints
+from equipix._check import Array, Floats, Ints, naming_memory
 from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
@@ -100,8 +100,10 @@ def factor(shape: tuple[int, int], positions: Ints, powers: Floats) -> float:
         frames = light + _NOISE * rng.standard_normal(light.shape)
         # A bare fit, without the test of the sign. One thread: on so small a part two are slower.
         options = FitOptions(tolerance=_TOLERANCE, workers=1)
-        measured, flux = measured_of(frames), Flux.of(powers, None, None, len(powers))
-        solved = Exposures.of(measured, Positions.of(positions), flux).fit(options)
+        with naming_memory("planning"):
+            measured, flux = measured_of(frames), Flux.of(powers, None, None, len(powers))
+            exposures = Exposures.of(measured, Positions.of(positions), flux)
+        solved = exposures.fit(options)
         error = (solved.sensitivity - np.nanmean(solved.sensitivity)) / _NOISE
         valid = np.isfinite(error) & np.isfinite(local)
         ratios.append(float(np.sum(error**2, where=valid) / np.sum(local, where=valid)))

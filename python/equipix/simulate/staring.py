@@ -58,7 +58,8 @@ class StaringArray(PixelArray):
     drift_dn : array_like
         Standard deviation of a slow drift of the offset with a spectrum of 1/f, in DN.
     doubling_k : float
-        Rise of the detector's temperature that doubles the dark current, in kelvin.
+        Rise of the detector's temperature that doubles the dark current, in kelvin; infinite where
+        the temperature changes nothing.
     well_e : float
         Electrons that a pixel holds.
     bit_depth : int
@@ -118,7 +119,9 @@ class StaringArray(PixelArray):
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        self._check_numbers("doubling_k", "well_e", "band_start_um")
+        self._check_numbers("well_e", "band_start_um")
+        if not self.doubling_k > 0:
+            raise InputError(f"'doubling_k' is {self.doubling_k!r}, expected a number above 0")
         if self.cfa is not None:
             filtered(np.ones((1, 1)), self.cfa)
         for name in _NOT_BELOW_0:
