@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -78,9 +79,13 @@ def test_uncertainties_predict_without_being_told(experiments, tmp_path):
     read = equipix.compare(files)
     np.testing.assert_array_equal(read.predicted_rms, result.predicted_rms)
     assert np.isnan(read.predicted_block_rms).all()  # a file holds no measurements
-    picture = draw_comparison(read, ["one", "other"])
-    bars = np.concatenate([bar.get_data().values for bar in picture.axes[4].patches])
-    assert picture.axes[4].get_ylim()[0] < bars[bars > 0].min()  # one pixel that is far out shows
+    sensitivity = files[0].sensitivity.copy()
+    sensitivity[30, 40] *= 1.1
+    far = dataclasses.replace(files[0], sensitivity=sensitivity)
+    picture = draw_comparison(equipix.compare([far, files[1]]), ["one", "other"])
+    (axes,) = (each for each in picture.axes if each.get_title() == "Differences of pixels")
+    bars = np.concatenate([bar.get_data().values for bar in axes.patches])
+    assert axes.get_ylim()[0] < bars[bars > 0].min()  # that of one pixel far out
 
 
 def test_the_agreement_map_is_the_scatter_of_one(experiments):
