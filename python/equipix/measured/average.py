@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
 from equipix._check import (
+    Array,
+    ArrayLike,
     Progress,
     as_array,
     as_floats,
@@ -27,13 +28,7 @@ from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
 from equipix.io.record import read_record
 from equipix.measured.saturation import level_of
-from equipix.measured.statistics import (
-    FrameStatistics,
-    _masked,
-    _step,
-    _subtract,
-    saved_shape,
-)
+from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
 
 
@@ -141,13 +136,13 @@ class _How(NamedTuple):
     """Options of an average, checked but for the shape of the mask."""
 
     level: float | None
-    mask: NDArray[Any] | None
+    mask: Array | None
     rejection: Rejection | None
     workers: int | None
     progress: Progress | None
 
 
-def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
+def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
     """Paths as a list, an array as it is, other iterables as an iterator."""
     if isinstance(source, np.ndarray):
         return source if np.ma.is_masked(source) else np.asarray(source)
@@ -225,10 +220,10 @@ def _statistics(
     )
 
 
-def _average_batches(given: Iterator[NDArray[Any]], how: _How, total: int) -> FrameStatistics:
+def _average_batches(given: Iterator[Array], how: _How, total: int) -> FrameStatistics:
     first = next(given)
     dtype, level = sum_dtype(first), level_of(first.dtype, how.level)
-    everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
+    everything: Iterator[Array] = itertools.chain([first], given)
     if how.rejection is not None:
         dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything)
     mask = as_mask(how.mask, first.shape[1:])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from equipix._check import Bools, Floats
+from equipix._check import Array, ArrayLike, Bools, Floats
 from equipix.errors import InputError
 
 LARGEST_PERIOD = 8
@@ -108,7 +108,7 @@ class Colours:
         """Return a map (rows, cols) of the value that each pixel's colour has."""
         return np.array([values[label] for label in self.labels])[self.numbers(shape)]
 
-    def means(self, image: NDArray[Any], counted: Bools) -> dict[str, float]:
+    def means(self, image: Array, counted: Bools) -> dict[str, float]:
         """Mean of each colour over its pixels that are counted; NaN of none."""
         return {
             label: float(image[plane & counted].mean()) if (plane & counted).any() else np.nan

@@ -3,10 +3,8 @@
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from equipix._check import Array, Bools, ReadOnly, number
 from equipix.errors import InputError
@@ -86,10 +84,8 @@ class BadPixels(ReadOnly):
 
 
 def dead_pixels(
-    signals: NDArray[Any],
-    models: Sequence[NoiseModel] | None,
-    usual: NDArray[Any] | float = 1.0,
-) -> NDArray[Any]:
+    signals: Array, models: Sequence[NoiseModel] | None, usual: Array | float = 1.0
+) -> Array:
     """Find pixels whose response to light is below half of that of their neighbours.
 
     Parameters
@@ -115,7 +111,7 @@ def dead_pixels(
     return dead
 
 
-def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
+def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> Array:
     """Find pixels whose dark level or dark noise is far above that of the others.
 
     Parameters
@@ -134,7 +130,7 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     """
     excess = dark.mean - np.nanmedian(dark.mean)
     spread = max(1.0, dark.step, ROBUST * float(np.nanmedian(np.abs(excess))))
-    hot: NDArray[Any] = excess > HOT_SIGMAS * spread
+    hot: Array = excess > HOT_SIGMAS * spread
     frames = int(dark.count.max())
     if noise is not None and frames > 1:
         limit = scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
@@ -257,8 +253,8 @@ def _with_light(limit: Array | float, light: Array) -> Array:
 
 
 def response_outliers(
-    sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]], *, least: float = DEAD_RESPONSE
-) -> tuple[NDArray[Any], NDArray[Any]]:
+    sensitivity: Array, std: Callable[[], Array], *, least: float = DEAD_RESPONSE
+) -> tuple[Array, Array]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.
 
     Parameters
@@ -321,12 +317,12 @@ def response_outliers(
     return dead, hot
 
 
-def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
+def _block_medians(image: Array) -> Array:
     """Take for each pixel the median of the 16×16 block that it lies in."""
     return _of_pixels(_medians(image), image.shape)
 
 
-def _usual(image: NDArray[Any]) -> NDArray[Any]:
+def _usual(image: Array) -> Array:
     """Medians of blocks, but of an odd block the median of the 5×5 blocks around.
 
     A block is odd where its median is below half or above twice that of the blocks around, and most
@@ -344,7 +340,7 @@ def _usual(image: NDArray[Any]) -> NDArray[Any]:
     return np.where(odd, around, medians)
 
 
-def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any], NDArray[Any]]:
+def _range_around(usual: Array, least: float = 0.0) -> tuple[Array, Array]:
     """Lowest and highest response of each block and those beside it.
 
     Blocks below `least` times the highest do not count.
@@ -355,7 +351,7 @@ def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any]
     return np.fmin.reduce(counted, axis=(2, 3)), highest
 
 
-def _on_its_side(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int) -> NDArray[Any]:
+def _on_its_side(image: Array, pixels: tuple[Array, ...], sign: int) -> Array:
     """Usual response on each pixel's side of a step, to find dead (`sign` -1) or hot pixels."""
     rows, cols = pixels
     # The differences go on beyond the border, so that a step at an angle does not turn back there.
@@ -368,19 +364,19 @@ def _on_its_side(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: in
     return np.asarray(-sign * np.maximum(*ranked))
 
 
-def _are_alike(values: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
+def _are_alike(values: Array, usual: Array) -> Array:
     """Which responses are between half and twice the usual one."""
     return (values >= DEAD_RESPONSE * usual) & (values * DEAD_RESPONSE <= usual)
 
 
-def _medians(image: NDArray[Any]) -> NDArray[Any]:
+def _medians(image: Array) -> Array:
     """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
     rows, cols = image.shape
     padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
     return nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
 
 
-def _of_pixels(blocks: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _of_pixels(blocks: Array, shape: tuple[int, ...]) -> Array:
     """Spread values of blocks over their pixels."""
     return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[: shape[0], : shape[1]]
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, check_maps
 from equipix.errors import InputError
@@ -96,7 +95,7 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
         check_maps("FrameStatistics", self.maps | dark)
 
     @property
-    def maps(self) -> dict[str, NDArray[Any]]:
+    def maps(self) -> dict[str, Array]:
         """The five maps by their names."""
         return {name: getattr(self, name) for name in _MAPS}
 
@@ -111,7 +110,7 @@ def saved_shape(path: Path) -> tuple[int, int] | None:
     return rows, cols
 
 
-def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> float:
+def _step(mean: Array, variance: Array, count: Array) -> float:
     """Step between the values of frames, of a sample of the pixels.
 
     Sums over frames are multiples of it. Those of a pixel whose frames are equal are multiples of
@@ -122,7 +121,7 @@ def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> fl
     return step_of(means * np.where(variances > 0, counts, 1))
 
 
-def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStatistics:
+def _masked(statistics: FrameStatistics, mask: Array | None) -> FrameStatistics:
     """Return averages without the pixels of a mask."""
     if mask is None:
         return statistics
@@ -132,9 +131,7 @@ def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStat
     return dataclasses.replace(statistics, **maps)
 
 
-def _subtract(
-    statistics: FrameStatistics, dark: FrameStatistics | NDArray[Any] | None
-) -> FrameStatistics:
+def _subtract(statistics: FrameStatistics, dark: FrameStatistics | Array | None) -> FrameStatistics:
     if dark is None:
         return statistics
     if statistics.dark is not None:

@@ -6,7 +6,6 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, as_array, number
 from equipix.errors import InputError
@@ -19,7 +18,7 @@ _BATCH_BYTES = 2**26
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
-def batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
+def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
     """Give the frames a few at a time: views of an array, copies of what an iterator gives."""
     if isinstance(frames, np.ndarray):
         if frames.ndim != 3 or 0 in frames.shape:
@@ -54,18 +53,18 @@ def batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
         yield batch[:filled]
 
 
-def _frame(index: int, item: Any) -> NDArray[Any]:
+def _frame(index: int, item: Any) -> Array:
     """Check one frame of an iterable; a masked array stays one."""
     name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
     frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
     return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
 
 
-def _batch_size(frame: NDArray[Any]) -> int:
+def _batch_size(frame: Array) -> int:
     return max(1, min(_BATCH, _BATCH_BYTES // max(1, frame.nbytes)))
 
 
-def sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
+def sum_dtype(frames: Array) -> np.dtype[Any]:
     """Choose the dtype that frames are summed in: their own, or float64.
 
     Masked samples are summed as NaN, which does not count, so whole numbers need float64.
@@ -77,7 +76,7 @@ def sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
     return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
 
 
-def unmasked(batch: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+def unmasked(batch: Array, dtype: np.dtype[Any]) -> Array:
     """Return a batch with NaN in the place of masked samples."""
     if not isinstance(batch, np.ma.MaskedArray):
         return batch

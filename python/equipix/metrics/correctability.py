@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, as_array, as_mask, naming_memory, number
+from equipix._check import ArrayLike, Bools, Floats, as_array, as_mask, naming_memory, number
 from equipix.errors import InputError
 from equipix.findings import ask, say
 from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, as_array, check_type, naming_memory, number
+from equipix._check import ArrayLike, Bools, Floats, as_array, check_type, naming_memory, number
 from equipix.errors import InputError
 from equipix.findings import Finding, say
 from equipix.measured.statistics import FrameStatistics

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, as_array, naming_memory
+from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, say
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted

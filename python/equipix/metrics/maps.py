@@ -1,13 +1,11 @@
 """Figures of maps and frames: rms, block means, tilt, roughness, NETD, non-uniformity."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, as_array, naming_memory, number
+from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory, number
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
 from equipix.measured.filters import BLOCK
@@ -15,12 +13,12 @@ from equipix.measured.noise import scatter_limit
 from equipix.metrics.frame_noise import stack_of, temporal_of
 
 
-def rms(values: NDArray[Any]) -> float:
+def rms(values: Array) -> float:
     """Root mean square of the values that are finite."""
     return float(np.sqrt(np.mean(np.square(values[np.isfinite(values)]))))
 
 
-def rms_at_both_scales(error: NDArray[Any]) -> tuple[float, float]:
+def rms_at_both_scales(error: Array) -> tuple[float, float]:
     """Root mean square over pixels, and of means over 16×16 pixels: NaN without a whole block."""
     return rms(error), rms(block_means(error)) if min(error.shape) >= BLOCK else np.nan
 
@@ -97,7 +95,7 @@ def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:
     return means
 
 
-def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> Bools:
+def slope_pixels(sensitivity: Array, flags: Array) -> Bools:
     """Find the pixels that count for the slope of ln M.
 
     They are those of which M is determined, that are not flagged ``UNRELIABLE_FLAT``, and whose M
@@ -120,7 +118,7 @@ def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> Bools:
     )
 
 
-def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
+def tilt_weights(valid: Bools) -> Floats:
     """Weights whose sums with ln M are its least-squares slopes, edge to edge.
 
     Parameters
@@ -144,7 +142,7 @@ def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
     return np.asarray(np.einsum("ab,brc->arc", np.linalg.inv(normal), centred))
 
 
-def tilt(sensitivity: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+def tilt(sensitivity: Array, valid: Bools) -> Floats:
     """Least-squares slope of ln M over valid pixels, edge to edge, (row, col).
 
     Parameters
