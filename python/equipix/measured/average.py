@@ -225,12 +225,13 @@ def _average_batches(given: Iterator[Array], how: _How, total: int) -> FrameStat
     dtype, level = sum_dtype(first), level_of(first.dtype, how.level)
     everything: Iterator[Array] = itertools.chain([first], given)
     if how.rejection is not None:
-        dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything)
+        whole = first.dtype.kind in "bui"
+        dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything, whole=whole)
     mask = as_mask(how.mask, first.shape[1:])
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, how.workers)
     done = 0
     for batch in everything:
-        sums.add(np.ascontiguousarray(unmasked(batch, dtype), dtype=dtype))
+        sums.add(unmasked(batch, dtype))
         done += len(batch)
         if how.progress is not None:
             how.progress(done, max(done, total), "average")

@@ -76,11 +76,9 @@ def sum_dtype(frames: Array) -> np.dtype[Any]:
     return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
 
 
-def unmasked(batch: Array, dtype: np.dtype[Any]) -> Array:
-    """Return a batch with NaN in the place of masked samples."""
-    if not isinstance(batch, np.ma.MaskedArray):
-        return batch
-    return np.where(np.ma.getmaskarray(batch), dtype.type(np.nan), np.ma.getdata(batch))
+def unmasked(frames: Array, dtype: np.dtype[Any]) -> Array:
+    """Return frames in the dtype of their sums, with NaN in the place of masked samples."""
+    return np.ascontiguousarray(np.ma.filled(frames.astype(dtype, copy=False), np.nan))
 
 
 _START = 9
@@ -159,13 +157,15 @@ class Rejection:
         inside = 2 * normal.cdf(self._sigmas) - 1
         self.variance_kept = 1 - 2 * self._sigmas * normal.pdf(self._sigmas) / inside
 
-    def cleaned(self, batches: Iterable[Array]) -> Iterator[Floats]:
+    def cleaned(self, batches: Iterable[Array], *, whole: bool) -> Iterator[Floats]:
         """Give batches of frames as float64 with NaN in the place of samples left out.
 
         Parameters
         ----------
         batches : iterable of ndarray, shape (n, rows, cols)
             Frames of one steady scene.
+        whole : bool
+            Whether they hold whole numbers, whose noise is that of rounding at least.
 
         Yields
         ------
@@ -177,14 +177,14 @@ class Rejection:
         InputError
             If there are fewer than nine frames, or more than a tenth of one would be left out.
         """
-        frames = (frame for batch in batches for frame in batch)
+        # A frame is copied when it is drawn: the next one may take its place in the batch.
+        frames = (np.ma.filled(each.astype(float), np.nan) for batch in batches for each in batch)
         first = list(itertools.islice(frames, _START))
         if len(first) < _START:
             raise InputError(
                 f"'frames' holds {len(first)}, expected {_START} or more to reject samples"
             )
-        whole = first[0].dtype.kind in "bui"
-        start = np.stack([_floats(frame) for frame in first])
+        start = np.stack(first)
         centre, common, own = self._estimates(start, _ROUNDING if whole else 0.0)
         limit = _limit(common, own, len(start))
         for index, frame in enumerate(start):
@@ -193,8 +193,7 @@ class Rejection:
         with np.errstate(invalid="ignore"):
             mean = np.where(np.isfinite(start), start, 0).sum(axis=0) / count
         yield start
-        for index, raw in enumerate(frames, start=len(first)):
-            frame = _floats(raw)
+        for index, frame in enumerate(frames, start=len(first)):
             with np.errstate(divide="ignore"):
                 of_mean = np.sqrt(1 + 1 / count)
             size = self._clean(frame, mean, _limit(common, own, index) * of_mean, index) / of_mean
@@ -257,9 +256,3 @@ class Rejection:
 def _limit(common: Floats, own: Floats, samples: int) -> Floats:
     """Noise that samples are compared with, once so many have been seen."""
     return np.where(own > (1 + _OWN * _SCATTER / np.sqrt(samples)) * common, own, common)
-
-
-def _floats(frame: Array) -> Floats:
-    """Return a frame as new float64 numbers, masked samples as NaN."""
-    values: Any = unmasked(frame.astype(np.float64), np.dtype(np.float64))
-    return np.array(values, dtype=np.float64)
