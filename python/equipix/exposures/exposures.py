@@ -22,8 +22,8 @@ from equipix.errors import InputError
 from equipix.exposures.fit import FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Orientation, Positions, nearest_whole
+from equipix.measured.colour import Filters, mean_signal
 from equipix.measured.defects import BadPixels
-from equipix.measured.filters import Filters, mean_signal
 from equipix.measured.measured import Measured
 from equipix.measured.saturation import clipping_advice
 

@@ -1,14 +1,21 @@
 """Which pixels must not be used: dead, hot, noisy, blind, unlike their neighbours."""
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from equipix._check import Array, Bools, ReadOnly, number
+from equipix._check import Array, Bools, ReadOnly, number, union
 from equipix.errors import InputError
-from equipix.measured.noise import ROBUST, NoiseModel, nanmedian, scatter_limit
+from equipix.measured.noise import (
+    BLOCK,
+    ROBUST,
+    NoiseModel,
+    block_medians,
+    nanmedian,
+    of_blocks,
+    scatter_limit,
+)
 from equipix.measured.statistics import FrameStatistics, light_of
 
 SIGMAS = 6.0
@@ -25,9 +32,6 @@ _CHANCE = 1e-7
 
 _ROUNDS = 3
 """Rounds in which the share of samples left out is found without the pixels found before."""
-
-_BLOCK = 16
-"""Side of the blocks of pixels whose median is what is usual there."""
 
 _STEP = 1.1
 """Response of a block over that of the one beside it from which a step may lie between them."""
@@ -78,9 +82,7 @@ class BadPixels(ReadOnly):
     @property
     def unreliable(self) -> Bools | None:
         """Pixels whose sensitivity counts neither for its mean nor for its slope."""
-        if self.contradictory is None or self.faint is None:
-            return self.faint if self.contradictory is None else self.contradictory
-        return self.contradictory | self.faint
+        return union(self.contradictory, self.faint)
 
 
 def dead_pixels(
@@ -106,8 +108,9 @@ def dead_pixels(
     dead = np.ones(signals.shape[1:], dtype=bool)
     for k, signal in enumerate(signals):
         margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
+        around = of_blocks(block_medians(signal / usual), signal.shape)
         # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
-        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * _block_medians(signal / usual))
+        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * around)
     return dead
 
 
@@ -145,7 +148,7 @@ def noisy_pixels(
     noise: NoiseModel,
     *,
     times: float = 1.0,
-    light: Iterable[Array] | None = None,
+    light: Iterable[Array],
 ) -> Bools:
     """Find pixels that scatter between frames by more than the noise explains.
 
@@ -160,7 +163,7 @@ def noisy_pixels(
     times : float
         Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
         is beyond chance.
-    light : iterable of ndarray, shape (rows, cols), optional
+    light : iterable of ndarray, shape (rows, cols)
         What the variances of each exposure have of light that varied between its frames, in DN².
 
     Returns
@@ -170,8 +173,7 @@ def noisy_pixels(
     """
     noisy = np.ones(means.shape[1:], dtype=bool)
     seen = np.zeros_like(noisy)
-    common = itertools.repeat(np.zeros(()), len(frames)) if light is None else light
-    for mean, variance, count, shared in zip(means, variances, frames, common, strict=True):
+    for mean, variance, count, shared in zip(means, variances, frames, light, strict=True):
         if count < 2:
             continue
         of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(mean)
@@ -307,19 +309,14 @@ def response_outliers(
         (dead, -1, least, highest, alive),
         (hot, 1, 1 / DEAD_RESPONSE, lowest, lowest),
     ):
-        beyond = sign * (sensitivity - limit * _of_pixels(extreme, sensitivity.shape))
+        beyond = sign * (sensitivity - limit * of_blocks(extreme, sensitivity.shape))
         suspects = np.nonzero(beyond > 0)
-        blocks = suspects[0] // _BLOCK, suspects[1] // _BLOCK
+        blocks = suspects[0] // BLOCK, suspects[1] // BLOCK
         beside = np.clip(_on_its_side(sensitivity, suspects, sign), floor[blocks], highest[blocks])
         around = np.where(stepped[blocks], beside, usual[blocks])
         beyond = sign * (sensitivity[suspects] - limit * around)
         found[suspects] = beyond > SIGMAS * deviation[suspects]
     return dead, hot
-
-
-def _block_medians(image: Array) -> Array:
-    """Take for each pixel the median of the 16×16 block that it lies in."""
-    return _of_pixels(_medians(image), image.shape)
 
 
 def _usual(image: Array) -> Array:
@@ -330,7 +327,7 @@ def _usual(image: Array) -> Array:
     responds weakly no block is odd. In steep light every block may be so, hence this is for
     responses alone.
     """
-    medians, reach = _medians(image), _AROUND // 2
+    medians, reach = block_medians(image), _AROUND // 2
     padded = np.pad(medians, reach, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_AROUND, _AROUND))
     around = nanmedian(windows, axis=(2, 3))
@@ -367,18 +364,6 @@ def _on_its_side(image: Array, pixels: tuple[Array, ...], sign: int) -> Array:
 def _are_alike(values: Array, usual: Array) -> Array:
     """Which responses are between half and twice the usual one."""
     return (values >= DEAD_RESPONSE * usual) & (values * DEAD_RESPONSE <= usual)
-
-
-def _medians(image: Array) -> Array:
-    """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
-    rows, cols = image.shape
-    padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
-    return nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
-
-
-def _of_pixels(blocks: Array, shape: tuple[int, ...]) -> Array:
-    """Spread values of blocks over their pixels."""
-    return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[: shape[0], : shape[1]]
 
 
 _WELL_ABOVE = 10.0

@@ -12,8 +12,7 @@ from numpy.typing import DTypeLike
 from equipix._check import EXPOSURES, Array, Bools, Floats, Words
 from equipix.errors import InputError
 from equipix.measured import defects
-from equipix.measured.colour import Colours, planes_of
-from equipix.measured.filters import Filters, mean_signal, pattern_of
+from equipix.measured.colour import Colours, Filters, mean_signal, pattern_of, planes_of
 from equipix.measured.noise import NoiseModel, photon_transfer
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
 from equipix.measured.statistics import (

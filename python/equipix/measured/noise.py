@@ -538,6 +538,22 @@ def nanmedian(values: Array, axis: int | tuple[int, ...]) -> Array:
         return np.asarray(np.nanmedian(values, axis=axis))
 
 
+BLOCK = 16
+"""Side of the blocks of pixels whose median or mean is what is usual there."""
+
+
+def block_medians(image: Array, size: int = BLOCK) -> Array:
+    """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
+    rows, cols = image.shape
+    padded = np.pad(image, ((0, -rows % size), (0, -cols % size)), mode="symmetric")
+    return nanmedian(padded.reshape(padded.shape[0] // size, size, -1, size), axis=(1, 3))
+
+
+def of_blocks(values: Array, shape: tuple[int, ...], size: int = BLOCK) -> Array:
+    """Give each pixel of a sensor of that shape the value of its block."""
+    return values.repeat(size, axis=0).repeat(size, axis=1)[: shape[0], : shape[1]]
+
+
 def nanmedian_abs(residuals: Array) -> Floats:
     """Median absolute residual of each exposure, the first axis; 0 without any."""
     found = []

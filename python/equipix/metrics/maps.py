@@ -8,8 +8,7 @@ from equipix import _native
 from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory, number
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
-from equipix.measured.filters import BLOCK
-from equipix.measured.noise import scatter_limit
+from equipix.measured.noise import BLOCK, scatter_limit
 from equipix.metrics.frame_noise import stack_of, temporal_of
 
 

@@ -11,7 +11,7 @@ from equipix._check import Array
 from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction
 from equipix.demo import Demo
-from equipix.measured.filters import BLOCK
+from equipix.measured.noise import BLOCK
 from equipix.metrics.maps import block_means, rms
 from equipix.pictures.canvas import PREDICTION, draw_map, new_figure
 from equipix.scene.sequence import SequenceResult
