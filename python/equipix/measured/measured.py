@@ -180,7 +180,8 @@ def _of_averaged(
     """Averaged frames: their noise model, or the variances that the caller gives."""
     model = averaged.noise if variance is None else variance
     if isinstance(model, NoiseModel):
-        model = averaged.rounded(model)
+        if model.step == 0:
+            model = dataclasses.replace(model, step=averaged.step)
         noise, variances = averaged.models(model), None
     else:
         noise, variances = _noise_of(variance, averaged.values, words)
