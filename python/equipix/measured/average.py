@@ -16,7 +16,6 @@ from equipix._check import (
     Array,
     ArrayLike,
     Progress,
-    as_array,
     as_floats,
     as_level,
     as_mask,
@@ -116,7 +115,7 @@ def average(
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     how = _How(
         as_level(saturation),
-        None if mask is None else as_array("mask", mask, ndim=2),
+        mask,
         None if reject is None else Rejection(reject),
         positive_workers(workers),
         progress,
@@ -127,16 +126,14 @@ def average(
             statistics = _average_files(taken, how)
         else:
             statistics = _average_batches(batches(taken), how, _length(frames))
-        if reject is not None:
-            statistics = dataclasses.replace(statistics, reject=float(reject))
-        return _masked(_subtract(statistics, offset), how.mask)
+        return _masked(_subtract(statistics, offset), as_mask(mask, statistics.mean.shape))
 
 
 class _How(NamedTuple):
-    """Options of an average, checked but for the shape of the mask."""
+    """Options of an average, checked but for the mask."""
 
     level: float | None
-    mask: Array | None
+    mask: ArrayLike | None
     rejection: Rejection | None
     workers: int | None
     progress: Progress | None
@@ -170,10 +167,9 @@ def _average_files(names: list[Any], how: _How) -> FrameStatistics:
         return _saved(paths, how)
     if how.rejection is None:
         with suppress(UnsupportedFileError):
-            if how.mask is not None:
-                as_mask(how.mask, frame_format(paths[0])[0][1:])
-            maps = _native.average_files(paths, how.level, how.mask, how.workers, how.progress)
-            dtype = frame_format(paths[0])[1]
+            shape, dtype = frame_format(paths[0])
+            mask = as_mask(how.mask, shape[1:])
+            maps = _native.average_files(paths, how.level, mask, how.workers, how.progress)
             return _statistics(maps, dtype, level_of(dtype, how.level))
     if any(saved_shape(path) for path in paths):
         return _saved(paths, how)
@@ -199,14 +195,18 @@ def _saved(paths: list[Path], how: _How) -> FrameStatistics:
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
             f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
         )
-    as_mask(how.mask, statistics.mean.shape)
     return statistics if how.mask is None else dataclasses.replace(statistics, light_variance=None)
 
 
 def _statistics(
-    maps: tuple[Any, ...], dtype: np.dtype[Any], level: float | None
+    maps: tuple[Any, ...],
+    dtype: np.dtype[Any],
+    level: float | None,
+    rejection: Rejection | None = None,
 ) -> FrameStatistics:
     mean, variance, count, saturated, light_variance = maps
+    if rejection is not None:
+        variance = variance / rejection.variance_kept
     return FrameStatistics(
         mean,
         variance,
@@ -215,6 +215,7 @@ def _statistics(
         saturated,
         saturation=level,
         raw=dtype.kind in "iu",
+        reject=None if rejection is None else rejection.sigmas,
         step=_step(mean, variance, count),
         light_variance=None if np.isnan(light_variance) else light_variance,
     )
@@ -235,7 +236,4 @@ def _average_batches(given: Iterator[Array], how: _How, total: int) -> FrameStat
         done += len(batch)
         if how.progress is not None:
             how.progress(done, max(done, total), "average")
-    maps = sums.finish()
-    if how.rejection is not None:
-        maps = (maps[0], maps[1] / how.rejection.variance_kept, *maps[2:])
-    return _statistics(maps, first.dtype, level)
+    return _statistics(sums.finish(), first.dtype, level, how.rejection)

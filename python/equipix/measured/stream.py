@@ -150,12 +150,12 @@ class Rejection:
     """
 
     def __init__(self, sigmas: float) -> None:
-        self._sigmas = number("reject", sigmas)
-        if not 3 <= self._sigmas < np.inf:
+        self.sigmas = number("reject", sigmas)
+        if not 3 <= self.sigmas < np.inf:
             raise InputError(f"'reject' is {sigmas!r}, expected a number of sigmas from 3 on")
         normal = NormalDist()
-        inside = 2 * normal.cdf(self._sigmas) - 1
-        self.variance_kept = 1 - 2 * self._sigmas * normal.pdf(self._sigmas) / inside
+        inside = 2 * normal.cdf(self.sigmas) - 1
+        self.variance_kept = 1 - 2 * self.sigmas * normal.pdf(self.sigmas) / inside
 
     def cleaned(self, batches: Iterable[Array], *, whole: bool) -> Iterator[Floats]:
         """Give batches of frames as float64 with NaN in the place of samples left out.
@@ -212,11 +212,11 @@ class Rejection:
         if not known.any():
             return np.asarray(deviation)
         size: Floats = np.abs(deviation - np.median(deviation[known]))
-        outside = size > self._sigmas * sigma
+        outside = size > self.sigmas * sigma
         share = np.count_nonzero(outside) / np.count_nonzero(known)
         if share > _MOST:
             raise InputError(
-                f"'frames': {share:.0%} of frame {index} deviate by more than {self._sigmas:g} "
+                f"'frames': {share:.0%} of frame {index} deviate by more than {self.sigmas:g} "
                 f"standard deviations from those before, expected at most {_MOST:.0%}: is it "
                 "another scene? Leave out 'reject', or the frame"
             )
@@ -242,7 +242,7 @@ class Rejection:
     def _noise(self, samples: Floats, sigma: float) -> float:
         """Noise that pixels have in common, without the samples beyond the limit."""
         for _ in range(_ROUNDS):
-            inside = np.abs(samples) <= self._sigmas * sigma
+            inside = np.abs(samples) <= self.sigmas * sigma
             count = inside.sum(axis=0)
             values = np.where(inside, samples, 0)
             squares = np.sum(values**2, axis=0) - values.sum(axis=0) ** 2 / np.maximum(count, 1)
