@@ -214,10 +214,16 @@ class Filters:
 
     @property
     def words(self) -> str:
-        """Name a pattern that the values alone show, and what to write; or nothing."""
-        if self.given:
-            return "" if self.shown is None else self._contradicted
-        rows, cols = self.colours.period
+        """Name a pattern that only the values show, or other than the given one; or nothing."""
+        if self.given and self.shown is None:
+            return ""
+        rows, cols = (self.shown or self.colours).period
+        if self.shown is not None:
+            return (
+                f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: the "
+                f"response repeats every {rows} rows and {cols} columns otherwise than "
+                f"'{self.colours}', so colours are mixed: {_advice(self.shown)}"
+            )
         if min(rows, cols) == 1:
             axis, period = ("columns", cols) if rows == 1 else ("rows", rows)
             return (
@@ -229,16 +235,6 @@ class Filters:
             f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
             f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
             f"the colours, and a corrected frame loses its white balance: {_advice(self.colours)}"
-        )
-
-    @property
-    def _contradicted(self) -> str:
-        shown = self.shown or self.colours
-        rows, cols = shown.period
-        return (
-            f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: the "
-            f"response repeats every {rows} rows and {cols} columns otherwise than "
-            f"'{self.colours}', so colours are mixed: {_advice(shown)}"
         )
 
     @property
