@@ -164,11 +164,10 @@ def high_passed(image: Floats) -> Floats:
 def _along_both(image: Floats, weights: Floats) -> Floats:
     """Weighted running mean along rows and columns; borders are reflected, edge values doubled."""
     half = len(weights) // 2
-    for axis in (0, 1):
-        pads = [(half, half) if each == axis else (0, 0) for each in (0, 1)]
-        padded, size = np.pad(image, pads, mode="symmetric"), image.shape[axis]
-        parts = (np.take(padded, range(k, k + size), axis) for k in range(len(weights)))
-        image = np.asarray(sum(weight * part for weight, part in zip(weights, parts, strict=True)))
+    for _ in ("rows", "columns"):
+        padded = np.pad(image, ((half, half), (0, 0)), mode="symmetric")
+        parts = (weight * padded[k : k + len(image)] for k, weight in enumerate(weights))
+        image = np.asarray(sum(parts)).T
     return image
 
 
