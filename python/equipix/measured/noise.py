@@ -217,12 +217,8 @@ class NoiseModel:
         found = _bounded_line(signal, variance, degrees, least, gain)
         for _ in range(_ROUNDS):
             model = cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
-            former, found = (
-                found,
-                _bounded_line(
-                    signal, *model._linearised(signal, variance, degrees, lowest), least, gain
-                ),
-            )
+            former, linear = found, model._linearised(signal, variance, degrees, lowest)
+            found = _bounded_line(signal, *linear, least, gain)
             if np.allclose(found, former, rtol=_STEADY, atol=0):
                 break
         return cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
@@ -389,8 +385,8 @@ _SMALL = 0.02
 _FINE = 1.0
 """Variance in squared steps above which rounding averages out: B is below 1e-18 there."""
 
-_TERMS = 7
-"""Terms of a series: at `_SMALL` the eighth is below 1e-11."""
+_TERMS = range(1, 8)
+"""Numbers of the terms of a series: at `_SMALL` the eighth is below 1e-11."""
 
 _GRID = 1001
 """Spreads between 0 and one step that are compared."""
@@ -414,7 +410,7 @@ def unaveraged(v: ArrayLike) -> Array:
     if v.size and v.min() > _FINE:
         return np.zeros(v.shape)
     few = np.maximum(v, _SMALL)
-    total = sum(np.exp(-4 * np.pi**2 * k**2 * few) / (2 * np.pi**2 * k**2) for k in _terms())
+    total = sum(np.exp(-4 * np.pi**2 * k**2 * few) / (2 * np.pi**2 * k**2) for k in _TERMS)
     return np.asarray(np.where(v < _SMALL, UNIFORM + v - np.sqrt(v / np.pi), total))
 
 
@@ -428,7 +424,7 @@ def scatter_slope(v: ArrayLike) -> Array:
     """Derivative of `scatter`; infinite at 0."""
     v = np.asarray(v, np.float64)
     few = np.maximum(v, _SMALL)
-    total = 1 + 2 * sum(np.exp(-4 * np.pi**2 * k**2 * few) for k in _terms())
+    total = 1 + 2 * sum(np.exp(-4 * np.pi**2 * k**2 * few) for k in _TERMS)
     with np.errstate(divide="ignore"):
         return np.asarray(np.where(v < _SMALL, 0.5 / np.sqrt(np.pi * v), total))
 
@@ -446,7 +442,7 @@ def largest_scatter(v: ArrayLike) -> Array:
         return np.asarray(v + UNIFORM)
     few = np.maximum(v, _SMALL)
     waves = sum(
-        np.exp(-2 * np.pi**2 * k**2 * few) * (1 / (np.pi * k) ** 2 + 4 * few) for k in _terms()
+        np.exp(-2 * np.pi**2 * k**2 * few) * (1 / (np.pi * k) ** 2 + 4 * few) for k in _TERMS
     )
     return np.asarray(np.where(v < _SMALL, 0.25, few + UNIFORM + waves))
 
@@ -504,10 +500,6 @@ def step_of(values: Array) -> float:
     if len(different) < _FEWEST_VALUES:
         return 1.0
     return float(np.gcd.reduce(different.astype(np.int64)))
-
-
-def _terms() -> range:
-    return range(1, _TERMS + 1)
 
 
 def chi2_tail(value: float, freedom: int) -> float:
