@@ -225,7 +225,7 @@ class Averaged:
         if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
             return f"'dark': {stray.words} (limit {STRAY:g}). See that all its frames are dark"
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
-        if not self.light[worst].is_large:
+        if not self.light[worst].over_noise > NAMED:
             return ""
         which = self.words.place(worst, self.names[worst])
         return (

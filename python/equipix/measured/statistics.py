@@ -29,8 +29,6 @@ from equipix.measured.noise import scatter_limit, step_of
 
 _MAPS = ("mean", "variance", "variance_of_mean", "count", "saturated")
 
-_COUNTS = ("count", "saturated")
-
 _SAMPLED = 4096  # pixels that show the step between values
 
 DARKER = 0.25
@@ -125,10 +123,11 @@ def _masked(statistics: FrameStatistics, mask: Array | None) -> FrameStatistics:
     """Return averages without the pixels of a mask."""
     if mask is None:
         return statistics
-    maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
-    for name, values in maps.items():
-        values[mask] = 0 if name in _COUNTS else np.nan
-    return dataclasses.replace(statistics, **maps)
+    kept: Any = {
+        name: np.where(mask, values.dtype.type(0 if values.dtype.kind == "u" else np.nan), values)
+        for name, values in statistics.maps.items()
+    }
+    return dataclasses.replace(statistics, **kept)
 
 
 def _subtract(statistics: FrameStatistics, dark: FrameStatistics | Array | None) -> FrameStatistics:
@@ -230,11 +229,6 @@ class Light(NamedTuple):
     def variance(self, signal: Array) -> Floats:
         """Variance that it adds to one frame of a pixel of this signal, in DN²."""
         return np.asarray(self.relative * np.square(signal, dtype=np.float64) + self.offset)
-
-    @property
-    def is_large(self) -> bool:
-        """Whether noise would be larger by a tenth or more with it."""
-        return self.over_noise > NAMED
 
     @property
     def words(self) -> str:
