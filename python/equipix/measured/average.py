@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import operator
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -125,7 +126,7 @@ def average(
         if isinstance(taken, list):
             statistics = _average_files(taken, how)
         else:
-            statistics = _average_batches(batches(taken), how, _length(frames))
+            statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
         return _masked(_subtract(statistics, offset), as_mask(mask, statistics.mean.shape))
 
 
@@ -155,10 +156,6 @@ def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
         everything = itertools.chain([first], items)
         return list(everything) if isinstance(first, str | os.PathLike) else everything
     raise InputError("'frames' holds no frames")
-
-
-def _length(source: Any) -> int:
-    return len(source) if hasattr(source, "__len__") else 0
 
 
 def _average_files(names: list[Any], how: _How) -> FrameStatistics:

@@ -34,15 +34,9 @@ def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
     filled = 0
     for index, item in enumerate(itertools.chain([first], frames)):
         frame = _frame(index, item)
-        if type(frame) is not type(first):
+        if _kind(frame) != _kind(first):
             raise InputError(
-                f"'source[{index}]' is a {type(frame).__name__}, expected a {type(first).__name__}"
-                " like the first: give all frames as masked arrays, or none"
-            )
-        if frame.shape != first.shape or frame.dtype != first.dtype:
-            raise InputError(
-                f"'source[{index}]' is {frame.dtype} of shape {frame.shape}, expected"
-                f" {first.dtype} of shape {first.shape} like the first"
+                f"'source[{index}]' is {_kind(frame)}, expected {_kind(first)} like the first"
             )
         batch[filled] = frame
         filled += 1
@@ -58,6 +52,11 @@ def _frame(index: int, item: Any) -> Array:
     name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
     frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
     return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
+
+
+def _kind(frame: Array) -> str:
+    masked = "masked " if isinstance(frame, np.ma.MaskedArray) else ""
+    return f"{masked}{frame.dtype} of shape {frame.shape}"
 
 
 def _batch_size(frame: Array) -> int:
