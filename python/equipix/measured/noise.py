@@ -30,7 +30,7 @@ from typing import Self
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, Floats, number
+from equipix._check import Array, ArrayLike, Floats, number, positive
 from equipix.errors import InputError
 
 MEDIAN_SQUARE = 0.4549
@@ -110,9 +110,7 @@ class NoiseModel:
     def __post_init__(self) -> None:
         """Refuse parameters that give no variance."""
         for name in ("read_noise", "gain", "step", "dark_variance"):
-            value = getattr(self, name)
-            if not 0 <= number(name, value) < np.inf:
-                raise InputError(f"'{name}' is {value!r}, expected a number not below 0")
+            positive(name, getattr(self, name), zero=True)
         if not number("frames", self.frames) >= 1:
             raise InputError(f"'frames' is {self.frames!r}, expected 1 or more")
         if self.read_noise == self.gain == 0:

@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 
 from equipix import _native
-from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory, number
+from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory, positive
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
 from equipix.measured.noise import BLOCK, scatter_limit
@@ -200,8 +200,7 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_k: float) -> Floats:
     >>> print(f"{np.median(metrics.netd(cold, hot, delta_k=5.0)):.3f}")
     0.025
     """
-    if not number("delta_k", delta_k) > 0:
-        raise InputError(f"'delta_k' is {delta_k!r}, expected a difference above 0 kelvin")
+    positive("delta_k", delta_k)
     low, high = stack_of("cold", cold), stack_of("hot", hot)
     if low.shape[1:] != high.shape[1:]:
         raise InputError(f"'hot' has shape {high.shape}, expected frames of {low.shape[1:]}")
@@ -345,8 +344,7 @@ def non_uniformity(frames: ArrayLike, span: float) -> float:
     0.015
     """
     values = as_array("frames", frames, ndim=3).astype(np.float64)
-    if not 0 < number("span", span) < np.inf:
-        raise InputError(f"'span' is {span!r}, expected a finite number of DN above 0")
+    positive("span", span)
     if np.isinf(values).any():
         raise InputError("'frames' holds infinite values, expected finite ones, or NaN where bad")
     empty = np.flatnonzero(~np.isfinite(values).any(axis=(1, 2)))
