@@ -146,9 +146,9 @@ def noisy_pixels(
     variances: Array,
     frames: Sequence[int],
     noise: NoiseModel,
+    light: Iterable[Array],
     *,
     times: float = 1.0,
-    light: Iterable[Array],
 ) -> Bools:
     """Find pixels that scatter between frames by more than the noise explains.
 
@@ -160,11 +160,11 @@ def noisy_pixels(
         Number of frames of each exposure.
     noise : NoiseModel
         That of one frame of a good pixel.
+    light : iterable of ndarray, shape (rows, cols)
+        What the variances of each exposure have of light that varied between its frames, in DN².
     times : float
         Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
         is beyond chance.
-    light : iterable of ndarray, shape (rows, cols)
-        What the variances of each exposure have of light that varied between its frames, in DN².
 
     Returns
     -------

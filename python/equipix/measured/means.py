@@ -258,11 +258,8 @@ class Averaged:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
-            pairs = zip(self.light, self.values, strict=True)
-            light = (of_light.variance(values) for of_light, values in pairs)
-            noisy = defects.noisy_pixels(
-                self._signals, self.variances, self.frames, noise, light=light
-            )
+            light = map(Light.variance, self.light, self.values)
+            noisy = defects.noisy_pixels(self._signals, self.variances, self.frames, noise, light)
             if self._screened:
                 noisy |= defects.often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)

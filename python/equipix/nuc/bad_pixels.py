@@ -104,8 +104,8 @@ def of_frames(
     noisy = flickering = np.zeros(good.shape, bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
-        flickering = defects.noisy_pixels(*of_level, light=[np.zeros(())])
-        noisy = defects.noisy_pixels(*of_level, times=limits.noise, light=[common])
+        flickering = defects.noisy_pixels(*of_level, [np.zeros(())])
+        noisy = defects.noisy_pixels(*of_level, [common], times=limits.noise)
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
         noisy = noisy | defects.often_rejected(missing, count)
