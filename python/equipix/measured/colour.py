@@ -119,13 +119,10 @@ class Colours:
         }
 
 
-def planes_of(colours: Colours | None, shape: tuple[int, ...]) -> Iterator[Bools]:
+def planes_of(colours: Colours | None, shape: tuple[int, ...]) -> list[Bools]:
     """Give a map of the pixels of each colour; one of all pixels where there are no colours."""
-    if colours is None:
-        yield np.ones(shape, bool)
-        return
-    for _, plane in colours.planes(shape):
-        yield plane
+    planes = [] if colours is None else [plane for _, plane in colours.planes(shape)]
+    return planes or [np.ones(shape, bool)]
 
 
 def _rows(cfa: ArrayLike) -> tuple[tuple[str, ...], ...]:
