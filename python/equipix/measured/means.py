@@ -15,14 +15,10 @@ from equipix.measured import defects
 from equipix.measured.colour import Colours, Filters, mean_signal, pattern_of, planes_of
 from equipix.measured.noise import NoiseModel, photon_transfer
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
-from equipix.measured.statistics import (
-    NAMED,
-    STRAY,
-    FrameStatistics,
-    Light,
-    light_of,
-    same_statistics,
-)
+from equipix.measured.statistics import STRAY, FrameStatistics, Light, light_of, same_statistics
+
+_NAMED = 0.1
+"""Variance by the light over that of noise, above which it is worth a word."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -116,6 +112,7 @@ class Averaged:
         """
         exposure, shape = len(self.frames), frames.mean.shape
         if exposure == 0:
+            self._missing = np.zeros(shape, np.uint32)
             self.dark = frames.dark
             if self.dark is not None:
                 self._refuse_saturated("'dark'", self.dark)
@@ -162,8 +159,6 @@ class Averaged:
         """Count the samples that were left out as those of cosmic rays."""
         if frames.reject is None:
             return
-        if not self._screened:
-            self._missing = np.zeros(frames.count.shape, np.uint32)
         self._missing += np.where(frames.count > 0, frames.count.max() - frames.count, np.uint32(0))
         self._screened += int(frames.count.max())
 
@@ -225,11 +220,11 @@ class Averaged:
         if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
             return f"'dark': {stray.words} (limit {STRAY:g}). See that all its frames are dark"
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
-        if not self.light[worst].over_noise > NAMED:
+        if not self.light[worst].over_noise > _NAMED:
             return ""
         which = self.words.place(worst, self.names[worst])
         return (
-            f"{which}: {self.light[worst].words} (limit {NAMED:g}). It was "
+            f"{which}: {self.light[worst].words} (limit {_NAMED:g}). It was "
             f"taken out of the noise model. See that all frames are of one {self.words.one}, let "
             "the source settle, or average more frames"
         )

@@ -208,10 +208,6 @@ def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) 
 _LARGEST = 0.5
 """Relative variation up to which frames are those of one light; above, offsets vary."""
 
-NAMED = 0.1
-"""Variance by the light over that of noise, above which it is worth a word."""
-
-
 STRAY = 10.0
 """Variance in common over that of noise, which only frames of different things have."""
 
@@ -233,14 +229,10 @@ class Light(NamedTuple):
     @property
     def words(self) -> str:
         """What varies, by how much, and over the noise."""
-        what = (
-            f"light varies by {self.relative**0.5:.2%}"
-            if self.relative
-            else (f"offset varies by {self.offset**0.5:.3g} DN")
-        )
-        return (
-            f"the {what} rms between the frames, which adds {self.over_noise:.3g} times the noise"
-        )
+        what = f"offset varies by {self.offset**0.5:.3g} DN"
+        if self.relative:
+            what = f"light varies by {self.relative**0.5:.2%}"
+        return f"the {what} rms between the frames and adds {self.over_noise:.3g} times the noise"
 
 
 def light_of(frames: FrameStatistics) -> Light:
