@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from equipix._check import Array, ArrayLike, Bools, Floats
 from equipix.errors import InputError
-from equipix.measured.noise import BLOCK, MEDIAN_SQUARE, block_medians, of_blocks
+from equipix.measured.noise import BLOCK, MEDIAN_SQUARE, block_medians, nanmedian, of_blocks
 
 _LARGEST_PERIOD = 8
 """Most rows and columns after which a pattern repeats."""
@@ -273,24 +273,17 @@ def responses(colours: Colours, image: Array, corner: tuple[int, int] = (0, 0)) 
     part, (row, col) = _middle(image, _MEASURED, corner)
     shape = row + part.shape[0], col + part.shape[1]
     planes = {label: plane[row:, col:] for label, plane in colours.planes(shape)}
-    size = _size(part.shape)
-    means = np.array(
-        [block_medians(np.where(each, part, np.nan), size) for each in planes.values()]
-    )
+    of_colours = [np.where(plane, part, np.nan) for plane in planes.values()]
+    means = np.array([block_medians(each, _size(part.shape)) for each in of_colours])
     share = np.array([each.mean() for each in planes.values()])[:, None, None]
     known = np.isfinite(means)
     weights = np.where(known, share, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = means * weights.sum(axis=0) / np.sum(weights * np.where(known, means, 0), axis=0)
-    found = {}
-    for label, ratio in zip(planes, ratios, strict=True):
-        finite = ratio[np.isfinite(ratio)]
-        median = float(np.median(finite)) if finite.size else 1.0
-        found[label] = median if median > 0 else 1.0
-    mean = sum(
-        found[label] * float(part) for label, part in zip(planes, share.ravel(), strict=True)
-    )
-    return {label: value / mean for label, value in found.items()}
+    medians = nanmedian(np.where(np.isfinite(ratios), ratios, np.nan), axis=(1, 2))
+    found = np.where(medians > 0, medians, 1.0)
+    mean = sum(found * share.ravel())
+    return dict(zip(planes, (found / mean).tolist(), strict=True))
 
 
 def pattern_of(image: Array, corner: tuple[int, int] = (0, 0)) -> Colours | None:
