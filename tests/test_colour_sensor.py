@@ -12,8 +12,7 @@ import equipix
 from equipix import cross_pattern, errors, metrics, nuc, plan, simulate
 from equipix.io.tiff import write_frames
 from equipix.lens import cos4
-from equipix.measured.colour import Colours
-from equipix.measured.filters import pattern_of
+from equipix.measured.colour import Colours, pattern_of
 
 SHAPE, CROSS, NOISE = (48, 56), cross_pattern(11, 19), 3.0
 X_TRANS = "GBGGRG/RGRBGB/GBGGRG/GRGGBG/BGBRGR/GRGGBG"

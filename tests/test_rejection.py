@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import cli, errors
 from equipix.io.tiff import write_frames
+from equipix.measured import stream
 
 SHAPE, SIGMA = (80, 100), 5.0
 
@@ -134,6 +135,17 @@ def test_masked_and_missing_samples_stay_missing():
     assert (found.count[1, 1], found.count[2, 2]) == (0, 15)
     masked = np.ma.array(frames, mask=np.isnan(frames))
     np.testing.assert_array_equal(equipix.average(masked, reject=5).count, found.count)
+
+
+def test_large_frames_that_come_a_few_at_a_time_give_the_same(monkeypatch):
+    """The first nine are compared with each other, though a batch has room for fewer."""
+    _, frames = clean_frames(20, np.random.default_rng(11), (24, 32))
+    wanted = equipix.average(frames, reject=5)
+    monkeypatch.setattr(stream, "_BATCH_BYTES", 4 * frames[0].nbytes)
+    for source in (iter(frames), iter(np.ma.array(frames))):
+        found = equipix.average(source, reject=5)
+        for name, values in wanted.maps.items():
+            np.testing.assert_array_equal(getattr(found, name), values)
 
 
 def test_an_iterator_and_files_give_the_same(tmp_path):

@@ -10,7 +10,7 @@ from equipix._check import Array, ArrayLike, Bools, Ints, as_array, check_count
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError
 from equipix.findings import determined, usable
-from equipix.measured.filters import BLOCK
+from equipix.measured.noise import BLOCK
 from equipix.metrics.maps import block_means, relative_error, rms
 
 _MOST_BLOCKS = 16

@@ -11,8 +11,7 @@ from equipix._check import Bools, Floats, ReadOnly, as_array, as_mask, check_sha
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import set_bits
-from equipix.measured.colour import Colours
-from equipix.measured.filters import responses
+from equipix.measured.colour import Colours, responses
 from equipix.measured.noise import ROBUST
 from equipix.metrics.maps import block_means
 

@@ -14,7 +14,7 @@ from equipix.correction.protocol import Correction
 from equipix.demo import Demo
 from equipix.errors import EquipixError, InputError
 from equipix.io.paths import write_whole
-from equipix.measured.filters import BLOCK
+from equipix.measured.noise import BLOCK
 from equipix.metrics.maps import block_means, rms
 from equipix.plan.budget import ErrorBudget
 from equipix.scene.sequence import SequenceResult

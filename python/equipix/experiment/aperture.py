@@ -14,7 +14,7 @@ from equipix.exposures.positions import in_beam, variance_in_beam
 from equipix.exposures.spots import ShiftMeasurement, Spot, hot_places, measure_shift, mended
 from equipix.findings import usable
 from equipix.fitting.weighted import Weighted
-from equipix.measured.filters import Filters
+from equipix.measured.colour import Filters
 from equipix.measured.saturation import saturation_level
 from equipix.measured.statistics import FrameStatistics
 

@@ -126,7 +126,7 @@ class Described(Generic[_Manifest]):
         """Mean of every exposure or level; the frames' other statistics are reduced at once."""
         sensor, measurements = self.manifest.sensor, self.manifest.measurements
         averaged = Averaged(
-            len(measurements),
+            count=len(measurements),
             dtype=self._dtype,
             gain=sensor.gain_dn_per_e,
             saturation=sensor.saturation_level,

@@ -27,8 +27,8 @@ from equipix._native import Fit
 from equipix.errors import InputError
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions, nearest_whole
+from equipix.measured.colour import Filters, mean_signal
 from equipix.measured.defects import BadPixels
-from equipix.measured.filters import Filters, mean_signal
 from equipix.measured.measured import Measured
 from equipix.measured.saturation import clipping_advice
 

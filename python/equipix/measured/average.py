@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import operator
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -10,12 +11,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
 from equipix._check import (
+    Array,
+    ArrayLike,
     Progress,
-    as_array,
     as_floats,
     as_level,
     as_mask,
@@ -27,13 +28,7 @@ from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
 from equipix.io.record import read_record
 from equipix.measured.saturation import level_of
-from equipix.measured.statistics import (
-    FrameStatistics,
-    _masked,
-    _step,
-    _subtract,
-    saved_shape,
-)
+from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
 
 
@@ -121,7 +116,7 @@ def average(
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     how = _How(
         as_level(saturation),
-        None if mask is None else as_array("mask", mask, ndim=2),
+        mask,
         None if reject is None else Rejection(reject),
         positive_workers(workers),
         progress,
@@ -131,23 +126,21 @@ def average(
         if isinstance(taken, list):
             statistics = _average_files(taken, how)
         else:
-            statistics = _average_batches(batches(taken), how, _length(frames))
-        if reject is not None:
-            statistics = dataclasses.replace(statistics, reject=float(reject))
-        return _masked(_subtract(statistics, offset), how.mask)
+            statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
+        return _masked(_subtract(statistics, offset), as_mask(mask, statistics.mean.shape))
 
 
 class _How(NamedTuple):
-    """Options of an average, checked but for the shape of the mask."""
+    """Options of an average, checked but for the mask."""
 
     level: float | None
-    mask: NDArray[Any] | None
+    mask: ArrayLike | None
     rejection: Rejection | None
     workers: int | None
     progress: Progress | None
 
 
-def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
+def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
     """Paths as a list, an array as it is, other iterables as an iterator."""
     if isinstance(source, np.ndarray):
         return source if np.ma.is_masked(source) else np.asarray(source)
@@ -165,20 +158,15 @@ def _paths_or_frames(source: Any) -> list[Any] | NDArray[Any] | Iterator[Any]:
     raise InputError("'frames' holds no frames")
 
 
-def _length(source: Any) -> int:
-    return len(source) if hasattr(source, "__len__") else 0
-
-
 def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     paths = find_files(names)
     if any(path.suffix.lower() == ".npz" for path in paths):
         return _saved(paths, how)
     if how.rejection is None:
         with suppress(UnsupportedFileError):
-            if how.mask is not None:
-                as_mask(how.mask, frame_format(paths[0])[0][1:])
-            maps = _native.average_files(paths, how.level, how.mask, how.workers, how.progress)
-            dtype = frame_format(paths[0])[1]
+            shape, dtype = frame_format(paths[0])
+            mask = as_mask(how.mask, shape[1:])
+            maps = _native.average_files(paths, how.level, mask, how.workers, how.progress)
             return _statistics(maps, dtype, level_of(dtype, how.level))
     if any(saved_shape(path) for path in paths):
         return _saved(paths, how)
@@ -204,14 +192,18 @@ def _saved(paths: list[Path], how: _How) -> FrameStatistics:
             f"{path}: was averaged with the saturation level {statistics.saturation:g}, expected "
             f"{level:g}: average the frames again with 'saturation' (--saturation {level:g})"
         )
-    as_mask(how.mask, statistics.mean.shape)
     return statistics if how.mask is None else dataclasses.replace(statistics, light_variance=None)
 
 
 def _statistics(
-    maps: tuple[Any, ...], dtype: np.dtype[Any], level: float | None
+    maps: tuple[Any, ...],
+    dtype: np.dtype[Any],
+    level: float | None,
+    rejection: Rejection | None = None,
 ) -> FrameStatistics:
     mean, variance, count, saturated, light_variance = maps
+    if rejection is not None:
+        variance = variance / rejection.variance_kept
     return FrameStatistics(
         mean,
         variance,
@@ -220,26 +212,25 @@ def _statistics(
         saturated,
         saturation=level,
         raw=dtype.kind in "iu",
+        reject=None if rejection is None else rejection.sigmas,
         step=_step(mean, variance, count),
         light_variance=None if np.isnan(light_variance) else light_variance,
     )
 
 
-def _average_batches(given: Iterator[NDArray[Any]], how: _How, total: int) -> FrameStatistics:
+def _average_batches(given: Iterator[Array], how: _How, total: int) -> FrameStatistics:
     first = next(given)
     dtype, level = sum_dtype(first), level_of(first.dtype, how.level)
-    everything: Iterator[NDArray[Any]] = itertools.chain([first], given)
+    everything: Iterator[Array] = itertools.chain([first], given)
     if how.rejection is not None:
-        dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything)
+        whole = first.dtype.kind in "bui"
+        dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything, whole=whole)
     mask = as_mask(how.mask, first.shape[1:])
     sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, how.workers)
     done = 0
     for batch in everything:
-        sums.add(np.ascontiguousarray(unmasked(batch, dtype), dtype=dtype))
+        sums.add(unmasked(batch, dtype))
         done += len(batch)
         if how.progress is not None:
             how.progress(done, max(done, total), "average")
-    maps = sums.finish()
-    if how.rejection is not None:
-        maps = (maps[0], maps[1] / how.rejection.variance_kept, *maps[2:])
-    return _statistics(maps, first.dtype, level)
+    return _statistics(sums.finish(), first.dtype, level, how.rejection)

@@ -1,18 +1,21 @@
-"""Colours of the filters in front of the pixels."""
+"""Colours of the filters in front of the pixels, and how pixels behind them respond."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from itertools import product
+from string import ascii_uppercase
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from equipix._check import Bools, Floats
+from equipix._check import Array, ArrayLike, Bools, Floats
 from equipix.errors import InputError
+from equipix.measured.noise import BLOCK, MEDIAN_SQUARE, block_medians, nanmedian, of_blocks
 
-LARGEST_PERIOD = 8
+_LARGEST_PERIOD = 8
 """Most rows and columns after which a pattern repeats."""
 
 
@@ -57,10 +60,10 @@ class Colours:
                 f"'cfa' is {cfa!r}, expected four letters such as 'RGGB', or rows of one length: "
                 "'RRGG/RRGG/GGBB/GGBB', or an array of labels"
             )
-        if max(len(rows), len(rows[0])) > LARGEST_PERIOD:
+        if max(len(rows), len(rows[0])) > _LARGEST_PERIOD:
             raise InputError(
                 f"'cfa' has a period of {len(rows)}×{len(rows[0])} pixels, expected at most "
-                f"{LARGEST_PERIOD}×{LARGEST_PERIOD}"
+                f"{_LARGEST_PERIOD}×{_LARGEST_PERIOD}"
             )
         return cls(rows)
 
@@ -108,7 +111,7 @@ class Colours:
         """Return a map (rows, cols) of the value that each pixel's colour has."""
         return np.array([values[label] for label in self.labels])[self.numbers(shape)]
 
-    def means(self, image: NDArray[Any], counted: Bools) -> dict[str, float]:
+    def means(self, image: Array, counted: Bools) -> dict[str, float]:
         """Mean of each colour over its pixels that are counted; NaN of none."""
         return {
             label: float(image[plane & counted].mean()) if (plane & counted).any() else np.nan
@@ -116,13 +119,10 @@ class Colours:
         }
 
 
-def planes_of(colours: Colours | None, shape: tuple[int, ...]) -> Iterator[Bools]:
+def planes_of(colours: Colours | None, shape: tuple[int, ...]) -> list[Bools]:
     """Give a map of the pixels of each colour; one of all pixels where there are no colours."""
-    if colours is None:
-        yield np.ones(shape, bool)
-        return
-    for _, plane in colours.planes(shape):
-        yield plane
+    planes = [] if colours is None else [plane for _, plane in colours.planes(shape)]
+    return planes or [np.ones(shape, bool)]
 
 
 def _rows(cfa: ArrayLike) -> tuple[tuple[str, ...], ...]:
@@ -139,3 +139,259 @@ def _rows(cfa: ArrayLike) -> tuple[tuple[str, ...], ...]:
     if given.ndim == 2 and given.dtype.kind in "Uiu":
         return tuple(tuple(map(str, row)) for row in given.tolist())
     return ()
+
+
+_SAMPLED = 128
+"""Rows and columns in the middle of the sensor in which a pattern is looked for."""
+
+_MEASURED = 512
+"""Rows and columns in the middle of the sensor in which responses are measured."""
+
+_FEWEST = 16
+"""Least number of pixels in each place of the period."""
+
+_LEFT = 2.0
+"""Variance that a pattern of a shorter period may leave, over that which the best one leaves."""
+
+_ROUNDING = 1e-6
+"""Relative scatter of an image without noise."""
+
+_SIGMAS = 6.0
+"""Standard errors that noise does not reach."""
+
+_CONTRADICTS = 0.1
+"""Spread of responses within given colours that two greens of one colour do not have."""
+
+_APART = 0.05
+"""Share of the range of responses that divides two colours."""
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Colours of the pixels and how they respond to the light of a measurement.
+
+    Attributes
+    ----------
+    colours : Colours
+        The pattern.
+    response : dict of str to float
+        Response of each colour; the mean over the pixels is 1.
+    given : bool
+        Whether the caller named the pattern, or the values alone show it.
+    shown : Colours or None
+        The pattern that the values show, where it contradicts the given one.
+    """
+
+    colours: Colours
+    response: dict[str, float]
+    given: bool = True
+    shown: Colours | None = None
+
+    @classmethod
+    def of(
+        cls, colours: Colours | None, image: Array, corner: tuple[int, int] = (0, 0)
+    ) -> Filters | None:
+        """Filters of a sensor by an image (rows, cols) of light without structure of few pixels.
+
+        The image may be a part of the sensor that begins at `corner`. Where no colours are given
+        those that stand out of the image; None where none do.
+        """
+        found = pattern_of(image, corner) if colours is None else colours
+        if found is None:
+            return None
+        response = responses(found, image, corner)
+        if colours is None:
+            return cls(found, response, given=False)
+        part, at = _middle(image, _MEASURED, corner)
+        row, col = (each % period for each, period in zip(at, found.period, strict=True))
+        usual = found.map_of(response, (row + part.shape[0], col + part.shape[1]))
+        rest = cls.of(None, part / usual[row:, col:], at)
+        contradicts = rest is not None and rest.spread > _CONTRADICTS
+        return cls(found, response, shown=pattern_of(image, corner) if contradicts else None)
+
+    @property
+    def words(self) -> str:
+        """Name a pattern that only the values show, or other than the given one; or nothing."""
+        if self.given and self.shown is None:
+            return ""
+        rows, cols = (self.shown or self.colours).period
+        if self.shown is not None:
+            return (
+                f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: the "
+                f"response repeats every {rows} rows and {cols} columns otherwise than "
+                f"'{self.colours}', so colours are mixed: {_advice(self.shown)}"
+            )
+        if min(rows, cols) == 1:
+            axis, period = ("columns", cols) if rows == 1 else ("rows", rows)
+            return (
+                f"the response repeats every {period} {axis} by {self.spread:.0%}, as channels of "
+                "the read-out have it, not colours. No pixel is flagged for it; see whether the "
+                "gains of the channels are adjusted"
+            )
+        return (
+            f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
+            f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
+            f"the colours, and a corrected frame loses its white balance: {_advice(self.colours)}"
+        )
+
+    @property
+    def spread(self) -> float:
+        """Largest over smallest response, less 1."""
+        return max(self.response.values()) / min(self.response.values()) - 1
+
+    def map_of(self, shape: tuple[int, ...]) -> Floats:
+        """Return a map (rows, cols) of the response of each pixel's colour."""
+        return self.colours.map_of(self.response, shape)
+
+
+def _advice(colours: Colours) -> str:
+    named = _bayer(colours)
+    write = " or ".join(f"cfa={each!r}" for each in named or [str(colours)])
+    return f"write {write}{', whichever the data sheet names' if named else ''}"
+
+
+def mean_signal(values: Array, mask: Bools | None = None) -> tuple[Floats, tuple[int, int]]:
+    """Mean over the frames (n, rows, cols) that have a usable value, else NaN, and its corner.
+
+    Of the middle of the sensor, in which responses are measured.
+    """
+    (row, col), (rows, cols) = _place(values.shape[1:], _MEASURED)
+    middle = np.s_[..., row : row + rows, col : col + cols]
+    known = np.isfinite(values[middle])
+    if mask is not None:
+        known &= ~mask[middle]
+    total = np.sum(values[middle], axis=0, dtype=np.float64, where=known)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / known.sum(axis=0)), (row, col)
+
+
+def responses(colours: Colours, image: Array, corner: tuple[int, int] = (0, 0)) -> dict[str, float]:
+    """Response of each colour, of mean 1 over the pixels: ratios within blocks, their median.
+
+    A colour without a pixel to measure, or without light, counts as 1.
+    """
+    part, (row, col) = _middle(image, _MEASURED, corner)
+    shape = row + part.shape[0], col + part.shape[1]
+    planes = {label: plane[row:, col:] for label, plane in colours.planes(shape)}
+    of_colours = [np.where(plane, part, np.nan) for plane in planes.values()]
+    means = np.array([block_medians(each, _size(part.shape)) for each in of_colours])
+    share = np.array([each.mean() for each in planes.values()])[:, None, None]
+    known = np.isfinite(means)
+    weights = np.where(known, share, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = means * weights.sum(axis=0) / np.sum(weights * np.where(known, means, 0), axis=0)
+    medians = nanmedian(np.where(np.isfinite(ratios), ratios, np.nan), axis=(1, 2))
+    found = np.where(medians > 0, medians, 1.0)
+    mean = sum(found * share.ravel())
+    return dict(zip(planes, (found / mean).tolist(), strict=True))
+
+
+def pattern_of(image: Array, corner: tuple[int, int] = (0, 0)) -> Colours | None:
+    """Find a pattern of period 2 to 8 that stands out of an image; None where none does.
+
+    The variance between the places of the period must exceed that of the pixels within a place: a
+    smaller pattern flags nothing. Of periods that explain as much the shortest is taken.
+    """
+    part, corner = _levelled(image, corner)
+    steps = range(1, _LARGEST_PERIOD + 1)
+    periods = [*product(steps, steps)][1:]
+    places = {period: found for period in periods if (found := _Places.of(part, period))}
+    left = {period: 1 / (1 + found.ratio) for period, found in places.items()}
+    least = min(left.values(), default=1.0)
+    if not least < 0.5:
+        return None
+    close = [period for period, rest in left.items() if rest <= _LEFT * least]
+    period = min(close, key=lambda each: each[0] * each[1])
+    turned = [at % step for at, step in zip(corner, period, strict=True)]
+    colours = places[period].labelled(turned)
+    return None if colours.period == (1, 1) else colours
+
+
+def _levelled(image: Array, corner: tuple[int, int]) -> tuple[Floats, tuple[int, int]]:
+    """The middle of an image over medians of blocks, and where it begins on the sensor."""
+    part, corner = _middle(image, _SAMPLED, corner)
+    size = _size(part.shape)
+    usual = of_blocks(block_medians(part, size), part.shape, size)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(usual > 0, part / usual, np.nan), corner
+
+
+def _size(shape: Sequence[int]) -> int:
+    """Side of the blocks of an image."""
+    return min(BLOCK, *shape)
+
+
+def _place(shape: Sequence[int], most: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Corner and size of the middle, of whole blocks and at most so many pixels a side."""
+    size = _size(shape)
+    rows, cols = (min(most, each) // size * size for each in shape)
+    return ((shape[0] - rows) // 2, (shape[1] - cols) // 2), (rows, cols)
+
+
+def _middle(image: Array, most: int, corner: tuple[int, int]) -> tuple[Floats, tuple[int, int]]:
+    """The middle of an image that begins at `corner`, and where the middle begins."""
+    (row, col), (rows, cols) = _place(image.shape, most)
+    part = np.asarray(image[row : row + rows, col : col + cols], np.float64)
+    return np.where(np.isfinite(part), part, np.nan), (corner[0] + row, corner[1] + col)
+
+
+class _Places(NamedTuple):
+    """Medians (rows, cols) of the places of a period, and the scatter about them."""
+
+    medians: Floats
+    scatter: float
+    error: float
+
+    @classmethod
+    def of(cls, image: Floats, period: tuple[int, int]) -> Self | None:
+        """Take them from an image; None where pixels are few."""
+        down, right = period
+        rows, cols = image.shape[0] // down, image.shape[1] // right
+        once = (down > 1 and rows < 2) or (right > 1 and cols < 2)
+        if once or rows * cols < _FEWEST:
+            return None
+        cut = image[: rows * down, : cols * right].reshape(rows, down, cols, right)
+        stack = cut.transpose(1, 3, 0, 2).reshape(down, right, -1)
+        known = np.isfinite(stack)
+        if known.sum(axis=2).min() < _FEWEST:
+            return None
+        medians = np.nanmedian(stack, axis=2)
+        away = np.nanmedian(np.abs(stack - medians[..., None]), axis=2)
+        scatter = float(np.sqrt(np.mean(away**2) / MEDIAN_SQUARE))
+        # The variance of a median of N normal values is π/2 of that of their mean.
+        return cls(medians, scatter, scatter * float(np.pi / 2 / known.sum(axis=2).min()) ** 0.5)
+
+    @property
+    def ratio(self) -> float:
+        """Variance between the places over that within them."""
+        between = max(float(self.medians.var()) - self.error**2, 0.0)
+        return between / max(self.scatter**2, _ROUNDING**2)
+
+    def labelled(self, turned: Sequence[int]) -> Colours:
+        """Give places of about one response one letter, counted from pixel (0, 0)."""
+        once = np.roll(self.medians, turned, (0, 1))
+        values = np.sort(once.ravel())
+        steps = np.diff(values) > max(_APART * (values[-1] - values[0]), _SIGMAS * self.error)
+        numbers = np.searchsorted(values[1:][steps], once, side="right")
+        rows, cols = (_shortest(numbers, axis) for axis in (0, 1))
+        once = numbers[:rows, :cols].tolist()
+        return Colours(tuple(tuple(ascii_uppercase[k] for k in row) for row in once))
+
+
+def _shortest(numbers: Array, axis: int) -> int:
+    """Shortest period of a pattern along an axis, which divides that one given."""
+    size = numbers.shape[axis]
+    steps = (step for step in range(1, size) if size % step == 0)
+    return next((s for s in steps if np.array_equal(np.roll(numbers, s, axis), numbers)), size)
+
+
+def _bayer(colours: Colours) -> list[str]:
+    """Orders of Bayer's pattern that have such a diagonal; none of another pattern."""
+    if colours.period != (2, 2):
+        return []
+    (a, b), (c, d) = colours.pattern
+    if b == c and a == d:
+        return ["RGGB", "BGGR", "GRBG", "GBRG"]
+    if b == c and b not in (a, d):
+        return ["RGGB", "BGGR"]
+    return ["GRBG", "GBRG"] if a == d and a not in (b, c) else []

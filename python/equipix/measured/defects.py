@@ -1,16 +1,21 @@
 """Which pixels must not be used: dead, hot, noisy, blind, unlike their neighbours."""
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from equipix._check import Array, Bools, ReadOnly, number
+from equipix._check import Array, Bools, ReadOnly, number, union
 from equipix.errors import InputError
-from equipix.measured.noise import ROBUST, NoiseModel, nanmedian, scatter_limit
+from equipix.measured.noise import (
+    BLOCK,
+    ROBUST,
+    NoiseModel,
+    block_medians,
+    nanmedian,
+    of_blocks,
+    scatter_limit,
+)
 from equipix.measured.statistics import FrameStatistics, light_of
 
 SIGMAS = 6.0
@@ -27,9 +32,6 @@ _CHANCE = 1e-7
 
 _ROUNDS = 3
 """Rounds in which the share of samples left out is found without the pixels found before."""
-
-_BLOCK = 16
-"""Side of the blocks of pixels whose median is what is usual there."""
 
 _STEP = 1.1
 """Response of a block over that of the one beside it from which a step may lie between them."""
@@ -80,16 +82,12 @@ class BadPixels(ReadOnly):
     @property
     def unreliable(self) -> Bools | None:
         """Pixels whose sensitivity counts neither for its mean nor for its slope."""
-        if self.contradictory is None or self.faint is None:
-            return self.faint if self.contradictory is None else self.contradictory
-        return self.contradictory | self.faint
+        return union(self.contradictory, self.faint)
 
 
 def dead_pixels(
-    signals: NDArray[Any],
-    models: Sequence[NoiseModel] | None,
-    usual: NDArray[Any] | float = 1.0,
-) -> NDArray[Any]:
+    signals: Array, models: Sequence[NoiseModel] | None, usual: Array | float = 1.0
+) -> Array:
     """Find pixels whose response to light is below half of that of their neighbours.
 
     Parameters
@@ -110,12 +108,13 @@ def dead_pixels(
     dead = np.ones(signals.shape[1:], dtype=bool)
     for k, signal in enumerate(signals):
         margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
+        around = of_blocks(block_medians(signal / usual), signal.shape)
         # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
-        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * _block_medians(signal / usual))
+        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * around)
     return dead
 
 
-def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
+def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> Array:
     """Find pixels whose dark level or dark noise is far above that of the others.
 
     Parameters
@@ -134,7 +133,7 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> NDArray[Any]:
     """
     excess = dark.mean - np.nanmedian(dark.mean)
     spread = max(1.0, dark.step, ROBUST * float(np.nanmedian(np.abs(excess))))
-    hot: NDArray[Any] = excess > HOT_SIGMAS * spread
+    hot: Array = excess > HOT_SIGMAS * spread
     frames = int(dark.count.max())
     if noise is not None and frames > 1:
         limit = scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
@@ -147,9 +146,9 @@ def noisy_pixels(
     variances: Array,
     frames: Sequence[int],
     noise: NoiseModel,
+    light: Iterable[Array],
     *,
     times: float = 1.0,
-    light: Iterable[Array] | None = None,
 ) -> Bools:
     """Find pixels that scatter between frames by more than the noise explains.
 
@@ -161,11 +160,11 @@ def noisy_pixels(
         Number of frames of each exposure.
     noise : NoiseModel
         That of one frame of a good pixel.
+    light : iterable of ndarray, shape (rows, cols)
+        What the variances of each exposure have of light that varied between its frames, in DN².
     times : float
         Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
         is beyond chance.
-    light : iterable of ndarray, shape (rows, cols), optional
-        What the variances of each exposure have of light that varied between its frames, in DN².
 
     Returns
     -------
@@ -174,8 +173,7 @@ def noisy_pixels(
     """
     noisy = np.ones(means.shape[1:], dtype=bool)
     seen = np.zeros_like(noisy)
-    common = itertools.repeat(np.zeros(()), len(frames)) if light is None else light
-    for mean, variance, count, shared in zip(means, variances, frames, common, strict=True):
+    for mean, variance, count, shared in zip(means, variances, frames, light, strict=True):
         if count < 2:
             continue
         of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(mean)
@@ -257,8 +255,8 @@ def _with_light(limit: Array | float, light: Array) -> Array:
 
 
 def response_outliers(
-    sensitivity: NDArray[Any], std: Callable[[], NDArray[Any]], *, least: float = DEAD_RESPONSE
-) -> tuple[NDArray[Any], NDArray[Any]]:
+    sensitivity: Array, std: Callable[[], Array], *, least: float = DEAD_RESPONSE
+) -> tuple[Array, Array]:
     """Find pixels whose sensitivity is below half, or above twice, that of their neighbours.
 
     Parameters
@@ -311,9 +309,9 @@ def response_outliers(
         (dead, -1, least, highest, alive),
         (hot, 1, 1 / DEAD_RESPONSE, lowest, lowest),
     ):
-        beyond = sign * (sensitivity - limit * _of_pixels(extreme, sensitivity.shape))
+        beyond = sign * (sensitivity - limit * of_blocks(extreme, sensitivity.shape))
         suspects = np.nonzero(beyond > 0)
-        blocks = suspects[0] // _BLOCK, suspects[1] // _BLOCK
+        blocks = suspects[0] // BLOCK, suspects[1] // BLOCK
         beside = np.clip(_on_its_side(sensitivity, suspects, sign), floor[blocks], highest[blocks])
         around = np.where(stepped[blocks], beside, usual[blocks])
         beyond = sign * (sensitivity[suspects] - limit * around)
@@ -321,12 +319,7 @@ def response_outliers(
     return dead, hot
 
 
-def _block_medians(image: NDArray[Any]) -> NDArray[Any]:
-    """Take for each pixel the median of the 16×16 block that it lies in."""
-    return _of_pixels(_medians(image), image.shape)
-
-
-def _usual(image: NDArray[Any]) -> NDArray[Any]:
+def _usual(image: Array) -> Array:
     """Medians of blocks, but of an odd block the median of the 5×5 blocks around.
 
     A block is odd where its median is below half or above twice that of the blocks around, and most
@@ -334,7 +327,7 @@ def _usual(image: NDArray[Any]) -> NDArray[Any]:
     responds weakly no block is odd. In steep light every block may be so, hence this is for
     responses alone.
     """
-    medians, reach = _medians(image), _AROUND // 2
+    medians, reach = block_medians(image), _AROUND // 2
     padded = np.pad(medians, reach, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_AROUND, _AROUND))
     around = nanmedian(windows, axis=(2, 3))
@@ -344,7 +337,7 @@ def _usual(image: NDArray[Any]) -> NDArray[Any]:
     return np.where(odd, around, medians)
 
 
-def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any], NDArray[Any]]:
+def _range_around(usual: Array, least: float = 0.0) -> tuple[Array, Array]:
     """Lowest and highest response of each block and those beside it.
 
     Blocks below `least` times the highest do not count.
@@ -355,7 +348,7 @@ def _range_around(usual: NDArray[Any], least: float = 0.0) -> tuple[NDArray[Any]
     return np.fmin.reduce(counted, axis=(2, 3)), highest
 
 
-def _on_its_side(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: int) -> NDArray[Any]:
+def _on_its_side(image: Array, pixels: tuple[Array, ...], sign: int) -> Array:
     """Usual response on each pixel's side of a step, to find dead (`sign` -1) or hot pixels."""
     rows, cols = pixels
     # The differences go on beyond the border, so that a step at an angle does not turn back there.
@@ -368,21 +361,9 @@ def _on_its_side(image: NDArray[Any], pixels: tuple[NDArray[Any], ...], sign: in
     return np.asarray(-sign * np.maximum(*ranked))
 
 
-def _are_alike(values: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
+def _are_alike(values: Array, usual: Array) -> Array:
     """Which responses are between half and twice the usual one."""
     return (values >= DEAD_RESPONSE * usual) & (values * DEAD_RESPONSE <= usual)
-
-
-def _medians(image: NDArray[Any]) -> NDArray[Any]:
-    """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
-    rows, cols = image.shape
-    padded = np.pad(image, ((0, -rows % _BLOCK), (0, -cols % _BLOCK)), mode="symmetric")
-    return nanmedian(padded.reshape(padded.shape[0] // _BLOCK, _BLOCK, -1, _BLOCK), axis=(1, 3))
-
-
-def _of_pixels(blocks: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Spread values of blocks over their pixels."""
-    return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[: shape[0], : shape[1]]
 
 
 _WELL_ABOVE = 10.0

@@ -1,8 +1,8 @@
 """Averages of exposures or levels, reduced one by one."""
 
 import copy
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
@@ -12,20 +12,16 @@ from numpy.typing import DTypeLike
 from equipix._check import EXPOSURES, Array, Bools, Floats, Words
 from equipix.errors import InputError
 from equipix.measured import defects
-from equipix.measured.colour import Colours, planes_of
-from equipix.measured.filters import Filters, mean_signal, pattern_of
+from equipix.measured.colour import Colours, Filters, mean_signal, pattern_of, planes_of
 from equipix.measured.noise import NoiseModel, photon_transfer
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
-from equipix.measured.statistics import (
-    NAMED,
-    STRAY,
-    FrameStatistics,
-    Light,
-    light_of,
-    same_statistics,
-)
+from equipix.measured.statistics import STRAY, FrameStatistics, Light, light_of, same_statistics
+
+_NAMED = 0.1
+"""Variance by the light over that of noise, above which it is worth a word."""
 
 
+@dataclass(kw_only=True, eq=False)
 class Averaged:
     """The part of the `FrameStatistics` of each exposure that a calibration needs.
 
@@ -63,37 +59,31 @@ class Averaged:
         Largest step between the values of frames, in DN; 0 if they are not whole.
     light : list of Light
         What the variances of each exposure have of light that varied between its frames.
+    clipped : Clipping or None
+        A saturation level that was not given, if the values show one.
     pedestal : float
         Value from which noise models count the signal, in DN: 0 unless of `counted_from_lowest`.
     """
 
-    def __init__(
-        self,
-        count: int,
-        *,
-        dtype: DTypeLike = np.float64,
-        gain: float | None = None,
-        saturation: float | None = None,
-        saturation_key: str = "saturation",
-        words: Words = EXPOSURES,
-        colours: Colours | None = None,
-    ) -> None:
-        self._words, self.colours = words, colours
-        self._period = (1, 1)
-        self.count, self.gain, self.saturation = count, gain, saturation
-        self._saturation_key = saturation_key
-        self.dark: FrameStatistics | None = None
-        self.pedestal, self._is_counted = 0.0, False
-        self._dtype = np.dtype(dtype)
-        self.frames: list[int] = []
-        self.names: list[str] = []
-        self._of_dark: list[float] = []
-        self._points: list[Array] = []
-        self._clipped: list[Clipping | None] = []
-        self._screened = 0  # samples of a pixel that were compared with the others
-        self.raw = True
-        self.step = 0.0
-        self.light: list[Light] = []
+    count: int
+    dtype: DTypeLike = np.float64
+    gain: float | None = None
+    saturation: float | None = None
+    saturation_key: str = "saturation"
+    words: Words = EXPOSURES
+    colours: Colours | None = None
+    dark: FrameStatistics | None = field(init=False, default=None)
+    frames: list[int] = field(init=False, default_factory=list)
+    names: list[str] = field(init=False, default_factory=list)
+    light: list[Light] = field(init=False, default_factory=list)
+    raw: bool = field(init=False, default=True)
+    step: float = field(init=False, default=0.0)
+    clipped: Clipping | None = field(init=False, default=None)
+    pedestal: float = field(init=False, default=0.0)
+    _is_counted: bool = field(init=False, default=False)
+    _of_dark: list[float] = field(init=False, default_factory=list)
+    _points: list[Array] = field(init=False, default_factory=list)
+    _screened: int = field(init=False, default=0)  # samples of a pixel compared with the others
 
     @classmethod
     def of(
@@ -106,7 +96,7 @@ class Averaged:
         """Reduce the statistics of all exposures."""
         levels = {each.saturation for each in frames}
         saturation = levels.pop() if len(levels) == 1 else None
-        averaged = cls(len(frames), saturation=saturation, words=words, colours=colours)
+        averaged = cls(count=len(frames), saturation=saturation, words=words, colours=colours)
         for each in frames:
             averaged.add(each)
         return averaged
@@ -122,33 +112,33 @@ class Averaged:
         """
         exposure, shape = len(self.frames), frames.mean.shape
         if exposure == 0:
-            if frames.dark is not None:
-                self._refuse_saturated("'dark'", frames.dark)
-            self.values = np.empty((self.count, *shape), self._dtype)
+            self._missing = np.zeros(shape, np.uint32)
+            self.dark = frames.dark
+            if self.dark is not None:
+                self._refuse_saturated("'dark'", self.dark)
+                self._screen(self.dark)
+                self.step = self.dark.step
+            self.values = np.empty((self.count, *shape), self.dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
-            self.dark = frames.dark
             shown = pattern_of(frames.mean) if self.colours is None else self.colours
             self._period = (1, 1) if shown is None else shown.period
-            self.step = 0.0 if frames.dark is None else frames.dark.step
-            if self.dark is not None:
-                self._screen(self.dark)
         if shape != self.saturated.shape:
             raise InputError(
-                f"{self._words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
+                f"{self.words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
                 "expected one"
             )
         if not same_statistics(frames.dark, self.dark):
             raise InputError(
-                f"{self._words.place(exposure)} has another dark than the first: average all with "
+                f"{self.words.place(exposure)} has another dark than the first: average all with "
                 "one 'dark'"
             )
         saturates = frames.saturated > 0
-        which = self._words.place(exposure, name)
+        which = self.words.place(exposure, name)
         _refuse_no_variance(which, frames)
         self._refuse_saturated(which, frames)
         clipped = clipping_of(frames)
-        self._clipped.append(clipped)
+        self.clipped = highest([self.clipped, clipped])
         self.raw &= frames.raw
         self.values[exposure] = np.where(saturates, np.nan, frames.mean)
         self.variances[exposure] = frames.variance
@@ -162,21 +152,13 @@ class Averaged:
         # Clipped samples scatter less: their bins would have most of the weight in the noise model.
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
         self.step = max(self.step, frames.step)
-        light = light_of(frames)
-        self.light.append(light)
-        common = light.variance(frames.mean)
-        self._points.append(
-            photon_transfer(
-                frames.mean, frames.variance, free, count, frames.step, common, self._period
-            )
-        )
+        self.light.append(light_of(frames))
+        self._points.append(_points(frames, frames.mean, free, self.light[-1], self._period))
 
     def _screen(self, frames: FrameStatistics) -> None:
         """Count the samples that were left out as those of cosmic rays."""
         if frames.reject is None:
             return
-        if not self._screened:
-            self._missing = np.zeros(frames.count.shape, np.uint32)
         self._missing += np.where(frames.count > 0, frames.count.max() - frames.count, np.uint32(0))
         self._screened += int(frames.count.max())
 
@@ -189,8 +171,7 @@ class Averaged:
         for known in ("noise", "filters"):
             vars(counted).pop(known, None)
         counted._is_counted = True
-        lowest = counted._lowest
-        counted.pedestal = float(np.nanmin(lowest))
+        counted.pedestal = float(np.nanmin(counted._lowest))
         return counted
 
     @cached_property
@@ -220,16 +201,13 @@ class Averaged:
         points = [each - (self.pedestal, 0, 0) for each in self._points]
         known = any(map(len, points))
         if self.dark is not None:
-            points.append(_dark_points(self.dark))
+            signal, free = np.zeros(self.dark.mean.shape), self.dark.saturated == 0
+            points.append(_points(self.dark, signal, free, light_of(self.dark)))
             known |= self.gain is not None and len(points[-1]) > 0
         every = np.concatenate(points)
         if not known or (self.step == 0 and not every[:, 1].any()):
             return None
         return NoiseModel.fit(every, gain=self.gain, step=self.step)
-
-    def rounded(self, noise: NoiseModel) -> NoiseModel:
-        """Noise model of one frame that counts the rounding of these frames."""
-        return noise if noise.step > 0 else dataclasses.replace(noise, step=self.step)
 
     def raw_values(self, exposure: int) -> Array:
         """Mean of an exposure before the dark was subtracted."""
@@ -242,23 +220,18 @@ class Averaged:
         if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
             return f"'dark': {stray.words} (limit {STRAY:g}). See that all its frames are dark"
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
-        if not self.light[worst].is_large:
+        if not self.light[worst].over_noise > _NAMED:
             return ""
-        which = self._words.place(worst, self.names[worst])
+        which = self.words.place(worst, self.names[worst])
         return (
-            f"{which}: {self.light[worst].words} (limit {NAMED:g}). It was "
-            f"taken out of the noise model. See that all frames are of one {self._words.one}, let "
+            f"{which}: {self.light[worst].words} (limit {_NAMED:g}). It was "
+            f"taken out of the noise model. See that all frames are of one {self.words.one}, let "
             "the source settle, or average more frames"
         )
 
-    @property
-    def clipped(self) -> Clipping | None:
-        """A saturation level that was not given, if the values show one."""
-        return highest(self._clipped)
-
-    def models(self, noise: NoiseModel) -> tuple[NoiseModel, ...]:
-        """Noise model of each mean frame without that of the dark, from that of one frame."""
-        return tuple(noise.of_mean(frames) for frames in self.frames)
+    def models(self, noise: NoiseModel, dark_variance: float = 0.0) -> tuple[NoiseModel, ...]:
+        """Noise model of each mean frame less a dark of that variance, from that of one frame."""
+        return tuple(noise.of_mean(each, dark_variance=dark_variance) for each in self.frames)
 
     def dark_variance(self, noise: NoiseModel) -> Floats | None:
         """Variance of the dark that was subtracted from all, from the noise of one frame.
@@ -280,11 +253,8 @@ class Averaged:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
-            pairs = zip(self.light, self.values, strict=True)
-            light = (of_light.variance(values) for of_light, values in pairs)
-            noisy = defects.noisy_pixels(
-                self._signals, self.variances, self.frames, noise, light=light
-            )
+            light = map(Light.variance, self.light, self.values)
+            noisy = defects.noisy_pixels(self._signals, self.variances, self.frames, noise, light)
             if self._screened:
                 noisy |= defects.often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
@@ -297,11 +267,14 @@ class Averaged:
 
     def _refuse_saturated(self, which: str, frames: FrameStatistics) -> None:
         saturates = frames.saturated > 0
-        refuse_saturated(which, frames.mean, saturates, self.saturation, self._saturation_key)
+        refuse_saturated(which, frames.mean, saturates, self.saturation, self.saturation_key)
 
     def _dead(self, noise: NoiseModel | None) -> Bools:
         """Pixels that are dead in every exposure in which they do not saturate."""
-        models = None if noise is None else self._models_with_dark(noise)
+        models = None
+        if noise is not None:
+            of_dark = self.dark_variance(noise)
+            models = self.models(noise, 0.0 if of_dark is None else float(np.median(of_dark)))
         measured = np.isfinite(self.values).any(axis=0)
         usual = 1.0 if self.filters is None else self.filters.map_of(self.saturated.shape)
         dead: Bools = defects.dead_pixels(self._signals, models, usual)
@@ -313,12 +286,6 @@ class Averaged:
     def _signals(self) -> Array:
         """Values above the level without light, as far as it is known."""
         return self.values - self._lowest if self._is_counted else self.values
-
-    def _models_with_dark(self, noise: NoiseModel) -> list[NoiseModel]:
-        """Noise model of each mean frame less the dark, for one exposure by itself."""
-        of_dark = self.dark_variance(noise)
-        variance = 0.0 if of_dark is None else float(np.median(of_dark))
-        return [noise.of_mean(frames, dark_variance=variance) for frames in self.frames]
 
 
 def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:
@@ -348,10 +315,13 @@ def _between_neighbours(frame: Array) -> float:
     return float(np.nanpercentile(steps, 68.27) ** 2 / 2)
 
 
-def _dark_points(dark: FrameStatistics) -> Array:
-    """Points of the photon-transfer curve at signal 0."""
-    usable: Bools = np.asarray(dark.saturated == 0)
-    frames = int(dark.count.max())
-    common = light_of(dark).variance(dark.mean)
-    signal = np.zeros(dark.mean.shape)
-    return photon_transfer(signal, dark.variance, usable, frames, dark.step, common)
+def _points(
+    frames: FrameStatistics,
+    signal: Array,
+    free: Bools,
+    light: Light,
+    period: tuple[int, int] = (1, 1),
+) -> Array:
+    """Points of the photon-transfer curve of the pixels that are `free` of saturation."""
+    common, count = light.variance(frames.mean), int(frames.count.max())
+    return photon_transfer(signal, frames.variance, free, count, frames.step, common, period)

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from typing import Any, Self, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import (
     EXPOSURES,
     Array,
+    ArrayLike,
     Bools,
     Floats,
+    Ints,
     ReadOnly,
     Words,
     as_array,
@@ -125,7 +126,7 @@ class Measured(ReadOnly):
         """Return the exposures without some measurements, besides those masked before."""
         return dataclasses.replace(self, mask=union(mask, self.mask))
 
-    def chosen(self, exposures: NDArray[np.int64]) -> Self:
+    def chosen(self, exposures: Ints) -> Self:
         """Return some of the exposures."""
         variance, mask = self.variance, self.mask
         return dataclasses.replace(
@@ -174,14 +175,13 @@ def averaged_of(frames: object, words: Words, colours: Colours | None) -> Averag
 
 
 def _of_averaged(
-    averaged: Averaged,
-    variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None,
-    words: Words,
+    averaged: Averaged, variance: ArrayLike | NoiseModel | Sequence[NoiseModel] | None, words: Words
 ) -> Measured:
     """Averaged frames: their noise model, or the variances that the caller gives."""
     model = averaged.noise if variance is None else variance
     if isinstance(model, NoiseModel):
-        model = averaged.rounded(model)
+        if model.step == 0:
+            model = dataclasses.replace(model, step=averaged.step)
         noise, variances = averaged.models(model), None
     else:
         noise, variances = _noise_of(variance, averaged.values, words)

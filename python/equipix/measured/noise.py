@@ -26,12 +26,11 @@ import math
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from equipix._check import Array, Floats, number
+from equipix._check import Array, ArrayLike, Floats, number, positive
 from equipix.errors import InputError
 
 MEDIAN_SQUARE = 0.4549
@@ -111,33 +110,31 @@ class NoiseModel:
     def __post_init__(self) -> None:
         """Refuse parameters that give no variance."""
         for name in ("read_noise", "gain", "step", "dark_variance"):
-            value = getattr(self, name)
-            if not 0 <= number(name, value) < np.inf:
-                raise InputError(f"'{name}' is {value!r}, expected a number not below 0")
+            positive(name, getattr(self, name), zero=True)
         if not number("frames", self.frames) >= 1:
             raise InputError(f"'frames' is {self.frames!r}, expected 1 or more")
         if self.read_noise == self.gain == 0:
             raise InputError("'read_noise' and 'gain' are both 0, expected some noise")
 
-    def variance(self, signal: ArrayLike) -> NDArray[Any]:
+    def variance(self, signal: ArrayLike) -> Array:
         """Variance of the value, in DN², at the mean `signal`, in DN."""
         variance = self.scatter(signal)
         variance /= self.frames  # in place: images are large
         variance += self.rounding(signal) + self.dark_variance
         return variance
 
-    def scatter(self, signal: ArrayLike) -> NDArray[Any]:
+    def scatter(self, signal: ArrayLike) -> Array:
         """Mean variance s² between frames, in DN²."""
         found = np.asarray(self._of_frame(signal))
         return found if self.step == 0 else np.asarray(found - self.rounding(signal))
 
-    def rounding(self, signal: ArrayLike) -> NDArray[Any]:
+    def rounding(self, signal: ArrayLike) -> Array:
         """Variance B of the rounding that frames do not average out, in DN²."""
         if self.step == 0:
             return np.zeros(())
         return self.step**2 * unaveraged(self._in_steps(signal))
 
-    def rounding_apart(self, signal: float, means: NDArray[Any]) -> float:
+    def rounding_apart(self, signal: float, means: Array) -> float:
         """Part of the rounding B that differs between pixels of one signal, with these means.
 
         Where the means are less than a step apart pixels have a part of it in common.
@@ -154,7 +151,7 @@ class NoiseModel:
         v = float(self._in_steps(signal))
         return self.step**2 * unaveraged_apart(v, between, of_noise)
 
-    def largest_scatter(self, signal: ArrayLike) -> NDArray[Any]:
+    def largest_scatter(self, signal: ArrayLike) -> Array:
         """Variance between frames of a pixel half-way between two steps, in DN²."""
         if self.step == 0:
             return self._of_frame(signal)
@@ -165,16 +162,16 @@ class NoiseModel:
         added = self.dark_variance / frames + dark_variance
         return dataclasses.replace(self, frames=frames * self.frames, dark_variance=added)
 
-    def _of_frame(self, signal: ArrayLike) -> NDArray[Any]:
+    def _of_frame(self, signal: ArrayLike) -> Array:
         """Variance of one frame."""
         return self.read_noise**2 + self.gain * np.maximum(signal, 0)
 
-    def _in_steps(self, signal: ArrayLike) -> NDArray[Any]:
+    def _in_steps(self, signal: ArrayLike) -> Array:
         """Variance of one frame before it is rounded, in squared steps."""
         return np.maximum(self._of_frame(signal) / self.step**2 - UNIFORM, 0)
 
     @classmethod
-    def fit(cls, points: NDArray[Any], *, gain: float | None = None, step: float = 0.0) -> Self:
+    def fit(cls, points: Array, *, gain: float | None = None, step: float = 0.0) -> Self:
         """Model that fits the photon-transfer curve best.
 
         Parameters
@@ -218,19 +215,15 @@ class NoiseModel:
         found = _bounded_line(signal, variance, degrees, least, gain)
         for _ in range(_ROUNDS):
             model = cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
-            former, found = (
-                found,
-                _bounded_line(
-                    signal, *model._linearised(signal, variance, degrees, lowest), least, gain
-                ),
-            )
+            former, linear = found, model._linearised(signal, variance, degrees, lowest)
+            found = _bounded_line(signal, *linear, least, gain)
             if np.allclose(found, former, rtol=_STEADY, atol=0):
                 break
         return cls(read_noise=float(np.sqrt(found[0])), gain=found[1], step=step)
 
     def _linearised(
-        self, signal: NDArray[Any], variance: NDArray[Any], degrees: NDArray[Any], lowest: float
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        self, signal: Array, variance: Array, degrees: Array, lowest: float
+    ) -> tuple[Array, Array]:
         """Variances of one frame that the scatter found stands for, near the model, and weights."""
         expected, slope = self.scatter(signal), np.ones(())
         phase = self.largest_scatter(signal) - expected
@@ -241,11 +234,7 @@ class NoiseModel:
 
 
 def _bounded_line(
-    signal: NDArray[Any],
-    variance: NDArray[Any],
-    weight: NDArray[Any],
-    least: float,
-    gain: float | None,
+    signal: Array, variance: Array, weight: Array, least: float, gain: float | None
 ) -> tuple[float, float]:
     """Intercept, at least `least`, and slope, at least 0 unless given, of a weighted fit."""
     given = gain
@@ -264,14 +253,14 @@ def _bounded_line(
 
 
 def photon_transfer(
-    signal: NDArray[Any],
-    variance: NDArray[Any],
-    usable: NDArray[Any],
+    signal: Array,
+    variance: Array,
+    usable: Array,
     frames: int,
     step: float = 0.0,
-    common: NDArray[Any] | None = None,
+    common: Array | None = None,
     period: tuple[int, int] = (1, 1),
-) -> NDArray[Any]:
+) -> Array:
     """Give the points of the photon-transfer curve that one exposure contributes.
 
     The usable pixels, in the order of the mean signal of their neighbours, are cut into bins of
@@ -324,23 +313,21 @@ def photon_transfer(
     return _without_light(np.array(points).reshape(-1, 4))
 
 
-def _without_light(points: NDArray[Any]) -> NDArray[Any]:
+def _without_light(points: Array) -> Array:
     """Points of signal, variance and degrees of freedom, of those with the part of the light."""
     signal, variance, light, degrees = points.T
     left = max(_FLOOR, 1 - light.sum() / variance.sum()) if light.any() else 1.0
     return np.stack([signal, variance - light, left**2 * degrees], axis=1)
 
 
-def _of_neighbours(
-    image: NDArray[Any], usable: NDArray[Any], period: tuple[int, int]
-) -> NDArray[Any]:
+def _of_neighbours(image: Array, usable: Array, period: tuple[int, int]) -> Array:
     """Mean of the usable ones of the eight neighbours of each pixel; NaN where there is none."""
     sums = _around(np.where(usable, image, 0.0), period)
     with np.errstate(invalid="ignore"):
         return np.asarray(sums / _around(usable.astype(np.float64), period))
 
 
-def _around(image: NDArray[Any], period: tuple[int, int]) -> NDArray[Any]:
+def _around(image: Array, period: tuple[int, int]) -> Array:
     """Sum over the eight neighbours of each pixel, a period away."""
     down, right = period
     padded = np.pad(image, ((down, down), (right, right)))
@@ -349,8 +336,8 @@ def _around(image: NDArray[Any], period: tuple[int, int]) -> NDArray[Any]:
 
 
 def modelled_variances(
-    models: Sequence[NoiseModel], expected: Iterable[NDArray[Any]], like: NDArray[Any]
-) -> NDArray[Any]:
+    models: Sequence[NoiseModel], expected: Iterable[Array], like: Array
+) -> Array:
     """Variance of every value of `like`, shape (n, rows, cols), where its model expects `expected`.
 
     Where no signal is expected the least variance is a millionth of the largest, so that a model
@@ -375,12 +362,12 @@ def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:
     return float((1 - width + sigmas * np.sqrt(width)) ** 3)
 
 
-def inliers(values: NDArray[Any], limit: float, *, least: float = 0.0) -> NDArray[Any]:
+def inliers(values: Array, limit: float, *, least: float = 0.0) -> Array:
     """Which values are at most `limit` times the mean of those that are; found in a few rounds.
 
     They are compared with `least` where the mean is below it.
     """
-    keep: NDArray[Any] = np.isfinite(values)
+    keep: Array = np.isfinite(values)
     for _ in range(5):
         if keep.any():
             keep &= values <= limit * max(least, values[keep].mean())
@@ -396,8 +383,8 @@ _SMALL = 0.02
 _FINE = 1.0
 """Variance in squared steps above which rounding averages out: B is below 1e-18 there."""
 
-_TERMS = 7
-"""Terms of a series: at `_SMALL` the eighth is below 1e-11."""
+_TERMS = range(1, 8)
+"""Numbers of the terms of a series: at `_SMALL` the eighth is below 1e-11."""
 
 _GRID = 1001
 """Spreads between 0 and one step that are compared."""
@@ -409,7 +396,7 @@ _FEWEST_VALUES = 8
 """Different values that must all be multiples of a step before it is one."""
 
 
-def unaveraged(v: ArrayLike) -> NDArray[Any]:
+def unaveraged(v: ArrayLike) -> Array:
     """Variance B of the rounding that a mean keeps, at noise of variance `v`, both in q².
 
     Notes
@@ -421,26 +408,26 @@ def unaveraged(v: ArrayLike) -> NDArray[Any]:
     if v.size and v.min() > _FINE:
         return np.zeros(v.shape)
     few = np.maximum(v, _SMALL)
-    total = sum(np.exp(-4 * np.pi**2 * k**2 * few) / (2 * np.pi**2 * k**2) for k in _terms())
+    total = sum(np.exp(-4 * np.pi**2 * k**2 * few) / (2 * np.pi**2 * k**2) for k in _TERMS)
     return np.asarray(np.where(v < _SMALL, UNIFORM + v - np.sqrt(v / np.pi), total))
 
 
-def scatter(v: ArrayLike) -> NDArray[Any]:
+def scatter(v: ArrayLike) -> Array:
     """Mean variance s² between frames at noise of variance `v`, both in q²."""
     v = np.asarray(v, np.float64)
     return np.asarray(v + UNIFORM - unaveraged(v))
 
 
-def scatter_slope(v: ArrayLike) -> NDArray[Any]:
+def scatter_slope(v: ArrayLike) -> Array:
     """Derivative of `scatter`; infinite at 0."""
     v = np.asarray(v, np.float64)
     few = np.maximum(v, _SMALL)
-    total = 1 + 2 * sum(np.exp(-4 * np.pi**2 * k**2 * few) for k in _terms())
+    total = 1 + 2 * sum(np.exp(-4 * np.pi**2 * k**2 * few) for k in _TERMS)
     with np.errstate(divide="ignore"):
         return np.asarray(np.where(v < _SMALL, 0.5 / np.sqrt(np.pi * v), total))
 
 
-def largest_scatter(v: ArrayLike) -> NDArray[Any]:
+def largest_scatter(v: ArrayLike) -> Array:
     """Variance between frames of a pixel half-way between two steps, where it is largest, in q².
 
     Notes
@@ -453,7 +440,7 @@ def largest_scatter(v: ArrayLike) -> NDArray[Any]:
         return np.asarray(v + UNIFORM)
     few = np.maximum(v, _SMALL)
     waves = sum(
-        np.exp(-2 * np.pi**2 * k**2 * few) * (1 / (np.pi * k) ** 2 + 4 * few) for k in _terms()
+        np.exp(-2 * np.pi**2 * k**2 * few) * (1 / (np.pi * k) ** 2 + 4 * few) for k in _TERMS
     )
     return np.asarray(np.where(v < _SMALL, 0.25, few + UNIFORM + waves))
 
@@ -487,7 +474,7 @@ def unaveraged_apart(v: float, between: float, of_noise: float) -> float:
     return max(_LEAST_APART * whole, float(np.interp(between - of_noise, w + left, left)))
 
 
-def step_of(values: NDArray[Any]) -> float:
+def step_of(values: Array) -> float:
     """Step of which all values are multiples: 0 of values that are not whole, else 1 or more.
 
     Parameters
@@ -513,10 +500,6 @@ def step_of(values: NDArray[Any]) -> float:
     return float(np.gcd.reduce(different.astype(np.int64)))
 
 
-def _terms() -> range:
-    return range(1, _TERMS + 1)
-
-
 def chi2_tail(value: float, freedom: int) -> float:
     """Probability that χ² of so many degrees of freedom is above a value.
 
@@ -538,14 +521,30 @@ ROBUST = 1.4826
 """Standard deviation over median absolute deviation, for normal noise."""
 
 
-def nanmedian(values: NDArray[Any], axis: int | tuple[int, ...]) -> NDArray[Any]:
+def nanmedian(values: Array, axis: int | tuple[int, ...]) -> Array:
     """Median of the values that are numbers; NaN where there is none."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN", RuntimeWarning)
         return np.asarray(np.nanmedian(values, axis=axis))
 
 
-def nanmedian_abs(residuals: NDArray[np.floating]) -> Floats:
+BLOCK = 16
+"""Side of the blocks of pixels whose median or mean is what is usual there."""
+
+
+def block_medians(image: Array, size: int = BLOCK) -> Array:
+    """Medians of blocks; those at the far edges are filled up by mirrored pixels."""
+    rows, cols = image.shape
+    padded = np.pad(image, ((0, -rows % size), (0, -cols % size)), mode="symmetric")
+    return nanmedian(padded.reshape(padded.shape[0] // size, size, -1, size), axis=(1, 3))
+
+
+def of_blocks(values: Array, shape: tuple[int, ...], size: int = BLOCK) -> Array:
+    """Give each pixel of a sensor of that shape the value of its block."""
+    return values.repeat(size, axis=0).repeat(size, axis=1)[: shape[0], : shape[1]]
+
+
+def nanmedian_abs(residuals: Array) -> Floats:
     """Median absolute residual of each exposure, the first axis; 0 without any."""
     found = []
     for each in residuals:

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, check_maps
 from equipix.errors import InputError
@@ -29,8 +28,6 @@ from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.measured.noise import scatter_limit, step_of
 
 _MAPS = ("mean", "variance", "variance_of_mean", "count", "saturated")
-
-_COUNTS = ("count", "saturated")
 
 _SAMPLED = 4096  # pixels that show the step between values
 
@@ -96,7 +93,7 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
         check_maps("FrameStatistics", self.maps | dark)
 
     @property
-    def maps(self) -> dict[str, NDArray[Any]]:
+    def maps(self) -> dict[str, Array]:
         """The five maps by their names."""
         return {name: getattr(self, name) for name in _MAPS}
 
@@ -111,7 +108,7 @@ def saved_shape(path: Path) -> tuple[int, int] | None:
     return rows, cols
 
 
-def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> float:
+def _step(mean: Array, variance: Array, count: Array) -> float:
     """Step between the values of frames, of a sample of the pixels.
 
     Sums over frames are multiples of it. Those of a pixel whose frames are equal are multiples of
@@ -122,19 +119,18 @@ def _step(mean: NDArray[Any], variance: NDArray[Any], count: NDArray[Any]) -> fl
     return step_of(means * np.where(variances > 0, counts, 1))
 
 
-def _masked(statistics: FrameStatistics, mask: NDArray[Any] | None) -> FrameStatistics:
+def _masked(statistics: FrameStatistics, mask: Array | None) -> FrameStatistics:
     """Return averages without the pixels of a mask."""
     if mask is None:
         return statistics
-    maps: dict[str, Any] = {name: values.copy() for name, values in statistics.maps.items()}
-    for name, values in maps.items():
-        values[mask] = 0 if name in _COUNTS else np.nan
-    return dataclasses.replace(statistics, **maps)
+    kept: Any = {
+        name: np.where(mask, values.dtype.type(0 if values.dtype.kind == "u" else np.nan), values)
+        for name, values in statistics.maps.items()
+    }
+    return dataclasses.replace(statistics, **kept)
 
 
-def _subtract(
-    statistics: FrameStatistics, dark: FrameStatistics | NDArray[Any] | None
-) -> FrameStatistics:
+def _subtract(statistics: FrameStatistics, dark: FrameStatistics | Array | None) -> FrameStatistics:
     if dark is None:
         return statistics
     if statistics.dark is not None:
@@ -212,10 +208,6 @@ def same_statistics(one: FrameStatistics | None, other: FrameStatistics | None) 
 _LARGEST = 0.5
 """Relative variation up to which frames are those of one light; above, offsets vary."""
 
-NAMED = 0.1
-"""Variance by the light over that of noise, above which it is worth a word."""
-
-
 STRAY = 10.0
 """Variance in common over that of noise, which only frames of different things have."""
 
@@ -235,21 +227,12 @@ class Light(NamedTuple):
         return np.asarray(self.relative * np.square(signal, dtype=np.float64) + self.offset)
 
     @property
-    def is_large(self) -> bool:
-        """Whether noise would be larger by a tenth or more with it."""
-        return self.over_noise > NAMED
-
-    @property
     def words(self) -> str:
         """What varies, by how much, and over the noise."""
-        what = (
-            f"light varies by {self.relative**0.5:.2%}"
-            if self.relative
-            else (f"offset varies by {self.offset**0.5:.3g} DN")
-        )
-        return (
-            f"the {what} rms between the frames, which adds {self.over_noise:.3g} times the noise"
-        )
+        what = f"offset varies by {self.offset**0.5:.3g} DN"
+        if self.relative:
+            what = f"light varies by {self.relative**0.5:.2%}"
+        return f"the {what} rms between the frames and adds {self.over_noise:.3g} times the noise"
 
 
 def light_of(frames: FrameStatistics) -> Light:

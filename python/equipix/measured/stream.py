@@ -6,7 +6,6 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from equipix._check import Array, Floats, as_array, number
 from equipix.errors import InputError
@@ -19,7 +18,7 @@ _BATCH_BYTES = 2**26
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
-def batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
+def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
     """Give the frames a few at a time: views of an array, copies of what an iterator gives."""
     if isinstance(frames, np.ndarray):
         if frames.ndim != 3 or 0 in frames.shape:
@@ -35,15 +34,9 @@ def batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
     filled = 0
     for index, item in enumerate(itertools.chain([first], frames)):
         frame = _frame(index, item)
-        if type(frame) is not type(first):
+        if _kind(frame) != _kind(first):
             raise InputError(
-                f"'source[{index}]' is a {type(frame).__name__}, expected a {type(first).__name__}"
-                " like the first: give all frames as masked arrays, or none"
-            )
-        if frame.shape != first.shape or frame.dtype != first.dtype:
-            raise InputError(
-                f"'source[{index}]' is {frame.dtype} of shape {frame.shape}, expected"
-                f" {first.dtype} of shape {first.shape} like the first"
+                f"'source[{index}]' is {_kind(frame)}, expected {_kind(first)} like the first"
             )
         batch[filled] = frame
         filled += 1
@@ -54,18 +47,23 @@ def batches(frames: NDArray[Any] | Iterator[Any]) -> Iterator[NDArray[Any]]:
         yield batch[:filled]
 
 
-def _frame(index: int, item: Any) -> NDArray[Any]:
+def _frame(index: int, item: Any) -> Array:
     """Check one frame of an iterable; a masked array stays one."""
     name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
     frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
     return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
 
 
-def _batch_size(frame: NDArray[Any]) -> int:
+def _kind(frame: Array) -> str:
+    masked = "masked " if isinstance(frame, np.ma.MaskedArray) else ""
+    return f"{masked}{frame.dtype} of shape {frame.shape}"
+
+
+def _batch_size(frame: Array) -> int:
     return max(1, min(_BATCH, _BATCH_BYTES // max(1, frame.nbytes)))
 
 
-def sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
+def sum_dtype(frames: Array) -> np.dtype[Any]:
     """Choose the dtype that frames are summed in: their own, or float64.
 
     Masked samples are summed as NaN, which does not count, so whole numbers need float64.
@@ -77,11 +75,9 @@ def sum_dtype(frames: NDArray[Any]) -> np.dtype[Any]:
     return np.dtype(dtype.name if dtype.name in _SUMMABLE and not masked else "float64")
 
 
-def unmasked(batch: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return a batch with NaN in the place of masked samples."""
-    if not isinstance(batch, np.ma.MaskedArray):
-        return batch
-    return np.where(np.ma.getmaskarray(batch), dtype.type(np.nan), np.ma.getdata(batch))
+def unmasked(frames: Array, dtype: np.dtype[Any]) -> Array:
+    """Return frames in the dtype of their sums, with NaN in the place of masked samples."""
+    return np.ascontiguousarray(np.ma.filled(frames.astype(dtype, copy=False), np.nan))
 
 
 _START = 9
@@ -153,20 +149,22 @@ class Rejection:
     """
 
     def __init__(self, sigmas: float) -> None:
-        self._sigmas = number("reject", sigmas)
-        if not 3 <= self._sigmas < np.inf:
+        self.sigmas = number("reject", sigmas)
+        if not 3 <= self.sigmas < np.inf:
             raise InputError(f"'reject' is {sigmas!r}, expected a number of sigmas from 3 on")
         normal = NormalDist()
-        inside = 2 * normal.cdf(self._sigmas) - 1
-        self.variance_kept = 1 - 2 * self._sigmas * normal.pdf(self._sigmas) / inside
+        inside = 2 * normal.cdf(self.sigmas) - 1
+        self.variance_kept = 1 - 2 * self.sigmas * normal.pdf(self.sigmas) / inside
 
-    def cleaned(self, batches: Iterable[Array]) -> Iterator[Floats]:
+    def cleaned(self, batches: Iterable[Array], *, whole: bool) -> Iterator[Floats]:
         """Give batches of frames as float64 with NaN in the place of samples left out.
 
         Parameters
         ----------
         batches : iterable of ndarray, shape (n, rows, cols)
             Frames of one steady scene.
+        whole : bool
+            Whether they hold whole numbers, whose noise is that of rounding at least.
 
         Yields
         ------
@@ -178,14 +176,14 @@ class Rejection:
         InputError
             If there are fewer than nine frames, or more than a tenth of one would be left out.
         """
-        frames = (frame for batch in batches for frame in batch)
+        # A frame is copied when it is drawn: the next one may take its place in the batch.
+        frames = (np.ma.filled(each.astype(float), np.nan) for batch in batches for each in batch)
         first = list(itertools.islice(frames, _START))
         if len(first) < _START:
             raise InputError(
                 f"'frames' holds {len(first)}, expected {_START} or more to reject samples"
             )
-        whole = first[0].dtype.kind in "bui"
-        start = np.stack([_floats(frame) for frame in first])
+        start = np.stack(first)
         centre, common, own = self._estimates(start, _ROUNDING if whole else 0.0)
         limit = _limit(common, own, len(start))
         for index, frame in enumerate(start):
@@ -194,8 +192,7 @@ class Rejection:
         with np.errstate(invalid="ignore"):
             mean = np.where(np.isfinite(start), start, 0).sum(axis=0) / count
         yield start
-        for index, raw in enumerate(frames, start=len(first)):
-            frame = _floats(raw)
+        for index, frame in enumerate(frames, start=len(first)):
             with np.errstate(divide="ignore"):
                 of_mean = np.sqrt(1 + 1 / count)
             size = self._clean(frame, mean, _limit(common, own, index) * of_mean, index) / of_mean
@@ -214,11 +211,11 @@ class Rejection:
         if not known.any():
             return np.asarray(deviation)
         size: Floats = np.abs(deviation - np.median(deviation[known]))
-        outside = size > self._sigmas * sigma
+        outside = size > self.sigmas * sigma
         share = np.count_nonzero(outside) / np.count_nonzero(known)
         if share > _MOST:
             raise InputError(
-                f"'frames': {share:.0%} of frame {index} deviate by more than {self._sigmas:g} "
+                f"'frames': {share:.0%} of frame {index} deviate by more than {self.sigmas:g} "
                 f"standard deviations from those before, expected at most {_MOST:.0%}: is it "
                 "another scene? Leave out 'reject', or the frame"
             )
@@ -244,7 +241,7 @@ class Rejection:
     def _noise(self, samples: Floats, sigma: float) -> float:
         """Noise that pixels have in common, without the samples beyond the limit."""
         for _ in range(_ROUNDS):
-            inside = np.abs(samples) <= self._sigmas * sigma
+            inside = np.abs(samples) <= self.sigmas * sigma
             count = inside.sum(axis=0)
             values = np.where(inside, samples, 0)
             squares = np.sum(values**2, axis=0) - values.sum(axis=0) ** 2 / np.maximum(count, 1)
@@ -258,9 +255,3 @@ class Rejection:
 def _limit(common: Floats, own: Floats, samples: int) -> Floats:
     """Noise that samples are compared with, once so many have been seen."""
     return np.where(own > (1 + _OWN * _SCATTER / np.sqrt(samples)) * common, own, common)
-
-
-def _floats(frame: Array) -> Floats:
-    """Return a frame as new float64 numbers, masked samples as NaN."""
-    values: Any = unmasked(frame.astype(np.float64), np.dtype(np.float64))
-    return np.array(values, dtype=np.float64)

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, as_array, as_mask, naming_memory, number
+from equipix._check import ArrayLike, Bools, Floats, as_array, as_mask, naming_memory, number
 from equipix.errors import InputError
 from equipix.findings import ask, say
 from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of
@@ -161,10 +160,8 @@ def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
     >>> metrics.validity_interval([0, 10, 20], [0.2, 0.8, 1.2])
     15.0
     """
-    when, values = (
-        as_array(name, each, ndim=1).astype(np.float64)
-        for name, each in (("times", times), ("ratios", ratios))
-    )
+    when = as_array("times", times, ndim=1).astype(np.float64)
+    values = as_array("ratios", ratios, ndim=1).astype(np.float64)
     if when.shape != values.shape or not len(when):
         raise InputError(f"'ratios' has {len(values)} values, expected {len(when)}, one a time")
     if not (np.isfinite(when).all() and np.isfinite(values).all() and (np.diff(when) > 0).all()):

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, as_array, check_type, naming_memory, number
+from equipix._check import ArrayLike, Bools, Floats, as_array, check_type, naming_memory, number
 from equipix.errors import InputError
 from equipix.findings import Finding, say
 from equipix.measured.statistics import FrameStatistics
@@ -123,21 +122,20 @@ def emva_spatial(
             f"'frames' are of {on.mean.shape}, 'dark' of {off.mean.shape}: expected one "
             "shape of two or more rows and columns"
         )
-    signal = float(on.mean.mean() - off.mean.mean())
+    dark_mean, bright_mean = float(off.mean.mean()), float(on.mean.mean())
+    signal = bright_mean - dark_mean
     if not signal > 0:
         raise InputError(
-            f"'frames' have the mean {on.mean.mean():.6g} DN, 'dark' {off.mean.mean():.6g}: "
-            "expected more light"
+            f"'frames' have the mean {bright_mean:.6g} DN, 'dark' {dark_mean:.6g}: expected more "
+            "light"
         )
     if gain_dn_per_e is not None and not number("gain_dn_per_e", gain_dn_per_e) > 0:
         raise InputError(f"'gain_dn_per_e' is {gain_dn_per_e!r}, expected a number above 0")
     dsnu = _roots(split_variances(off) / (gain_dn_per_e or 1.0) ** 2)
-    filtered = [
-        each._replace(mean=high_passed(each.mean)) if highpass else each for each in (on, off)
-    ]
-    variances = split_variances(filtered[0]) - split_variances(filtered[1])
-    prnu = _roots(variances / signal**2)
-    return EmvaSpatial(dsnu, prnu, float(off.mean.mean()), float(on.mean.mean()))
+    if highpass:
+        off, on = (each._replace(mean=high_passed(each.mean)) for each in (off, on))
+    prnu = _roots((split_variances(on) - split_variances(off)) / signal**2)
+    return EmvaSpatial(dsnu, prnu, dark_mean, bright_mean)
 
 
 def split_variances(found: Moments) -> Floats:
@@ -165,11 +163,10 @@ def high_passed(image: Floats) -> Floats:
 def _along_both(image: Floats, weights: Floats) -> Floats:
     """Weighted running mean along rows and columns; borders are reflected, edge values doubled."""
     half = len(weights) // 2
-    for axis in (0, 1):
-        pads = [(half, half) if each == axis else (0, 0) for each in (0, 1)]
-        padded, size = np.pad(image, pads, mode="symmetric"), image.shape[axis]
-        parts = (np.take(padded, range(k, k + size), axis) for k in range(len(weights)))
-        image = np.asarray(sum(weight * part for weight, part in zip(weights, parts, strict=True)))
+    for _ in ("rows", "columns"):
+        padded = np.pad(image, ((half, half), (0, 0)), mode="symmetric")
+        parts = (weight * padded[k : k + len(image)] for k, weight in enumerate(weights))
+        image = np.asarray(sum(parts)).T
     return image
 
 

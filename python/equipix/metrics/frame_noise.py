@@ -1,12 +1,12 @@
 """Noise of a stack of frames: moments, and its seven components."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, as_array, naming_memory
+from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, say
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
@@ -266,26 +266,19 @@ def three_d_noise(frames: ArrayLike) -> ThreeDNoise:
     if min(y.shape) < 2:
         raise InputError(f"'frames' has shape {y.shape}, expected two or more along each axis")
     refuse_missing("frames", y)
-    sizes = np.array(y.shape)
-    mean_squares = {}
-    for axes, squares in _squares(y).items():
-        degrees = np.prod([sizes[axis] - 1 for axis in axes])
-        repeats = np.prod([sizes[axis] for axis in range(3) if axis not in axes])
-        mean_squares[axes] = float(squares * repeats / degrees)
-    found: dict[tuple[int, ...], float] = {}
-    for axes in sorted(mean_squares, key=len, reverse=True):
-        above = sum(
-            variance * np.prod([sizes[axis] for axis in range(3) if axis not in other])
-            for other, variance in found.items()
-            if set(axes) < set(other)
-        )
-        repeats = np.prod([sizes[axis] for axis in range(3) if axis not in axes])
-        found[axes] = float((mean_squares[axes] - above) / repeats)
-    names = {"".join("tvh"[axis] for axis in axes): value for axes, value in found.items()}
-    return ThreeDNoise(**names)
+    sizes, squares = dict(zip("tvh", y.shape, strict=True)), _squares(y)
+    repeats = {
+        axes: math.prod(sizes[axis] for axis in "tvh" if axis not in axes) for axes in squares
+    }
+    found: dict[str, float] = {}
+    for axes in sorted(squares, key=len, reverse=True):
+        mean_square = squares[axes] * repeats[axes] / math.prod(sizes[axis] - 1 for axis in axes)
+        above = sum(found[other] * repeats[other] for other in found if set(axes) < set(other))
+        found[axes] = (mean_square - above) / repeats[axes]
+    return ThreeDNoise(**found)
 
 
-def _squares(y: Array) -> dict[tuple[int, ...], float]:
+def _squares(y: Array) -> dict[str, float]:
     """Sum of the squared effects of each set of axes: means over the others, less the subsets'.
 
     Two passes over the frames: one for the means, one for what they leave.
@@ -306,5 +299,5 @@ def _squares(y: Array) -> dict[tuple[int, ...], float]:
         lines = t[index] + v + tv[index]
         free = frame.astype(np.float64) - whole
         rest += float(np.sum((free - lines[:, None] - (h + th[index]) - vh) ** 2))
-    effects = {(0,): t, (1,): v, (2,): h, (0, 1): tv, (0, 2): th, (1, 2): vh}
-    return {axes: float(np.sum(effect**2)) for axes, effect in effects.items()} | {(0, 1, 2): rest}
+    effects = {"t": t, "v": v, "h": h, "tv": tv, "th": th, "vh": vh}
+    return {axes: float(np.sum(effect**2)) for axes, effect in effects.items()} | {"tvh": rest}

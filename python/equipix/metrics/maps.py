@@ -1,26 +1,23 @@
 """Figures of maps and frames: rms, block means, tilt, roughness, NETD, non-uniformity."""
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, as_array, naming_memory, number
+from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory, positive
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
-from equipix.measured.filters import BLOCK
-from equipix.measured.noise import scatter_limit
+from equipix.measured.noise import BLOCK, scatter_limit
 from equipix.metrics.frame_noise import stack_of, temporal_of
 
 
-def rms(values: NDArray[Any]) -> float:
+def rms(values: Array) -> float:
     """Root mean square of the values that are finite."""
     return float(np.sqrt(np.mean(np.square(values[np.isfinite(values)]))))
 
 
-def rms_at_both_scales(error: NDArray[Any]) -> tuple[float, float]:
+def rms_at_both_scales(error: Array) -> tuple[float, float]:
     """Root mean square over pixels, and of means over 16×16 pixels: NaN without a whole block."""
     return rms(error), rms(block_means(error)) if min(error.shape) >= BLOCK else np.nan
 
@@ -97,7 +94,7 @@ def block_means(image: ArrayLike, size: int = BLOCK) -> Floats:
     return means
 
 
-def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> Bools:
+def slope_pixels(sensitivity: Array, flags: Array) -> Bools:
     """Find the pixels that count for the slope of ln M.
 
     They are those of which M is determined, that are not flagged ``UNRELIABLE_FLAT``, and whose M
@@ -120,7 +117,7 @@ def slope_pixels(sensitivity: NDArray[Any], flags: NDArray[Any]) -> Bools:
     )
 
 
-def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
+def tilt_weights(valid: Bools) -> Floats:
     """Weights whose sums with ln M are its least-squares slopes, edge to edge.
 
     Parameters
@@ -144,7 +141,7 @@ def tilt_weights(valid: NDArray[np.bool_]) -> Floats:
     return np.asarray(np.einsum("ab,brc->arc", np.linalg.inv(normal), centred))
 
 
-def tilt(sensitivity: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+def tilt(sensitivity: Array, valid: Bools) -> Floats:
     """Least-squares slope of ln M over valid pixels, edge to edge, (row, col).
 
     Parameters
@@ -203,8 +200,7 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_k: float) -> Floats:
     >>> print(f"{np.median(metrics.netd(cold, hot, delta_k=5.0)):.3f}")
     0.025
     """
-    if not number("delta_k", delta_k) > 0:
-        raise InputError(f"'delta_k' is {delta_k!r}, expected a difference above 0 kelvin")
+    positive("delta_k", delta_k)
     low, high = stack_of("cold", cold), stack_of("hot", hot)
     if low.shape[1:] != high.shape[1:]:
         raise InputError(f"'hot' has shape {high.shape}, expected frames of {low.shape[1:]}")
@@ -348,8 +344,7 @@ def non_uniformity(frames: ArrayLike, span: float) -> float:
     0.015
     """
     values = as_array("frames", frames, ndim=3).astype(np.float64)
-    if not 0 < number("span", span) < np.inf:
-        raise InputError(f"'span' is {span!r}, expected a finite number of DN above 0")
+    positive("span", span)
     if np.isinf(values).any():
         raise InputError("'frames' holds infinite values, expected finite ones, or NaN where bad")
     empty = np.flatnonzero(~np.isfinite(values).any(axis=(1, 2)))

@@ -10,9 +10,8 @@ from equipix.correction.protocol import named_cfa
 from equipix.errors import InputError
 from equipix.findings import Finding, ask, say, set_bits, usable
 from equipix.measured import defects, noise
-from equipix.measured.colour import Colours, planes_of
+from equipix.measured.colour import Colours, Filters, planes_of
 from equipix.measured.defects import DefectLimits
-from equipix.measured.filters import Filters
 from equipix.measured.statistics import FrameStatistics, Light, light_of
 from equipix.metrics.frame_noise import STEADY, stack_of, temporal_of
 from equipix.nuc.curves import response_at
@@ -105,8 +104,8 @@ def of_frames(
     noisy = flickering = np.zeros(good.shape, bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
-        flickering = defects.noisy_pixels(*of_level)
-        noisy = defects.noisy_pixels(*of_level, times=limits.noise, light=[common])
+        flickering = defects.noisy_pixels(*of_level, [np.zeros(())])
+        noisy = defects.noisy_pixels(*of_level, [common], times=limits.noise)
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
         noisy = noisy | defects.often_rejected(missing, count)

@@ -12,9 +12,8 @@ from equipix import _native
 from equipix._check import Array, Bools, Floats, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
-from equipix.measured.colour import Colours
+from equipix.measured.colour import Colours, Filters
 from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
-from equipix.measured.filters import Filters
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, averaged_of, check_levels, measured_of
 from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
