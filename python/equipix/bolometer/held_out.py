@@ -44,13 +44,6 @@ class Form(NamedTuple):
     regressor: Regressor
 
 
-class Chosen(NamedTuple):
-    """The order that predicts best, and the mean square error of each order."""
-
-    order: int
-    errors: list[float]
-
-
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """Deviations of usable pixels, shape (n, pixels), to be predicted from other temperatures.
@@ -65,8 +58,10 @@ class HeldOut:
     variance: Floats | None
     largest: float
 
-    def chosen(self) -> Chosen:
-        """Lowest order within 0.1 % of the smallest error; 0, without errors, of one temperature.
+    def chosen(self) -> tuple[int, list[float]]:
+        """Order that predicts best, and the mean square error of each order.
+
+        The lowest within 0.1 % of the smallest error; 0, without errors, of one temperature.
 
         Raises
         ------
@@ -74,14 +69,18 @@ class HeldOut:
             If there are two temperatures, so that the others of one that is held out are one.
         """
         if len(self.states.groups) == 1:
-            return Chosen(0, [])
-        self._refuse_two()
+            return 0, []
+        if len(self.states.groups) == 2:
+            raise InputError(
+                "'order' is 'auto', which holds out a temperature, but 'substrate_c' has "
+                f"{[float(group[0]) for group in self.states.groups]} °C: give three, or an order"
+            )
         orders = range(1, min(HIGHEST, len(self.states.groups) - 2) + 1)
         possible = [0, *takewhile(self._is_possible, orders)]
         errors = [self._error(each) for each in possible]
         enough = min(errors) * (1 + _BETTER) + self.rounding
         order = next(each for each, error in enumerate(errors) if error <= enough)
-        return Chosen(order, errors)
+        return order, errors
 
     @property
     def rounding(self) -> float:
@@ -163,15 +162,6 @@ class HeldOut:
         if len(course) < _FEWEST or squares[-1] < _MOST * squares.sum() or squares[-1] <= 0:
             course = np.zeros_like(course)
         return celsius[order], course
-
-    def _refuse_two(self) -> None:
-        """Refuse to choose an order where one temperature would be predicted from one other."""
-        groups = self.states.groups
-        if len(groups) == 2:
-            raise InputError(
-                "'order' is 'auto', which holds out a temperature, but 'substrate_c' has "
-                f"{[float(group[0]) for group in groups]} °C: give three, or an order"
-            )
 
 
 class Judged(NamedTuple):

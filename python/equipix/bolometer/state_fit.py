@@ -130,7 +130,7 @@ def fit(
     chosen, errors, more = shown.order(order)
     said += more
     axes, offset = shown.coefficients(chosen)
-    level = shown.coefficients_of_mean(chosen)
+    level = np.asarray(solver_of(axes, states) @ shown.mean)
     metadata: dict[str, Any] = {
         "options": {
             "order": chosen if errors is None else "auto",
@@ -181,28 +181,19 @@ class Shown:
         check_spread(axes, self.states, solver)
         return axes, np.tensordot(solver, self.deviation, 1)
 
-    def coefficients_of_mean(self, order: int) -> Floats:
-        """Coefficients of the mean of the array."""
-        axes = self.states.axes(order, *self.form)
-        return np.asarray(solver_of(axes, self.states) @ self.mean)
-
     def order(
         self, order: int | Literal["auto"]
     ) -> tuple[int, list[float] | None, tuple[Finding, ...]]:
         """Order that is given, or that which best predicts; prediction errors, and findings."""
-        given = None
-        if not (isinstance(order, str) and order == "auto"):
-            given = _checked_order(order)
-        held_out = self._held_out()
-        chosen, errors = held_out.chosen() if given is None else (given, None)
-        said = say(*ask(STATES, Judged(held_out, chosen, errors, self.is_offset)))
-        return chosen, errors or None, said
-
-    def _held_out(self) -> HeldOut:
-        """Values of usable pixels, of which some are to be predicted."""
+        is_auto = isinstance(order, str) and order == "auto"
+        if not (is_auto or is_whole(order, 0, HIGHEST)):
+            raise InputError(f"'order' is {order!r}, expected 0 to {HIGHEST} or 'auto'")
         largest = float(np.abs(self.values[:, self.good]).max())
         deviation = self.deviation[:, self.good]
-        return HeldOut(deviation, self.states, self.form, self.variance, largest)
+        held_out = HeldOut(deviation, self.states, self.form, self.variance, largest)
+        chosen, errors = held_out.chosen() if is_auto else (int(order), None)
+        said = say(*ask(STATES, Judged(held_out, chosen, errors, self.is_offset)))
+        return chosen, errors or None, said
 
 
 def _bias_order(states: States, given: int | None) -> int:
@@ -212,12 +203,6 @@ def _bias_order(states: States, given: int | None) -> int:
     if not is_whole(given, 0):
         raise InputError(f"'bias_order' is {given!r}, expected a whole number from 0, or None")
     return int(given)
-
-
-def _checked_order(order: int | str) -> int:
-    if not is_whole(order, 0, HIGHEST):
-        raise InputError(f"'order' is {order!r}, expected 0 to {HIGHEST} or 'auto'")
-    return int(order)
 
 
 def references_of(name: str, given: Any) -> Measured:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -13,12 +13,8 @@ from equipix.errors import FileError
 from equipix.io.paths import folder_beside, replace_folder
 from equipix.io.tiff import write_frames
 
-
-class Stream(NamedTuple):
-    """Frames of one file, made one at a time when they are written, and their number."""
-
-    frames: Callable[[], Iterator[Array]]
-    length: int
+Stream: TypeAlias = tuple[Callable[[], Iterator[Array]], int]
+"""Frames of one file, made one at a time when they are written, and their number."""
 
 
 def write_experiment(
@@ -41,11 +37,11 @@ def write_experiment(
             "of a folder that holds nothing but an experiment written before"
         )
     with folder_beside(target) as folder:
-        done, total = count(1), sum(stream.length for stream in streams.values())
-        for name, stream in streams.items():
+        done, total = count(1), sum(length for _, length in streams.values())
+        for name, (made, length) in streams.items():
             (folder / name).parent.mkdir(exist_ok=True)
-            frames = _reported(stream.frames(), progress, done, total)
-            write_frames(folder / name, frames, nbytes=stream.length * frame_bytes)
+            frames = _reported(made(), progress, done, total)
+            write_frames(folder / name, frames, nbytes=length * frame_bytes)
         np.savez(folder / "truth.npz", **truth)
         manifest = _manifest(sensor, sum(name.startswith("frames/") for name in streams))
         (folder / "experiment.toml").write_text(manifest, encoding="utf-8")

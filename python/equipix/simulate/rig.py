@@ -195,12 +195,12 @@ class VirtualExperiment:
             If `folder` is not the name of a folder.
         """
         camera, hole = self.camera, self.aperture_count
-        streams = {"dark/dark.tif": Stream(self.dark, self.dark_count)}
+        streams: dict[str, Stream] = {"dark/dark.tif": (self.dark, self.dark_count)}
         for k in range(len(self.positions)):
-            streams[f"frames/p{k}.tif"] = Stream(partial(self.frames, k), self.count)
+            streams[f"frames/p{k}.tif"] = partial(self.frames, k), self.count
         for k in range(1, len(self.positions)):
-            streams[f"aperture/p{k}-before.tif"] = Stream(partial(self.aperture_before, k), hole)
-            streams[f"aperture/p{k}-after.tif"] = Stream(partial(self.aperture_after, k), hole)
+            streams[f"aperture/p{k}-before.tif"] = partial(self.aperture_before, k), hole
+            streams[f"aperture/p{k}-after.tif"] = partial(self.aperture_after, k), hole
         cfa = None if self.cfa is None else self.cfa.written
         return write_experiment(
             as_path("folder", folder),
