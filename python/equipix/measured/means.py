@@ -25,7 +25,7 @@ _NAMED = 0.1
 class Averaged:
     """The part of the `FrameStatistics` of each exposure that a calibration needs.
 
-    Parameters
+    Attributes
     ----------
     count : int
         Number of exposures.
@@ -41,9 +41,6 @@ class Averaged:
         What messages call the frames.
     colours : Colours, optional
         Colour filters of the pixels; unless given those that stand out of the first frames.
-
-    Attributes
-    ----------
     values : ndarray, shape (n, rows, cols)
         Mean frames, the dark subtracted; NaN where a sample saturates, which is left out of that
         exposure alone.
