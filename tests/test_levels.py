@@ -73,6 +73,18 @@ class TestLevelExperiment:
         assert metadata["noise"]["gain"] > 0
         json.dumps(metadata)
 
+    def test_says_the_gain_without_a_dark(self, tmp_path):
+        """The level without light, here 1000 DN, has no photon noise."""
+        rng, text = np.random.default_rng(1), "[sensor]\nbit_depth = 14\n"
+        for light in (500, 1500, 2500):
+            electrons = rng.poisson(np.full((16, *SHAPE), 4 * light))
+            frames = np.rint(1000 + electrons / 4 + rng.normal(0, 2, electrons.shape))
+            write_frames(tmp_path / f"{light}.tif", iter(frames.astype(np.uint16)), nbytes=1)
+            text += f'[[level]]\nframes = "{light}.tif"\n'
+        (tmp_path / "raw.toml").write_text(text, encoding="utf-8")
+        metadata = LevelExperiment.load(tmp_path / "raw.toml").run().metadata
+        assert metadata["noise"]["gain"] == pytest.approx(1 / 4, rel=0.05)
+
     def test_needs_no_dark(self, folder, array):
         response = LevelExperiment.load(folder / "raw.toml").run(order=2)
         assert response.raw

@@ -92,7 +92,7 @@ class LevelExperiment(Described[LevelManifest]):
         excluded, hashes = self._checked(mask)
         entry = self.manifest.dark
         dark = None if entry is None else self._dark(entry, workers, progress)
-        averaged = self._average(dark, workers, progress)
+        averaged = self._average(dark, workers, progress).counted_from_lowest()
         levels = levels_of(averaged, mask=excluded)
         if words := self._falling(levels):
             said = say(Finding("light", words, "misfit"))

@@ -160,10 +160,12 @@ class Averaged:
         self._screened += int(frames.count.max())
 
     def counted_from_lowest(self) -> Self:
-        """Return a copy whose noise models count the signal from the lowest of several exposures.
+        """Return averages whose noise models count raw signals from the lowest of several.
 
         Raw values contain the level without light, which adds no photon noise.
         """
+        if self._is_counted or not self.raw or self.count < 2:
+            return self
         counted = copy.copy(self)
         for known in ("noise", "filters"):
             vars(counted).pop(known, None)

@@ -168,7 +168,7 @@ def levels_of(
     """Check what the caller gave; the arguments are those of `equipix.nuc.fit`."""
     check_levels(levels)
     averaged = averaged_of(levels, _LEVELS, Colours.of(cfa))
-    if averaged is not None and averaged.raw and averaged.count > 1:
+    if averaged is not None:
         averaged = averaged.counted_from_lowest()
     source = levels if averaged is None else averaged
     measured = measured_of(source, variance, saturation, words=_LEVELS, colours=Colours.of(cfa))
